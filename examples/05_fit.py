@@ -51,7 +51,8 @@ def built(run: Path) -> Path:
     command = Build(out=run, capture=PERSON)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)  # the small scan is repaired here and there
-        build(run, command.inputs(), command.config(), last="60_assemble")
+        plan = command.plan()
+        build(run, plan.inputs, plan.config, last="60_assemble")
     return run
 
 

@@ -6,7 +6,7 @@
 
 `photographs`: the training cameras' photographs with their masks' boxes; errors against the true body's landmarks as a
 camera and a triangulation see them, and the body that `smplxpp.register` fits to these keypoints, with masks and
-without, from nothing else. `scans`: landmarks of bare scans drawn all around (`pipelines.stages.scan_keypoints`), of
+without, from nothing else. `scans`: landmarks of bare scans drawn all around (`smplxpp.build.scan_keypoints`), of
 every capture and procedural person, as they are, after `benchmarks.people.VARIANTS`, without colours. `masks`: of
 MediaPipe, and of empty plates: the captures are on black, so their people are put before made rooms, with noise, a
 shadow on the floor and another exposure than the plate's. The truth is looked at in measuring alone.
@@ -32,10 +32,10 @@ from benchmarks.support.results import store_results
 from pipelines.captures.detect_keypoints import detect_keypoints, problems_of
 from pipelines.commands.capture import selected_frames
 from pipelines.commands.options import OptionalPath, OptionalText
-from pipelines.stages.observe import observe
-from pipelines.stages.register_config import RegisterInputs
-from pipelines.stages.scan_keypoints import ScanViews, facing, keypoints_of_scan
+from pipelines.stages.build_config import RegisterInputs
 from smplxpp.body import BodyModel, load_body
+from smplxpp.build.observe import observe
+from smplxpp.build.scan_keypoints import ScanViews, facing, keypoints_of_scan
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams

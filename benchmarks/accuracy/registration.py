@@ -26,9 +26,9 @@ from benchmarks.support.results import store_results
 from pipelines.commands.options import OptionalPath
 from pipelines.runs.artefacts import load_stacked_params
 from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS, REFINED_PARAMS
-from pipelines.stages.observe import observe
-from pipelines.stages.register_config import RegisterInputs
+from pipelines.stages.build_config import RegisterInputs
 from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.build.observe import observe
 from smplxpp.core.labels import SKIN
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec

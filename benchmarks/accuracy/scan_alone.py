@@ -20,8 +20,8 @@ import tyro
 
 from benchmarks.people import VARIANTS, PersonScan, captured, captured_names, people, person, variant
 from benchmarks.support.results import store_results
-from pipelines.stages.locate import sure_labels
 from smplxpp.body import BodyModel, load_body
+from smplxpp.build.locate import certain_labels
 from smplxpp.clean import convert_points, find_scan_frame
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -82,7 +82,7 @@ def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, fl
     try:
         frame = find_scan_frame(scan.mesh.vertices, scan.mesh.faces)
         mesh = scan.mesh.with_vertices(convert_points(scan.mesh.vertices, units=frame.units, up=frame.up))
-        labeller = partial(sure_labels, mesh, body, scan.colors)
+        labeller = partial(certain_labels, mesh, body, scan.colors)
         found = locate_body(body, mesh, colors=scan.colors, labeller=labeller)
     except InputError as error:
         return {"scan": scan.name, "refused": str(error)}

@@ -34,7 +34,7 @@ from avatar.training.tracking.track import TrackTask
 from benchmarks.support.results import store_results
 from pipelines.runs import layout
 from pipelines.runs.stage import read_manifest
-from pipelines.stages.protocol import run_protocol
+from pipelines.stages.run_inputs import run_protocol
 from smplxpp.capture import open_capture
 from smplxpp.capture.protocols import TRACKED
 from smplxpp.core.errors import InputError

@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from pipelines.commands.build_inputs import chosen_inputs, chosen_reconstruction, chosen_registration
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
 from pipelines.runs.folders import keep_out_of_capture, take_file
-from pipelines.runs.layout import (
-    BUILD_STAGES,
-    CORRECTIONS_FILE,
-    EVALUATE_STAGE,
-    FIT_STAGE,
-    LANDMARKS_FILE,
-    REFINE_STAGE,
-    RELIGHT_STAGE,
-    TRAIN_STAGES,
-)
-from pipelines.runs.stage import StageRecord
-from pipelines.stages.build_config import BuildConfig, BuildInputs
-from pipelines.stages.register_config import RegisterInputs
-from smplxpp.core.errors import InputError
+from pipelines.runs.layout import BUILD_STAGES, CORRECTIONS_FILE, LANDMARKS_FILE, REGISTER_STAGE, reconstructed_scan
+from pipelines.runs.stage import read_manifest
+from pipelines.stages.build_config import load_reconstruct, load_register, stages_of
+from smplxpp.build.config import BuildConfig
+from smplxpp.build.inputs import BuildPlan, BuildRequest, plan_build
+from smplxpp.clean.remesh import require_remesher
 from smplxpp.core.files.json_file import read_json
+from smplxpp.detect import load_detector
+from smplxpp.register import read_landmarks
+from smplxpp.segment import Corrections
 
 StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
 
@@ -117,38 +110,31 @@ class Build:
     def run(self) -> dict:
         """Build, write metrics.json and the report, print the summary."""
         from pipelines.commands.inspect import Inspect
-        from pipelines.report.sections.build import write_build_report
+        from pipelines.report.sections.build import report_stands, write_build_report
         from pipelines.stages.build import build
-        from smplxpp.clean.remesh import require_remesher
-        from smplxpp.detect import load_detector
-        from smplxpp.register import read_landmarks
-        from smplxpp.segment import Corrections
 
         keep_out_of_capture(self.out, self.capture)
-        config, inputs = self.config(), self.inputs()
-        registration, reconstruction = self.registration(inputs), chosen_reconstruction(self, inputs)
-        if self.detector is not None:
-            load_detector(self.detector)  # before work starts
-        require_remesher(self.remesh)
+        plan = self.plan()
+        self._check_tools()
         take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
         take_file(self.out, CORRECTIONS_FILE, self.corrections, read=Corrections.load)
         bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)
-        count = sum(name in inputs.stages for name in BUILD_STAGES[bounds[0] : bounds[1] + 1])
+        count = sum(name in stages_of(plan.inputs) for name in BUILD_STAGES[bounds[0] : bounds[1] + 1])
         whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report
         with stage_progress(count + whole, enabled=not self.json) as step:
             records = build(
                 self.out,
-                inputs,
-                config,
-                registration=registration,
-                reconstruction=reconstruction,
+                plan.inputs,
+                plan.config,
+                registration=plan.registration,
+                reconstruction=plan.reconstruction,
                 first=self.from_stage,
                 last=self.until_stage,
                 progress=step,
             )
-            if whole and not self._report_stands(records):
+            if whole and not report_stands(self.out, records):
                 step("report", False)
-                write_build_report(self.out, inputs, config, records)
+                write_build_report(self.out, plan.inputs, plan.config, records)
                 step("report", True)
         if not self.json:
             Inspect(run_folder=self.out).run()
@@ -156,61 +142,49 @@ class Build:
         failed = sum(check["status"] == "fail" for check in metrics["checks"])
         return {**metrics, "failed": failed, "exit_status": 0}
 
-    def _report_stands(self, records: dict[str, StageRecord]) -> bool:
-        """Whether the report was written after every stage, those of other commands among them."""
-        report = self.out / "report.html"
-        manifests = [record.folder / "manifest.json" for record in records.values()]
-        manifests += [
-            self.out / name / "manifest.json"
-            for name in (REFINE_STAGE, FIT_STAGE, *TRAIN_STAGES, EVALUATE_STAGE, RELIGHT_STAGE)
-        ]
-        made = [path.stat().st_mtime_ns for path in manifests if path.exists()]
-        return report.is_file() and report.stat().st_mtime_ns > max(made)
-
-    def inputs(self) -> BuildInputs:
-        """The files of this build.
+    def plan(self) -> BuildPlan:
+        """Decide what this build takes.
 
         Raises:
-            InputError: neither or both ways of naming the input, or files that a capture lacks.
+            InputError: neither or both ways of naming the input, files that a capture lacks, or choices out of range.
         """
-        return chosen_inputs(self)
+        return plan_build(self.request())
 
-    def registration(self, inputs: BuildInputs) -> RegisterInputs | None:
-        """What the body is registered to, None where it is not."""
-        return chosen_registration(self, inputs)
+    def request(self) -> BuildRequest:
+        """Turn the options into one request, with what earlier commands have made in the run."""
+        registered = read_manifest(self.out / REGISTER_STAGE) is not None
+        return BuildRequest(
+            scan=self.scan,
+            capture=self.capture,
+            params=self.params,
+            labels=self.labels,
+            body=self.body,
+            config=self.config(),
+            surface=self.out / reconstructed_scan(self.frame),
+            registration=load_register(self.out) if registered else None,
+            reconstruction=load_reconstruct(self.out),
+        )
 
     def config(self) -> BuildConfig:
-        """The choices of this build.
+        """Collect the choices of this build.
 
         Raises:
             InputError: a budget for an unknown part, or numbers out of range.
         """
         default = BuildConfig()
-        unknown = sorted(set(self.budgets) - set(default.budgets))
-        if unknown:
-            raise InputError(
-                "option budgets", expected=f"parts among {', '.join(default.budgets)}", received=", ".join(unknown)
-            )
-        for name, value, least, most in (
-            ("clearance-mm", self.clearance_mm, 0.1, 10.0),
-            ("max-influences", self.max_influences, 1, math.inf),
-            ("samples", self.samples, 1000, math.inf),
-            ("seed", self.seed, 0, math.inf),
-            ("frame", self.frame, 0, math.inf),
-            ("budgets", min(self.budgets.values(), default=100), 100, math.inf),
-        ):
-            if not (least <= value <= most and math.isfinite(value)):
-                limit = f" and at most {most:g}" if math.isfinite(most) else ""
-                raise InputError(
-                    f"option {name}", expected=f"a finite number, at least {least:g}{limit}", received=f"{value:g}"
-                )
-        alone = self.scan is not None and self.params is None
         changed: dict[str, Any] = {
-            "units": self.units if alone or self.units != "auto" else "m",
-            "up": self.up if alone or self.up != "auto" else "y",
             "budgets": default.budgets | self.budgets,
             "webs": replace(default.webs, rounds=0) if self.keep_webs else default.webs,
             "darning": replace(default.darning, width=0.0) if self.keep_holes else default.darning,
+            # Landmarks and corrections lie in the run, where every stage finds them.
+            "landmarks": None,
+            "corrections": None,
         }
         names = {f.name for f in dataclasses.fields(BuildConfig)} - set(changed)
         return BuildConfig(**{n: getattr(self, n) for n in names}, **changed)
+
+    def _check_tools(self) -> None:
+        """Find that the detector and the remesher can be loaded before work starts."""
+        if self.detector is not None:
+            load_detector(self.detector)
+        require_remesher(self.remesh)

@@ -18,8 +18,8 @@ from smplxpp.core.validation import require_at_least, require_positive
 
 if TYPE_CHECKING:
     from pipelines.runs.stage import StageRecord
+    from pipelines.stages.build_config import ReconstructInputs
     from pipelines.stages.reconstruct import Method
-    from pipelines.stages.reconstruct_config import ReconstructInputs
 
 _SHOWN = 8
 
@@ -102,7 +102,7 @@ class ReconstructCommand:
             InputError: options that make no sense, a missing folder, frames that the capture has not.
         """
         from pipelines.commands.capture import selected_frames
-        from pipelines.stages.reconstruct_config import ReconstructInputs
+        from pipelines.stages.build_config import ReconstructInputs
         from smplxpp.capture import open_capture
 
         require_at_least("option dissent", self.dissent, 0)

@@ -20,7 +20,7 @@ from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
     from pipelines.runs.stage import StageRecord
-    from pipelines.stages.register_config import RegisterInputs
+    from pipelines.stages.build_config import RegisterInputs
 
 _SHOWN = 8
 
@@ -116,7 +116,8 @@ class Register:
             InputError: neither a capture nor a scan, a missing file, frames that the capture has not.
         """
         from pipelines.commands.capture import selected_frames
-        from pipelines.stages.register_config import RegisterInputs, named_params
+        from smplxpp.build.config import RegisterInputs
+        from smplxpp.build.inputs import named_params
         from smplxpp.capture import open_capture
 
         if self.capture is None and self.scan is None:
@@ -170,7 +171,7 @@ class Register:
 
 
 def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None) -> None:
-    from pipelines.stages.registration import RESIDUALS
+    from smplxpp.build.register import RESIDUALS
 
     console, numbers = Console(), record.manifest["numbers"]
     medians = numbers["residuals"]

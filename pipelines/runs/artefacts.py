@@ -22,6 +22,7 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.stage import MANIFEST, StageRecord
 from smplxpp.body import BodyModel, load_params
+from smplxpp.build.data import LocatedInScan, Part, PosedFit, PreparedScan
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.json_file import as_integer, as_numbers
@@ -29,6 +30,23 @@ from smplxpp.core.files.safe_pickle import safe_npz
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.skinning import Unposed
+
+LOCATED_FILES = ("params.npz", "labels.npz")
+"""Files of the stage that finds the body in a scan."""
+
+
+def save_scan(folder: Path, scan: PreparedScan) -> None:
+    """Write the repaired scan of a run."""
+    arrays = {
+        "vertices": scan.mesh.vertices,
+        "faces": scan.mesh.faces,
+        "colors": scan.colors,
+        "source_vertex": scan.source_vertex,
+        "source_face": scan.source_face,
+    }
+    save_arrays(folder / Path(SCAN).name, {"scan": arrays})
+
 
 # Remedies of the errors below: a file whose arrays are missing, and one whose values cannot be used.
 _DAMAGED = "the stage's file is damaged: delete the stage's folder and give the command again"
@@ -44,6 +62,20 @@ def load_scan(run: Path) -> tuple[TriangleMesh, np.ndarray, np.ndarray]:
     found = take(arrays, "vertices", "faces", "colors", "source_vertex", path=run / SCAN)
     with values_of(run / SCAN):
         return _mesh(found), found["colors"], found["source_vertex"]
+
+
+def load_source_faces(run: Path) -> np.ndarray:
+    """Read the index of each of the scan's faces in the user's file."""
+    return take(load_arrays(run / SCAN).get("scan", {}), "source_face", path=run / SCAN)["source_face"]
+
+
+def load_prepared_scan(run: Path) -> PreparedScan:
+    """Read what `save_scan` wrote."""
+    mesh, colors, source_vertex = load_scan(run)
+    source_face = load_source_faces(run)
+    with values_of(run / SCAN):
+        _check("source_face", source_face, "iu", (mesh.face_count,))
+        return PreparedScan(mesh, colors, source_vertex, source_face)
 
 
 def load_params_of_run(run: Path) -> BodyParams:
@@ -62,11 +94,6 @@ def load_stacked_params(path: Path) -> tuple[tuple[int, ...], BodyParams]:
         return tuple(np.flatnonzero(good).tolist()), BodyParams.from_mapping(kept, source=f"file {path}")
 
 
-def load_source_faces(run: Path) -> np.ndarray:
-    """Read the index of each of the scan's faces in the user's file."""
-    return take(load_arrays(run / SCAN).get("scan", {}), "source_face", path=run / SCAN)["source_face"]
-
-
 def load_scan_labels(run: Path, faces: int) -> np.ndarray:
     """Read the labels of the scan's faces, one for each of `faces`."""
     (labels,) = read_named(run / SCAN_LABELS, "face_labels")
@@ -75,39 +102,99 @@ def load_scan_labels(run: Path, faces: int) -> np.ndarray:
         return labels
 
 
-def load_posed_body(run: Path, body: BodyModel) -> tuple[TriangleMesh, np.ndarray]:
-    """Read the fitted body in the reference frame, and its (J, 4, 4) `posed_from_rest`."""
-    vertices, posed_from_rest = read_named(run / POSED_BODY, "vertices", "posed_from_rest")
+def save_fit(folder: Path, fit: PosedFit) -> None:
+    """Write the fitted body of the reference frame."""
+    np.savez(
+        folder / Path(POSED_BODY).name,
+        vertices=fit.mesh.vertices,
+        rest_vertices=fit.at_rest.vertices,
+        joints=fit.joints,
+        rest_joints=fit.rest_joints,
+        posed_from_rest=fit.posed_from_rest,
+    )
+
+
+def load_fit(run: Path, body: BodyModel) -> PosedFit:
+    """Read what `save_fit` wrote."""
+    V, J = body.vertex_count, body.joint_count
+    shapes = {
+        "vertices": (V, 3),
+        "rest_vertices": (V, 3),
+        "joints": (J, 3),
+        "rest_joints": (J, 3),
+        "posed_from_rest": (J, 4, 4),
+    }
+    arrays = dict(zip(shapes, read_named(run / POSED_BODY, *shapes), strict=True))
     with values_of(run / POSED_BODY):
-        transforms = as_numbers(posed_from_rest, (body.joint_count, 4, 4), subject="posed_from_rest")
-        return body.mesh(as_numbers(vertices, (body.vertex_count, 3), subject="vertices")), transforms
+        found = {name: as_numbers(arrays[name], shape, subject=name) for name, shape in shapes.items()}
+        return PosedFit(
+            body.mesh(found["vertices"]),
+            body.mesh(found["rest_vertices"]),
+            found["joints"],
+            found["rest_joints"],
+            found["posed_from_rest"],
+        )
 
 
-def load_resting_body(run: Path, body: BodyModel) -> TriangleMesh:
-    """Read the fitted body in its rest pose."""
-    (vertices,) = read_named(run / POSED_BODY, "rest_vertices")
-    with values_of(run / POSED_BODY):
-        return body.mesh(as_numbers(vertices, (body.vertex_count, 3), subject="rest_vertices"))
+def save_located(folder: Path, located: LocatedInScan) -> None:
+    """Write the body that was found in a scan: one row of parameters, certain labels, and the body's bare vertices."""
+    params, labels = LOCATED_FILES
+    located.params.save(folder / params)
+    np.savez(folder / labels, labels=located.labels, bare=located.bare)
 
 
-def load_cleaned_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
-    """Read the cleaned parts in the reference pose: mesh, and arrays `label`, `source_vertex`, `colors`."""
+def load_located(folder: Path) -> LocatedInScan:
+    """Read what `save_located` wrote.
+
+    Raises:
+        InputError: files of another version.
+    """
+    params, file = LOCATED_FILES
+    labels, bare = read_named(folder / file, "labels", "bare")
+    with values_of(folder / file):
+        return LocatedInScan(load_params(folder / params), labels.astype(np.int64), bare.astype(bool))
+
+
+def save_parts(folder: Path, parts: Mapping[str, Part]) -> None:
+    """Write loose parts in the reference pose."""
+    groups = {
+        name: {
+            "vertices": part.mesh.vertices,
+            "faces": part.mesh.faces,
+            "label": np.array(part.label),
+            "source_vertex": part.source_vertex,
+            "colors": part.colors,
+        }
+        for name, part in parts.items()
+    }
+    save_arrays(folder / Path(PARTS).name, groups)
+
+
+def load_cleaned_parts(run: Path) -> dict[str, Part]:
+    """Read the cleaned parts in the reference pose."""
     return _parts(run / PARTS)
 
 
-def load_parts(run: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
-    """Read the parts without bridges, which is what the skin weights are for; layout of `load_cleaned_parts`."""
+def load_parts(run: Path) -> dict[str, Part]:
+    """Read the parts without bridges, which is what the skin weights are for."""
     return _parts(run / PARTS_WITHOUT_WEBS)
 
 
-def load_weights(run: Path, parts: Mapping[str, tuple[TriangleMesh, Any]]) -> dict[str, SkinWeights]:
+def save_weights(folder: Path, weights: Mapping[str, SkinWeights]) -> None:
+    """Write the skin weights of parts."""
+    names = [field.name for field in fields(SkinWeights)]
+    groups = {part: {name: np.asarray(getattr(found, name)) for name in names} for part, found in weights.items()}
+    save_arrays(folder / Path(WEIGHTS).name, groups)
+
+
+def load_weights(run: Path, parts: Mapping[str, Part]) -> dict[str, SkinWeights]:
     """Read the skin weights of the parts."""
     out = {}
     names, groups = [field.name for field in fields(SkinWeights)], load_arrays(run / WEIGHTS)
-    for name, (mesh, _) in parts.items():
+    for name, part in parts.items():
         with values_of(run / WEIGHTS):
             found = take(groups[name], *names, path=run / WEIGHTS)
-            count, slots = mesh.vertex_count, found["joint_indices"].shape[-1]
+            count, slots = part.mesh.vertex_count, found["joint_indices"].shape[-1]
             joint_count = as_integer(found.pop("joint_count").item(), subject="joint_count", least=1, most=10_000)
             policies = tuple(map(str, found.pop("policies").tolist()))
             _check(f"{name}/joint_indices", found["joint_indices"], "i", (count, slots))
@@ -124,23 +211,32 @@ def load_weights(run: Path, parts: Mapping[str, tuple[TriangleMesh, Any]]) -> di
     return out
 
 
-def load_canonical(run: Path, parts: Mapping[str, tuple[TriangleMesh, Any]]) -> dict[str, TriangleMesh]:
+def save_canonical(folder: Path, parts: Mapping[str, Unposed]) -> None:
+    """Write the vertices of parts in the T-pose, and the determinants of what brought them there."""
+    groups = {name: {"vertices": part.vertices, "determinant": part.determinant} for name, part in parts.items()}
+    save_arrays(folder / Path(CANONICAL).name, groups)
+
+
+def load_canonical(run: Path, parts: Mapping[str, Part]) -> dict[str, TriangleMesh]:
     """Read the parts in the T-pose."""
     groups, out = load_arrays(run / CANONICAL), {}
-    for name, (mesh, _) in parts.items():
+    for name, part in parts.items():
         with values_of(run / CANONICAL):
             vertices = take(groups[name], "vertices", path=run / CANONICAL)["vertices"]
-            out[name] = mesh.with_vertices(as_numbers(vertices, (mesh.vertex_count, 3), subject=f"{name}/vertices"))
+            shape = (part.mesh.vertex_count, 3)
+            out[name] = part.mesh.with_vertices(as_numbers(vertices, shape, subject=f"{name}/vertices"))
     return out
 
 
-def _parts(file: Path) -> dict[str, tuple[TriangleMesh, dict[str, np.ndarray]]]:
+def _parts(file: Path) -> dict[str, Part]:
     needed = ("vertices", "faces", "label", "source_vertex", "colors")
     groups = {name: take(arrays, *needed, path=file) for name, arrays in load_arrays(file).items()}
     with values_of(file):
-        for arrays in groups.values():
-            as_integer(arrays["label"].item(), subject="label", least=0, most=255)
-        return {name: (_mesh(arrays), arrays) for name, arrays in groups.items()}
+        out = {}
+        for name, arrays in groups.items():
+            label = as_integer(arrays["label"].item(), subject="label", least=0, most=255)
+            out[name] = Part(_mesh(arrays), label, arrays["source_vertex"], arrays["colors"])
+        return out
 
 
 def _mesh(arrays: Mapping[str, np.ndarray]) -> TriangleMesh:

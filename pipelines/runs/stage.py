@@ -29,7 +29,7 @@ from typing import Any, Literal
 
 from pipelines.runs.code import GEOMETRY, code_of, sha256_file, versions
 from pipelines.runs.manifest import SCHEMA, read_record
-from smplxpp.core.checks import Check
+from smplxpp.core.checks import StageOutput
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.files.json_file import jsonable
@@ -93,14 +93,6 @@ class Stage:
     def work_name(self) -> str:
         """Return the name of the folder with the state of a running stage."""
         return f"{self.name}_work"
-
-
-@dataclass
-class StageOutput:
-    """Checks and numbers that a stage's function returns beside its files."""
-
-    checks: list[Check] = field(default_factory=list)
-    numbers: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -9,44 +9,29 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+from pipelines.runs import layout
 from pipelines.runs.code import sha256_file
 from pipelines.runs.folders import own_run_folder
-from pipelines.runs.layout import (
-    ASSEMBLE_STAGE,
-    BUILD_STAGES,
-    CAPTURE_STAGE,
-    CLEAN_STAGE,
-    CORRECTIONS_FILE,
-    LANDMARKS_FILE,
-    LOCATE_STAGE,
-    METRICS_FILE,
-    POSE_BODY_STAGE,
-    RECONSTRUCT_STAGE,
-    REGISTER_STAGE,
-    SEGMENT_STAGE,
-    TRANSFER_STAGE,
-    UNPOSE_STAGE,
-    VALIDATE_STAGE,
-)
+from pipelines.runs.layout import BUILD_STAGES, RECONSTRUCT_STAGE, REGISTER_STAGE
 from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
-from pipelines.stages import assemble, capture, clean, locate, pose_body, segment, transfer, unpose, validate
-from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build
+from pipelines.stages import template_stages
+from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build, stages_of
 from pipelines.stages.reconstruct import reconstruct_capture
-from pipelines.stages.reconstruct_config import ReconstructInputs
 from pipelines.stages.register_capture import register_capture
-from pipelines.stages.register_config import RegisterInputs
-from smplxpp.body import load_body, load_params
+from smplxpp.build.config import ReconstructInputs, RegisterInputs, resolved
+from smplxpp.build.inputs import check_inputs
+from smplxpp.core.checks import StageOutput
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.validation import require_choice
 from smplxpp.detect import load_detector
-from smplxpp.segment import find_label_set
 
 METRICS_SCHEMA = 1
+Progress = Callable[[str, bool], None]
+"""Called with a stage's name before (False) and after (True) it."""
 
 
 @dataclass(frozen=True)
@@ -54,59 +39,94 @@ class _Part:
     """A stage of the build.
 
     Attributes:
-        module: its `run(folder, build)` does the work; its imports are the stage's code.
+        work: writes the stage's files.
+        step: module of `smplxpp.build` that computes them; its imports are the stage's code.
         needs: stages that it reads, where the build has them.
-        settings: fields of the configuration or the inputs that it depends on. files: inputs that it reads.
+        settings: fields of the inputs or the configuration that it depends on.
+        files: inputs that it reads.
         by_hand: files that it reads where they lie in the run.
+        writers: modules that write its files, beside those of all stages.
     """
 
-    module: ModuleType
+    work: Callable[[Path, BuildContext], StageOutput]
+    step: str
     needs: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
     by_hand: tuple[str, ...] = ()
+    writers: tuple[str, ...] = ()
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """The modules that do its work."""
+        return (f"smplxpp.build.{self.step}", "pipelines.runs.artefacts", *self.writers)
 
 
 PARTS: dict[str, _Part] = {
-    LOCATE_STAGE: _Part(
-        locate,
+    layout.LOCATE_STAGE: _Part(
+        template_stages.locate,
+        "locate",
         (RECONSTRUCT_STAGE,),
         settings=("units", "up", "detector"),
         files=("scan", "body"),
-        by_hand=(LANDMARKS_FILE,),
+        by_hand=(layout.LANDMARKS_FILE,),
     ),
-    CAPTURE_STAGE: _Part(
-        capture,
-        (LOCATE_STAGE, REGISTER_STAGE),
+    layout.CAPTURE_STAGE: _Part(
+        template_stages.capture,
+        "prepare",
+        (layout.LOCATE_STAGE, REGISTER_STAGE),
         settings=("units", "up", "frame", "params_row"),
         files=("scan", "params", "body"),
     ),
-    POSE_BODY_STAGE: _Part(pose_body, (CAPTURE_STAGE,), files=("body",)),
-    SEGMENT_STAGE: _Part(
-        segment,
-        (CAPTURE_STAGE,),
+    layout.POSE_BODY_STAGE: _Part(template_stages.pose_body, "prepare", (layout.CAPTURE_STAGE,), files=("body",)),
+    layout.SEGMENT_STAGE: _Part(
+        template_stages.segment,
+        "segment",
+        (layout.CAPTURE_STAGE,),
         settings=("label_set", "label_source"),
         files=("labels", "label_maps", "cameras", "scan", "body"),
-        by_hand=(CORRECTIONS_FILE,),
+        by_hand=(layout.CORRECTIONS_FILE,),
     ),
-    CLEAN_STAGE: _Part(clean, (CAPTURE_STAGE, SEGMENT_STAGE), settings=("budgets", "remesh")),
-    TRANSFER_STAGE: _Part(
-        transfer, (POSE_BODY_STAGE, CLEAN_STAGE), settings=("max_influences", "method", "webs"), files=("body",)
+    layout.CLEAN_STAGE: _Part(
+        template_stages.clean,
+        "parts",
+        (layout.CAPTURE_STAGE, layout.SEGMENT_STAGE),
+        settings=("budgets", "remesh"),
     ),
-    UNPOSE_STAGE: _Part(unpose, (POSE_BODY_STAGE, TRANSFER_STAGE), files=("body",)),
-    ASSEMBLE_STAGE: _Part(
-        assemble,
-        (CAPTURE_STAGE, POSE_BODY_STAGE, SEGMENT_STAGE, CLEAN_STAGE, TRANSFER_STAGE, UNPOSE_STAGE),
+    layout.TRANSFER_STAGE: _Part(
+        template_stages.transfer,
+        "parts",
+        (layout.POSE_BODY_STAGE, layout.CLEAN_STAGE),
+        settings=("max_influences", "method", "webs"),
+        files=("body",),
+        writers=("pipelines.figures.colors",),
+    ),
+    layout.UNPOSE_STAGE: _Part(
+        template_stages.unpose, "parts", (layout.POSE_BODY_STAGE, layout.TRANSFER_STAGE), files=("body",)
+    ),
+    layout.ASSEMBLE_STAGE: _Part(
+        template_stages.assemble,
+        "assemble",
+        (
+            *(layout.CAPTURE_STAGE, layout.POSE_BODY_STAGE, layout.SEGMENT_STAGE),
+            *(layout.CLEAN_STAGE, layout.TRANSFER_STAGE, layout.UNPOSE_STAGE),
+        ),
         settings=("clearance_mm", "darning"),
         files=("body",),
+        writers=("smplxpp.export.gltf", "smplxpp.export.obj"),
     ),
-    VALIDATE_STAGE: _Part(
-        validate,
-        (REGISTER_STAGE, CAPTURE_STAGE, SEGMENT_STAGE, TRANSFER_STAGE, ASSEMBLE_STAGE),
+    layout.VALIDATE_STAGE: _Part(
+        template_stages.validate,
+        "validate",
+        (
+            *(REGISTER_STAGE, layout.CAPTURE_STAGE, layout.SEGMENT_STAGE),
+            *(layout.TRANSFER_STAGE, layout.ASSEMBLE_STAGE),
+        ),
         settings=("samples", "seed"),
         files=("body", "motion", "photographs", "cameras"),
     ),
 }
+"""The stages that make a template; see `_Part`. Two stages have commands of their own: reconstruct and register."""
 
 
 def build(
@@ -118,7 +138,7 @@ def build(
     reconstruction: ReconstructInputs | None = None,
     first: str = BUILD_STAGES[0],
     last: str = BUILD_STAGES[-1],
-    progress: Callable[[str, bool], None] = lambda name, done: None,
+    progress: Progress = lambda name, done: None,
 ) -> dict[str, StageRecord]:
     """Build a template in the folder `run`.
 
@@ -126,8 +146,13 @@ def build(
     code and libraries have not changed is not run again.
 
     Args:
-        registration: what the body is registered to, where the inputs say that it is. reconstruction: what the scan is
-            made of, where they say that.
+        run: folder of the run.
+        inputs: what is read, and which stages make the rest.
+        config: choices.
+        registration: what the body is registered to, where the inputs register.
+        reconstruction: what the scan is made of, where the inputs reconstruct.
+        first: stage to begin with.
+        last: stage to end with.
         progress: called with a stage's name before (False) and after (True) it.
 
     Returns:
@@ -140,9 +165,10 @@ def build(
         require_choice("stage", name, BUILD_STAGES)
     if BUILD_STAGES.index(first) > BUILD_STAGES.index(last):
         raise InputError("stages", expected="a first one before the last", received=f"first {first}, last {last}")
-    assert (REGISTER_STAGE in inputs.stages) == (registration is not None), "what to register to"
+    assert inputs.registers == (registration is not None), "what to register to"
     assert inputs.reconstructs == (reconstruction is not None), "what to reconstruct from"
-    _check_inputs(inputs)
+    config = resolved(config, inputs)
+    check_inputs(inputs)
     with own_run_folder(run, (*BUILD_STAGES, "build", "metrics", "report")):
         save_build(run, inputs, config)
         makers = {}
@@ -160,12 +186,13 @@ def _run_stages(
     makers: Mapping[str, Callable[[], StageRecord]],
     first: str,
     last: str,
-    progress: Callable[[str, bool], None],
+    progress: Progress,
 ) -> dict[str, StageRecord]:
     """Run stages one after the other; those of `makers` have commands of their own."""
     records: dict[str, StageRecord] = {}
+    wanted = stages_of(context.inputs)
     for name in BUILD_STAGES[: BUILD_STAGES.index(last) + 1]:
-        if name not in context.inputs.stages:
+        if name not in wanted:
             continue
         if BUILD_STAGES.index(name) < BUILD_STAGES.index(first):
             records[name] = require_stage(context.run, name)
@@ -174,8 +201,8 @@ def _run_stages(
         if name in makers:
             records[name] = makers[name]()
         else:
-            stage, module = _stage(name, context, records), PARTS[name].module
-            records[name] = run_stage(context.run, stage, partial(module.run, build=context))
+            work = partial(PARTS[name].work, build=context)
+            records[name] = run_stage(context.run, _stage(name, context, records), work)
         progress(name, True)
     return records
 
@@ -187,7 +214,7 @@ def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) ->
     for key in part.files:
         digests |= _file_digests(key, getattr(inputs, key))
     if "detector" in part.settings and config.detector is not None:
-        # The path of a model says nothing of what is in it.
+        # The path of a model does not identify its content.
         identity = load_detector(config.detector).identity
         digests["detector"] = hashlib.sha256(identity.encode()).hexdigest()
     digests |= {file: sha256_file(context.run / file) for file in part.by_hand if (context.run / file).exists()}
@@ -195,9 +222,10 @@ def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) ->
         digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}
     return Stage(
         name=name,
-        config={key: getattr(config if hasattr(config, key) else inputs, key) for key in part.settings},
+        # Inputs come first: they hold what the choices of the same name have led to.
+        config={key: getattr(inputs if hasattr(inputs, key) else config, key) for key in part.settings},
         inputs=digests,
-        code=(part.module.__name__,),
+        code=part.code,
         seed=config.seed,
     )
 
@@ -212,27 +240,9 @@ def write_metrics(run: Path, inputs: BuildInputs, records: dict[str, StageRecord
         "stages": {name: record.manifest["numbers"] for name, record in records.items()},
         "seconds": {name: record.manifest["seconds"] for name, record in records.items()},
     }
-    path = run / METRICS_FILE
+    path = run / layout.METRICS_FILE
     atomic_write_text(path, json.dumps(jsonable(content), indent=1) + "\n")
     return path
-
-
-def _check_inputs(inputs: BuildInputs) -> None:
-    """What can be known before the first stage starts: files that are missing, and those only the last stages read."""
-    for name in ("scan", "params", "labels", "cameras", "motion", "body"):
-        path = None if name == "scan" and inputs.reconstructs else getattr(inputs, name)
-        if path is not None and not Path(path).exists():
-            raise InputError(f"option {name}", expected="an existing file", received=str(path))
-    if inputs.label_maps and inputs.cameras is None:
-        raise InputError(
-            "label maps",
-            expected="a camera file with them",
-            received="none",
-            remedy="put cameras.json or calibration.csv into the capture",
-        )
-    find_label_set(inputs.label_set)
-    if inputs.motion is not None:
-        load_params(inputs.motion, body=load_body(inputs.body))
 
 
 def _file_digests(name: str, value: Any) -> dict[str, str]:

@@ -1,115 +1,32 @@
-"""What a build takes: its inputs and every choice that changes its result."""
+"""Records in a run of what its build, its registration and its reconstruction were made from."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pipelines.runs.artefacts import values_of
-from pipelines.runs.layout import BUILD_FILE, LOCATE_STAGE, RECONSTRUCT_STAGE, REGISTER_STAGE, TEMPLATE_STAGES
+from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, RECONSTRUCT_FILE, REGISTER_FILE
 from pipelines.runs.manifest import require_plain_fields
 from smplxpp.assemble import DarnConfig
+from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.clean import WebConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import read_json
+from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, read_json
 from smplxpp.core.files.paths import absolute
-from smplxpp.core.labels import LABELS
 
 log = logging.getLogger(__name__)
-MOST_PHOTOGRAPHS = 8
-"""Photographs of the reference frame that a build looks at: a few from all around tell left from right."""
-
-
-def _default_budgets() -> dict[str, int]:
-    return {label.name: label.face_budget for label in LABELS if label.face_budget}
-
-
-@dataclass(frozen=True)
-class BuildInputs:
-    """Files of one build.
-
-    Attributes:
-        subject: name used in the report.
-        scan: clothed scan of the reference frame.
-        params: body parameters; None: those that the run's registration gives, or what is found in the scan.
-            params_row: the frame's row in a file that stacks several.
-        reconstructs: whether the scan is one that the run makes of photographs. locates: whether the body has to be
-            found in the scan. registers: whether the parameters come from a registration.
-        frame: number of the frame in its capture: what trainings take its photographs by.
-        labels: labels of the scan's vertices or faces (npz, npy, pickle), or None when the scan file holds them,
-            views do, or the fitted body is to tell them. label_source: "auto" takes what there is, in this order;
-            "body" looks at no labels.
-        label_maps: label image by camera name, with `cameras` their camera file.
-        photographs: image of the frame by camera name, of the same cameras: what a mirrored scan is told by.
-        label_set: name of the label set that labels and label maps use, or a JSON mapping file.
-        motion: parameters of the capture's own frames, for validation and the report; may be None.
-        body: SMPL-X-layout body file, None for the open body.
-        protocol: of the capture, by which these files were found; None: without one.
-    """
-
-    subject: str
-    scan: Path
-    params: Path | None
-    frame: int = 0
-    params_row: int = 0
-    labels: Path | None = None
-    label_maps: dict[str, Path] = field(default_factory=dict)
-    photographs: dict[str, Path] = field(default_factory=dict)
-    cameras: Path | None = None
-    label_set: str = "4ddress"
-    label_source: str = "auto"
-    reconstructs: bool = False
-    locates: bool = False
-    registers: bool = False
-    motion: Path | None = None
-    body: Path | None = None
-    protocol: str | None = None
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The stages of the build, in order: those that make parameters where they are to be made."""
-        makers = (
-            (RECONSTRUCT_STAGE, self.reconstructs),
-            (LOCATE_STAGE, self.locates),
-            (REGISTER_STAGE, self.registers),
-        )
-        return (*(name for name, needed in makers if needed), *TEMPLATE_STAGES)
-
-
-@dataclass(frozen=True)
-class BuildConfig:
-    """Choices of one build; part of every stage's key.
-
-    Attributes:
-        units, up: how the scan file is written; it is converted to metres, +Y up.
-        detector: asked which way a person faces whose scan comes alone: "mediapipe" or an ONNX file; None: nobody.
-        budgets: faces kept by part name. remesh: what they are made by, "quadric" or "isotropic".
-        clearance_mm: how far outer layers are kept from inner ones.
-        max_influences: joints a vertex.
-        webs: what of a part is cut because it bridges two limbs; no `rounds`: nothing is.
-        darning: which of the holes that this leaves are closed.
-        method: "ours", or "paper" for robust transfer exactly as published.
-        samples: surface samples of the validation.
-        seed: of the samples.
-    """
-
-    units: str = "m"
-    up: str = "y"
-    detector: str | None = None
-    budgets: dict[str, int] = field(default_factory=_default_budgets)
-    remesh: str = "quadric"
-    clearance_mm: float = 1.0
-    max_influences: int = 8
-    webs: WebConfig = field(default_factory=WebConfig)
-    darning: DarnConfig = field(default_factory=DarnConfig)
-    method: str = "ours"
-    samples: int = 100_000
-    seed: int = 0
+_T = TypeVar("_T")
+# Fields that are paths, by the record that they stand in.
+_BUILD_PATHS = ("scan", "params", "labels", "cameras", "motion", "body")
+_CHOICE_PATHS = ("keypoints", "masks", "landmarks", "corrections")
+_REGISTER_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks", "scans")
+_RECONSTRUCT_PATHS = ("capture", "masks", "mesh")
 
 
 @dataclass(frozen=True)
@@ -118,6 +35,8 @@ class BuildContext:
 
     Attributes:
         run: folder of the run, in which the stages before stand.
+        inputs: what is read.
+        config: choices.
     """
 
     run: Path
@@ -125,50 +44,106 @@ class BuildContext:
     config: BuildConfig
 
 
-_PATHS = ("scan", "params", "labels", "cameras", "motion", "body")
+def stages_of(inputs: BuildInputs) -> tuple[str, ...]:
+    """Return the stages of a build in their order, with those that make what is not given."""
+    return tuple(stage for stage in BUILD_STAGES if stage.partition("_")[2] in inputs.steps)
 
 
 def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
-    """Write `build.json` into a run, unless it says the same already."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, Path):
-            return str(absolute(value))
-        return {k: plain(v) for k, v in value.items()} if isinstance(value, dict) else value
-
-    content = {"inputs": plain(asdict(inputs)), "config": asdict(config)}
+    """Write `build.json` into a run, unless the file has the same content."""
+    content = {"inputs": _plain(asdict(inputs)), "config": _plain(asdict(config))}
     text, path = json.dumps(content, indent=1) + "\n", run / BUILD_FILE
     if not path.is_file() or path.read_bytes() != text.encode():
         atomic_write_text(path, text)
 
 
 def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
-    """What `save_build` wrote; None where there is none, or none that this version can read, which is logged.
+    """Read what `save_build` wrote; None where there is none, or none that this version can read, which is logged.
 
     Optional inputs that are gone are left out.
     """
-    path = run / BUILD_FILE
+
+    def parsed(content: Mapping[str, Any]) -> tuple[BuildInputs, BuildConfig]:
+        return _build_inputs(content["inputs"]), _build_config(content["config"])
+
+    return _load(run / BUILD_FILE, parsed, "%s counts as a run that does not say what it was built from: %s")
+
+
+def save_register(run: Path, inputs: RegisterInputs) -> None:
+    """Write `register.json` into a run."""
+    atomic_write_text(run / REGISTER_FILE, json.dumps(_plain(asdict(inputs)), indent=1) + "\n")
+
+
+def load_register(run: Path) -> RegisterInputs | None:
+    """Read what `save_register` wrote; None where there is none, or none that can be read, which is logged."""
+
+    def parsed(values: Mapping[str, Any]) -> RegisterInputs:
+        require_plain_fields(RegisterInputs, values, subject=REGISTER_FILE)
+        return RegisterInputs(**{**values, **_paths(values, _REGISTER_PATHS), **_frames_and_cameras(values)})
+
+    words = "%s counts as a run without a registration by `smplxpp register`: %s"
+    return _load(run / REGISTER_FILE, parsed, words)
+
+
+def save_reconstruct(run: Path, inputs: ReconstructInputs) -> None:
+    """Write `reconstruct.json` into a run."""
+    atomic_write_text(run / RECONSTRUCT_FILE, json.dumps(_plain(asdict(inputs)), indent=1) + "\n")
+
+
+def load_reconstruct(run: Path) -> ReconstructInputs | None:
+    """Read what `save_reconstruct` wrote; None where there is none, or none that can be read, which is logged."""
+
+    def parsed(values: Mapping[str, Any]) -> ReconstructInputs:
+        require_plain_fields(ReconstructInputs, values, subject=RECONSTRUCT_FILE)
+        return ReconstructInputs(**{**values, **_paths(values, _RECONSTRUCT_PATHS), **_frames_and_cameras(values)})
+
+    return _load(run / RECONSTRUCT_FILE, parsed, "%s counts as a run without a reconstruction: %s")
+
+
+def _load(path: Path, parsed: Callable[[dict[str, Any]], _T], words: str) -> _T | None:
+    """What a record holds; None where there is none, or none that can be read, which is logged in these words."""
     if not path.exists():
         return None
     try:
-        content = read_json(path)
+        values = as_object(read_json(path), subject=f"file {path}")
         with values_of(path):
-            return _inputs(content["inputs"]), _config(content["config"])
+            return parsed(values)
     except InputError as error:
-        log.warning("%s counts as a run that does not say what it was built from: %s", run, error)
+        log.warning(words, path.parent, error)
         return None
 
 
-def _config(values: Mapping[str, Any]) -> BuildConfig:
+def _plain(value: Any) -> Any:
+    """A value with its paths as absolute texts."""
+    if isinstance(value, Path):
+        return str(absolute(value))
+    return {k: _plain(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+
+def _paths(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Path]:
+    return {name: Path(values[name]) for name in names if values.get(name) is not None}
+
+
+def _frames_and_cameras(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers of frames, None for all, and names of held-out cameras."""
+    frames = values["frames"]
+    if frames is not None:
+        frames = tuple(as_integer(frame, subject="frames") for frame in as_list(frames, subject="frames"))
+    names = as_list(values["hold_out"], subject="hold_out")
+    return {"frames": frames, "hold_out": tuple(as_text(name, subject="hold_out") for name in names)}
+
+
+def _build_config(values: Mapping[str, Any]) -> BuildConfig:
     require_plain_fields(BuildConfig, values, subject=BUILD_FILE)
     webs, darning = values.get("webs", {}), values.get("darning", {})
     require_plain_fields(WebConfig, webs, subject=BUILD_FILE)
     require_plain_fields(DarnConfig, darning, subject=BUILD_FILE)
-    return BuildConfig(**{**values, "webs": WebConfig(**webs), "darning": DarnConfig(**darning)})
+    made = {"webs": WebConfig(**webs), "darning": DarnConfig(**darning)}
+    return BuildConfig(**{**values, **_paths(values, _CHOICE_PATHS), **made})
 
 
-def _inputs(written: Mapping[str, Any]) -> BuildInputs:
-    # Builds of earlier versions had no protocols, looked at no photographs, and registered what they were not given.
+def _build_inputs(written: Mapping[str, Any]) -> BuildInputs:
+    # Builds of earlier versions had no protocols and no photographs, and registered what was not given.
     added: dict[str, Any] = {
         "protocol": None,
         "photographs": {},
@@ -180,7 +155,7 @@ def _inputs(written: Mapping[str, Any]) -> BuildInputs:
     values = {"registers": values.get("params") is None, **values}
     require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
     found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
-    found |= {name: Path(values[name]) for name in _PATHS if values[name] is not None}
+    found |= {name: Path(values[name]) for name in _BUILD_PATHS if values[name] is not None}
     for name in ("labels", "cameras", "motion"):
         if found[name] is not None and not found[name].exists():
             found[name] = None

@@ -9,9 +9,9 @@ from avatar.training.scene import normal_maps
 from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import MANIFEST, read_manifest
 from pipelines.stages.build_config import load_build
-from pipelines.stages.said_of_inputs import SaidOfInputs, folder_of_maps
+from pipelines.stages.run_inputs import folder_of_maps, labels_of_build, parameters_in_run
 from smplxpp.capture import Capture
-from smplxpp.capture.declared import path_of_params
+from smplxpp.capture.declared import DeclaredInputs, path_of_params
 from smplxpp.core.files.json_file import as_integer, as_text
 
 
@@ -25,12 +25,13 @@ def input_protocol(run: Path, capture: Capture) -> InputProtocol:
     Raises:
         InputError: a capture that says it in other words than docs/captures.md.
     """
-    said = SaidOfInputs.of(capture)
+    declared = DeclaredInputs.of(capture)
     build = load_build(run)
-    parameters, stage = said.parameters(run, path_of_params(capture.recording.params))
+    parameters, stage = parameters_in_run(declared, run, path_of_params(capture.recording.params))
     of_template = parameters
     if build is not None:
-        of_template = said.parameters(run, build[0].params or run / REGISTERED_PARAMS)[0]
+        given = build[0].params if isinstance(build[0].params, Path) else run / REGISTERED_PARAMS
+        of_template = parameters_in_run(declared, run, given)[0]
     if of_template != parameters:
         parameters = NOT_KNOWN if NOT_KNOWN in (parameters, of_template) else MIXED
     used, frames, cameras = _trained(run)
@@ -38,11 +39,12 @@ def input_protocol(run: Path, capture: Capture) -> InputProtocol:
     if used == "surface":
         normals = "estimated"
     else:
-        normals = "none" if not there or used == "none" else said.of_views("normals", folder_of_maps(capture, "normal"))
+        folder = folder_of_maps(capture, "normal")
+        normals = "none" if not there or used == "none" else declared.of_views("normals", folder)
     return InputProtocol(
         parameters=parameters,
         stage=stage,
-        labels=NOT_KNOWN if build is None else said.labels(build[0]),
+        labels=NOT_KNOWN if build is None else labels_of_build(declared, build[0]),
         normals=normals,
         views_with_normals=there,
         training_views=all_views,

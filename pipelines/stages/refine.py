@@ -16,8 +16,8 @@ from pipelines.runs.code import TRAINING
 from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTERED_PARAMS
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
-from pipelines.stages.params_in_use import params_in_use, params_to_begin_with, told_of_given
 from pipelines.stages.refine_pictures import write_pictures
+from pipelines.stages.run_inputs import params_in_use, params_to_begin_with, record_of_given
 from pipelines.stages.scene import TrainInputs, of_protocol, open_scene, open_views
 from smplxpp.capture.declared import has_estimated_params
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
@@ -126,7 +126,7 @@ def _work(
         ),
     ]
     numbers |= {
-        "given": told_of_given(inputs.params),
+        "given": record_of_given(inputs.params),
         "pictures": write_pictures(folder, refined.sequence, found),
         "iterations": looks,
         "iterations_done": looks,

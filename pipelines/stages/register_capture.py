@@ -1,25 +1,30 @@
-"""Stage 05: the body registered to all frames of a capture, or to a scan."""
+"""The stage that registers the body to a capture or a scan; the work is done by `smplxpp.build.register`."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import replace
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipelines.runs.artefacts import LOCATED_FILES, load_located
 from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, REGISTER_STAGE
-from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
-from pipelines.stages.observe import Observed, observe
-from pipelines.stages.register_config import RegisterInputs, save_register
-from pipelines.stages.registration import registration_checks, stacked_rows, summary
+from pipelines.runs.stage import MANIFEST, Stage, StageRecord, run_stage
+from pipelines.stages.build_config import RegisterInputs, save_register
 from smplxpp.body import BodyModel, load_body
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
+from smplxpp.build.observe import Observed, observe
+from smplxpp.build.register import register_observed, stacked_rows
+from smplxpp.capture import Capture
+from smplxpp.core.checks import StageOutput
+from smplxpp.core.errors import ProgressCallback, ignore_progress
 from smplxpp.core.files.json_file import jsonable
-from smplxpp.register import RegisterConfig, follow, lost_frames, register
+from smplxpp.core.params import ARRAY_NAMES
+from smplxpp.register import Observations, RegisterConfig
 
 
 def register_capture(
@@ -33,6 +38,12 @@ def register_capture(
 
     Landmarks that lie in the run, placed by hand on the reference frame's scan, are observations too.
 
+    Args:
+        run: folder of the run.
+        inputs: what the body is registered to.
+        force: register again even if the stage stands.
+        progress: called with what is being done, and the share of it that is done.
+
     Raises:
         InputError: inputs that nothing can be registered to, or not a single frame that was.
     """
@@ -43,11 +54,11 @@ def register_capture(
         inputs,
         body,
         landmarks=placed if placed.exists() else None,
-        located=located if (located / "manifest.json").exists() else None,
+        located=partial(load_located, located) if (located / MANIFEST).exists() else None,
     )
-    digests = dict(observed.digests)
-    if inputs.body is not None:
-        digests["body"] = sha256_file(inputs.body)
+    digests = observed_digests(observed, inputs, landmarks=placed if observed.placed else None)
+    if observed.found is not None:
+        digests |= {f"{LOCATE_STAGE}/{file}": sha256_file(located / file) for file in LOCATED_FILES}
     observations = observed.observations
     choices = {
         "register": config,
@@ -73,20 +84,8 @@ def _work(
     progress: ProgressCallback,
 ) -> StageOutput:
     """Write `params.npz`, `initial.npz`, `confidence.npz` and `registration.json`."""
-    observations = observed.observations
-    lost: tuple[str, ...] = ()
-    if observed.found is not None and not observations.keypoints:
-        initial = follow(body, observations, observed.found, at=inputs.frame, config=config, progress=progress)
-        lost = lost_frames(body, observations, initial, at=inputs.frame)
-        observations = replace(observations, initial=initial)
-    fit = register(body, observations, config, progress=progress)
-    if not fit.frames:
-        raise InputError(
-            "registration",
-            expected="a body in at least one frame",
-            received=f"none in {len(observations.frames)} frames: {'; '.join(fit.notes) or 'nobody was seen'}",
-            remedy="look at the inputs with `smplxpp capture check`",
-        )
+    registration, output = register_observed(observed, body, at=inputs.frame, config=config, progress=progress)
+    fit, observations = registration.fit, registration.observations
     _save(folder / "params.npz", stacked_rows(fit.frames, fit.params))
     if observations.initial is not None:
         _save(folder / "initial.npz", stacked_rows(observations.frames, observations.initial))
@@ -96,23 +95,57 @@ def _work(
         joint_names=np.array(body.joint_names),
         confidence=fit.confidence,
     )
-    problems = (*observed.all_problems(), *fit.notes, *lost)
-    content = summary(body, observations, fit, problems)
-    (folder / "registration.json").write_text(json.dumps(jsonable(content), indent=1) + "\n")
-    medians = {
-        when: {name: float(np.nanmedian(values)) for name, values in found.items() if np.isfinite(values).any()}
-        for when, found in content["residuals"].items()
-    }
-    shape_frames = observations.shape_frames or observations.frames
-    numbers = {
-        "frames": len(fit.frames),
-        "absent": content["absent"],
-        "residuals": medians,
-        "problems": len(problems),
-        "seen": {"cameras": list(observations.cameras), "frames": list(shape_frames)},
-    }
-    return StageOutput(registration_checks(observations, fit), numbers)
+    (folder / "registration.json").write_text(json.dumps(jsonable(registration.summary), indent=1) + "\n")
+    return output
 
 
 def _save(path: Path, arrays: dict[str, Any]) -> None:
     np.savez_compressed(path, **arrays)
+
+
+def observed_digests(observed: Observed, inputs: RegisterInputs, *, landmarks: Path | None) -> dict[str, str]:
+    """Return SHA-256 by name of everything that a registration reads.
+
+    Masks and label maps count by their names and sizes, because a sequence has gigabytes of them.
+    """
+    digests = _seen_digests(observed.observations, observed.capture)
+    digests |= {f"scan of frame {frame}": sha256_file(path) for frame, path in _files(observed.scans).items()}
+    if inputs.body is not None:
+        digests["body"] = sha256_file(inputs.body)
+    if landmarks is not None:
+        digests["landmarks"] = sha256_file(landmarks)
+    if isinstance(inputs.labels, Path):
+        digests["labels"] = sha256_file(inputs.labels)
+    return digests
+
+
+def _files(scans: Mapping[int, Any]) -> dict[int, Path]:
+    return {frame: scan for frame, scan in scans.items() if isinstance(scan, Path)}
+
+
+def _seen_digests(observations: Observations, capture: Capture | None) -> dict[str, str]:
+    """SHA-256 of cameras, keypoints and the fit to start from, and of the names and sizes of masks and label maps."""
+    cameras, points, start, files = (hashlib.sha256() for _ in range(4))
+    for name, camera in observations.cameras.items():
+        cameras.update(f"{name} {camera.width} {camera.height}".encode())
+        cameras.update(camera.K.tobytes() + camera.cam_from_world.tobytes())
+    for name, found in observations.keypoints.items():
+        points.update(f"{name} {found.names}".encode())
+        for array in (found.frames, found.points, found.confidence):
+            points.update(np.ascontiguousarray(array).tobytes())
+    if observations.initial is not None:
+        for key in ARRAY_NAMES:
+            start.update(np.ascontiguousarray(getattr(observations.initial, key)).tobytes())
+    if capture is not None:
+        for name in observations.cameras:
+            for frame in observations.frames:
+                for kind in ("mask", "label"):
+                    path = capture.file(name, frame, kind)
+                    if path is not None:
+                        files.update(f"{kind} {name} {frame} {path.name} {path.stat().st_size}\n".encode())
+    return {
+        "capture/cameras": cameras.hexdigest(),
+        "capture/keypoints": points.hexdigest(),
+        "capture/fit to start from": start.hexdigest(),
+        "capture/names and sizes of masks and label maps": files.hexdigest(),
+    }

@@ -12,8 +12,7 @@ from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import REFINE_STAGE, REFINED_CAMERAS, REFINED_PARAMS, TEMPLATE
 from pipelines.stages.build_config import load_build
 from pipelines.stages.held_out import refuse_seen
-from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
-from pipelines.stages.protocol import chosen_protocol
+from pipelines.stages.run_inputs import chosen_protocol, params_in_use, params_to_begin_with
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, Splits, open_capture, read_cameras
 from smplxpp.capture.readers.simple import stacked_params

@@ -10,9 +10,8 @@ import numpy as np
 
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import PARAMS
-from pipelines.stages.build_config import load_build
-from pipelines.stages.params_in_use import params_in_use
-from pipelines.stages.register_config import load_register
+from pipelines.stages.build_config import load_build, load_register
+from pipelines.stages.run_inputs import params_in_use
 from smplxpp.body import load_params
 from smplxpp.body.bvh_params import load_bvh
 from smplxpp.body.retarget import Skeleton

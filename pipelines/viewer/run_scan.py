@@ -14,18 +14,15 @@ from pipelines.runs.layout import (
     LANDMARKS_FILE,
     RECONSTRUCT_FILE,
     REGISTER_FILE,
-    REGISTER_STAGE,
     SCAN,
     SCAN_LABELS,
     SEGMENT_STAGE,
 )
 from pipelines.stages.build import build
-from pipelines.stages.build_config import load_build
-from pipelines.stages.capture import GREY
-from pipelines.stages.reconstruct_config import load_reconstruct
-from pipelines.stages.register_config import load_register
-from pipelines.stages.scan_files import read_scan
+from pipelines.stages.build_config import load_build, load_reconstruct, load_register
 from pipelines.viewer.session import LabelledScan, LabelSession
+from smplxpp.build.prepare import GREY
+from smplxpp.build.scan import read_scan
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.json_file import as_numbers
@@ -117,9 +114,9 @@ def label_again(run: Path, *, progress: Callable[[str, bool], None] = lambda nam
             remedy="give `smplxpp build` again",
         )
     inputs, config = found
-    registration = load_register(run) if REGISTER_STAGE in inputs.stages else None
+    registration = load_register(run) if inputs.registers else None
     reconstruction = load_reconstruct(run) if inputs.reconstructs else None
-    lacks = (registration is None and REGISTER_STAGE in inputs.stages, reconstruction is None and inputs.reconstructs)
+    lacks = (registration is None and inputs.registers, reconstruction is None and inputs.reconstructs)
     if any(lacks):
         name = REGISTER_FILE if lacks[0] else RECONSTRUCT_FILE
         raise InputError(

@@ -91,6 +91,11 @@ class DeclaredInputs:
             return stacked
         return folder if any(folder.glob("[0-9]*.npz")) else None
 
+    def scan_labels(self) -> str:
+        """Return the word for labels that come with a scan of the capture."""
+        word = self._word("labels", "labels", "labels")
+        return "true" if word == NOT_KNOWN and any(one.scan_labels for one in self._named(EXACT)) else word
+
     def of_views(self, kind: str, folder: str | None) -> str:
         """Return the word for the label or normal maps in a folder; "not known" for None."""
         return NOT_KNOWN if folder is None else self._word(kind, folder, kind)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 
@@ -75,3 +75,16 @@ class Gate:
             'warn'
         """
         return Check(name, value, self.unit, self.warn, self.fail, self.higher_is_better, explanation)
+
+
+@dataclass
+class StageOutput:
+    """Checks and numbers of a stage, beside its data.
+
+    Attributes:
+        checks: numbers held against limits.
+        numbers: what else was measured, by name; may be nested.
+    """
+
+    checks: list[Check] = field(default_factory=list)
+    numbers: dict[str, Any] = field(default_factory=dict)

@@ -24,11 +24,20 @@ from pipelines.report.sections.refine import refine_section
 from pipelines.runs.artefacts import load_arrays, save_arrays
 from pipelines.runs.layout import BUILD_STAGES, FIT_STAGE, REFINE_STAGE
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage
-from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
-from pipelines.stages.photographed import unit_cube_of
-from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct, save_reconstruct
-from pipelines.stages.register_config import RegisterInputs, load_register, save_register
+from pipelines.stages.build_config import (
+    BuildConfig,
+    BuildInputs,
+    ReconstructInputs,
+    RegisterInputs,
+    load_build,
+    load_reconstruct,
+    load_register,
+    save_build,
+    save_reconstruct,
+    save_register,
+)
 from smplxpp.body import load_body
+from smplxpp.build.reconstruct import unit_cube_of
 from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.checks import Check
 from smplxpp.core.errors import GeometryWarning

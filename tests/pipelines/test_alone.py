@@ -10,11 +10,11 @@ import pytest
 
 from pipelines.commands.build import Build
 from pipelines.report.sections.register import locate_section
+from pipelines.runs.artefacts import load_located
 from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, SEGMENT_STAGE
 from pipelines.runs.stage import require_stage
-from pipelines.stages import locate
-from pipelines.stages.located import read_located, read_located_labels
 from smplxpp.body import load_body, load_params
+from smplxpp.build import locate
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, SKIN
 from smplxpp.core.mesh import TriangleMesh
@@ -73,13 +73,13 @@ def test_labels_are_told(alone):
 
 
 def test_what_a_registration_takes_up(alone):
-    params, bare = read_located(alone / LOCATE_STAGE, BODY)
-    labels = read_located_labels(
-        alone / LOCATE_STAGE, len(read_raw_mesh(alone / SEGMENT_STAGE / "labels.ply").vertices)
-    )
+    located = load_located(alone / LOCATE_STAGE)
+    params, bare = located.params, located.bare_of(BODY)
+    labels = located.labels_of(len(read_raw_mesh(alone / SEGMENT_STAGE / "labels.ply").vertices))
+    assert labels is not None
     assert len(params) == 1 and 0.2 < bare.mean() < 0.7
     assert (labels == SKIN.id).mean() > 0.2 and (labels == BACKGROUND).any()
-    assert read_located_labels(alone / LOCATE_STAGE, 7) is None
+    assert located.labels_of(7) is None
 
 
 def test_the_report_shows_what_else_it_might_have_been(alone):

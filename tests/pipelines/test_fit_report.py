@@ -19,8 +19,15 @@ from pipelines.report.sections.build import rewrite_report
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, head_box, standing_fit
 from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
-from pipelines.stages.register_config import RegisterInputs, load_register, save_register
+from pipelines.stages.build_config import (
+    BuildConfig,
+    BuildInputs,
+    RegisterInputs,
+    load_build,
+    load_register,
+    save_build,
+    save_register,
+)
 from smplxpp.core.errors import InputError
 from tests.dolls.standing import HELD_OUT, TRAIN, write_capture, write_run
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers

@@ -22,7 +22,7 @@ from pipelines.runs.stage import SCHEMA
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.evaluate_poses import covered_vertices
-from pipelines.stages.protocol import chosen_protocol
+from pipelines.stages.run_inputs import chosen_protocol
 from pipelines.stages.scene import TrainInputs, open_frame, open_scene
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError

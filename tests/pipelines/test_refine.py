@@ -16,8 +16,8 @@ from pipelines.report.sections.refine import refine_section, refinement_key_numb
 from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import REFINED_CAMERAS, REFINED_HELD_OUT_PARAMS, REFINED_PARAMS, REGISTERED_PARAMS, TEMPLATE
 from pipelines.runs.stage import read_manifest
-from pipelines.stages.params_in_use import params_in_use, params_to_begin_with
 from pipelines.stages.refine import wants_refinement
+from pipelines.stages.run_inputs import params_in_use, params_to_begin_with
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.body import load_params
 from smplxpp.capture import read_cameras

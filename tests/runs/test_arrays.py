@@ -22,6 +22,7 @@ from pipelines.runs.artefacts import (
     save_arrays,
 )
 from pipelines.runs.layout import CANONICAL, PARTS_WITHOUT_WEBS, SCAN, SCAN_LABELS, WEIGHTS
+from smplxpp.build.data import Part
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
@@ -63,7 +64,8 @@ def test_damaged_files_are_refused(tmp_path):
 
 
 def test_artefacts_without_their_arrays(tmp_path):
-    parts = {"scan": (TriangleMesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), {})}
+    mesh = TriangleMesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    parts = {"scan": Part(mesh, 3, np.arange(3), np.zeros((3, 3), np.uint8))}
     weights = partial(load_weights, parts=parts)
     for file, load in ((SCAN, load_scan), (PARTS_WITHOUT_WEBS, load_parts), (WEIGHTS, weights)):
         (tmp_path / file).parent.mkdir(exist_ok=True)
@@ -79,7 +81,7 @@ def test_artefacts_of_other_kinds_name_their_file(tmp_path):
     plain |= {"source_vertex": np.arange(3), "label": np.array(3)}
     weights = SkinWeights.from_dense(np.eye(3), policies=("matched",))
     told = {field.name: np.asarray(getattr(weights, field.name)) for field in fields(SkinWeights)}
-    parts = {"a": (mesh, plain)}
+    parts = {"a": Part(mesh, 3, plain["source_vertex"], plain["colors"])}
     readers = {
         SCAN: ("scan", plain, load_scan),
         PARTS_WITHOUT_WEBS: ("a", plain, load_parts),

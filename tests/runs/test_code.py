@@ -11,7 +11,7 @@ from pipelines.runs import code
 from pipelines.runs.code import code_of
 
 ROOT = Path(__file__).resolve().parents[2]
-POSE_BODY = "pipelines.stages.pose_body"
+POSE_BODY = "smplxpp.build.prepare"
 
 
 @pytest.fixture

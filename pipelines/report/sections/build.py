@@ -34,6 +34,7 @@ from pipelines.report.sections.template import (
     weights_section,
 )
 from pipelines.report.sections.training import cloth_section, standing_trainings, training_key_numbers, training_section
+from pipelines.runs import layout
 from pipelines.runs.artefacts import load_params_of_run, load_scan, values_of
 from pipelines.runs.code import versions
 from pipelines.runs.layout import (
@@ -51,7 +52,7 @@ from pipelines.runs.layout import (
     TEMPLATE_STAGES,
     VALIDATE_STAGE,
 )
-from pipelines.runs.stage import StageRecord, require_stage
+from pipelines.runs.stage import MANIFEST, StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
 from smplxpp.body import load_body
 from smplxpp.core.files.json_file import jsonable
@@ -59,6 +60,16 @@ from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.template.template import Template
 
 HEIGHT = 640
+
+
+def report_stands(run: Path, records: dict[str, StageRecord]) -> bool:
+    """Tell whether the report was written after every stage, those of other commands among them."""
+    report = run / layout.REPORT_FILE
+    manifests = [record.folder / MANIFEST for record in records.values()]
+    others = (layout.REFINE_STAGE, *layout.MODEL_STAGES, layout.EVALUATE_STAGE, layout.RELIGHT_STAGE)
+    manifests += [run / name / MANIFEST for name in others]
+    made = [path.stat().st_mtime_ns for path in manifests if path.exists()]
+    return report.is_file() and report.stat().st_mtime_ns > max(made)
 
 
 def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> Path:

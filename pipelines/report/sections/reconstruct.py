@@ -16,8 +16,8 @@ from pipelines.report.builder import readable, readable_numbers
 from pipelines.runs.artefacts import read_named
 from pipelines.runs.layout import RECONSTRUCT_STAGE
 from pipelines.runs.stage import StageRecord
-from pipelines.stages.photographed import open_photographs
-from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct
+from pipelines.stages.build_config import ReconstructInputs, load_reconstruct
+from smplxpp.build.reconstruct import open_photographs
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.mesh import TriangleMesh

@@ -15,16 +15,15 @@ from pipelines.figures.body_drawings import body_on_photograph, draw_bones
 from pipelines.figures.sheets import heat_strip
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.report.builder import readable, readable_numbers
-from pipelines.runs.artefacts import load_stacked_params, read_named, values_of
+from pipelines.runs.artefacts import load_located, load_stacked_params, read_named, values_of
 from pipelines.runs.layout import LOCATION_FILE, REGISTER_STAGE
 from pipelines.runs.stage import StageRecord
-from pipelines.stages.located import read_located
-from pipelines.stages.observe import open_inputs
-from pipelines.stages.register_config import RegisterInputs, load_register
-from pipelines.stages.registration import BODY_JOINTS, RESIDUALS
-from pipelines.stages.scan_files import read_scan
+from pipelines.stages.build_config import RegisterInputs, load_register
 from smplxpp.body import BodyModel, load_body
 from smplxpp.body.model import PosedBody
+from smplxpp.build.observe import open_inputs
+from smplxpp.build.register import BODY_JOINTS, RESIDUALS
+from smplxpp.build.scan import read_scan
 from smplxpp.capture import Capture, find_scans
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
@@ -275,8 +274,9 @@ def locate_section(record: StageRecord, body: BodyModel, scan: TriangleMesh) -> 
     """Show the body within a run's scan from three sides, and the table of what it might have been."""
     path = record.folder / LOCATION_FILE
     content = as_object(read_json(path, subject="location"), subject=f"location {path}")
-    params, bare = read_located(record.folder, body)
-    found = body.mesh(body.forward(params).vertices[0])
+    located = load_located(record.folder)
+    bare = located.bare_of(body)
+    found = body.mesh(body.forward(located.params).vertices[0])
     cameras = body_cameras(scan, views=("front", "side", "back"), height=HEIGHT)
     glass = [render_overlay(found, scan, camera) for camera in cameras]
     shown = np.where(bare[:, None], _BARE, _COVERED).astype(np.uint8)

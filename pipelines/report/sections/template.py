@@ -22,7 +22,7 @@ from pipelines.runs.artefacts import load_arrays, load_cleaned_parts, load_parts
 from pipelines.runs.layout import SCAN_LABELS
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import BuildInputs
-from pipelines.stages.motion import motion_of_build
+from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.files.json_file import as_list, as_text
@@ -106,8 +106,8 @@ _METHODS = {
 def parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
     """Show the parts and how simplification changed them."""
     parts = load_cleaned_parts(run)
-    mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
-    labels = np.concatenate([np.full(m.face_count, int(a["label"])) for m, a in parts.values()])
+    mesh = concatenate_meshes([part.mesh for part in parts.values()])
+    labels = np.concatenate([np.full(part.mesh.face_count, part.label) for part in parts.values()])
     numbers = record.manifest["numbers"]
     # Stages from before the choice have none.
     method = as_text(record.manifest["config"].get("remesh", "quadric"), subject="remesh")
@@ -138,7 +138,7 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
     """Show the skin weights of the parts."""
     parts = load_parts(run)
     weights = load_weights(run, parts)
-    mesh = concatenate_meshes([mesh for mesh, _ in parts.values()])
+    mesh = concatenate_meshes([part.mesh for part in parts.values()])
     colors = np.concatenate([blend_joint_colors(weights[name]) for name in parts])
     matched = np.concatenate([weights[name].matched for name in parts])
     tint = np.where(matched[:, None], (90, 170, 120), (230, 160, 60)).astype(np.uint8)

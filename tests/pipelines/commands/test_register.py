@@ -11,7 +11,7 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.register import Register
-from pipelines.stages.register_config import RegisterInputs, load_register, save_register
+from pipelines.stages.build_config import RegisterInputs, load_register, save_register
 from smplxpp.core.errors import InputError
 from tests.pipelines.registrations import FIXTURE, use_keypoints, use_solver
 
@@ -146,8 +146,8 @@ def test_options_reach_the_inputs(tmp_path):
 
 def test_keypoints_and_masks_of_other_folders_take_the_place_of_the_captures(tmp_path):
     """What a detector wrote apart from the capture is what the registration sees, and its record says so."""
-    from pipelines.stages.observe import observe
     from smplxpp.body import load_body
+    from smplxpp.build.observe import observe
 
     apart = shutil.copytree(FIXTURE / "keypoints", tmp_path / "k")
     (apart / "Cam001.npz").unlink()
@@ -165,8 +165,8 @@ def test_keypoints_and_masks_of_other_folders_take_the_place_of_the_captures(tmp
 
 def test_a_folder_of_scans_takes_the_place_of_the_captures(tmp_path):
     """Reconstructions of all frames are scans like any others; what is no folder of scans is refused."""
-    from pipelines.stages.observe import observe
     from smplxpp.body import load_body
+    from smplxpp.build.observe import observe
 
     folder = tmp_path / "02_reconstruct"
     folder.mkdir()

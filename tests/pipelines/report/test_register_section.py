@@ -12,8 +12,8 @@ from PIL import Image
 from pipelines.figures.body_drawings import JOINT, body_on_photograph, draw_bones
 from pipelines.figures.sheets import heat_strip
 from pipelines.report.sections.register import register_section, worst_frames
+from pipelines.stages.build_config import RegisterInputs
 from pipelines.stages.register_capture import register_capture
-from pipelines.stages.register_config import RegisterInputs
 from smplxpp.capture import open_capture
 from tests.pipelines.registrations import FIXTURE, exact, posed_joints, use_keypoints, use_solver
 

@@ -17,7 +17,7 @@ def test_holes_that_cuts_leave_are_closed_in_the_template_and_the_report_counts_
     quality = mesh_quality(template.part_mesh("upper"))
     assert quality.border_loops == 4  # neck, cuffs, hem
     assert quality.nonmanifold_edges == quality.nonmanifold_vertices == 0
-    cut, _ = load_parts(person_run)["upper"]
+    cut = load_parts(person_run)["upper"].mesh
     assert quality.faces == cut.face_count + darned["upper"]["faces"]
     assert (template.scan_index[template.vertex_part == template.part_names.index("upper")] < 0).any()
     assert "holes of cuts" in (person_run / "report.html").read_text()

@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.runs.artefacts import load_params_of_run, load_scan, load_scan_labels
 from pipelines.runs.layout import TEMPLATE
-from pipelines.stages.completeness import completeness_checks
+from smplxpp.build.completeness import completeness_checks
 from smplxpp.clean import sanitize
 from smplxpp.core.labels import LOWER, SKIN
 from smplxpp.core.mesh import TriangleMesh

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipelines.runs.layout import LOCATE_STAGE
 from pipelines.runs.stage import StageOutput
-from pipelines.stages import locate
-from pipelines.stages.build import build
+from pipelines.stages.build import PARTS, build
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from tests.detect.keypoint_models import write_card, write_model
 
@@ -23,7 +23,7 @@ def test_another_model_of_the_same_name_is_asked_again(tmp_path: Path, monkeypat
         asked.append(build.config.detector)
         return StageOutput([], {})
 
-    monkeypatch.setattr(locate, "run", run)
+    monkeypatch.setitem(PARTS, LOCATE_STAGE, replace(PARTS[LOCATE_STAGE], work=run))
     scan = tmp_path / "scan.ply"
     scan.write_bytes(b"a scan")
     model = write_card(write_model(tmp_path / "pose.onnx", "simcc"))

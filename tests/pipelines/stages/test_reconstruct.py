@@ -11,11 +11,11 @@ from avatar.reconstruct import SurfaceConfig
 from pipelines.commands.reconstruct import ReconstructCommand
 from pipelines.runs.layout import RECONSTRUCT_STAGE, reconstructed_scan
 from pipelines.stages import reconstruct as stage_module
+from pipelines.stages.build_config import ReconstructInputs, load_reconstruct
 from pipelines.stages.held_out import seen_of
 from pipelines.stages.neural_surface import neural_method
-from pipelines.stages.photographed import open_photographs, unit_cube_of, usable_cameras, usable_frames
 from pipelines.stages.reconstruct import reconstruct_capture
-from pipelines.stages.reconstruct_config import ReconstructInputs, load_reconstruct
+from smplxpp.build.reconstruct import open_photographs, unit_cube_of, usable_cameras, usable_frames
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh

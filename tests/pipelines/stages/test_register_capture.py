@@ -11,10 +11,9 @@ import pytest
 
 from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE, REGISTERED_PARAMS, REGISTRATION
 from pipelines.stages.build import build
-from pipelines.stages.build_config import BuildConfig, BuildInputs
-from pipelines.stages.params_in_use import params_in_use
+from pipelines.stages.build_config import BuildConfig, BuildInputs, RegisterInputs, load_register
 from pipelines.stages.register_capture import register_capture
-from pipelines.stages.register_config import RegisterInputs, load_register
+from pipelines.stages.run_inputs import params_in_use
 from smplxpp.body import load_params
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError

@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs
-from pipelines.stages.scan_files import read_scan
+from smplxpp.build.scan import read_scan
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply

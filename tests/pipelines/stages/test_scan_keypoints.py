@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.stages.scan_keypoints import ScanViews, facing, keypoints_of_scan
 from smplxpp.body import load_body
+from smplxpp.build.scan_keypoints import ScanViews, facing, keypoints_of_scan
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
@@ -92,7 +92,7 @@ def test_progress_is_told(painted):
 
 def test_a_scan_without_anybody_is_refused(painted):
     mesh, colors, _ = painted
-    with pytest.raises(InputError, match="somebody in 0 of 8 pictures"):
+    with pytest.raises(InputError, match="one in 0 of 8 pictures"):
         keypoints_of_scan(mesh, None, Spots(), config=VIEWS)
     with pytest.raises(InputError, match="no two pictures agree"):
         keypoints_of_scan(mesh, colors, Spots(), config=ScanViews(count=8, height=240, least_views=8))

@@ -1,50 +1,55 @@
-"""What a registration may see of a capture, and nothing else: held-out cameras are never looked at."""
+"""Collect what a registration may see of a capture: held-out cameras and frames are never used."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 
-from pipelines.runs.code import sha256_file
-from pipelines.stages.located import LOCATED_FILES, read_located
-from pipelines.stages.observed_scans import observed_scans
-from pipelines.stages.register_config import RegisterInputs
 from smplxpp.body import BodyModel, load_params
-from smplxpp.capture import Capture, find_scans, open_capture, scans_in
+from smplxpp.build.config import RegisterInputs
+from smplxpp.build.data import LocatedInScan
+from smplxpp.build.locate import landmark_points
+from smplxpp.build.observed_scans import observed_scans
+from smplxpp.build.opened import opened
+from smplxpp.capture import Capture, find_scans, scans_in
 from smplxpp.core.errors import InputError
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import BACKGROUND
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.register import LandmarkModel, Observations, read_landmarks
+from smplxpp.core.mesh import MeshLike
+from smplxpp.core.params import BodyParams
+from smplxpp.register import LandmarkModel
+from smplxpp.register import Observations
 from smplxpp.segment import map_labels
 
 ELSEWHERE = 255
 """Value of a label map where there is no label of the person."""
-_NAMED = 6
+_NAMED = 6  # frames or landmarks named in an error
 
 
 @dataclass(eq=False)
 class ViewMaps:
-    """Masks or label maps of the cameras that may be used; one that cannot be read is named once and is none.
+    """Masks or label maps of the cameras that may be used; one that cannot be read counts as missing.
 
     Attributes:
+        capture: that they are of.
+        cameras: names of those that may be used.
         kind: "mask" or "label".
-        problems: of the files that were asked for so far.
+        notes: on the files that could not be read so far, by camera and frame.
     """
 
     capture: Capture
     cameras: tuple[str, ...]
     kind: str
-    problems: dict[tuple[str, int], str] = field(default_factory=dict)
+    notes: dict[tuple[str, int], str] = field(default_factory=dict)
 
     def __call__(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
-        """The map of a camera and a frame; None where there is none."""
-        if camera not in self.cameras or (camera, frame) in self.problems:
+        """Return the map of a camera and a frame; None where there is none."""
+        if camera not in self.cameras or (camera, frame) in self.notes:
             return None
         try:
             if self.kind == "mask":
@@ -54,7 +59,7 @@ class ViewMaps:
                 return None
             ours = map_labels(labels, self.capture.label_set)
         except InputError as error:
-            self.problems[camera, frame] = f"camera {camera}, frame {frame}: {self.kind} left out: {error}"
+            self.notes[camera, frame] = f"camera {camera}, frame {frame}: {self.kind} left out: {error}"
             return None
         return np.where(ours == BACKGROUND, ELSEWHERE, ours).astype(np.uint8)
 
@@ -64,31 +69,42 @@ class Observed:
     """Observations, and what they are made of.
 
     Attributes:
-        digests: SHA-256 by name of everything that a registration reads.
+        capture: None for a scan alone.
+        observations: what a registration sees.
+        scans: the scans by frame.
+        notes: what was left out on opening.
+        maps: masks and label maps, which give more notes when they are read.
+        placed: whether landmarks placed by hand are among the observations.
         found: the body that was found in the reference frame's scan, one row, where nothing else tells where it is.
-        problems: what was left out on opening, in words. maps: that say more when they are read.
     """
 
     capture: Capture | None
     observations: Observations
-    digests: dict[str, str]
-    problems: tuple[str, ...]
+    scans: Mapping[int, Path | MeshLike]
+    notes: tuple[str, ...]
     maps: tuple[ViewMaps, ...] = ()
+    placed: bool = False
     found: BodyParams | None = None
 
-    def all_problems(self) -> tuple[str, ...]:
-        """Everything that was wrong with the inputs, as far as they were read."""
-        return (*self.problems, *(words for one in self.maps for words in one.problems.values()))
+    def all_notes(self) -> tuple[str, ...]:
+        """Return everything that was wrong with the inputs, as far as they were read."""
+        return (*self.notes, *(note for one in self.maps for note in one.notes.values()))
 
 
 def observe(
-    inputs: RegisterInputs, body: BodyModel, *, landmarks: Path | None = None, located: Path | None = None
+    inputs: RegisterInputs,
+    body: BodyModel,
+    *,
+    landmarks: Path | Mapping[str, Any] | None = None,
+    located: Callable[[], LocatedInScan] | None = None,
 ) -> Observed:
     """Collect what a registration of these inputs sees.
 
     Args:
-        landmarks: file of those that were placed by hand on the reference frame's scan.
-        located: folder of the stage that found the body in that scan (`pipelines.stages.locate`).
+        inputs: what the body is registered to.
+        body: the model.
+        landmarks: points placed by hand on the reference frame's scan, a file or by name.
+        located: gives the body that was found in that scan; it is called where nothing else tells where the body is.
 
     Raises:
         InputError: neither cameras nor scans, keypoints without cameras, nothing to start from, parameters of another
@@ -98,22 +114,24 @@ def observe(
         return _observe_scan(inputs, body, landmarks)
     capture = open_inputs(inputs, body)
     cameras = _training_cameras(capture, inputs)
-    files = _scan_files(inputs.capture, inputs)
+    files = _scan_files(capture.root, inputs)
     frames = _frames(capture, files, inputs)
-    # A held-out frame's scan shows what held-out cameras saw.
+    # Leave out scans of held-out frames: they show what held-out cameras saw.
     held_out = set(capture.splits.novel_pose_frames)
     files = {frame: path for frame, path in files.items() if frame in frames and frame not in held_out}
     keypoints, unread = _keypoints(capture, cameras)
     if not cameras and not files:
         _refuse_nothing(capture)
     masks, labels = (_maps(capture, cameras, kind) for kind in ("mask", "label"))
-    scans, problems = observed_scans(files, inputs, capture, labels, located)
-    problems = [*unread, *problems]
+    scans, notes = observed_scans(files, inputs, capture, labels, located)
+    notes = [*unread, *notes]
+    # Begin with the fit that there is, else with the body that was found in the reference frame's scan.
     initial, more = _initial(capture, frames, body) if inputs.start else (None, [])
     placed = _placed(landmarks, inputs.frame, body) if landmarks is not None and inputs.frame in frames else {}
     found, bare = None, None
     if initial is None and located is not None and inputs.frame in frames:
-        found, bare = read_located(located, body)
+        place = located()
+        found, bare = place.params, place.bare_of(body)
     if initial is None and not keypoints and not placed and found is None:
         raise InputError(
             f"capture {capture.name}",
@@ -141,20 +159,17 @@ def observe(
         bare=bare,
     )
     maps = tuple(one for one in (masks, labels) if one is not None)
-    digests = _digests(observations, capture, files, inputs, landmarks if placed else None)
-    if found is not None and located is not None:
-        digests |= {f"{located.name}/{file}": sha256_file(located / file) for file in LOCATED_FILES}
-    return Observed(capture, observations, digests, (*problems, *more), maps, found)
+    return Observed(capture, observations, files, (*notes, *more), maps, bool(placed), found)
 
 
-def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | None) -> Observed:
+def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | Mapping[str, Any] | None) -> Observed:
     """One scan with a fit, or landmarks, to start from."""
     if inputs.scan is None:
         raise InputError("input", expected="--capture, or --scan with --params", received="neither")
     given = inputs.params if inputs.start else None
     if given is None and landmarks is None:
         raise InputError(
-            f"scan {inputs.scan.name}",
+            f"scan {inputs.scan.name if isinstance(inputs.scan, Path) else 'in memory'}",
             expected="a fit, or landmarks, to start from: a scan alone does not say where its limbs are",
             received="neither",
             remedy="name a fit with --params, or landmarks with --landmarks; `smplxpp build --scan` finds the body by "
@@ -162,29 +177,32 @@ def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | Non
         )
     initial = None
     if given is not None:
-        params = load_params(given, body=body)
+        in_memory = isinstance(given, BodyParams)
+        params = given if isinstance(given, BodyParams) else load_params(given, body=body)
         initial = params.frame(inputs.frame if len(params) > 1 else 0)
-        _check_body(initial, body, str(given))
+        _check_body(initial, body, "body parameters" if in_memory else str(given))
     placed = {} if landmarks is None else _placed(landmarks, inputs.frame, body)
-    files = {inputs.frame: inputs.scan}
+    files: dict[int, Path | MeshLike] = {inputs.frame: inputs.scan}
     scans, _ = observed_scans(files, inputs, None, None, None)
     observations = Observations(
         (inputs.frame,), scans=scans, landmarks=placed, initial=initial, shape_frames=(inputs.frame,)
     )
-    return Observed(None, observations, _digests(observations, None, files, inputs, landmarks), ())
+    return Observed(None, observations, files, (), placed=landmarks is not None)
 
 
-def _placed(path: Path, frame: int, body: BodyModel) -> dict[int, dict[str, Float64[np.ndarray, " 3"]]]:
-    """The landmarks of a file, of its frame; nothing where the file has none.
+def _placed(
+    landmarks: Path | Mapping[str, Any], frame: int, body: BodyModel
+) -> dict[int, dict[str, Float64[np.ndarray, " 3"]]]:
+    """Landmarks by the frame that they are of; empty where there are none.
 
     Raises:
         InputError: names that the body does not have.
     """
-    points = read_landmarks(path)
+    points = landmark_points(landmarks) or {}
     unknown = LandmarkModel.of(body, tuple(points)).unknown
     if unknown:
         raise InputError(
-            f"landmarks {path}",
+            f"landmarks {landmarks}" if isinstance(landmarks, Path) else "landmarks",
             expected="joints of the body, nose, left_ear, left_heel, left_big_toe, face_30 and the like",
             received=", ".join(unknown[:_NAMED]),
             remedy="see docs/registration.md for the names",
@@ -196,9 +214,10 @@ def open_inputs(inputs: RegisterInputs, body: BodyModel) -> Capture:
     """Open the capture of a registration with the parameters that it starts from."""
     assert inputs.capture is not None
     params = inputs.params if inputs.start else None
-    return open_capture(
+    return opened(
         inputs.capture,
         params=params,
+        frame=inputs.frame,
         body=body,
         protocol=inputs.protocol,
         keypoints=inputs.keypoints,
@@ -240,7 +259,7 @@ def _training_cameras(capture: Capture, inputs: RegisterInputs) -> tuple[str, ..
     return cameras
 
 
-def _scan_files(capture: Path, inputs: RegisterInputs) -> dict[int, Path]:
+def _scan_files(root: Path, inputs: RegisterInputs) -> dict[int, Path | MeshLike]:
     """Scans by frame: the one that is named, those of the folder that is named, or the capture's own.
 
     Raises:
@@ -249,16 +268,16 @@ def _scan_files(capture: Path, inputs: RegisterInputs) -> dict[int, Path]:
     if inputs.scan is not None:
         return {inputs.frame: inputs.scan}
     if inputs.scans is None:
-        return find_scans(capture)
+        return dict(find_scans(root))
     found = scans_in(inputs.scans)
     if not found:
         raise InputError(
             "option scans", expected="a folder of scan_FFFFFF.ply (or .obj, .glb)", received=f"none in {inputs.scans}"
         )
-    return found
+    return dict(found)
 
 
-def _frames(capture: Capture, scans: dict[int, Path], inputs: RegisterInputs) -> tuple[int, ...]:
+def _frames(capture: Capture, scans: Mapping[int, Any], inputs: RegisterInputs) -> tuple[int, ...]:
     """The frames to register: those asked for, or all that are trained on or held out."""
     splits = capture.splits
     have = set(capture.frames) | set(scans)
@@ -331,13 +350,13 @@ def _initial(capture: Capture, frames: tuple[int, ...], body: BodyModel) -> tupl
     _check_body(next(iter(known.values())), body, f"capture {capture.name}")
     have = np.array(sorted(known))
     nearest = [int(have[np.abs(have - frame).argmin()]) for frame in frames]
-    problems = [
+    notes = [
         f"frame {frame}: no fit to start from, that of frame {other} is taken"
         + (f": {errors[frame]}" if frame in errors else "")
         for frame, other in zip(frames, nearest, strict=True)
         if frame != other
     ]
-    return BodyParams.concatenate([known[frame] for frame in nearest]), problems
+    return BodyParams.concatenate([known[frame] for frame in nearest]), notes
 
 
 def _check_body(params: BodyParams, body: BodyModel, source: str) -> None:
@@ -351,41 +370,3 @@ def _check_body(params: BodyParams, body: BodyModel, source: str) -> None:
             received=error.received,
             remedy=f"name the body file that the fit is for with --body ({error.remedy})",
         ) from None
-
-
-def _digests(
-    observations: Observations,
-    capture: Capture | None,
-    scans: dict[int, Path],
-    inputs: RegisterInputs,
-    landmarks: Path | None,
-) -> dict[str, str]:
-    """SHA-256 of what is read; of masks and label maps names and sizes alone, a sequence has gigabytes of them."""
-    cameras, points, start, files = (hashlib.sha256() for _ in range(4))
-    for name, camera in observations.cameras.items():
-        cameras.update(f"{name} {camera.width} {camera.height}".encode())
-        cameras.update(camera.K.tobytes() + camera.cam_from_world.tobytes())
-    for name, found in observations.keypoints.items():
-        points.update(f"{name} {found.names}".encode())
-        for array in (found.frames, found.points, found.confidence):
-            points.update(np.ascontiguousarray(array).tobytes())
-    if observations.initial is not None:
-        for key in ARRAY_NAMES:
-            start.update(np.ascontiguousarray(getattr(observations.initial, key)).tobytes())
-    if capture is not None:
-        for name in observations.cameras:
-            for frame in observations.frames:
-                for kind in ("mask", "label"):
-                    path = capture.file(name, frame, kind)
-                    if path is not None:
-                        files.update(f"{kind} {name} {frame} {path.name} {path.stat().st_size}\n".encode())
-    digests = {
-        "capture/cameras": cameras.hexdigest(),
-        "capture/keypoints": points.hexdigest(),
-        "capture/fit to start from": start.hexdigest(),
-        "capture/names and sizes of masks and label maps": files.hexdigest(),
-    }
-    digests |= {f"scan of frame {frame}": sha256_file(path) for frame, path in scans.items()}
-    if landmarks is not None:
-        digests["landmarks"] = sha256_file(landmarks)
-    return digests if inputs.labels is None else {**digests, "labels": sha256_file(inputs.labels)}

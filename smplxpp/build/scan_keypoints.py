@@ -1,4 +1,4 @@
-"""Landmarks of a bare scan: it is drawn from all around, a detector looks at the pictures, rays meet at the points."""
+"""Find landmarks of a bare scan: draw it from all around, detect keypoints in the pictures, triangulate them."""
 
 from __future__ import annotations
 
@@ -8,20 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from pipelines.figures import ShadeStyle, render_shaded, turntable_cameras
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.validation import require_at_least
 from smplxpp.detect import Detector
+from smplxpp.raster import ShadeStyle, render_shaded, turntable_cameras
 from smplxpp.register import Triangulation, TriangulationConfig, triangulate
 
 Landmarks = dict[str, tuple[Float64[np.ndarray, " 3"], float]]
-# Confidence from which a view counts as one that sees a point.
 _SEEN = 0.3
-_GREY = (128, 128, 128)
-# Pairs of which the lines from right to left tell where the front is, the wider the more.
-_PAIRS = ("coco_{}_shoulder", "coco_{}_hip", "{}_eye", "{}_ear")
+"""Confidence from which a view counts as one that sees a point."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +26,11 @@ class ScanViews:
     """How a scan is drawn.
 
     Attributes:
-        count: pictures, on one turn about the scan's upright axis.
+        count: number of pictures, on one turn about the scan's upright axis.
         height: of a picture, pixels.
-        relief: of light and shadow over a scan with colours, low since noise of the surface shows in it; without
-            colours it is all there is to see.
-        least_views: that have to agree on a point.
+        relief: strength of light and shadow over a scan with colours. It is low because the surface's noise shows in
+            it; without colours it is 1, because shading is all there is to see.
+        least_views: number of views that have to agree on a point.
     """
 
     count: int = 12
@@ -58,17 +55,18 @@ def keypoints_of_scan(
     """Find the landmarks that a detector knows on a scan that stands upright.
 
     Args:
-        mesh: metres, +Y up; which way it faces is not assumed.
+        mesh: metres, +Y up; it may face any way.
         colors: sRGB; None: drawn as grey clay.
         detector: see `smplxpp.detect`.
-        config: see there.
+        config: how it is drawn.
+        progress: called with the share of the pictures that are drawn.
 
     Returns:
         By name the point in the scan's space and a confidence from 0 to 1: the detector's own mean, times the share of
         the views that agree among those that saw the point.
 
     Raises:
-        InputError: nobody in the pictures, or nothing that several of them agree on.
+        InputError: no person in the pictures, or no point that several of them agree on.
     """
     config = config or ScanViews()
     seen = views_of_scan(mesh, colors, detector, config, progress=progress)
@@ -91,13 +89,14 @@ def views_of_scan(
     *,
     progress: ProgressCallback = ignore_progress,
 ) -> Triangulation:
-    """What the detector sees in pictures all around, triangulated; one frame.
+    """Triangulate what the detector sees in pictures from all around, as one frame.
 
     Raises:
-        InputError: fewer than two pictures with anybody in them.
+        InputError: fewer than two pictures with a person in them.
     """
     used = mesh.vertices[np.unique(mesh.faces)]
-    style = ShadeStyle(background=_GREY, relief=1.0 if colors is None else config.relief)
+    # Middle grey: neither light nor dark hair and clothes vanish before it.
+    style = ShadeStyle(background=(128, 128, 128), relief=1.0 if colors is None else config.relief)
     keypoints, cameras = {}, {}
     for k, camera in enumerate(turntable_cameras(used, count=config.count, height=config.height)):
         people = detector(render_shaded(mesh, camera, vertex_colors=colors, style=style))
@@ -112,19 +111,20 @@ def views_of_scan(
         raise InputError(
             "scan",
             expected="a person who is found in pictures of it",
-            received=f"somebody in {len(cameras)} of {config.count} pictures",
+            received=f"one in {len(cameras)} of {config.count} pictures",
             remedy="check that it stands upright (--up), or place landmarks by hand",
         )
     return triangulate(keypoints, cameras, config=TriangulationConfig(least_confidence=_SEEN))
 
 
 def facing(landmarks: Mapping[str, tuple[Float64[np.ndarray, " 3"], float]]) -> Float64[np.ndarray, " 3"] | None:
-    """The horizontal unit vector to the person's front, from shoulders, hips, eyes and ears together; None without any.
+    """Return the horizontal unit vector to the person's front, from shoulders, hips, eyes and ears; None without any.
 
     With up +Y and the left side at +X the front is at +Z.
     """
     across = np.zeros(3)
-    for pair in _PAIRS:
+    # Lines from right to left are summed, so that wider pairs count more.
+    for pair in ("coco_{}_shoulder", "coco_{}_hip", "{}_eye", "{}_ear"):
         left, right = (landmarks.get(pair.format(side)) for side in ("left", "right"))
         if left is not None and right is not None:
             across += left[0] - right[0]
@@ -142,6 +142,6 @@ def _landmarks(seen: Triangulation, config: ScanViews) -> Landmarks:
         count = int(agree[:, k].sum())
         if count < config.least_views or not np.isfinite(seen.points[0, k]).all():
             continue
-        sure = weights[agree[:, k], k].mean() * count / max((weights[:, k] >= _SEEN).sum(), count)
-        out[name] = (seen.points[0, k], float(np.clip(sure, 0.0, 1.0)))
+        certainty = weights[agree[:, k], k].mean() * count / max((weights[:, k] >= _SEEN).sum(), count)
+        out[name] = (seen.points[0, k], float(np.clip(certainty, 0.0, 1.0)))
     return out

@@ -1,32 +1,40 @@
-"""A registration in numbers: files that others read, gates, and how far keypoints are from the fitted joints."""
+"""Register the body to observations, and measure the fit: limits, and distances of keypoints by camera."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.checks import Check
+from smplxpp.build.observe import Observed
+from smplxpp.core.checks import Check, StageOutput
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.register import BodyFit, LandmarkModel, Observations
+from smplxpp.register import BodyFit
+from smplxpp.register import RegisterConfig
+from smplxpp.register import register
+from smplxpp.register import follow, lost_frames
+from smplxpp.register import LandmarkModel
+from smplxpp.register import Observations
 
 CONFIDENT = 0.5
-"""Mean confidence of the body's joints from which a frame counts as seen, not guessed by the priors."""
+"""Mean confidence of the body's joints from which a frame counts as observed, not filled in by the priors."""
 BODY_JOINTS = 22
-"""Joints that a frame's confidence is the mean of: without face and fingers."""
+"""Number of leading joints whose mean confidence is that of a frame: the body without face and fingers."""
 
 
 @dataclass(frozen=True)
 class Residual:
-    """How a residual is shown and gated.
+    """A kind of residual, with the limits of its median over frames.
 
     Attributes:
-        words: what it is. unit: of its numbers.
-        gate: where the median over frames passes and where it fails; of pixels, shares of the images' height.
+        words: what it is.
+        unit: of its numbers.
+        gate: up to where the median passes, and from where it fails. Pixels are in shares of the images' height.
     """
 
     words: str
@@ -42,11 +50,78 @@ RESIDUALS: dict[str, Residual] = {
     "inside_mm": Residual("cloth of the scan inside the body", "mm", (5.0, 15.0)),
     "surface_mm": Residual("scan to the body", "mm"),
 }
-"""Those that have a gate and words of their own; others are shown by their name."""
+"""Residuals that have a title; others are shown by their name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A body registered to observations.
+
+    Attributes:
+        fit: parameters, confidence and residuals of the frames that could be registered.
+        observations: what it was registered to, with the fit that it started from.
+        summary: residuals by frame, reprojection by camera, notes.
+    """
+
+    fit: BodyFit
+    observations: Observations
+    summary: dict[str, Any]
+
+
+def register_observed(
+    observed: Observed,
+    body: BodyModel,
+    *,
+    at: int,
+    config: RegisterConfig,
+    progress: ProgressCallback = ignore_progress,
+) -> tuple[Registration, StageOutput]:
+    """Register the body to what was observed.
+
+    Args:
+        observed: see `observe`.
+        body: the model.
+        at: reference frame, where the body was found in a scan.
+        config: of the solver.
+        progress: called with what is being done, and the share of it that is done.
+
+    Raises:
+        InputError: not a single frame that could be registered.
+    """
+    observations = observed.observations
+    lost: tuple[str, ...] = ()
+    if observed.found is not None and not observations.keypoints:
+        # Without keypoints only masks and scans tell the motion: follow them from the frame where the body was found.
+        initial = follow(body, observations, observed.found, at=at, config=config, progress=progress)
+        lost = lost_frames(body, observations, initial, at=at)
+        observations = replace(observations, initial=initial)
+    fit = register(body, observations, config, progress=progress)
+    if not fit.frames:
+        raise InputError(
+            "registration",
+            expected="a body in at least one frame",
+            received=f"none in {len(observations.frames)} frames: {'; '.join(fit.notes) or 'nobody was seen'}",
+            remedy="look at the inputs with `smplxpp capture check`",
+        )
+    notes = (*observed.all_notes(), *fit.notes, *lost)
+    content = summary(body, observations, fit, notes)
+    medians = {
+        when: {name: float(np.nanmedian(values)) for name, values in found.items() if np.isfinite(values).any()}
+        for when, found in content["residuals"].items()
+    }
+    shape_frames = observations.shape_frames or observations.frames
+    numbers = {
+        "frames": len(fit.frames),
+        "absent": content["absent"],
+        "residuals": medians,
+        "problems": len(notes),
+        "seen": {"cameras": list(observations.cameras), "frames": list(shape_frames)},
+    }
+    return Registration(fit, observations, content), StageOutput(registration_checks(observations, fit), numbers)
 
 
 def stacked_rows(frames: Sequence[int], params: BodyParams) -> dict[str, Any]:
-    """Arrays whose row is the frame's number, NaN where there is no frame, as a capture reads them."""
+    """Return arrays whose row is the frame's number, NaN where there is no frame, as a capture reads them."""
     rows = max(frames) + 1
     arrays = params.as_dict()
     for name in ARRAY_NAMES:
@@ -57,9 +132,9 @@ def stacked_rows(frames: Sequence[int], params: BodyParams) -> dict[str, Any]:
 
 
 def by_camera(body: BodyModel, observed: Observations, fit: BodyFit) -> dict[str, dict[str, Any]]:
-    """Number of keypoints, and median and 90th percentile of their distance in pixels, before and after, by camera.
+    """Measure the distance of keypoints to the fitted joints by camera: number, median and 90th percentile in pixels.
 
-    Every keypoint with a confidence counts, whether the solver believed it or not.
+    Every keypoint with a confidence counts, whether the solver used it or not.
     """
     names = list(dict.fromkeys(name for found in observed.keypoints.values() for name in found.names))
     landmarks = LandmarkModel.of(body, names)
@@ -82,7 +157,7 @@ def by_camera(body: BodyModel, observed: Observations, fit: BodyFit) -> dict[str
 
 
 def _landmark_points(body: BodyModel, params: BodyParams, landmarks: LandmarkModel) -> Float64[np.ndarray, "F K 3"]:
-    """Where the points that keypoints mark are on the body, world."""
+    """Positions in the world of the points that keypoints mark on the body."""
     points = np.zeros((len(params), len(landmarks.names), 3))
     for row in range(len(params)):
         posed = body.forward(params.frame(row)).frame(0)
@@ -95,12 +170,12 @@ def _spread_of(errors: np.ndarray) -> dict[str, float]:
 
 
 def frame_confidence(confidence: Float64[np.ndarray, "F J"]) -> Float64[np.ndarray, " F"]:
-    """The mean confidence of the body's joints in each frame."""
+    """Return the mean confidence of the body's joints in each frame."""
     return confidence[:, :BODY_JOINTS].mean(axis=1)
 
 
 def registration_checks(observed: Observations, fit: BodyFit) -> list[Check]:
-    """Gates of a registration."""
+    """Check the medians of the residuals, and the shares of frames registered and observed."""
     height = float(np.median([camera.height for camera in observed.cameras.values()] or [1]))
     checks = []
     for name, residual in RESIDUALS.items():
@@ -151,8 +226,8 @@ def _few(frames: Sequence[int], count: int = 8) -> str:
     return shown if len(frames) <= count else f"{shown} and {len(frames) - count} more"
 
 
-def summary(body: BodyModel, observed: Observations, fit: BodyFit, problems: Sequence[str]) -> dict[str, Any]:
-    """What `registration.json` says: residuals by frame before and after, reprojection by camera, problems."""
+def summary(body: BodyModel, observed: Observations, fit: BodyFit, notes: Sequence[str]) -> dict[str, Any]:
+    """Summarise a registration: residuals by frame before and after, reprojection by camera, notes under "problems"."""
     residuals: Mapping[str, Mapping[str, Any]] = {"after": fit.residuals, "before": fit.initial_residuals}
     return {
         "frames": list(fit.frames),
@@ -173,5 +248,5 @@ def summary(body: BodyModel, observed: Observations, fit: BodyFit, problems: Seq
             "scans": {frame: scan.labels is not None for frame, scan in observed.scans.items()},
             "start": observed.initial is not None,
         },
-        "problems": list(problems),
+        "problems": list(notes),
     }

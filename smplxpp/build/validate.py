@@ -1,24 +1,21 @@
-"""Stage 65: the template against the scan it came from, and under poses that try its skinning."""
+"""Validate a template against the scan it came from, and under poses that try its skinning."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.artefacts import load_params_of_run, load_parts, load_scan, load_scan_labels, save_arrays
-from pipelines.runs.layout import TEMPLATE
-from pipelines.runs.stage import StageOutput
-from pipelines.stages.build_config import BuildConfig, BuildContext
-from pipelines.stages.completeness import completeness_checks
-from pipelines.stages.motion import motion_of_build
-from pipelines.stages.photographs import photograph_checks
 from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.build.completeness import completeness_checks, photograph_checks
+from smplxpp.build.config import BuildConfig, BuildInputs
+from smplxpp.build.data import Part, PreparedScan
 from smplxpp.clean import loop_lengths, thickened
-from smplxpp.core.checks import Check
+from smplxpp.core.checks import Check, StageOutput
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
@@ -40,35 +37,61 @@ from smplxpp.metrics.conventions import convention_named
 from smplxpp.metrics.distance import MM
 from smplxpp.template.template import BODY_PART, Template
 
-MOTION_FRAMES = 12
-CLOTH = 1e-3
-"""Thickness of the cloth, inward, whose volume is measured; metres."""
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Distances between a template in the reference pose and its scan.
+
+    Attributes:
+        to_scan: from the template's visible points.
+        to_template: from the scan's visible points.
+    """
+
+    to_scan: DirectedDistances
+    to_template: DirectedDistances
 
 
-def run(folder: Path, build: BuildContext) -> StageOutput:
-    """Write distances to the scan in the reference pose, flips, and stretch under hard poses and the motion."""
-    template = Template.load(build.run / TEMPLATE)
-    scan, colors, _ = load_scan(build.run)
-    face_labels = load_scan_labels(build.run, scan.face_count)
-    reference = load_params_of_run(build.run)
-    posed = template.mesh.with_vertices(template.pose(reference)[0])
-    checks, numbers, back = _against_scan(folder, posed, template.vertex_labels, scan, face_labels, build.config)
-    whole, numbers["completeness"] = completeness_checks(template, reference, scan, face_labels, back)
+def validate_template(
+    template: Template,
+    params: BodyParams,
+    scan: PreparedScan,
+    face_labels: np.ndarray,
+    parts: Mapping[str, Part],
+    motion: BodyParams | None,
+    inputs: BuildInputs,
+    config: BuildConfig,
+) -> tuple[Validation, StageOutput]:
+    """Measure distances to the scan in the reference pose, turned faces, and stretch under hard poses and the motion.
+
+    Args:
+        template: of the scan.
+        params: of the scan's pose.
+        scan: prepared.
+        face_labels: (M,) of the scan.
+        parts: the cleaned parts in the scan's pose, without webs.
+        motion: frames of the capture; None: there are none.
+        inputs: they name photographs, which tell a mirrored scan.
+        config: choices of the build.
+    """
+    posed = template.mesh.with_vertices(template.pose(params)[0])
+    found, checks, numbers = _against_scan(posed, template.vertex_labels, scan.mesh, face_labels, config)
+    whole, numbers["completeness"] = completeness_checks(template, params, scan.mesh, face_labels, found.to_template)
     checks += whole
-    seen, numbers["photographs"] = photograph_checks(template, reference, scan, colors, build.inputs)
+    seen, numbers["photographs"] = photograph_checks(template, params, scan.mesh, scan.colors, inputs)
     checks += seen
     quality = {name: mesh_quality(template.part_mesh(name)) for name in template.part_names}
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
     numbers["shared_volume"] = _shared_volumes(template)
-    flips = _flips(template, posed, build.run)
-    checks.append(Check("faces of the parts turned over against the cleaned scan", flips, "", 0, 0))
-    poses = {"hard poses": stress_poses(reference)}
-    motion = motion_of_build(build.run, build.inputs)
+    turned = _turned_faces(template, posed, parts)
+    checks.append(Check("faces of the parts turned over against the cleaned scan", turned, "", 0, 0))
+    # Stretch under poses that nobody records, and under a dozen frames of what was recorded.
+    motion_frames = 12
+    poses = {"hard poses": stress_poses(params)}
     if motion is not None:
-        poses["motion"] = motion.select(spread(range(len(motion)), MOTION_FRAMES))
-    for title, params in poses.items():
-        names = list(STRESS_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(params))]
-        numbers[title], worst = _stretch(template, params, names)
+        poses["motion"] = motion.select(spread(range(len(motion)), motion_frames))
+    for title, tried in poses.items():
+        names = list(STRESS_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(tried))]
+        numbers[title], worst = _stretch(template, tried, names)
         checks.append(
             Check(
                 f"edge stretch p99.9, {title}",
@@ -79,30 +102,23 @@ def run(folder: Path, build: BuildContext) -> StageOutput:
                 explanation="the worst part and pose, over what the pose asks of the part's longest opening",
             )
         )
-    return StageOutput(checks, numbers)
+    return found, StageOutput(checks, numbers)
 
 
 def _against_scan(
-    folder: Path,
     posed: TriangleMesh,
     vertex_labels: np.ndarray,
     scan: TriangleMesh,
     face_labels: np.ndarray,
     config: BuildConfig,
-) -> tuple[list[Check], dict, DirectedDistances]:
+) -> tuple[Validation, list[Check], dict]:
+    """Distances between the posed template and the scan, both ways, by label."""
     measured = partial(
         directed_distances, samples=config.samples, seed=config.seed, config=CompareConfig(visible_only=True)
     )
     forth = measured(posed, scan, source_labels=vertex_labels, target_labels=face_labels)
     back = measured(scan, posed, source_labels=face_labels, target_labels=vertex_labels)
     result = summarize(forth, back, convention=convention_named("smplxpp"), threshold_mm=5.0)
-    save_arrays(
-        folder / "errors.npz",
-        {
-            name: {"distance_mm": (d.distance * MM).astype(np.float32), "label": np.asarray(d.label).astype(np.int8)}
-            for name, d in (("template_to_scan", forth), ("scan_to_template", back))
-        },
-    )
     checks = []
     for label in LABELS:
         found = result.labels.get(label.name)
@@ -120,17 +136,19 @@ def _against_scan(
         checks.append(
             Check("scan's skin to the template: mean", fit, "mm", 5.0, 15.0, explanation="how well the body was fitted")
         )
-    return checks, {"template_vs_scan": result.as_dict()}, back
+    return Validation(forth, back), checks, {"template_vs_scan": result.as_dict()}
 
 
 def _shared_volumes(template: Template) -> dict[str, dict[str, float]]:
-    """The volumes that the body and each part, and any two parts share at rest, parts as cloth of `CLOTH` metres.
+    """The volumes that the body and each part, and any two parts share at rest, parts as cloth of one millimetre.
 
     Pairs of which one has no volume, such as a body with edges of three faces, are left out.
     """
-    solids = {name: template.part_mesh(name) for name in template.part_names}
+    thickness = 1e-3  # metres, inward
+    meshes = {name: template.part_mesh(name) for name in template.part_names}
     solids = {
-        name: closed_mesh(mesh) if name == BODY_PART else thickened(mesh, inward=CLOTH) for name, mesh in solids.items()
+        name: closed_mesh(mesh) if name == BODY_PART else thickened(mesh, inward=thickness)
+        for name, mesh in meshes.items()
     }
     out = {}
     for a, b in combinations(solids, 2):
@@ -139,15 +157,15 @@ def _shared_volumes(template: Template) -> dict[str, dict[str, float]]:
     return out
 
 
-def _flips(template: Template, posed: TriangleMesh, run: Path) -> int:
+def _turned_faces(template: Template, posed: TriangleMesh, parts: Mapping[str, Part]) -> int:
     """Faces of the posed template's parts that face away from where they faced on the cleaned scan."""
     part_of_face = template.vertex_part[template.faces[:, 0]]
     turned = 0
-    for name, (mesh, _) in load_parts(run).items():
+    for name, part in parts.items():
         there = posed.submesh(part_of_face == template.part_names.index(name))[0]
-        # What was darned comes behind the scan's faces.
-        scanned = there.face_cross[: mesh.face_count]
-        turned += int((np.einsum("ij,ij->i", mesh.face_cross, scanned) < 0).sum())
+        # Faces that close holes follow the scan's faces.
+        scanned = there.face_cross[: part.mesh.face_count]
+        turned += int((np.einsum("ij,ij->i", part.mesh.face_cross, scanned) < 0).sum())
     return turned
 
 
@@ -157,15 +175,15 @@ def _lengthened(rest: TriangleMesh, posed: TriangleMesh, loop: np.ndarray) -> fl
 
 
 def _stretch(template: Template, params: BodyParams, names: list[str]) -> tuple[dict, float]:
-    """Edge stretch of each worn part in each pose, and the largest p99.9 over what the pose asks for.
+    """Edge stretch of each worn part in each pose, and the largest p99.9 relative to what the pose asks for.
 
-    A raised thigh pulls the hem of a skirt, a loop around both legs, to half its length more. No weights can undo that,
-    and they can only spread it over the cloth between the legs; what a gate can tell is cloth that tears beyond.
+    A raised thigh lengthens the hem of a skirt, a loop around both legs, by half. Weights can only spread that over the
+    cloth between the legs, so that the stretch is divided by that of the part's longest opening.
     """
     vertices = template.pose(params)
     out: dict[str, dict] = {}
     for part in template.part_names:
-        if part == "body":
+        if part == BODY_PART:
             continue
         chosen = template.vertex_part[template.faces[:, 0]] == template.part_names.index(part)
         rest = template.mesh.submesh(chosen)[0]

@@ -1,4 +1,4 @@
-"""Whether scan, body and labels are of one whole person: what is missing, what has no label, what is mirrored."""
+"""Check that scan, body and labels are of one whole person: missing parts, missing labels, mirror images."""
 
 from __future__ import annotations
 
@@ -6,12 +6,26 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.runs.gates import ENDS_UNCOVERED, MIRRORED, REGION_UNCOVERED, SKIN_PATCH, UNCOVERED, UNEXPLAINED
+from smplxpp.build.config import BuildInputs
+from smplxpp.build.limits import (
+    ENDS_UNCOVERED,
+    MIRRORED,
+    MIRRORED_VIEWS,
+    REGION_UNCOVERED,
+    SKIN_PATCH,
+    UNCOVERED,
+    UNEXPLAINED,
+)
+from smplxpp.capture.cameras import read_lenses
+from smplxpp.capture.views import ViewReader
+from smplxpp.capture.window import Window
+from smplxpp.core.camera import Camera
 from smplxpp.core.checks import Check
+from smplxpp.core.errors import InputError
 from smplxpp.core.labels import BACKGROUND, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
-from smplxpp.metrics import DirectedDistances, mirror_ratio, point_to_surface
+from smplxpp.metrics import DirectedDistances, mirror_ratio, mirrored_by_views, point_to_surface
 from smplxpp.metrics.completeness import ENDS, TRUNK_AND_LIMBS, body_regions, far_patches, uncovered_body
 from smplxpp.metrics.distance import MM
 from smplxpp.template.template import Template
@@ -21,8 +35,7 @@ EXPLAINED = 15e-3
 OFF_BODY = 20e-3
 """Metres off the body from which skin looks like cloth."""
 _LOOKS_DOWN = -0.5
-_MIRROR_POINTS = 5_000
-_LEAST_SKIN = 0.02
+"""Vertical component of a normal below which no scanner sees the surface."""
 
 
 def completeness_checks(
@@ -32,18 +45,26 @@ def completeness_checks(
     face_labels: np.ndarray,
     scan_to_template: DirectedDistances,
 ) -> tuple[list[Check], dict[str, Any]]:
-    """The checks of both sides, and their numbers.
+    """Check what the scan lacks of the body, what the template lacks of the scan, and whether the scan is mirrored.
 
     Args:
-        params: of the scan's pose. face_labels: (M,) of the scan.
+        template: of the scan.
+        params: of the scan's pose.
+        scan: prepared.
+        face_labels: (M,) of the scan.
         scan_to_template: from the scan's visible points.
+
+    Returns:
+        The checks, and their numbers by name.
     """
     figure = template.posed_body(params).frame(0)
     body = template.body.mesh(figure.vertices)
     names = np.array(body_regions(template.body.joint_names))
     region = names[template.body.weights.argmax(axis=1)]
     bare = np.isin(face_labels, (SKIN.id, BACKGROUND))
+    # What of the body has no scan near it, by region.
     checks, numbers = _body_side(body, region, scan)
+    # What of the scan has no template near it; surfaces that look down are left out, because scanners miss them.
     unexplained = (scan_to_template.distance > EXPLAINED) & (scan_to_template.samples.normals[:, 1] > _LOOKS_DOWN)
     share = float(unexplained.mean())
     checks.append(
@@ -54,6 +75,7 @@ def completeness_checks(
             "without its label, a thing beside the person, a wrong fit",
         )
     )
+    # Skin that stands off the body: a garment without its label.
     patches = far_patches(scan, bare, body, far=OFF_BODY)
     where = ""
     if patches:
@@ -104,7 +126,7 @@ def _body_side(body: TriangleMesh, region: np.ndarray, scan: TriangleMesh) -> tu
 
 
 def sagittal_plane(template: Template, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The point between the hips of posed joints (J, 3), and the direction from the right to the left one."""
+    """Return the point between the hips of posed joints (J, 3), and the direction from the right to the left one."""
     named = dict(zip(template.body.joint_names, joints, strict=True))
     left, right = named["left_hip"], named["right_hip"]
     return 0.5 * (left + right), left - right
@@ -113,8 +135,63 @@ def sagittal_plane(template: Template, joints: np.ndarray) -> tuple[np.ndarray, 
 def _mirror_ratio(
     body: TriangleMesh, plane: tuple[np.ndarray, np.ndarray], scan: TriangleMesh, bare: np.ndarray
 ) -> float:
-    """`mirror_ratio` of the scan's skin, of all of it where little skin shows."""
-    chosen = bare if bare.mean() > _LEAST_SKIN else np.ones_like(bare)
+    """The `mirror_ratio` of the scan's skin, or of the whole scan where less than a fiftieth of the faces is skin."""
+    least_skin, most_points = 0.02, 5_000  # a sample is enough, the ratio is one number
+    chosen = bare if bare.mean() > least_skin else np.ones_like(bare)
     used = np.unique(scan.faces[chosen])
-    used = used[np.sort(np.random.default_rng(0).permutation(len(used))[:_MIRROR_POINTS])]
+    used = used[np.sort(np.random.default_rng(0).permutation(len(used))[:most_points])]
     return mirror_ratio(scan.vertices[used], body, center=plane[0], across=plane[1])
+
+
+def photograph_checks(
+    template: Template, params: BodyParams, scan: TriangleMesh, colors: np.ndarray, inputs: BuildInputs
+) -> tuple[list[Check], dict[str, Any]]:
+    """Check whether the reference frame's photographs show the scan or its mirror image.
+
+    Args:
+        template: of the scan.
+        params: of the scan's pose.
+        scan: prepared.
+        colors: (N, 3) uint8 of the scan, all the same if it has none.
+        inputs: they name photographs and cameras.
+
+    Returns:
+        The check where scan and photographs have colours, and its numbers.
+    """
+    if not inputs.photographs or (colors == colors[0]).all():
+        return [], {}
+    views, notes = _views(inputs)
+    figure = template.posed_body(params).frame(0)
+    center, across = sagittal_plane(template, figure.joints)
+    body = template.body.mesh(figure.vertices)
+    share = mirrored_by_views(scan, colors / 255.0, views, body=body, center=center, across=across)
+    numbers = {"views": [camera.name for camera, _ in views], "unread": notes, "mirrored": share}
+    if share is None:
+        return [], numbers
+    words = "0: the scan as it is, 1: its mirror image; high: scan or parameters have left and right exchanged; 0.5 "
+    words += f"tells nothing; {len(views)} views" + (f", {len(notes)} cannot be read" if notes else "")
+    check = MIRRORED_VIEWS.check("photographs between the scan and its mirror image", share, explanation=words)
+    return [check], numbers
+
+
+def _views(inputs: BuildInputs) -> tuple[list[tuple[Camera, np.ndarray]], list[str]]:
+    """Small photographs (H, W, 3) in [0, 1] with their cameras, and notes on those that cannot be read."""
+    longer_side = 256  # pixels; left and right differ in large areas, not in details
+    if inputs.cameras is None:
+        return [], ["no camera file"]
+    try:
+        lenses = {camera.name: (camera, lens) for camera, lens in read_lenses(inputs.cameras)}
+    except InputError as error:
+        return [], [str(error)]
+    views, notes = [], []
+    for name, path in inputs.photographs.items():
+        if name not in lenses:
+            notes.append(f"camera {name}: not in {inputs.cameras.name}")
+            continue
+        camera, lens = lenses[name]
+        try:
+            window = Window.full(camera).resized(min(1.0, longer_side / max(camera.width, camera.height)))
+            views.append((window.camera(camera), ViewReader(camera, window, lens).color(path) / 255.0))
+        except InputError as error:
+            notes.append(f"camera {name}: {error}")
+    return views, notes

@@ -1,63 +1,62 @@
-"""Scans as a registration sees them, with the labels that it may know."""
+"""Read scans as a registration sees them, with the labels that it may know."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64
 
-from pipelines.stages.located import read_located_labels
-from pipelines.stages.register_config import RegisterInputs
-from pipelines.stages.scan_files import ScanFile, read_scan
+from smplxpp.build.config import RegisterInputs
+from smplxpp.build.data import LocatedInScan
+from smplxpp.build.scan import ScanFile, read_scan, scan_file_labels
 from smplxpp.capture import Capture
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import BACKGROUND, LABELS
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh import MeshLike, TriangleMesh
 from smplxpp.register import ScanObservation, ViewMap
-from smplxpp.segment import read_labels, vote_on_faces
-
-CLEAR_MAJORITY = 0.6
-"""Share of a vertex's votes that its label has; others are not known."""
+from smplxpp.segment import vote_on_faces
 
 
 def observed_scans(
-    files: Mapping[int, Path],
+    files: Mapping[int, Path | MeshLike],
     inputs: RegisterInputs,
     capture: Capture | None,
     maps: ViewMap | None,
-    located: Path | None,
+    located: Callable[[], LocatedInScan] | None,
 ) -> tuple[dict[int, ScanObservation], list[str]]:
     """Read scans; those that cannot be read are left out, unless it is the one that the user named.
 
     Labels of the reference frame's scan are those that the inputs name. Every other scan has the votes of its frame's
-    label maps, where there are any: a file of labels beside a scan is a truth that no tracker has. Where nobody has
-    labelled the reference frame, the body that was found in its scan says what is sure.
+    label maps, where there are any, because a file of labels beside a scan is a truth that no tracker has. A reference
+    frame without either has the certain labels of the body that was found in its scan.
 
     Args:
-        files: by frame.
+        files: scans by frame.
+        inputs: what the body is registered to.
+        capture: that the label maps are of; None for a scan alone.
         maps: label maps of the cameras that may be used, ids of `smplxpp.core.labels`, 255 elsewhere.
-        located: folder of the stage that found the body in the reference frame's scan, None where there is none.
+        located: gives the body that was found in the reference frame's scan; None where it was not searched.
 
     Returns:
-        The scans, and what was wrong with the others, in words.
+        The scans, and notes on those that were left out.
 
     Raises:
         InputError: the scan that the user named cannot be read, or the labels do not fit it.
     """
-    scans, problems = {}, []
-    for frame, path in files.items():
+    scans, notes = {}, []
+    for frame, source in files.items():
         try:
             with warnings.catch_warnings():
-                # What a template is built from is told at its stage; here a repair changes nothing that is kept.
+                # The step that prepares the template's scan repeats the warnings; repairs here are not kept.
                 warnings.simplefilter("ignore", GeometryWarning)
-                scan = read_scan(path, units=inputs.units, up=inputs.up)
+                scan = read_scan(source, units=inputs.units, up=inputs.up)
         except InputError as error:
-            if path == inputs.scan:
+            if source is inputs.scan or (isinstance(source, Path) and source == inputs.scan):
                 raise
-            problems.append(f"frame {frame}: the scan is left out: {error}")
+            notes.append(f"frame {frame}: the scan is left out: {error}")
             continue
         mesh = scan.clean.mesh
         labels: Int64[np.ndarray, " V"] | None
@@ -66,23 +65,16 @@ def observed_scans(
         else:
             labels = _voted_labels(mesh, frame, capture, maps)
             if labels is None and frame == inputs.frame and located is not None:
-                labels = read_located_labels(located, mesh.vertex_count)
+                labels = located().labels_of(mesh.vertex_count)
         scans[frame] = ScanObservation(mesh, labels)
-    return scans, problems
+    return scans, notes
 
 
-def _given_labels(path: Path, scan: ScanFile, label_set: str) -> Int64[np.ndarray, " V"]:
-    """The labels of a file, a vertex."""
-    raw = scan.raw
-    labels = read_labels(
-        path,
-        vertex_count=len(raw.vertices),
-        face_count=len(raw.faces),
-        label_set=label_set,
-        source_faces=raw.source_faces,
-    )
+def _given_labels(given: Path | np.ndarray, scan: ScanFile, label_set: str) -> Int64[np.ndarray, " V"]:
+    """The labels of a file or an array, one a vertex of the repaired scan."""
+    labels, of_faces = scan_file_labels(given, scan.raw, label_set=label_set)
     clean = scan.clean
-    if len(labels) != len(raw.faces):
+    if not of_faces:
         return labels[clean.source_vertex]
     out = np.full(clean.mesh.vertex_count, BACKGROUND, dtype=np.int64)
     out[clean.mesh.faces] = labels[clean.source_face][:, None]
@@ -92,7 +84,8 @@ def _given_labels(path: Path, scan: ScanFile, label_set: str) -> Int64[np.ndarra
 def _voted_labels(
     mesh: TriangleMesh, frame: int, capture: Capture | None, maps: ViewMap | None
 ) -> Int64[np.ndarray, " V"] | None:
-    """What a frame's label maps clearly say of the vertices, negative elsewhere; None where there are no maps."""
+    """Labels of the vertices where a clear majority of label maps agrees, -1 elsewhere; None without maps."""
+    clear_majority = 0.6  # share of a vertex's votes, below which its label is not known
     if capture is None or maps is None:
         return None
     views = []
@@ -106,9 +99,10 @@ def _voted_labels(
         faces = vote_on_faces(mesh, views)
     except InputError:  # maps that show nothing of the scan: nothing is known of it
         return None
+    # Sum the votes of the faces around each vertex.
     votes = np.stack(
         [np.bincount(mesh.faces.ravel(), np.repeat(column, 3), mesh.vertex_count) for column in faces.T], axis=1
     )
     total = votes.sum(axis=1)
-    clear = (total > 0) & (votes.max(axis=1) >= CLEAR_MAJORITY * total)
+    clear = (total > 0) & (votes.max(axis=1) >= clear_majority * total)
     return np.where(clear, votes.argmax(axis=1), BACKGROUND)

@@ -1,0 +1,219 @@
+"""The stages that make a template: each reads what stands, calls a step of `smplxpp.build`, keeps the result.
+
+Nothing is computed here. A stage's key counts the code of its step and of the files (`pipelines.stages.build.PARTS`).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.figures.colors import blend_joint_colors
+from pipelines.runs.artefacts import (
+    load_canonical,
+    load_cleaned_parts,
+    load_fit,
+    load_params_of_run,
+    load_parts,
+    load_prepared_scan,
+    load_scan_labels,
+    load_stacked_params,
+    load_weights,
+    save_arrays,
+    save_canonical,
+    save_fit,
+    save_located,
+    save_parts,
+    save_scan,
+    save_weights,
+)
+from pipelines.runs.layout import (
+    CORRECTIONS_FILE,
+    LANDMARKS_FILE,
+    LOCATED_PARAMS,
+    LOCATION_FILE,
+    REGISTERED_PARAMS,
+    TEMPLATE,
+)
+from pipelines.stages.build_config import BuildContext
+from pipelines.stages.run_inputs import motion_of_build
+from smplxpp.body import load_body, load_params
+from smplxpp.build.assemble import assemble_parts
+from smplxpp.build.data import RestPart
+from smplxpp.build.locate import locate_in_scan
+from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
+from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame
+from smplxpp.build.scan import ScanFile, read_scan
+from smplxpp.build.segment import label_faces, vertex_labels
+from smplxpp.build.validate import validate_template
+from smplxpp.core.checks import StageOutput
+from smplxpp.core.labels import display_colors
+from smplxpp.core.mesh_files.mesh_io import write_ply
+from smplxpp.core.params import BodyParams
+from smplxpp.export import write_glb, write_obj
+from smplxpp.metrics.distance import MM
+from smplxpp.segment import Corrections
+from smplxpp.template.template import Template
+
+
+def locate(folder: Path, build: BuildContext) -> StageOutput:
+    """Write the parameters of the body found in the scan, what else it might have been, and how certain it is."""
+    placed = build.run / LANDMARKS_FILE
+    found, output = locate_in_scan(
+        _read_scan(build),
+        load_body(build.inputs.body),
+        landmarks=placed if placed.exists() else None,
+        detector=build.config.detector,
+    )
+    save_located(folder, found)
+    (folder / LOCATION_FILE).write_text(json.dumps(output.numbers, indent=1) + "\n")
+    return output
+
+
+def capture(folder: Path, build: BuildContext) -> StageOutput:
+    """Write the scan in metres, +Y up, repaired, and the frame's parameters."""
+    scan, output = prepare_scan(_read_scan(build))
+    save_scan(folder, scan)
+    _params_of_frame(build).save(folder / "params.npz")
+    return output
+
+
+def pose_body(folder: Path, build: BuildContext) -> StageOutput:
+    """Write the posed body of the given fit, and how well the scan agrees with it."""
+    scan = load_prepared_scan(build.run)
+    fit, output = pose_fit(scan.mesh, load_body(build.inputs.body), load_params_of_run(build.run))
+    save_fit(folder, fit)
+    return output
+
+
+def segment(folder: Path, build: BuildContext) -> StageOutput:
+    """Write a label, a confidence and a seen flag for every face."""
+    scan, path = load_prepared_scan(build.run), build.run / CORRECTIONS_FILE
+    labelled, output = label_faces(
+        scan,
+        build.inputs,
+        load_body(build.inputs.body),
+        load_params_of_run(build.run),
+        corrections=Corrections.load(path) if path.exists() else None,
+    )
+    result, before = labelled.result, labelled.before
+    assert result.corrected is not None
+    np.savez(
+        folder / "labels.npz",
+        face_labels=result.face_labels,
+        confidence=result.confidence,
+        seen=result.seen,
+        corrected=result.corrected,
+        labels_before_hand=before.face_labels,
+        confidence_before_hand=before.confidence,
+    )
+    write_ply(
+        folder / "labels.ply",
+        scan.mesh,
+        vertex_colors=display_colors(vertex_labels(scan.mesh, result.face_labels)),
+        face_properties={
+            "label": result.face_labels,
+            "confidence": result.confidence,
+            "corrected": result.corrected.astype(np.uint8),
+        },
+    )
+    return output
+
+
+def clean(folder: Path, build: BuildContext) -> StageOutput:
+    """Write one clean mesh within its face budget for every part that is not skin."""
+    scan = load_prepared_scan(build.run)
+    parts, output = clean_scan(scan, load_scan_labels(build.run, scan.mesh.face_count), build.config)
+    save_parts(folder, parts)
+    return output
+
+
+def transfer(folder: Path, build: BuildContext) -> StageOutput:
+    """Write skin weights of every part from the posed body, and the parts without the webs that the weights show."""
+    body = load_body(build.inputs.body)
+    cleaned, fit = load_cleaned_parts(build.run), load_fit(build.run, body)
+    parts, weights, output = transfer_to_parts(cleaned, fit, body, build.config)
+    save_weights(folder, weights)
+    save_parts(folder, parts)
+    for name, part in parts.items():
+        write_ply(
+            folder / f"{name}_weights.ply",
+            part.mesh,
+            vertex_colors=blend_joint_colors(weights[name]),
+            vertex_properties={"matched": weights[name].matched.astype(np.int32)},
+        )
+    return output
+
+
+def unpose(folder: Path, build: BuildContext) -> StageOutput:
+    """Write the parts in the T-pose."""
+    parts = load_parts(build.run)
+    fit = load_fit(build.run, load_body(build.inputs.body))
+    at_rest, output = unpose_parts(parts, load_weights(build.run, parts), fit)
+    save_canonical(folder, at_rest)
+    return output
+
+
+def assemble(folder: Path, build: BuildContext) -> StageOutput:
+    """Write body and parts as one `Template`, layers apart: npz, GLB and OBJ."""
+    body, scan, posed = load_body(build.inputs.body), load_prepared_scan(build.run), load_parts(build.run)
+    at_rest, weights = load_canonical(build.run, posed), load_weights(build.run, posed)
+    template, output = assemble_parts(
+        body,
+        load_params_of_run(build.run),
+        scan,
+        load_scan_labels(build.run, scan.mesh.face_count),
+        load_fit(build.run, body),
+        load_cleaned_parts(build.run),
+        {name: RestPart(part, weights[name], at_rest[name].vertices) for name, part in posed.items()},
+        build.config,
+    )
+    template.save(folder / "smplxpp.npz")
+    write_glb(folder / "template.glb", template)
+    write_obj(folder / "template.obj", template)
+    return output
+
+
+def validate(folder: Path, build: BuildContext) -> StageOutput:
+    """Write distances to the scan in the reference pose; measure flips, and stretch under hard poses and the motion."""
+    scan = load_prepared_scan(build.run)
+    found, output = validate_template(
+        Template.load(build.run / TEMPLATE),
+        load_params_of_run(build.run),
+        scan,
+        load_scan_labels(build.run, scan.mesh.face_count),
+        load_parts(build.run),
+        motion_of_build(build.run, build.inputs),
+        build.inputs,
+        build.config,
+    )
+    distances = {"template_to_scan": found.to_scan, "scan_to_template": found.to_template}
+    save_arrays(
+        folder / "errors.npz",
+        {
+            name: {"distance_mm": (d.distance * MM).astype(np.float32), "label": np.asarray(d.label).astype(np.int8)}
+            for name, d in distances.items()
+        },
+    )
+    return output
+
+
+def _read_scan(build: BuildContext) -> ScanFile:
+    assert build.inputs.scan is not None, "a run keeps its scan in a file"
+    return read_scan(build.inputs.scan, units=build.config.units, up=build.config.up)
+
+
+def _params_of_frame(build: BuildContext) -> BodyParams:
+    """The reference frame's parameters: given, registered in the run, or of the body found in the scan.
+
+    Raises:
+        InputError: the frame could not be registered.
+    """
+    given = given_params(build.inputs, load_body(build.inputs.body))
+    if given is not None:
+        return given
+    if not build.inputs.registers:
+        return load_params(build.run / LOCATED_PARAMS)
+    return registered_frame(build.inputs.frame, *load_stacked_params(build.run / REGISTERED_PARAMS))

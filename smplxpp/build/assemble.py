@@ -1,0 +1,128 @@
+"""Assemble body and parts into one template: holes of cut webs closed, layers apart, the scan's colours on the skin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Integer
+
+from smplxpp.assemble import (
+    AssemblyConfig,
+    CanonicalPart,
+    assemble_template,
+    body_colors_from_scan,
+    cut_holes,
+    darn,
+)
+from smplxpp.body import BodyModel
+from smplxpp.build.config import BuildConfig
+from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
+from smplxpp.core.checks import Check, StageOutput
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import SKIN
+from smplxpp.core.params import BodyParams
+from smplxpp.metrics.distance import MM
+from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
+from smplxpp.template.template import Template
+
+
+def assemble_parts(
+    body: BodyModel,
+    params: BodyParams,
+    scan: PreparedScan,
+    face_labels: Integer[np.ndarray, " M"],
+    fit: PosedFit,
+    cleaned: Mapping[str, Part],
+    parts: Mapping[str, RestPart],
+    config: BuildConfig,
+) -> tuple[Template, StageOutput]:
+    """Put body and parts together as one `Template`, with its layers apart.
+
+    Args:
+        body: the model of the fit.
+        params: of the scan's pose; its shape becomes the template's.
+        scan: prepared, for the colours of the skin.
+        face_labels: of the scan.
+        fit: the posed body.
+        cleaned: the parts before webs were cut, which tell the holes of a cut from openings.
+        parts: the same parts without webs, in the T-pose.
+        config: choices of the build.
+    """
+    canonical, darned = {}, {}
+    for name, before in cleaned.items():
+        part = parts[name].posed
+        made = CanonicalPart(
+            mesh=part.mesh.with_vertices(parts[name].vertices),
+            weights=parts[name].weights,
+            label=part.label,
+            vertex_colors=part.colors,
+            scan_index=_of_file(scan, part.source_vertex),
+        )
+        # Close what the cut of a web opened. Cuffs and hems were open before and stay open.
+        holes = cut_holes(before.mesh, before.source_vertex, part.mesh, part.source_vertex)
+        canonical[name], darned[name] = darn(made, holes, config=config.darning)
+    settings = AssemblyConfig(clearance=config.clearance_mm / MM)
+    template, report = assemble_template(body, params, canonical, config=settings)
+    template = _with_scan_colors(template, scan, face_labels == SKIN.id, fit, body)
+    checks = [
+        Check(
+            "outer vertices inside an inner layer at rest",
+            report.penetrating_after,
+            "",
+            0,
+            0,
+            explanation="after the repair",
+        ),
+        Check(
+            "depth of what the repair leaves inside",
+            report.left_depth * MM,
+            "mm",
+            0.0,
+            5.0,
+            explanation=f"the body does not fit the scan here: register first. {report.left_where}"
+            if report.left_where
+            else "nothing needs a push beyond what its part stands off the body",
+        ),
+        Check(
+            "largest push of the repair",
+            report.max_push * MM,
+            "mm",
+            15.0,
+            60.0,
+            explanation=f"{report.max_push_where or 'none'}; no part is pushed farther than it stands off the body "
+            "(10 to 30 mm) and the clearance",
+        ),
+    ]
+    numbers = report.as_dict() | {"darned": {name: one.as_dict() for name, one in darned.items()}}
+    return template, StageOutput(checks, numbers)
+
+
+def _of_file(scan: PreparedScan, vertices: Integer[np.ndarray, " n"]) -> Integer[np.ndarray, " n"]:
+    """The vertex of the user's file for vertices of the prepared scan.
+
+    Raises:
+        InputError: vertices that the scan does not have.
+    """
+    count = len(scan.source_vertex)
+    if vertices.size and not (vertices.min() >= 0 and vertices.max() < count):
+        raise InputError("part: source_vertex", expected=f"vertices of the scan, below {count}", received="others")
+    return scan.source_vertex[vertices]
+
+
+def _with_scan_colors(
+    template: Template, scan: PreparedScan, skin: np.ndarray, fit: PosedFit, body: BodyModel
+) -> Template:
+    """The template with the scan's colours on the skin that the scan shows, and a dark inside of the mouth."""
+    body_colors, body_index = body_colors_from_scan(fit.mesh, scan.mesh, scan.colors, skin)
+    count = body.vertex_count
+    # The scan's nearest skin is that of the lips, so that the inside of the mouth would become red.
+    mouth = inside_of_mouth(template)[:count]
+    body_colors[mouth], body_index[mouth] = MOUTH_COLOR, -1
+    scan_index = np.where(body_index >= 0, scan.source_vertex[body_index], -1)
+    return replace(
+        template,
+        vertex_colors=np.concatenate([body_colors, template.vertex_colors[count:]]),
+        scan_index=np.concatenate([scan_index, template.scan_index[count:]]),
+    )

@@ -1,0 +1,325 @@
+"""Decide what a build takes: what is given, what a capture has, and what has to be made."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs, resolved
+from smplxpp.build.reconstruct import open_photographs, usable_cameras, usable_frames
+from smplxpp.capture import Capture, ReferenceFrame, find_reference
+from smplxpp.capture.declared import DeclaredInputs
+from smplxpp.capture.protocols import TRACKED, choose_protocol, read_description
+from smplxpp.capture.readers.simple import stacked_params
+from smplxpp.clean.scan_frame import AUTO
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.paths import same_place
+from smplxpp.core.mesh import MeshLike
+from smplxpp.core.params import BodyParams
+from smplxpp.core.spread import spread
+from smplxpp.segment import find_label_set
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class BuildRequest:
+    """What a user asks a build for.
+
+    Attributes:
+        scan: clothed scan of the reference frame, a file or a mesh.
+        capture: folder of a capture, or an open one. Either this or a scan is given.
+        params: body parameters of the scan.
+        labels: labels of the scan's vertices or faces, a file or an array of ids.
+        body: body file or model; None: the open body.
+        config: choices of the build.
+        surface: file in which a reconstructed scan is kept; None: in memory.
+        registration: what was registered to before, which is kept where it fits.
+        reconstruction: what was reconstructed from before, likewise.
+    """
+
+    scan: Path | MeshLike | None = None
+    capture: Path | Capture | None = None
+    params: Path | BodyParams | None = None
+    labels: Path | np.ndarray | None = None
+    body: Path | BodyModel | None = None
+    config: BuildConfig = field(default_factory=BuildConfig)
+    surface: Path | None = None
+    registration: RegisterInputs | None = None
+    reconstruction: ReconstructInputs | None = None
+
+    @property
+    def root(self) -> Path | None:
+        """Folder of the capture."""
+        return self.capture.root if isinstance(self.capture, Capture) else self.capture
+
+    @property
+    def protocol(self) -> str | None:
+        """Name of the protocol that is read: the configuration's, or that of an open capture."""
+        if self.config.protocol is None and isinstance(self.capture, Capture):
+            return self.capture.protocol
+        return self.config.protocol
+
+    @property
+    def body_file(self) -> Path | None:
+        """The body's file; None for the open body and for a model in memory."""
+        return None if isinstance(self.body, BodyModel) else self.body
+
+    @property
+    def named_params(self) -> Path | None:
+        """The parameters' file (`named_params`); parameters in memory have none."""
+        return named_params(self.root, self.params) if isinstance(self.params, Path) else None
+
+
+@dataclass(frozen=True, eq=False)
+class BuildPlan:
+    """What a build takes, decided.
+
+    Attributes:
+        inputs: what is read and which steps make the rest.
+        config: choices, with "auto" resolved as far as it can be before the scan is read.
+        registration: what the body is registered to; None where parameters are given or found.
+        reconstruction: photographs that the scan is made of; None where there is a scan.
+    """
+
+    inputs: BuildInputs
+    config: BuildConfig
+    registration: RegisterInputs | None
+    reconstruction: ReconstructInputs | None
+
+
+def named_params(root: Path | None, params: Path | None) -> Path | None:
+    """Return the file or folder that a user means by parameters: a path, or a name in the capture's folder `params`."""
+    return stacked_params(root, params) if params is not None and root is not None else params
+
+
+def plan_build(request: BuildRequest) -> BuildPlan:
+    """Decide what a build takes, before any work is done.
+
+    Raises:
+        InputError: neither or both ways of naming the input, files that a capture lacks, or photographs that cannot be
+            used.
+    """
+    if (request.capture is None) == (request.scan is None):
+        raise InputError(
+            "input",
+            expected="either --capture or --scan",
+            received="both" if request.scan is not None else "neither",
+        )
+    inputs = _of_scan(request) if request.capture is None else _of_capture(request)
+    config = resolved(request.config, inputs)
+    return BuildPlan(inputs, config, _registration(request, inputs), _reconstruction(request, inputs))
+
+
+def _of_capture(request: BuildRequest) -> BuildInputs:
+    """The inputs of a capture: a scan that it lacks is reconstructed, parameters that it lacks are registered."""
+    root, config = request.root, request.config
+    assert root is not None
+    registers = _registers(request)
+    in_memory = request.params if isinstance(request.params, BodyParams) else None
+    found = find_reference(
+        root,
+        frame=config.frame,
+        params=request.named_params,
+        protocol=request.protocol,
+        fitted=not registers and in_memory is None,
+        scanned=False,
+    )
+    labels = _scan_labels(request, found) if request.labels is None else request.labels
+    by_body = config.label_source == "body"
+    # A few photographs from all around tell left from right; more cost time and decide nothing.
+    most_photographs = 8
+    return BuildInputs(
+        subject=found.subject,
+        scan=found.scan or request.surface,
+        params=None if registers else (in_memory or found.params),
+        reconstructs=found.scan is None,
+        locates=registers and not _starts(request, found),
+        registers=registers,
+        frame=found.frame,
+        params_row=found.params_frame if in_memory is None else found.frame,
+        labels=labels,
+        label_maps={} if labels is not None or by_body else found.label_maps,
+        photographs=dict(spread(list(found.photographs.items()), most_photographs)),
+        cameras=found.cameras_file if found.photographs or labels is None else None,
+        label_set="capture" if config.label_set == AUTO else config.label_set,
+        label_source="body" if by_body else "auto",
+        motion=None if registers else (in_memory or found.motion),
+        body=request.body_file,
+        protocol=request.protocol,
+    )
+
+
+def _of_scan(request: BuildRequest) -> BuildInputs:
+    """The inputs of a scan with what is known of it.
+
+    Raises:
+        InputError: options that need a capture.
+    """
+    config = request.config
+    for name in ("protocol", "keypoints", "masks"):
+        if getattr(config, name) is not None:
+            raise InputError(f"option {name}", expected="with --capture", received="with --scan")
+    registers = request.params is not None and config.register == "on"
+    return BuildInputs(
+        subject=request.scan.stem if isinstance(request.scan, Path) else "scan",
+        scan=request.scan,
+        params=None if registers else request.params,
+        registers=registers,
+        locates=request.params is None,
+        frame=config.frame,
+        params_row=config.frame,
+        labels=request.labels,
+        label_set="4ddress" if config.label_set == AUTO else config.label_set,
+        label_source="body" if config.label_source == "body" else "auto",
+        body=request.body_file,
+    )
+
+
+def _registers(request: BuildRequest) -> bool:
+    """Whether the parameters come from a registration of the capture."""
+    root = request.root
+    assert root is not None
+    if request.config.register != AUTO:
+        return request.config.register == "on"
+    if _standing_registration(request) is not None:
+        return True
+    if isinstance(request.params, BodyParams) or not root.is_dir():
+        return False
+    declared = DeclaredInputs.of_folder(root, request.protocol)
+    params = declared.own_parameters() if request.params is None else request.named_params
+    return params is None or declared.given_parameters(params) == TRACKED
+
+
+def _starts(request: BuildRequest, found: ReferenceFrame) -> bool:
+    """Whether a registration has something to start from: a fit, keypoints, or an earlier registration."""
+    root = request.root
+    assert root is not None
+    if found.params is not None or isinstance(request.params, BodyParams):
+        return True
+    if request.config.keypoints is not None or _standing_registration(request) is not None:
+        return True
+    files = choose_protocol(root, read_description(root), request.protocol)
+    return files.keypoints is not None and (root / files.keypoints).is_dir()
+
+
+def _standing_registration(request: BuildRequest) -> RegisterInputs | None:
+    """The earlier registration, if it was of this capture and of these parameters, as far as any are named."""
+    found, root = request.registration, request.root
+    if found is None or root is None or not isinstance(found.capture, Path):
+        return None
+    if not same_place(found.capture, root) or found.protocol != request.protocol:
+        return None
+    params = request.named_params
+    if params is None:
+        return found
+    return found if isinstance(found.params, Path) and same_place(params, found.params) else None
+
+
+def _registration(request: BuildRequest, inputs: BuildInputs) -> RegisterInputs | None:
+    """What the body is registered to, None where the parameters are given."""
+    if not inputs.registers:
+        return None
+    config = resolved(request.config, inputs)
+    return _standing_registration(request) or RegisterInputs(
+        capture=request.capture,
+        params=request.params if isinstance(request.params, BodyParams) else request.named_params,
+        protocol=request.protocol,
+        body=request.body_file,
+        scan=inputs.scan if inputs.reconstructs else request.scan,
+        frame=config.frame,
+        labels=inputs.labels,
+        label_set=inputs.label_set,
+        keypoints=config.keypoints,
+        masks=config.masks,
+        units=config.units,
+        up=config.up,
+    )
+
+
+def _reconstruction(request: BuildRequest, inputs: BuildInputs) -> ReconstructInputs | None:
+    """The photographs that the scan is made of, None where there is one; an earlier reconstruction stands.
+
+    Raises:
+        InputError: no cameras or no photographs of the frame, known before work starts.
+    """
+    if not inputs.reconstructs:
+        return None
+    found, root = request.reconstruction, request.root
+    assert request.capture is not None and root is not None
+    made = isinstance(inputs.scan, Path) and inputs.scan.is_file()
+    if found is not None and made and isinstance(found.capture, Path) and same_place(found.capture, root):
+        return found
+    asked = ReconstructInputs(
+        request.capture, frames=(request.config.frame,), masks=request.config.masks, protocol=request.protocol
+    )
+    capture = open_photographs(asked)
+    usable_cameras(capture, ())
+    usable_frames(capture, asked.frames)
+    return asked
+
+
+def _scan_labels(request: BuildRequest, found: ReferenceFrame) -> Path | None:
+    """The labels that come with the scan, if they are used; None where label maps or the body decide.
+
+    Raises:
+        InputError: the labels that are asked for do not exist.
+    """
+    source, views, scan = request.config.label_source, bool(found.label_maps), found.scan_labels is not None
+    if source in ("views", "scan") and not {"views": views, "scan": scan}[source]:
+        barred = f", by protocol {request.protocol}" if request.protocol else ""
+        raise InputError(
+            f"capture {found.subject}",
+            expected={"scan": "labels of the scan", "views": "label maps of its views"}[source],
+            received=f"none for frame {found.frame}{barred}",
+            remedy="name a file with --labels",
+        )
+    if source == "body" or (views and source != "scan") or not scan:
+        return None
+    if source == AUTO:
+        log.warning(
+            "no label maps of frame %d: the labels that come with the scan are used, which are no estimate",
+            found.frame,
+        )
+    return found.scan_labels
+
+
+def check_inputs(inputs: BuildInputs, body: BodyModel | None = None) -> BodyModel:
+    """Refuse what can be known before the first step: missing files, and files that only the last steps read.
+
+    Args:
+        inputs: of the build.
+        body: the model, where it is in memory.
+
+    Returns:
+        The body model.
+
+    Raises:
+        InputError: it names the option.
+    """
+    for name in ("scan", "params", "labels", "cameras", "motion", "body"):
+        value = None if name == "scan" and inputs.reconstructs else getattr(inputs, name)
+        if isinstance(value, Path) and not value.exists():
+            raise InputError(f"option {name}", expected="an existing file", received=str(value))
+    if inputs.label_maps and inputs.cameras is None:
+        raise InputError(
+            "label maps",
+            expected="a camera file with them",
+            received="none",
+            remedy="put cameras.json or calibration.csv into the capture",
+        )
+    find_label_set(inputs.label_set)
+    model = load_body(inputs.body) if body is None else body
+    given_motion(inputs, model)
+    return model
+
+
+def given_motion(inputs: BuildInputs, body: BodyModel) -> BodyParams | None:
+    """Return the motion of the capture that the inputs name, None where they name none."""
+    if isinstance(inputs.motion, Path):
+        return load_params(inputs.motion, body=body)
+    return inputs.motion

@@ -1,0 +1,123 @@
+"""Find the body in a scan that comes with nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int64, UInt8
+
+from smplxpp.body import BodyModel
+from smplxpp.build.data import LocatedInScan
+from smplxpp.build.scan import ScanFile
+from smplxpp.build.scan_keypoints import facing, keypoints_of_scan
+from smplxpp.clean import smooth_if_rough
+from smplxpp.core.checks import Check, StageOutput
+from smplxpp.core.files.json_file import jsonable
+from smplxpp.core.labels import BACKGROUND
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.detect import load_detector
+from smplxpp.register import bare_of_scan
+from smplxpp.register import read_landmarks
+from smplxpp.register.locate import LocatedBody, locate_body
+from smplxpp.register import ScanObservation
+from smplxpp.segment import label_by_body
+
+
+def landmark_points(landmarks: Path | Mapping[str, Any] | None) -> dict[str, np.ndarray] | None:
+    """Return landmarks by name, read from their file if they are in one."""
+    if landmarks is None:
+        return None
+    if isinstance(landmarks, Path):
+        return dict(read_landmarks(landmarks))
+    return {name: np.asarray(point, dtype=np.float64) for name, point in landmarks.items()}
+
+
+def locate_in_scan(
+    scan: ScanFile,
+    body: BodyModel,
+    *,
+    landmarks: Path | Mapping[str, Any] | None = None,
+    detector: str | None = None,
+) -> tuple[LocatedInScan, StageOutput]:
+    """Find the body in a scan, and say what else it might have been and how certain it is.
+
+    Args:
+        scan: repaired.
+        body: the model.
+        landmarks: points placed by hand, which are trusted.
+        detector: keypoint model that is asked for the front; see `BuildConfig`. Not used beside landmarks.
+
+    Raises:
+        InputError: no person, or landmarks that the body does not have.
+    """
+    mesh, colors = smooth_if_rough(scan.clean.mesh).mesh, scan.colors
+    labeller = partial(certain_labels, mesh, body, colors)
+    search = partial(locate_body, body, mesh, colors=colors, labeller=labeller)
+    found = search(landmarks=landmark_points(landmarks))
+    note = ""
+    if detector is not None and landmarks is None:
+        found, note = _confirmed(found, search, mesh, colors, detector)
+    # Keep the labels that a registration may lean on, a label for each vertex of a certain face.
+    labels = np.full(mesh.vertex_count, BACKGROUND, dtype=np.int64)
+    of_faces = labeller(found.params)
+    known = of_faces != BACKGROUND
+    labels[mesh.faces[known]] = of_faces[known][:, None]
+    bare = bare_of_scan(body, found.params, ScanObservation(mesh, labels))
+    numbers = {
+        "units": scan.units,
+        "up": scan.up,
+        "said": scan.note,
+        "detector": note,
+        "facing_degrees": found.candidates[0].facing_degrees,
+        "confidence": found.confidence,
+        "problems": list(found.notes),
+        "candidates": found.candidates,
+        "bare": float(bare.mean()),
+    }
+    check = Check(
+        "confidence of the body found",
+        found.confidence,
+        "",
+        0.5,
+        0.2,
+        higher_is_better=True,
+        explanation="how far the best way to stand in the scan is ahead of the best that faces another way"
+        + "".join(f"; {problem}" for problem in found.notes),
+    )
+    return LocatedInScan(found.params, labels, bare), StageOutput([check], jsonable(numbers))
+
+
+def _confirmed(
+    found: LocatedBody,
+    search: Callable[..., LocatedBody],
+    mesh: TriangleMesh,
+    colors: UInt8[np.ndarray, "N 3"] | None,
+    detector: str,
+) -> tuple[LocatedBody, str]:
+    """The found body if a detector's keypoints on pictures of the scan agree on the front; else search again with them.
+
+    Keypoints are centimetres off and geometry is not, so that they decide the front alone.
+    """
+    landmarks = keypoints_of_scan(mesh, colors, load_detector(detector))
+    front = facing(landmarks)
+    if front is None:
+        return found, "the detector's keypoints do not tell the front"
+    own = np.radians(found.candidates[0].facing_degrees)
+    if np.sin(own) * front[0] + np.cos(own) * front[2] > 0:
+        return found, "the detector's keypoints face the same way"
+    again = search(landmarks={name: point for name, (point, _) in landmarks.items() if name.startswith("coco_")})
+    return again, "the surface alone was taken for somebody who faces the other way than the detector's keypoints do"
+
+
+def certain_labels(
+    mesh: TriangleMesh, body: BodyModel, colors: UInt8[np.ndarray, "N 3"] | None, params: BodyParams
+) -> Int64[np.ndarray, " M"]:
+    """Return labels of a scan's faces by its colours and a body in it; -1 where the confidence is below 0.6."""
+    least_confidence = 0.6  # a wrong label pulls the fit, a missing one only slows it
+    labelled = label_by_body(mesh, body, params, colors=colors)
+    return np.where(labelled.confidence >= least_confidence, labelled.face_labels, BACKGROUND)

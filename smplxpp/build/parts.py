@@ -1,0 +1,130 @@
+"""Make the loose parts of a template: cleaned, with skin weights, in the T-pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Integer
+
+from smplxpp.body import BodyModel
+from smplxpp.build.config import BuildConfig
+from smplxpp.build.data import Part, PosedFit, PreparedScan
+from smplxpp.clean import PartsConfig, WebConfig, clean_parts, cut_webs, find_webs
+from smplxpp.core.checks import Check, StageOutput
+from smplxpp.core.labels import LABELS
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
+from smplxpp.metrics.distance import MM
+from smplxpp.skinning import UnposeConfig, Unposed, unpose
+from smplxpp.transfer import TransferConfig, transfer_weights
+
+
+def clean_scan(
+    scan: PreparedScan, face_labels: Integer[np.ndarray, " M"], config: BuildConfig
+) -> tuple[dict[str, Part], StageOutput]:
+    """Make one clean mesh within its face budget for every part that is not skin."""
+    settings = PartsConfig(face_budgets=config.budgets, method=config.remesh)
+    cleaned = clean_parts(scan.mesh, face_labels, config=settings, vertex_colors=scan.colors)
+    parts, checks, numbers = {}, [], {}
+    for name, part in cleaned.items():
+        parts[name] = Part(part.mesh, part.label, part.source_vertex, np.asarray(part.vertex_colors))
+        distance = point_to_surface(part.mesh.vertices, scan.mesh)[0] * MM
+        quality = mesh_quality(part.mesh)
+        numbers[name] = {"faces": part.mesh.face_count, "quality": quality, "report": part.report}
+        checks += [
+            Check(f"{name}: non-manifold edges", quality.nonmanifold_edges, "", 0, 0),
+            Check(f"{name}: vertices to scan, p95", float(np.percentile(distance, 95)), "mm", 2.0, 5.0),
+        ]
+    return parts, StageOutput(checks, numbers)
+
+
+def transfer_to_parts(
+    cleaned: Mapping[str, Part], fit: PosedFit, body: BodyModel, config: BuildConfig
+) -> tuple[dict[str, Part], dict[str, SkinWeights], StageOutput]:
+    """Transfer skin weights from the posed body to every part, and cut the webs that the weights show.
+
+    Returns:
+        The parts without webs, their weights, checks and numbers.
+    """
+    parts: dict[str, Part] = {}
+    weights: dict[str, SkinWeights] = {}
+    checks: list[Check] = []
+    numbers: dict[str, Any] = {}
+    for name, part in cleaned.items():
+        settings = transfer_config(LABELS[part.label].name, body, config)
+        mesh, source, found = _without_webs(part.mesh, fit, body, settings, config.webs)
+        parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
+        weights[name] = found
+        report = weight_report(found)
+        numbers[name] = {
+            "matched_share": float(found.matched.mean()),
+            "components": len(found.policies),
+            "policies": sorted(set(found.policies)),
+            "report": report.as_dict(),
+            "web_faces": part.mesh.face_count - mesh.face_count,
+            "web_area_share": 1.0 - float(mesh.face_areas.sum() / part.mesh.face_areas.sum()),
+        }
+        checks += [
+            Check(f"{name}: rows off partition of unity", report.row_sum_error, "", 1e-12, 1e-9),
+            Check(f"{name}: negative weights and silent zero rows", report.negative + report.zero_rows, "", 0, 0),
+        ]
+    return parts, weights, StageOutput(checks, numbers)
+
+
+def transfer_config(label: str, body: BodyModel, config: BuildConfig) -> TransferConfig:
+    """Return the settings of the transfer for a part of this label, by the build's method."""
+    base = TransferConfig.paper() if config.method == "paper" else TransferConfig.for_label(label)
+    return replace(base, joint_names=body.joint_names, max_influences=config.max_influences)
+
+
+def _without_webs(
+    part: TriangleMesh, fit: PosedFit, body: BodyModel, settings: TransferConfig, config: WebConfig
+) -> tuple[TriangleMesh, np.ndarray, SkinWeights]:
+    """A part without its webs, the vertex of `part` that each of its vertices is, and its skin weights.
+
+    Weights are smoothed along the surface. Where that bridges two limbs they mix far outside the web too. They are
+    therefore computed again once it is cut, which shows what remains of a web.
+    """
+    source = np.arange(part.vertex_count)
+    weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
+    for _ in range(config.rounds):
+        # The limits of the inversion are lifted here: the next stage checks them on the part that is left.
+        limits = UnposeConfig(warn_below=0.0, fail_below=1e-9)
+        rest = unpose(part.vertices, weights, fit.posed_from_rest, config=limits)
+        web = find_webs(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
+        if not web.any():
+            break
+        part, kept = cut_webs(part, web, config=config)
+        source = source[kept]
+        weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
+    return part, source, weights
+
+
+def unpose_parts(
+    parts: Mapping[str, Part], weights: Mapping[str, SkinWeights], fit: PosedFit
+) -> tuple[dict[str, Unposed], StageOutput]:
+    """Bring the parts to the T-pose, by the inverse of the skinning that will drive them."""
+    results, checks, numbers = {}, [], {}
+    for name, part in parts.items():
+        result = unpose(part.mesh.vertices, weights[name], fit.posed_from_rest)
+        stretch = stretch_report(part.mesh, part.mesh.with_vertices(result.vertices))
+        results[name] = result
+        numbers[name] = {"stretch": stretch.as_dict()}
+        checks += [
+            Check(f"{name}: round trip", result.report.round_trip_max * MM, "mm", 1e-6, 1e-3),
+            Check(
+                f"{name}: smallest determinant",
+                result.report.determinant_min,
+                "",
+                0.25,
+                0.05,
+                higher_is_better=True,
+                explanation="of the blended transforms; 1 is rigid, 0 cannot be inverted",
+            ),
+            Check(f"{name}: edge stretch p99.9", stretch.p999, "x", 3.0, 10.0),
+        ]
+    return results, StageOutput(checks, numbers)

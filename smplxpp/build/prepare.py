@@ -1,0 +1,112 @@
+"""Prepare what every later step reads: the repaired scan, one frame of parameters, the posed body."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from smplxpp.body import BodyModel, load_params
+from smplxpp.build.config import BuildInputs
+from smplxpp.build.data import PosedFit, PreparedScan
+from smplxpp.build.limits import ROUGHNESS
+from smplxpp.build.scan import ScanFile
+from smplxpp.clean import smooth_if_rough
+from smplxpp.core.checks import Check, StageOutput
+from smplxpp.core.errors import InputError
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.params import BodyParams
+from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.metrics.distance import MM
+
+GREY = 180
+"""Value of all channels of a scan without colours."""
+
+
+def prepare_scan(scan: ScanFile) -> tuple[PreparedScan, StageOutput]:
+    """Smooth a repaired scan where it is rough, and measure how rough it was."""
+    clean = scan.clean
+    smoothed = smooth_if_rough(clean.mesh)
+    colors = np.full((clean.mesh.vertex_count, 3), GREY, np.uint8) if scan.colors is None else scan.colors
+    mesh = TriangleMesh(smoothed.mesh.vertices, clean.mesh.faces)
+    numbers = {"vertices": clean.mesh.vertex_count, "faces": clean.mesh.face_count, "repairs": str(clean.report)}
+    numbers |= {"units": scan.units, "up": scan.up, "said": scan.note}
+    numbers |= {"smoothing_steps": smoothed.steps, "smoothing_moved_mm": smoothed.moved * MM}
+    explanation = "how far vertices stand off their neighbours, as a share of the median edge"
+    if smoothed.steps:
+        explanation += f"; smoothed: vertices moved by {smoothed.moved * MM:.1f} mm, what follows is of that surface"
+    check = ROUGHNESS.check("roughness of the scan", smoothed.roughness, explanation=explanation)
+    return PreparedScan(mesh, colors, clean.source_vertex, clean.source_face), StageOutput([check], numbers)
+
+
+def given_params(inputs: BuildInputs, body: BodyModel) -> BodyParams | None:
+    """Return the reference frame's parameters that the user or the capture gives; None where they are made."""
+    if inputs.params is None:
+        return None
+    params = inputs.params if isinstance(inputs.params, BodyParams) else load_params(inputs.params, body=body)
+    return params.frame(inputs.params_row if len(params) > 1 else 0)
+
+
+def registered_frame(frame: int, frames: tuple[int, ...], fitted: BodyParams) -> BodyParams:
+    """Return the reference frame's parameters among those that were registered.
+
+    Raises:
+        InputError: the frame could not be registered.
+    """
+    if frame not in frames:
+        raise InputError(
+            f"reference frame {frame}",
+            expected="a frame that was registered",
+            received=f"none of the {len(frames)} that were, {frames[0]} to {frames[-1]}",
+            remedy="choose another with --frame, or give its parameters with --params and --register off",
+        )
+    return fitted.frame(frames.index(frame))
+
+
+def pose_fit(scan: TriangleMesh, body: BodyModel, params: BodyParams) -> tuple[PosedFit, StageOutput]:
+    """Pose the body of a fit, and check that the scan agrees with it.
+
+    A scan is never deeper inside the body than its noise. The share that is tells a bad fit without any labels.
+
+    Raises:
+        InputError: the body stands elsewhere than the scan.
+    """
+    posed = body.forward(params).frame(0)
+    fit = PosedFit(
+        body.mesh(posed.vertices),
+        body.mesh(posed.rest_vertices),
+        posed.joints,
+        posed.rest_joints,
+        posed.posed_from_rest,
+    )
+    # Signed distances of a sample of the scan, negative inside the body, millimetres.
+    rng = np.random.default_rng(0)
+    sample = scan.vertices[np.sort(rng.permutation(scan.vertex_count)[:20_000])]
+    distance = SignedDistanceField(fit.mesh, solid=True).query(sample).distance * MM
+    inside = float(np.mean(distance < -5.0))
+    overlap = float(np.mean(np.abs(distance) < 250.0))
+    checks = [
+        Check(
+            "share of the scan near the fitted body",
+            overlap,
+            "",
+            0.98,
+            0.8,
+            higher_is_better=True,
+            explanation="within 25 cm; low: another frame's parameters, or other units or axes",
+        ),
+        Check(
+            "share of the scan inside the fitted body",
+            inside,
+            "",
+            0.03,
+            0.25,
+            explanation="deeper than 5 mm; high: the fit is off by centimetres",
+        ),
+    ]
+    if overlap < 0.2:
+        raise InputError(
+            "body parameters",
+            expected="a body that stands in the scan",
+            received=f"{100 * overlap:.0f} % of the scan within 25 cm of the body",
+            remedy="check --frame, --units and --up, and that scan and parameters share one world",
+        )
+    return fit, StageOutput(checks, {"distance_median_mm": float(np.median(distance))})

@@ -1,0 +1,190 @@
+"""Read a scan, convert it to metres and +Y up, repair it, and check that it is a person's.
+
+A point cloud becomes a surface here. Its vertices stand for points of the file (`Sanitized.source_vertex`), so that
+labels and colours of points follow as those of a mesh's vertices do. It has no faces that labels could belong to.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64, UInt8
+
+from smplxpp.clean import PointSurface, check_human_scale, convert_points, sanitize, surface_from_points
+from smplxpp.clean.repair import Sanitized
+from smplxpp.clean.scan_frame import AUTO, find_scan_frame
+from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.mesh import MeshLike, as_mesh
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes
+from smplxpp.segment import map_labels, read_labels
+from smplxpp.segment.label_files import check_element_count
+
+
+@dataclass(frozen=True, eq=False)
+class ScanFile:
+    """A scan as its file has it, and repaired.
+
+    Attributes:
+        raw: in the file's units and axes; without faces where it is a point cloud.
+        clean: metres, +Y up, with the places of its elements in the file. Faces of a cloud's surface come from none
+            (-1).
+        units: in which the file is written, as given or as found.
+        up: upward axis of the file, as given or as found.
+        note: how units and axis were found; empty where they were given.
+    """
+
+    raw: RawMesh
+    clean: Sanitized
+    units: str = "m"
+    up: str = "y"
+    note: str = ""
+
+    @cached_property
+    def colors(self) -> UInt8[np.ndarray, "n 3"] | None:
+        """sRGB of the repaired scan's vertices: the mean of the file's vertices that became one; None without any."""
+        return None if self.raw.vertex_colors is None else self.clean.mean_colors(self.raw.vertex_colors)
+
+
+def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -> ScanFile:
+    """Read a scan: a mesh, or a point cloud, whose surface is reconstructed.
+
+    Args:
+        scan: a file (PLY, OBJ, GLB, STL, OFF, npz, pickle), or a mesh in memory with or without colours:
+            `TriangleMesh`, `trimesh.Trimesh`, or a pair (vertices, faces).
+        units: as `convert_points` takes them; "auto": found from the person's height.
+        up: upward axis likewise; "auto": found from the shape of the person.
+
+    Raises:
+        InputError: no surface, or no person that stands upright in metres; the file is named.
+        MissingExtraError: a point cloud without the package that reconstructs its surface.
+
+    Example:
+        >>> scan = smplxpp.read_scan("data/fixtures/person/scans/scan_000000.ply")
+        >>> scan.clean.mesh
+        TriangleMesh(29,934 vertices, 59,804 faces)
+    """
+    path = Path(scan) if isinstance(scan, str | Path) else None
+    raw = _raw_of(scan) if path is None else read_raw_mesh(path, clouds=True)
+    name = "in memory" if path is None else path.name
+    note = ""
+    if AUTO in (units, up):
+        vertices, faces = (raw.vertices, raw.faces) if not raw.is_cloud else _rough_surface(raw)
+        frame = find_scan_frame(vertices, faces, units=units, up=up)
+        units, up, note = frame.units, frame.up, frame.said
+    vertices = convert_points(raw.vertices, units=units, up=up)
+    try:
+        clean = _of_cloud(path, raw, units, up) if raw.is_cloud else sanitize(vertices, raw.faces)
+    except InputError as error:
+        raise InputError(
+            f"scan {name}: {error.subject}",
+            expected=error.expected,
+            received=error.received,
+            remedy=error.remedy,
+        ) from None
+    check_human_scale(clean.mesh.vertices, subject=f"scan {name}")
+    return ScanFile(raw, clean, units, up, note)
+
+
+def scan_file_labels(
+    labels: str | Path | np.ndarray, raw: RawMesh, *, label_set: str
+) -> tuple[Int64[np.ndarray, " n"], bool]:
+    """Read labels of a scan's vertices or faces, in the order of its file.
+
+    Args:
+        labels: a label file, the scan's own file, or an array of ids.
+        raw: the scan as its file has it.
+        label_set: name of the set that the ids are of.
+
+    Returns:
+        Labels in our ids, one a vertex or one a face, and whether they are of faces.
+
+    Raises:
+        InputError: no labels, another number of them than vertices or faces, or unknown ids.
+    """
+    vertex_count, face_count = len(raw.vertices), len(raw.faces)
+    if isinstance(labels, np.ndarray):
+        check_element_count(labels, vertex_count=vertex_count, face_count=face_count, subject="labels of the scan")
+        found = map_labels(labels, label_set)
+    else:
+        found = read_labels(
+            labels,
+            vertex_count=vertex_count,
+            face_count=face_count,
+            label_set=label_set,
+            source_faces=raw.source_faces,
+        )
+    return found, len(found) == face_count
+
+
+def _raw_of(mesh: MeshLike) -> RawMesh:
+    """The arrays of a mesh in memory, with its colours where it has any (`visual.vertex_colors` of trimesh)."""
+    found = as_mesh(mesh, subject="scan")
+    visual = getattr(mesh, "visual", None)
+    # trimesh invents grey colours where a mesh has none, and says so by `kind`.
+    colors = getattr(visual, "vertex_colors", None) if getattr(visual, "kind", None) == "vertex" else None
+    kept = None if colors is None else color_bytes(np.asarray(colors), subject="scan")
+    return RawMesh(found.vertices, found.faces, vertex_colors=kept)
+
+
+def _of_cloud(path: Path | None, raw: RawMesh, units: str, up: str) -> Sanitized:
+    """The repaired surface of a cloud, its vertices traced to points."""
+    if path is None:
+        surface = _make_surface(raw, units, up)
+    else:
+        state = path.stat()
+        surface = _surface(_Cloud(path, state.st_mtime_ns, state.st_size, units, up, raw))
+    name = "scan in memory" if path is None else path.name
+    warnings.warn(f"{name}: {surface.said}", GeometryWarning, stacklevel=3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # defects of our own reconstruction are not the user's
+        clean = sanitize(surface.mesh.vertices, surface.mesh.faces)
+    return Sanitized(
+        clean.mesh,
+        surface.source_point[clean.source_vertex],
+        np.full(clean.mesh.face_count, -1, dtype=np.int64),
+        clean.report,
+        np.arange(len(raw.vertices)),
+    )
+
+
+def _rough_surface(raw: RawMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The surface of a cloud of unknown units, in these units: made as if the person were of ordinary height."""
+    ordinary_height = 1.7  # metres
+    scale = ordinary_height / max(float(np.ptp(raw.vertices, axis=0).max()), 1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # repeated when the surface is made in metres
+        mesh = surface_from_points(scale * raw.vertices, raw.vertex_normals).mesh
+    return mesh.vertices / scale, mesh.faces
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    """The key of a cloud's surface; its points do not take part in the comparison."""
+
+    path: Path
+    changed: int
+    size: int
+    units: str
+    up: str
+    raw: RawMesh = field(compare=False)
+
+
+@lru_cache(maxsize=2)
+def _surface(cloud: _Cloud) -> PointSurface:
+    """The surface of a cloud, kept because several steps of a build read one file and the reconstruction is slow."""
+    return _make_surface(cloud.raw, cloud.units, cloud.up)
+
+
+def _make_surface(raw: RawMesh, units: str, up: str) -> PointSurface:
+    normals = raw.vertex_normals
+    if normals is not None:
+        normals = convert_points(normals, units="m", up=up)
+    points = convert_points(raw.vertices, units=units, up=up)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # repeated at each reading
+        return surface_from_points(points, normals)
