@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from smplxpp.build import limits
 from smplxpp.core.checks import Gate
 
+SILHOUETTE = limits.SILHOUETTE
 DRIFT = Gate("mm", 15.0, 60.0, higher_is_better=False)
 """Round-trip drift of the tracked clothes, from the last frames back to the first. A jump of one pattern period is
 a few centimetres."""

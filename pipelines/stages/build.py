@@ -39,7 +39,7 @@ class _Part:
     """A stage of the build.
 
     Attributes:
-        work: writes the stage's files.
+        work: `work(folder, build)` writes the stage's files.
         step: module of `smplxpp.build` that computes them; its imports are the stage's code.
         needs: stages that it reads, where the build has them.
         settings: fields of the inputs or the configuration that it depends on.
@@ -48,7 +48,7 @@ class _Part:
         writers: modules that write its files, beside those of all stages.
     """
 
-    work: Callable[[Path, BuildContext], StageOutput]
+    work: Callable[..., StageOutput]
     step: str
     needs: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()

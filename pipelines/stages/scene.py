@@ -135,7 +135,7 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
         refuse_seen(run, (layout.REGISTER_STAGE,), splits, anew=REGISTER_ANEW)
     if inputs.params == run / REFINED_PARAMS:
         refuse_seen(run, (REFINE_STAGE,), splits, anew=REFINE_ANEW)
-    if built is not None and lies_in(built[0].scan, run / layout.RECONSTRUCT_STAGE):
+    if built is not None and lies_in(built[0].scan_file, run / layout.RECONSTRUCT_STAGE):
         refuse_seen(run, (layout.RECONSTRUCT_STAGE,), splits, anew=RECONSTRUCT_ANEW)
     template_frame = _template_frame(run, inputs)
     if template_frame in splits.novel_pose_frames:
@@ -168,7 +168,7 @@ def _corrected(run: Path, capture: Capture) -> Capture:
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
     """The frame of the capture whose scan the template was built from."""
     built = load_build(run)
-    if built is None or not lies_in(built[0].scan, inputs.capture):
+    if built is None or not lies_in(built[0].scan_file, inputs.capture):
         return None
     return built[0].frame
 

@@ -201,8 +201,7 @@ def validate(folder: Path, build: BuildContext) -> StageOutput:
 
 
 def _read_scan(build: BuildContext) -> ScanFile:
-    assert build.inputs.scan is not None, "a run keeps its scan in a file"
-    return read_scan(build.inputs.scan, units=build.config.units, up=build.config.up)
+    return read_scan(build.inputs.scan_file, units=build.config.units, up=build.config.up)
 
 
 def _params_of_frame(build: BuildContext) -> BodyParams:

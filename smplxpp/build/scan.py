@@ -68,8 +68,11 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -
         >>> scan.clean.mesh
         TriangleMesh(29,934 vertices, 59,804 faces)
     """
-    path = Path(scan) if isinstance(scan, str | Path) else None
-    raw = _raw_of(scan) if path is None else read_raw_mesh(path, clouds=True)
+    if isinstance(scan, str | Path):
+        path: Path | None = Path(scan)
+        raw = read_raw_mesh(scan, clouds=True)
+    else:
+        path, raw = None, _raw_of(scan)
     name = "in memory" if path is None else path.name
     note = ""
     if AUTO in (units, up):
