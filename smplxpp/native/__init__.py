@@ -1,7 +1,7 @@
-"""Loads the package's native library (see CMakeLists.txt), built once for every instruction set it may meet.
+"""Load the native library of the package (CMakeLists.txt), which is built for several instruction sets.
 
-Every function of it returns a status (`common/status.hpp`), which becomes an exception here: callers have nothing to
-look at. What a caller hands over goes through `address`, and a number of threads through `thread_count`.
+Every function returns a status (`common/status.hpp`) that is converted to an exception here. Arrays are passed by
+`address`, and numbers of threads by `thread_count`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,18 @@ from pathlib import Path
 from typing import Any
 
 LEVELS = ("avx512", "avx2", "generic")
-"""Builds of the library, the best first."""
+"""Instruction sets that the library is built for, the fastest first."""
 
 INTERFACE = 8
-"""What `smplxpp_interface` of a library that fits these sources answers."""
+"""Version of the C interface; `smplxpp_interface` of the library must return the same."""
 MOST_THREADS = min(256, max(16, 4 * (os.cpu_count() or 1)))
-"""More threads than this are not started, whatever was asked for."""
+"""Upper bound of the number of threads of a kernel."""
 MOST_SIDE = 1 << 16
-"""Pixels on a side of an image that kernels take."""
+"""Largest width and height of an image, in pixels, that kernels accept."""
 
+# Status codes of common/status.hpp.
 _OUT_OF_MEMORY, _OUT_OF_RANGE, _OVER_LIMIT = 1, 2, 3
+# CPU flags that each build needs.
 _FEATURES = {
     "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
     "avx2": {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"},
@@ -35,18 +37,19 @@ _FEATURES = {
 
 
 def let_workers_sleep() -> None:
-    """Ask OpenMP, which torch and the native library share, to put workers to sleep where they have nothing to do.
+    """Let idle OpenMP workers, which torch and the native library share, sleep instead of spinning.
 
-    By default they spin for milliseconds after every parallel loop, on cores that another training could use: two on
-    one machine then take many times as long as one. Packages call this before they load torch, as the runtime looks
-    once; what the environment says of it (`OMP_WAIT_POLICY`, `GOMP_SPINCOUNT`) stands. No number depends on it.
+    By default they spin for milliseconds after every parallel loop, on cores that another training could use, so that
+    two trainings on one machine take many times as long as one. Packages call this before they load torch, because the
+    OpenMP runtime reads the environment once. Existing settings (`OMP_WAIT_POLICY`, `GOMP_SPINCOUNT`) are kept. Results
+    do not depend on it.
     """
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def usable_levels() -> tuple[str, ...]:
-    """Those of `LEVELS` that this CPU can run, the best first."""
+    """Return those of `LEVELS` that this CPU supports, the fastest first."""
     return tuple(level for level in LEVELS if _FEATURES[level] <= _cpu_features())
 
 
@@ -55,7 +58,7 @@ class OverLimitError(MemoryError):
 
 
 class _Library(ctypes.CDLL):
-    """The library, whose functions raise what their status says."""
+    """The native library, whose functions raise an exception according to their status."""
 
     def __getitem__(self, name: str) -> Any:
         function = super().__getitem__(name)
@@ -74,15 +77,15 @@ def _check_status(status: int, function: Any, _: tuple) -> None:
     if status == _OUT_OF_RANGE:
         from smplxpp.core.errors import InputError
 
-        raise InputError("indices", expected="numbers of rows of the arrays they point into", received="one beyond")
+        raise InputError("indices", expected="rows of the arrays that they refer to", received="a larger one")
     raise RuntimeError(f"{name} of the native library failed")
 
 
 def thread_count(asked: int | None = None) -> int:
-    """How many threads a kernel is to take: `asked`, at most `MOST_THREADS`; None is up to 8, a CPU each.
+    """Return the number of threads for a kernel: `asked`, at most `MOST_THREADS`; None: a thread a CPU, at most 8.
 
-    In a process forked from one that had loaded the library it is 1: OpenMP's workers were left behind, and a loop that
-    waits for them would wait for ever.
+    In a process that was forked after the library was loaded it is 1, because OpenMP's workers do not exist there and a
+    parallel loop would wait for them for ever.
 
     Raises:
         InputError: not an integer of 1 or more.
@@ -97,10 +100,10 @@ def thread_count(asked: int | None = None) -> int:
 
 
 def address(array: Any, dtype: str = "float32") -> ctypes.c_void_p:
-    """Where the numbers of a numpy array or a torch tensor on the CPU begin, which it keeps alive; null for None.
+    """Return the data pointer of a numpy array or CPU tensor, which it keeps alive; null for None.
 
     Raises:
-        TypeError: another dtype, numbers that do not lie in order, or another device: a kernel would read elsewhere.
+        TypeError: another dtype, a non-contiguous array, or another device, where a kernel would read wrong memory.
     """
     if array is None:
         return ctypes.c_void_p(None)
@@ -117,7 +120,7 @@ def address(array: Any, dtype: str = "float32") -> ctypes.c_void_p:
 
 
 def check_size(width: int, height: int, subject: str) -> None:
-    """Require an image size that kernels can count in.
+    """Require an image size that kernels accept.
 
     Raises:
         InputError: a side under 1 or over `MOST_SIDE` pixels.
@@ -132,7 +135,7 @@ _forked = False
 
 
 def _after_fork() -> None:
-    """Run by a forked child, which has none of the threads that OpenMP believes to have; torch's are the same."""
+    """Limit a forked child to one thread, also in torch, because OpenMP's workers do not exist in it."""
     global _forked
     _forked = True
     torch = sys.modules.get("torch")
@@ -148,12 +151,13 @@ def _watch_forks() -> None:
 
 @cache
 def native_library(level: str | None = None) -> ctypes.CDLL:
-    """The compiled library, for the best instruction set that this CPU and this build have.
+    """Return the compiled library for the fastest instruction set that this CPU and the build support.
 
-    `level` (or the environment's `SMPLXPP_ISA`) asks for one of `LEVELS` by name.
+    Args:
+        level: one of `LEVELS`; None: the environment variable `SMPLXPP_ISA`, else the fastest.
 
     Raises:
-        ImportError: the library was not built, or not at the level asked for, or from other sources than these.
+        ImportError: the library was not built, not for this level, or from other sources than these.
     """
     level = level or os.environ.get("SMPLXPP_ISA") or None
     if level is not None and level not in LEVELS:
@@ -179,7 +183,7 @@ def native_library(level: str | None = None) -> ctypes.CDLL:
 
 
 def _interface(library: ctypes.CDLL) -> int:
-    """The interface of a library; 0 of one that does not say."""
+    """Return the version of a library's interface; 0 if it has none."""
     try:
         function = ctypes.CDLL.__getitem__(library, "smplxpp_interface")
     except AttributeError:
@@ -188,7 +192,7 @@ def _interface(library: ctypes.CDLL) -> int:
 
 
 def _folders() -> list[Path]:
-    """Beside this file, or in site-packages for an editable install."""
+    """Return the folders of the library: that of this file, and site-packages for an editable install."""
     return [Path(__file__).parent] + [
         Path(sysconfig.get_path(key)) / "smplxpp" / "native" for key in ("platlib", "purelib")
     ]
@@ -196,7 +200,7 @@ def _folders() -> list[Path]:
 
 @cache
 def _cpu_features() -> set[str]:
-    """Flags of the CPU as Linux spells them; none elsewhere, where the generic build is taken."""
+    """Return the CPU flags in Linux's spelling; none on other systems, which use the generic build."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return set()
     try:

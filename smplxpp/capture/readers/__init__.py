@@ -1,1 +1,1 @@
-"""One reader a data set: each module has `NAME`, `LOOKS_FOR`, `detect(root)` and `read(root, options)`."""
+"""Read the layouts of data sets, one module for each, into a Recording."""

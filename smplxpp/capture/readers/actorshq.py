@@ -1,4 +1,4 @@
-"""ActorsHQ (Isik et al. 2023): `ActorNN/SequenceN/{1x,2x,4x}/calibration.csv`, `rgbs/`, `masks/`."""
+"""Read ActorsHQ (Isik et al. 2023): `ActorNN/SequenceN/{1x,2x,4x}/calibration.csv`, `rgbs/`, `masks/`."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from smplxpp.core.errors import InputError
 NAME = "actorshq"
 LOOKS_FOR = "calibration.csv beside rgbs/, there or in a folder 1x, 2x or 4x"
 _SCALES = ("1x", "2x", "4x", "8x")
-# Files of our own layout, which may hold a calibration.csv too.
-_OURS = ("capture.json", "cameras.json", "scans")
+# Files of the simple layout, which may contain a calibration.csv too.
+_SIMPLE_LAYOUT = ("capture.json", "cameras.json", "scans")
 
 
 def detect(root: Path) -> bool:
     """Tell whether a folder is a sequence or one of its scales."""
-    return bool(_scales(root)) and not any((root / name).exists() for name in _OURS)
+    return bool(_scales(root)) and not any((root / name).exists() for name in _SIMPLE_LAYOUT)
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a sequence; the images have their background removed (black), cameras are camera-to-world on disk.
+    """Find the files of a sequence; images are on black, and cameras are stored camera-to-world.
 
-    Fitted SMPL-X parameters of others (`smpl_params.npz` in AvatarReX's layout, beside `calibration.csv` or beside the
-    scales) are taken where they are.
+    SMPL-X parameters (`smpl_params.npz` in AvatarReX's layout, beside `calibration.csv` or beside the scales) are taken
+    if present.
 
     Raises:
         InputError: several scales, no camera, a broken calibration.
@@ -59,5 +59,6 @@ def read(root: Path, options: ReaderOptions) -> Recording:
 
 
 def _scales(root: Path) -> list[Path]:
+    """Return the folders of a sequence that hold a calibration and images: itself, or one for each scale."""
     folders = [root, *(root / scale for scale in _SCALES)]
     return [path for path in folders if (path / "calibration.csv").is_file() and (path / "rgbs").is_dir()]

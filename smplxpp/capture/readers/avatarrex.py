@@ -1,4 +1,4 @@
-"""AvatarReX (Zheng et al. 2023): `calibration_full.json`, `CAM/00000000.jpg`, `CAM/mask/pha/00000000.jpg`."""
+"""Read AvatarReX (Zheng et al. 2023): `calibration_full.json`, `CAM/00000000.jpg`, `CAM/mask/pha/00000000.jpg`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from smplxpp.core.files.json_file import as_numbers, read_json
 
 NAME = "avatarrex"
 LOOKS_FOR = "calibration_full.json"
-_FPS = 30.0
 
 
 def detect(root: Path) -> bool:
@@ -23,7 +22,7 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a subject: photographs, mattes, `smpl_params.npz` with a row a frame.
+    """Find the files of a subject: photographs, mattes, `smpl_params.npz` with a row for each of 30 frames a second.
 
     Raises:
         InputError: a broken calibration.
@@ -40,17 +39,17 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             "mask": numbered_images({name: root / name / "mask" / "pha" for name in cameras}),
         },
         params=chosen_params(options, root / "smpl_params.npz"),
-        fps=_FPS,
+        fps=30.0,
     )
 
 
 def read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distortion]]:
-    """Cameras of `{name: {K, R, T, imgSize, distCoeff}}`, as AvatarReX and THuman4 write them.
+    """Read the cameras `{name: {K, R, T, imgSize, distCoeff}}` of AvatarReX and THuman4.
 
-    The authors' own code takes pixel centres at whole numbers (it rounds projected points to indices).
+    Pixel centres are at whole numbers, because the authors' code rounds projected points to indices.
 
     Raises:
-        InputError: broken, or fields missing.
+        InputError: a broken file, or missing fields.
     """
     content = read_json(path)
     if not isinstance(content, Mapping) or not content:

@@ -1,4 +1,4 @@
-"""COLMAP (Schoenberger and Frahm 2016): `sparse/0/{cameras,images}.{bin,txt}`, `images/`."""
+"""Read COLMAP (Schoenberger and Frahm 2016): `sparse/0/{cameras,images}.{bin,txt}`, `images/`."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a reconstruction. Its world has no metre and no upright unless the user gave it both beforehand.
+    """Find the files of a reconstruction, whose scale and up axis are arbitrary unless the user aligned it.
 
     COLMAP reconstructs a rigid scene. If every folder of images has one registered image, the folder is a camera of a
-    fixed rig and its numbered files are the frames; otherwise every registered image is a camera and all show frame 0.
+    fixed rig and its numbered files are the frames. Otherwise every registered image is a camera, and all show frame 0.
     Masks are `masks/NAME.png` (NAME with its suffix, as for COLMAP itself) or `masks/` with the same names.
 
     Raises:
-        InputError: a broken model, a camera model that is not read, images outside of `images/`.
+        InputError: a broken model, an unsupported camera model, images outside of `images/`.
     """
     folder = model_folder(root)
     if folder is None:
@@ -40,6 +40,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     paths = [_path_of(root, image, folder) for image in images]
     rig = _is_rig(paths)
     names = camera_names((path.parent if rig else path for path in paths), subject=f"file {folder}")
+    # A camera for each registered image, with its own files or, in a rig, those of its folder.
     cameras, distortions = {}, {}
     files: dict[str, dict[str, FileSeries]] = {"image": {}, "mask": {}}
     for image, path in zip(images, paths, strict=True):
@@ -71,16 +72,19 @@ def read(root: Path, options: ReaderOptions) -> Recording:
 
 
 def _path_of(root: Path, image: ColmapImage, folder: Path) -> PurePosixPath:
+    """Return the path of an image below `images/`, refusing names that leave the folder."""
     inside = path_inside(root / "images", image.name, subject=f"file {folder}: name of an image")
     return PurePosixPath(inside.relative_to(os.path.normpath(root / "images")))
 
 
 def _is_rig(paths: Sequence[PurePosixPath]) -> bool:
+    """Tell whether each image is the only one of its folder and its name is a number."""
     folders = Counter(path.parent for path in paths)
     numbered = all((number_at_end(path) or ("?", 0))[0] == "" for path in paths)
     return numbered and PurePosixPath() not in folders and max(folders.values(), default=0) == 1
 
 
 def _single(folder: Path, names: Sequence[str]) -> FileSeries:
+    """Return the first existing file as frame 0; an empty series without any."""
     found = next((name for name in names if os.path.isfile(folder / name)), None)
     return FileSeries.from_names(folder, {} if found is None else {0: found})

@@ -1,4 +1,4 @@
-"""COLMAP's cameras and images, from text or binary files (src/colmap/scene/reconstruction_io_*.cc)."""
+"""Read COLMAP's cameras and images from text or binary files (src/colmap/scene/reconstruction_io_*.cc)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from smplxpp.core.files.paths import regular_file
 
 T = TypeVar("T")
 
-# Name, number of parameters, in the order of COLMAP's model ids (src/colmap/sensor/models.h, version 4.2).
+# Names and numbers of parameters of the camera models, in the order of COLMAP's ids (src/colmap/sensor/models.h,
+# version 4.2).
 MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -41,8 +42,8 @@ MODELS = (
     ("EUCM", 6),
     ("EQUIRECTANGULAR", 2),
 )
-# How many focal lengths the models that we can read have, and which lens their last parameters are, filled up with 0.
-_READ = {
+# Supported models: number of focal lengths, and the distortion model of the parameters after the principal point.
+_SUPPORTED = {
     "SIMPLE_PINHOLE": (1, OPENCV),
     "PINHOLE": (2, OPENCV),
     "SIMPLE_RADIAL": (1, OPENCV),
@@ -57,12 +58,11 @@ _READ = {
     "FISHEYE": (2, FISHEYE),
 }
 _REMEDY = "undistort with `colmap image_undistorter` and open its result"
-_LONGEST_NAME = 4096
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """Intrinsics: the model's name, the size and its parameters, pixel centres at +0.5."""
+    """Intrinsics of a camera: name of the model, image size and parameters, pixel centres at +0.5."""
 
     model: str
     width: int
@@ -70,17 +70,20 @@ class ColmapCamera:
     params: tuple[float, ...]
 
     def intrinsics(self, *, source: str) -> tuple[Float64[np.ndarray, "3 3"], Distortion | None]:
-        """K (3, 3), and the lens.
+        """Return K (3, 3) and the distortion, None for a pinhole.
 
         Raises:
-            InputError: a model that is none of ours, parameters that are no numbers.
+            InputError: an unsupported model, or parameters that are not numbers.
         """
-        if self.model not in _READ:
+        if self.model not in _SUPPORTED:
             raise InputError(
-                f"{source}: camera model", expected=f"one of {', '.join(_READ)}", received=self.model, remedy=_REMEDY
+                f"{source}: camera model",
+                expected=f"one of {', '.join(_SUPPORTED)}",
+                received=self.model,
+                remedy=_REMEDY,
             )
         p = as_numbers(self.params, (None,), subject=f"{source}: camera parameters").tolist()
-        focal_lengths, model = _READ[self.model]
+        focal_lengths, model = _SUPPORTED[self.model]
         K = np.diag([p[0], p[focal_lengths - 1], 1.0])
         K[:2, 2] = p[focal_lengths : focal_lengths + 2]
         lens = p[focal_lengths + 2 :]
@@ -91,7 +94,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """A registered image: `x_cam = R x_world + t`, its camera's id, its path below the image folder."""
+    """A registered image: pose `x_cam = R x_world + t`, id of the camera, path below the image folder."""
 
     R: Float64[np.ndarray, "3 3"]
     t: Float64[np.ndarray, " 3"]
@@ -100,7 +103,7 @@ class ColmapImage:
 
 
 def model_folder(root: Path) -> Path | None:
-    """The folder of the model: `sparse/0`, `sparse` or the folder itself."""
+    """Return the folder of the model (`sparse/0`, `sparse` or the folder itself); None without one."""
     for folder in (root / "sparse" / "0", root / "sparse", root):
         if any((folder / f"cameras.{s}").is_file() and (folder / f"images.{s}").is_file() for s in ("bin", "txt")):
             return folder
@@ -108,10 +111,9 @@ def model_folder(root: Path) -> Path | None:
 
 
 def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
-    """Cameras by id, and images; the binary files where both kinds are there.
+    """Read cameras by id, and images, from the binary files if both exist, else from the text files.
 
-    Poses of images are whole in `images`: `rigs` and `frames`, which COLMAP 3.12 and later write beside them, say the
-    same in another way.
+    `images` contains complete poses; `rigs` and `frames` of COLMAP 3.12 and later repeat them in factors.
 
     Raises:
         InputError: a truncated or foreign file, an unknown camera model.
@@ -123,6 +125,7 @@ def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]
 
 
 def _read_table(reader: Callable[[Path], T], path: Path) -> T:
+    """Call a reader, and convert its exceptions on damaged files into an InputError."""
     try:
         return reader(regular_file(path))
     except InputError:
@@ -168,7 +171,7 @@ def _images_txt(path: Path) -> list[ColmapImage]:
             if not fields or fields[0].startswith("#"):
                 continue
             images.append(_image(path, [float(f) for f in fields[1:8]], int(fields[8]), fields[9].strip()))
-            next(file, "")  # the image's points, which may be none
+            next(file, "")  # the line of the image's points, which may be empty
     return images
 
 
@@ -191,13 +194,14 @@ def _images_bin(path: Path) -> list[ColmapImage]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         (count,), at = struct.unpack_from("<Q", data), 8
         for _ in range(count):
+            # Id, quaternion, translation, camera, name ending in NUL, number of points, 24 bytes for each point.
             values = struct.unpack_from("<I7dI", data, at)
-            end = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
+            end = data.find(b"\0", at + 64, at + 64 + 4096)
             if end < 0:
                 raise ValueError(f"image {values[0]} without the end of its name")
             (points,) = struct.unpack_from("<Q", data, end + 1)
             images.append(_image(path, list(values[1:8]), values[8], data[at + 64 : end].decode()))
             at = end + 9 + 24 * points
             if at > len(data):
-                raise ValueError(f"{points} points of image {values[0]} beyond the end of the file")
+                raise ValueError(f"{points} points of image {values[0]} past the end of the file")
     return images

@@ -1,4 +1,4 @@
-"""What readers share: cameras from their numbers, image files of a camera."""
+"""Share options, cameras, image files and camera names among the readers."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from smplxpp.core.files.paths import check_name
 
 @dataclass(frozen=True, eq=False)
 class ReaderOptions:
-    """Choices of the user.
+    """Options of `open_capture` that every reader receives.
 
     Attributes:
-        params: a parameter file or folder instead of the set's own.
-        protocol: name of the protocol whose files are read; None: without one.
-        body: the body model that the parameters are for; None: the open body.
-        person: whose keypoints are taken, where there are several people; None: the surest.
+        params: parameter file or folder that replaces the data set's own.
+        protocol: name of the protocol whose files are read; None: no protocol.
+        body: body model of the parameters; None: the open body.
+        person: person whose keypoints are taken; None: the one of most confidence.
     """
 
     params: Path | None = None
@@ -40,25 +40,21 @@ class ReaderOptions:
     person: int | None = None
 
 
-# Largest deviation of R R^T from the identity: calibrations are written with six digits and more.
-_ROTATION_TOLERANCE = 1e-3
-# Pixels; the largest sensors have 20,000.
-_LONGEST_SIDE = 1 << 16
-
-
 def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_pixels: bool = False) -> Camera:
-    """A camera from numbers in any shape: K of 9 (or 4 x 4), R of 9 and T of 3 with x_cam = R x_world + T.
+    """Return a camera from numbers in any shape: K of 9 (or 4 x 4), R of 9 and T of 3 with x_cam = R x_world + T.
 
     Args:
-        name: of the camera.
-        K, R, T: numbers.
-        size: width and height.
-        opencv_pixels: the calibration puts pixel centres at whole numbers, as OpenCV's routines do; ours are at +0.5,
-            so that the principal point moves by half a pixel.
+        name: name of the camera.
+        K: intrinsics in pixels.
+        R: rotation from the world to the camera.
+        T: translation from the world to the camera.
+        size: width and height of the image.
+        opencv_pixels: whether the calibration puts pixel centres at whole numbers, as OpenCV's routines do. Half a
+            pixel is then added to the principal point, because centres are at +0.5 here.
 
     Raises:
-        InputError: wrong counts, anything but finite numbers, R not a rotation, no focal length, a size no image has,
-            or a name no file can have.
+        InputError: wrong counts, anything but finite numbers, R that is not a rotation, no focal length, an impossible
+            image size, or a name that no file can have.
     """
     subject = f"camera {name[:80]!r}"
     check_name(name, subject=f"{subject}: name")
@@ -69,8 +65,9 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
         received = f"shapes {intrinsics.shape}, {rotation.shape}, {shift.shape}"
         raise InputError(subject, expected="K and R of 9 numbers, T of 3", received=received)
     intrinsics, rotation = intrinsics.reshape(3, 3), rotation.reshape(3, 3)
+    # Calibrations are written with six digits or more, so that R R^T is the identity to better than 1e-3.
     if np.abs(rotation).max() > 2 or not (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+        np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
     ):
         raise InputError(f"{subject}: R", expected="a rotation matrix", received=f"{rotation.tolist()}")
     if not (intrinsics[2, 2] and intrinsics[[0, 1], [0, 1]].min() > 0 and not intrinsics[2, :2].any()):
@@ -79,7 +76,8 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
             expected="focal lengths above 0 and a last row 0, 0, 1",
             received=f"{intrinsics.tolist()}",
         )
-    width, height = (as_integer(side, subject=f"{subject}: image size", least=1, most=_LONGEST_SIDE) for side in size)
+    # The largest sensors have 20,000 pixels a side.
+    width, height = (as_integer(side, subject=f"{subject}: image size", least=1, most=1 << 16) for side in size)
     K = intrinsics / intrinsics[2, 2]
     if opencv_pixels:
         K[:2, 2] += 0.5
@@ -89,16 +87,16 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
 
 
 def chosen_params(options: ReaderOptions, own: Path | None = None) -> ParamSource | None:
-    """The user's parameters, else the set's own file or folder where it exists."""
+    """Return the parameters of the options, else those of the data set if its file or folder exists."""
     path = options.params or (own if own is not None and own.exists() else None)
     return None if path is None else find_params(path, body=options.body)
 
 
 def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
-    """R and T of `x_cam = R x_world + T` from a (4, 4) or (3, 4) camera-to-world matrix.
+    """Return R and T of `x_cam = R x_world + T` from a (4, 4) or (3, 4) camera-to-world matrix.
 
-    Scaled axes, as tools write them that scale a scene by its matrices, are made units again: a pinhole's picture has
-    no depth, and no pixel moves.
+    Uniformly scaled axes, which tools write that scale a scene by its matrices, are normalised. That moves no pixel of
+    a pinhole image.
     """
     matrix = as_numbers(world_from_cam, subject="camera-to-world matrix")
     if matrix.shape not in ((3, 4), (4, 4)):
@@ -112,16 +110,16 @@ def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[n
 
 
 def numbered_images(folders: Mapping[str, Path]) -> dict[str, FileSeries]:
-    """Find each camera's images in its folder whose names are numbers; cameras without any are left out."""
+    """Find the images with numbers for names in each camera's folder; cameras without any are left out."""
     found = {name: FileSeries.find(folder, image_name()) for name, folder in folders.items()}
     return {name: series for name, series in found.items() if len(series)}
 
 
 def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int, int]:
-    """Read the images' size from the first one, for calibrations that do not say it.
+    """Return the size of a camera's first image, for calibrations without image sizes.
 
     Raises:
-        InputError: the camera has no image.
+        InputError: a camera without an image.
     """
     if name not in files:
         raise InputError(
@@ -135,15 +133,15 @@ def size_of_first_image(name: str, files: Mapping[str, FileSeries]) -> tuple[int
 
 
 def first_folder(root: Path, names: Iterable[str]) -> Path | None:
-    """The first of these folders that exists."""
+    """Return the first of these folders that exists; None without any."""
     return next((root / name for name in names if (root / name).is_dir()), None)
 
 
 def required(mapping: Any, key: str, *, source: str) -> Any:
-    """`mapping[key]`.
+    """Return `mapping[key]`, which must exist.
 
     Raises:
-        InputError: no such key.
+        InputError: no such key, or not a mapping.
     """
     if not isinstance(mapping, Mapping) or key not in mapping:
         have = ", ".join(map(str, list(mapping)[:12])) if isinstance(mapping, Mapping) else type(mapping).__name__
@@ -151,19 +149,19 @@ def required(mapping: Any, key: str, *, source: str) -> Any:
     return mapping[key]
 
 
-# Folders that say nothing of a camera, with nerfstudio's reductions (images_4).
+# Names of image folders that do not name a camera, with nerfstudio's reductions (images_4).
 _IMAGE_FOLDER = re.compile(r"(?:images?|imgs?|rgbs?)(?:_\d+)?")
-# What an int64 holds.
+# A number at the end of a name, of as many digits as an int64 holds.
 _NUMBERED = re.compile(r"(.*?)([0-9]{1,18})", re.DOTALL)
 
 
 def camera_names(paths: Iterable[PurePosixPath], *, subject: str) -> dict[PurePosixPath, str]:
-    """A name of its own for each path: its parts joined by `_`.
+    """Return a unique camera name for each image path: its parts joined by `_`.
 
-    Left out are a first folder such as `images` and the suffix, as long as names stay different without.
+    A first folder such as `images` and the suffix are left out as long as the names stay different.
 
     Raises:
-        InputError: names that remain alike, or that no file can bear.
+        InputError: names that remain equal, or that no file can have.
     """
     distinct = list(dict.fromkeys(paths))
     for folder, suffix in ((False, False), (True, False), (True, True)):
@@ -181,12 +179,12 @@ def camera_names(paths: Iterable[PurePosixPath], *, subject: str) -> dict[PurePo
 
 
 def without_suffix(path: PurePosixPath) -> PurePosixPath:
-    """The path without the suffix of an image; a dot in a name alone is none."""
+    """Return the path without its suffix if that is one of an image file."""
     return path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
 
 
 def number_at_end(path: PurePosixPath) -> tuple[str, int] | None:
-    """What precedes the number at the end of an image's name, and the number; None where there is none."""
+    """Return the text before the number at the end of an image name, and the number; None without a number."""
     match = _NUMBERED.fullmatch(without_suffix(path).name)
     return None if match is None else (match[1], int(match[2]))
 

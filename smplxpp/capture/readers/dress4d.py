@@ -1,4 +1,4 @@
-"""4D-Dress (Wang et al. 2024): `Capture/cameras.pkl`, `Capture/CAM/{images,masks}`, `Meshes_pkl/`, `SMPLX/`."""
+"""Read 4D-Dress (Wang et al. 2024): `Capture/cameras.pkl`, `Capture/CAM/{images,masks}`, `Meshes_pkl/`, `SMPLX/`."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a take: photographs with rendered masks, scans as true meshes, SMPL-X fits. No pickle is executed.
+    """Find the files of a take: photographs with rendered masks, scans as true meshes, SMPL-X fits.
 
-    The file's `intrinsics` and `extrinsics` (3, 4) are OpenCV's: it is the authors' loader that negates the first two
-    rows, which turns them into PyTorch3D's axes (x left, y up). Pixel centres are at +0.5, as the masks are rendered.
+    No pickle is executed. `intrinsics` and `extrinsics` (3, 4) in the file follow OpenCV; the authors' loader negates
+    the first two rows for the axes of PyTorch3D (x left, y up). Pixel centres are at +0.5, like those of the rendered
+    masks.
 
     Raises:
         InputError: a broken camera file.
@@ -43,7 +44,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         for kind, folder, before in (("image", "images", "capture-f"), ("mask", "masks", "mask-f"))
     }
     files = {kind: {name: s for name, s in series.items() if len(s)} for kind, series in files.items()}
-    # Calibrated with more cameras than were released; their images' size is not known.
+    # More cameras were calibrated than released; the image size of the others is unknown.
     released = {str(name): entry for name, entry in content.items() if str(name) in files["image"]}
     meshes = FileSeries.find(root / "Meshes_pkl", r"mesh-f(?P<frame>\d+)\.pkl")
     fits = FileSeries.find(root / "SMPLX", r"mesh-f(?P<frame>\d+)_smplx\.pkl")

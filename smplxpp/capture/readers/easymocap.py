@@ -1,4 +1,4 @@
-"""EasyMocap: `intri.yml`, `extri.yml`, `images/CAM/000000.jpg`, `annots/CAM/000000.json`."""
+"""Read EasyMocap: `intri.yml`, `extri.yml`, `images/CAM/000000.jpg`, `annots/CAM/000000.json`."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from smplxpp.core.rotations import matrix_from_rotvec
 
 NAME = "easymocap"
 LOOKS_FOR = "intri.yml and extri.yml"
-# What its FileStorage.read drops from a list of names.
+# Name that EasyMocap's FileStorage.read drops from a list of cameras.
 _NO_CAMERA = "none"
-# Where its programs put fitted parameters, in the order of their worth to us.
+# Folders of fitted parameters, the preferred model first.
 _PARAMS = ("output/smplx/smpl", "output/smplx", "output/smpl/smpl", "output/smpl", "smplx", "smpl")
 
 
@@ -40,14 +40,13 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a recording: distorted photographs, undistorted on reading; masks in `masks/` or `mask/`; keypoints in
-    `annots/`.
+    """Find the files of a recording: photographs, masks in `masks/` or `mask/`, keypoints in `annots/`.
 
-    OpenCV's calibration, with pixel centres at whole numbers. The images' size is `H_CAM`, `W_CAM`, or that of the
-    camera's first image. A camera that is called `none` is left out, as EasyMocap itself does when it reads names.
+    Photographs are distorted on disk. The calibration follows OpenCV, with pixel centres at whole numbers. The image
+    size is `H_CAM`, `W_CAM`, or that of the camera's first image. A camera named `none` is left out, as EasyMocap does.
 
     Raises:
-        InputError: a broken camera file, a camera in one of the two alone.
+        InputError: a broken camera file, or a camera in only one of the two files.
     """
     intri, extri = read_opencv_yaml(root / "intri.yml"), read_opencv_yaml(root / "extri.yml")
     listed = required(intri, "names", source=f"file {root / 'intri.yml'}")
@@ -59,7 +58,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     cameras, distortions = {}, {}
     for name in names:
         size: Any = (intri.get(f"W_{name}", 0.0), intri.get(f"H_{name}", 0.0))
-        if any(isinstance(side, float) and side == 0.0 for side in size):  # as EasyMocap reads what is not there
+        if any(isinstance(side, float) and side == 0.0 for side in size):  # EasyMocap reads 0 for a missing size
             size = size_of_first_image(name, images)
         K = required(intri, f"K_{name}", source=f"file {root / 'intri.yml'}")
         cameras[name] = pinhole(name, K, *_pose(extri, name, root / "extri.yml"), size, opencv_pixels=True)
@@ -88,7 +87,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
 
 
 def _pose(extri: dict[str, Any], name: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The rotation vector counts, as in EasyMocap itself; `Rot_` is its matrix, for readers without one."""
+    """Return the pose R, T of a camera, by the rotation vector `R_` as in EasyMocap, else by the matrix `Rot_`."""
     T = required(extri, f"T_{name}", source=f"file {path}")
     if f"R_{name}" not in extri:
         return required(extri, f"Rot_{name}", source=f"file {path}"), T
@@ -99,6 +98,7 @@ def _pose(extri: dict[str, Any], name: str, path: Path) -> tuple[np.ndarray, np.
 
 
 def _params(root: Path, options: ReaderOptions) -> Any:
+    """Return the parameters of the options, else those of the first folder of fits; None without any."""
     if options.params is not None:
         return chosen_params(options)
     for name in _PARAMS:
@@ -112,10 +112,12 @@ _KEY = re.compile(r"^(?P<key>[^\s:#%-][^:]*):\s*(?P<value>.*)$")
 
 
 def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | str]:
-    """Entries of a file that `cv2.FileStorage` writes: `!!opencv-matrix` as float64 arrays, lists of texts, numbers.
+    """Read a YAML file of `cv2.FileStorage`: matrices as float64 arrays, lists of texts, and numbers by name.
+
+    Only the subset of calibration files is read: entries at the top level.
 
     Raises:
-        InputError: missing, not text, or a matrix whose numbers do not fit its size.
+        InputError: a missing file, not a text, or a matrix whose numbers do not match its size.
     """
     lines = read_text(path).splitlines()
     blocks: dict[str, list[str]] = {}
@@ -151,7 +153,7 @@ def _matrix(key: str, text: str, path: Path) -> np.ndarray:
     try:
         if data is None or rows is None or cols is None:
             raise ValueError("one of them is missing")
-        # OpenCV writes `.Nan` and `.Inf`.
+        # OpenCV writes `.Nan` and `.Inf`, which float() reads without the dot.
         values = [float(re.sub(r"\.(?=[NI])", "", item)) for item in data[1].split(",")]
         return np.array(values).reshape(int(rows[1]), int(cols[1]))
     except ValueError as error:

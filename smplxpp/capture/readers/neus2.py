@@ -1,4 +1,4 @@
-"""NeuS2 (Wang et al. 2023), Instant-NGP, nerfstudio, Blender's NeRF scenes: `transform*.json` and images."""
+"""Read NeuS2 (Wang et al. 2023), Instant-NGP, nerfstudio, Blender's NeRF scenes: `transform*.json` and images."""
 
 from __future__ import annotations
 
@@ -24,31 +24,30 @@ from smplxpp.core.files.json_file import as_list, as_number, as_object, as_text,
 NAME = "neus2"
 LOOKS_FOR = "transform*.json, there or in train/ and test/"
 _SETS = ("", "train", "test")
-# Parts that are held out, as files and nerfstudio's lists call them.
+# Names of held-out sets in file names and in nerfstudio's lists.
 _HELD_OUT = ("test", "val")
-_MOST_DIGITS = 18
 _TRAIN, _TEST, _NEITHER = "train", "test", ""
 
 
 def detect(root: Path) -> bool:
-    """Tell whether a folder holds such files."""
-    return bool(_moments(root))
+    """Tell whether a folder holds transform files."""
+    return bool(_transform_files(root))
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a scene. Every image is a view; `places` says which camera and frame it is.
+    """Find the files of a scene; `places` assigns a camera and a frame to each image.
 
-    `from_na` (its presence, as in NeuS2) means camera axes of OpenCV, otherwise they are OpenGL's; both are
-    camera-to-world in the axes and units of the data: `scale` and `offset` concern the trainer's unit cube alone. Files
-    and lists of test and val hold the held-out cameras and frames.
+    If `from_na` is present (NeuS2), camera axes are OpenCV's, otherwise OpenGL's. Matrices are camera-to-world in the
+    axes and units of the data; `scale` and `offset` describe the trainer's unit cube and are ignored. Files and lists
+    of test and val hold the held-out cameras and frames.
 
     Raises:
-        InputError: broken files, lenses that are none of ours, images outside of the folder, a camera that moves
-            between frames.
+        InputError: broken files, unsupported lenses, images outside of the folder, a camera that moves between frames.
     """
+    # All images that the transform files name.
     problems: list[Problem] = []
     images: list[NamedImage] = []
-    for path in _moments(root):
+    for path in _transform_files(root):
         content = as_object(read_json(path), subject=f"file {path}")
         images += _images(root, path, content, problems)
         problems += _scale_note(path, content)
@@ -56,6 +55,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         received = problems[0].message if problems else "none"
         raise InputError(f"capture {root}", expected="frames with images in transform*.json", received=received)
     problems += _dynamic_masks(root, images)
+    # Group them by camera; all frames of a camera must agree on its pose and intrinsics.
     cameras: dict[str, Camera] = {}
     distortions: dict[str, Distortion] = {}
     files: dict[str, dict[str, dict[int, str]]] = {"image": {}, "mask": {}}
@@ -68,7 +68,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
                 f"file {image.source}: camera {name}",
                 expected="the pose and intrinsics it has in the other frames",
                 received="others",
-                remedy="a capture's cameras stand still: give moving cameras names of their own",
+                remedy="cameras of a capture are static: give moving cameras different names",
             )
         if image.lens is not None:
             distortions[name] = image.lens
@@ -98,12 +98,12 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     )
 
 
-def _moments(root: Path) -> list[Path]:
+def _transform_files(root: Path) -> list[Path]:
     return [path for folder in _SETS for path in sorted((root / folder).glob("transform*.json"))]
 
 
 def _images(root: Path, path: Path, content: Mapping[str, Any], problems: list[Problem]) -> list[NamedImage]:
-    """The images of one file; those without a size, said or in a whole image, are named in `problems` alone."""
+    """Return the images of one file; images of unknown size are reported in `problems` and left out."""
     found = []
     frame = _frame_of(path)
     listed = _listed_parts(root, path, content)
@@ -132,9 +132,11 @@ def _images(root: Path, path: Path, content: Mapping[str, Any], problems: list[P
 
 
 def _frame_of(path: Path) -> int | None:
+    """Return the number at the end of a file name, which is the frame of all its images; None without one."""
     match = re.search(r"_([0-9]+)$", path.stem)
-    if match is not None and len(match[1]) > _MOST_DIGITS:
-        raise InputError(f"file {path}", expected=f"a number of at most {_MOST_DIGITS} digits", received=match[1][:80])
+    max_digits = 18  # those of an int64
+    if match is not None and len(match[1]) > max_digits:
+        raise InputError(f"file {path}", expected=f"a number of at most {max_digits} digits", received=match[1][:80])
     return None if match is None else int(match[1])
 
 
@@ -143,7 +145,7 @@ def _size(path: Path, values: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _listed_parts(root: Path, path: Path, content: Mapping[str, Any]) -> dict[str, str] | None:
-    """Which part nerfstudio's `train_filenames`, `val_filenames`, `test_filenames` put images in; None without them."""
+    """Return the split of images by nerfstudio's `train_`, `val_` and `test_filenames`; None without these lists."""
     lists = {part: content.get(f"{part}_filenames") for part in (*_HELD_OUT, _TRAIN)}
     if all(names is None for names in lists.values()):
         return None
@@ -157,14 +159,15 @@ def _listed_parts(root: Path, path: Path, content: Mapping[str, Any]) -> dict[st
 
 
 def _scale_note(path: Path, content: Mapping[str, Any]) -> list[Problem]:
+    """Report a scale that a tool applied to the world, which is not undone."""
     scale = content.get("applied_scale")
     if scale is None or as_number(scale, subject=f"file {path}: applied_scale") == 1:
         return []
-    return [Problem(f"{path}: applied_scale {scale:g}, by which somebody multiplied the world: left aside")]
+    return [Problem(f"{path}: applied_scale {scale:g}, a factor of the world: left aside")]
 
 
 def _dynamic_masks(root: Path, images: Sequence[NamedImage]) -> list[Problem]:
-    """Instant-NGP's `dynamic_mask_IMAGE.png` mark what a training skips: people, where the scene is meant."""
+    """Report Instant-NGP's `dynamic_mask_IMAGE.png`, which mark pixels that its training skips and are not read."""
     first = {image.path.parent: image.path for image in images}
     found = [path.with_name(f"dynamic_mask_{path.stem}.png") for path in first.values()]
     folders = [str(root / path.parent) for path in found if os.path.isfile(root / path)]
@@ -172,17 +175,17 @@ def _dynamic_masks(root: Path, images: Sequence[NamedImage]) -> list[Problem]:
 
 
 def _has_alpha(images: Mapping[str, FileSeries]) -> bool:
-    """What the first image that can be read says of all."""
+    """Tell whether the first readable image has an alpha channel, which is then assumed for all."""
     for series in images.values():
         try:
             return image_mode(series.required(int(series.numbers[0]))) in ("RGBA", "LA", "PA")
-        except InputError:  # find_problems tells of it
+        except InputError:  # `find_problems` reports it
             continue
     return False
 
 
 def _splits(cameras: Mapping[str, Camera], parts: Mapping[str, set[tuple[str, int]]]) -> Splits | None:
-    """What test and val alone name is held out; without any training image there is nothing to hold out from."""
+    """Hold out the cameras and frames that only test and val name; None without any training image."""
     if not parts[_TRAIN]:
         return None
     train_cameras, test_cameras = ({name for name, _ in parts[part]} for part in (_TRAIN, _TEST))

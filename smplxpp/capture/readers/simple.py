@@ -1,4 +1,4 @@
-"""The simple layout, our own: docs/captures.md."""
+"""Read the simple layout of this project, described in docs/captures.md."""
 
 from __future__ import annotations
 
@@ -38,11 +38,10 @@ _FOLDERS = {
     "normal": ("normals", "normal"),
 }
 _CAMERA_FILES = ("cameras.json", "calibration.csv")
-_BLACK = (0.0, 0.0, 0.0)
 
 
 def detect(root: Path) -> bool:
-    """Tell whether a folder is in this layout. A calibration.csv without anything of ours is ActorsHQ's."""
+    """Tell whether a folder is in this layout; a calibration.csv alone is ActorsHQ's."""
     described = (root / "capture.json").is_file()
     if described and _declared_format(root) != NAME:
         return False
@@ -52,15 +51,15 @@ def detect(root: Path) -> bool:
 
 
 def _declared_format(root: Path) -> str:
-    """The layout that a description speaks of: ours, unless it names another one, which it adds to."""
+    """Return the layout that a description names, by default this one; it may describe captures of other layouts."""
     try:
         return str(read_description(root).get("format", NAME))
-    except InputError:  # broken: our reader says so
+    except InputError:  # broken: `read` reports it
         return NAME
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find everything of a capture.
+    """Find the files and calibration of a capture.
 
     Raises:
         InputError: images without a camera file, a broken camera file or description.
@@ -115,7 +114,7 @@ def _keypoints(
 
 
 def stacked_params(root: Path, name: str | Path | None = None) -> Path:
-    """The stacked parameter file of a capture: `params/params.npz`, or another by path or by its name in `params/`."""
+    """Return the stacked parameter file of a capture: `params/params.npz`, or another by path or name in `params/`."""
     if name is None:
         return root / "params" / "params.npz"
     path = Path(name)
@@ -124,6 +123,7 @@ def stacked_params(root: Path, name: str | Path | None = None) -> Path:
 
 
 def _params(root: Path, options: ReaderOptions, protocol: ProtocolFiles) -> ParamSource | None:
+    """Return the parameters of the options, else of the protocol, else single files, else the stacked file."""
     if options.params is not None:
         return find_params(stacked_params(root, options.params), body=options.body)
     if protocol.name is not None:
@@ -137,6 +137,7 @@ def _params(root: Path, options: ReaderOptions, protocol: ProtocolFiles) -> Para
 
 
 def _lenses(root: Path) -> list[tuple[Camera, Distortion | None]]:
+    """Read the camera file; a capture without images needs none."""
     path = next((root / name for name in _CAMERA_FILES if (root / name).is_file()), None)
     if path is None:
         if (root / "rgbs").is_dir():
@@ -165,7 +166,7 @@ def _files(
             problems.append(
                 Problem(f"{root / folder / name}: a folder of camera {name}, which is not calibrated", name)
             )
-        # What ought to exist is said of the capture's own folder.
+        # A list of expected frames describes the capture's default folder only.
         listed = description.get(f"{kind}s", {}) if folder == own else {}
         for name, frames in listed.items() if isinstance(listed, Mapping) else ():
             if name in found:
@@ -175,7 +176,7 @@ def _files(
 
 
 def _background(description: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    value = description.get("background", _BLACK)
+    value = description.get("background", (0.0, 0.0, 0.0))
     if value is None:
         return None
     colour = np.asarray(value, dtype=np.float64)
@@ -187,6 +188,7 @@ def _background(description: Mapping[str, Any]) -> tuple[float, float, float] | 
 
 
 def _splits(recording: Recording, description: Mapping[str, Any]) -> Splits:
+    """Return the splits of a description; what it does not hold out is for training."""
     cameras, frames = list(recording.cameras), recording.frames()
     novel_views = _names(description, "novel_views", cameras) or []
     train_views = _names(description, "train_views", cameras)
@@ -212,7 +214,7 @@ def _names(description: Mapping[str, Any], key: str, cameras: list[str]) -> list
 
 
 def _ranges(description: Mapping[str, Any], key: str, frames: tuple[int, ...]) -> list[int] | None:
-    """Frames within the inclusive range [first, last], or within any of several ranges."""
+    """Return the frames within the inclusive range [first, last] or any of several ranges; None without a key."""
     if key not in description:
         return None
     try:

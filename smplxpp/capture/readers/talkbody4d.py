@@ -1,4 +1,4 @@
-"""TalkBody4D (Chen et al. 2025): a multi-camera calibration in JSON, `CAM/FRAME.jpg`, a JSON of parameters a frame."""
+"""Read TalkBody4D (Chen et al. 2025): a calibration in JSON, `CAM/FRAME.jpg`, a JSON of parameters a frame."""
 
 from __future__ import annotations
 
@@ -29,27 +29,25 @@ from smplxpp.core.validation import require_choice
 
 NAME = "talkbody4d"
 LOOKS_FOR = "a JSON file with `cameras` and `camera_poses`, beside a folder with a folder of images for each camera"
-_FPS = 20.0
 _CALIBRATION_KEYS = ("cameras", "camera_poses")
 _PARAM_KEYS = {"body_pose", "betas", "Rh", "Th"}
-# Folders of mattes, in the order in which they are taken; never images.
+# Names of folders of mattes, the preferred first; they are never searched for images.
 _MATTES = ("mattings", "matting", "mattes", "masks", "mask", "alphas", "alpha", "mask_images")
-_TRIED_FILES = 3
-# y down, as OpenCV's cameras have it, to y up.
-_TURNED = np.diag([1.0, -1.0, -1.0, 1.0])
+# Rotation by 180 degrees about x, from the set's y down to y up.
+_Y_UP_FROM_Y_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def detect(root: Path) -> bool:
-    """Tell whether a folder holds such a calibration."""
+    """Tell whether a folder holds a calibration of this set."""
     return _calibration(root) is not None
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a recording: distorted images of the person on black (undistorted on reading), mattes, parameters.
+    """Find the files of a recording: distorted images of the person on black, mattes, parameters; 20 frames a second.
 
-    The calibration is of OpenCV, with pixel centres at whole numbers; a pose is stored under the camera's own name or
-    as `CAM_to_REFERENCE`. The set's world has y down: cameras and parameters are turned about x. A `capture.json` with
-    `"format": "talkbody4d"` says what differs: `"background": null` for photographs, `"up": "y"`.
+    The calibration follows OpenCV, with pixel centres at whole numbers; a pose is stored under the camera's name or as
+    `CAM_to_REFERENCE`. The world of the set has y down, so that cameras and parameters are rotated about x. A
+    `capture.json` with `"format": "talkbody4d"` states differences: `"background": null` for photographs, `"up": "y"`.
 
     Raises:
         InputError: a broken calibration, no images.
@@ -62,7 +60,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     require_choice("up in capture.json of a TalkBody4D folder", up, ("y", "-y"))
     cameras, distortions = _read_calibration(path)
     if up == "-y":
-        cameras = {name: replace(c, cam_from_world=c.cam_from_world @ _TURNED) for name, c in cameras.items()}
+        cameras = {name: replace(c, cam_from_world=c.cam_from_world @ _Y_UP_FROM_Y_DOWN) for name, c in cameras.items()}
     params, problems = _params(root, options, up)
     masks = first_folder(root, _MATTES)
     return Recording(
@@ -77,7 +75,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         },
         background=_background(declared),
         params=params,
-        fps=_FPS,
+        fps=20.0,
         problems=tuple(problems),
     )
 
@@ -91,7 +89,7 @@ def _declared(root: Path) -> Mapping[str, Any]:
 
 
 def _background(declared: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    """What images are on: the set's are on black already, so that their edges are not multiplied by the matte again."""
+    """Return the background of the images: black by default, so that edges are not multiplied by the matte twice."""
     value = declared.get("background", [0.0, 0.0, 0.0])
     if value not in (None, [0.0, 0.0, 0.0]):
         raise InputError(
@@ -103,10 +101,11 @@ def _background(declared: Mapping[str, Any]) -> tuple[float, float, float] | Non
 
 
 def _calibration(root: Path) -> Path | None:
+    """Return the JSON file with `cameras` and `camera_poses`; None without one."""
     for path in sorted(root.glob("*.json")):
         try:
             content = read_json(path)
-        except InputError:  # a file of another layout, whose reader will say so
+        except InputError:  # a file of another layout, whose reader reports it
             continue
         if isinstance(content, Mapping) and all(isinstance(content.get(key), Mapping) for key in _CALIBRATION_KEYS):
             return path
@@ -135,10 +134,10 @@ def _read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distorti
 
 
 def _images(root: Path, cameras: Mapping[str, Any]) -> dict[str, Path]:
-    """The folder of images of each camera: in `images/`, in the folder itself, or in any folder that is not of mattes.
+    """Return the image folder of each camera: in `images/`, in the folder itself, or in any folder but those of mattes.
 
     Raises:
-        InputError: nowhere.
+        InputError: no images in any of them.
     """
     others = [name for name in subfolders(root) if name not in _MATTES]
     for folder in (root / "images", root, *(root / name for name in others)):
@@ -174,10 +173,11 @@ def _params(root: Path, options: ReaderOptions, up: UpAxis) -> tuple[ParamSource
 
 
 def _first_readable(series: FileSeries) -> Mapping[str, Any]:
-    for frame in series.numbers[:_TRIED_FILES].tolist():
+    """Return the content of the first readable one of three files; empty without one."""
+    for frame in series.numbers[:3].tolist():
         try:
             content = read_json(series.required(frame))
-        except InputError:  # the frame's own problem, told when it is read
+        except InputError:  # reported when the frame is read
             continue
         if isinstance(content, Mapping):
             return content
@@ -185,7 +185,7 @@ def _first_readable(series: FileSeries) -> Mapping[str, Any]:
 
 
 def _unfitting(content: Mapping[str, Any], body: BodyModel) -> str | None:
-    """What a body lacks of parameters, None if nothing."""
+    """Return in words what a body model lacks for parameters; None if it fits."""
     widths = [("betas", "betas", body.num_betas), ("expression", "expressions", body.num_expressions)]
     for key, word, known in widths:
         count = np.size(np.asarray(content.get(key, []), dtype=object))

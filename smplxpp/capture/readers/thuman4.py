@@ -1,4 +1,4 @@
-"""THuman4.0 (Zheng et al. 2022): `calibration.json`, `images/camNN/00000000.jpg`, `masks/camNN/00000000.jpg`."""
+"""Read THuman4.0 (Zheng et al. 2022): `calibration.json`, `images/camNN/00000000.jpg`, `masks/camNN/00000000.jpg`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
-    """Find a subject: photographs, masks, `smpl_params.npz` with a row a frame.
+    """Find the files of a subject: photographs, masks, `smpl_params.npz` with a row for each frame.
 
     Raises:
         InputError: a broken calibration.

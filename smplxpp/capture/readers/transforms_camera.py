@@ -1,4 +1,4 @@
-"""A camera from a frame of transforms.json, in the words of Instant-NGP, nerfstudio, Blender's NeRF and NeuS2.
+"""Read the camera of a frame of transforms.json, with the keys of Instant-NGP, nerfstudio, Blender's NeRF and NeuS2.
 
 Instant-NGP: `src/nerf_loader.cu` (`read_lens`, `read_focal_length`); nerfstudio: `nerfstudio_dataparser.py`,
 `cameras/cameras.py` (`CAMERA_MODEL_TO_TYPE`).
@@ -21,27 +21,27 @@ from smplxpp.core.files.json_file import as_integer, as_number, as_numbers, as_t
 
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-# What Instant-NGP takes for other projections where it is there.
+# Keys of other projections in Instant-NGP, which are not supported.
 _PROJECTIONS = ("latlong", "equirectangular", "orthographic", "ftheta_p0")
-_REMEDY = "render or undistort the images to pinholes, or to OpenCV's fisheye, and say their intrinsics"
-# Camera axes of OpenGL (y up, z backwards) in OpenCV's.
+_REMEDY = "render or undistort the images to pinholes, or to OpenCV's fisheye, and give their intrinsics"
+# Transform from OpenCV's camera axes to OpenGL's (y up, z backwards) and back.
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def frame_camera(
     content: Mapping[str, Any], frame: Mapping[str, Any], size: tuple[Any, Any], *, name: str, source: str
 ) -> tuple[Camera, Distortion | None]:
-    """A frame's camera and its lens; what the frame says goes before what the file says.
+    """Return the camera of a frame and its distortion; values of the frame override those of the file.
 
     Args:
-        content: the file's object.
+        content: JSON object of the file.
         frame: one of its `frames`.
         size: width and height of the image, unchecked.
-        name: of the camera. source: what messages call the frame.
+        name: name of the camera.
+        source: name of the frame in messages.
 
     Raises:
-        InputError: a projection that is no lens of ours, a camera that moves while it exposes, missing or broken
-            numbers.
+        InputError: an unsupported projection, a camera that moves during the exposure, missing or broken numbers.
     """
     width, height = (as_integer(side, subject=f"{source}: image size", least=1, most=1 << 16) for side in size)
     K = _intrinsics(content, frame, (width, height), source)
@@ -50,7 +50,7 @@ def frame_camera(
 
 
 def _pose(content: Mapping[str, Any], frame: Mapping[str, Any], source: str) -> Float64[np.ndarray, "N 4"]:
-    """Camera to world with OpenCV's camera axes; `from_na` says that the file has them already (NeuS2)."""
+    """Return the camera-to-world matrix in OpenCV's camera axes, which `from_na` marks as given (NeuS2)."""
     key = "transform_matrix_start" if "transform_matrix_start" in frame else "transform_matrix"
     matrix = as_numbers(required(frame, key, source=source), (None, 4), subject=f"{source}: {key}")
     end = as_numbers(frame.get("transform_matrix_end", matrix), (None, 4), subject=f"{source}: transform_matrix_end")
@@ -89,14 +89,14 @@ def _intrinsics(
 
 
 def _focal_lengths(values: Mapping[str, Any], size: tuple[int, int], source: str) -> tuple[float, float] | None:
-    """Of both axes; one alone counts for both."""
+    """Return the focal lengths in pixels of x and y, a single one for both; None without any."""
     x, y = (_focal_length(values, axis, side, source) for axis, side in zip("xy", size, strict=True))
     first = x or y
     return None if first is None else (first, y or first)
 
 
 def _focal_length(values: Mapping[str, Any], axis: str, side: int, source: str) -> float | None:
-    """Instant-NGP's order; its `x_fov` is in degrees and `camera_angle_x` in radians."""
+    """Return a focal length in pixels by Instant-NGP's keys: `x_fov` (degrees), `fl_x`, `camera_angle_x` (radians)."""
     for key, half_circle in ((f"{axis}_fov", 180.0), (f"fl_{axis}", None), (f"camera_angle_{axis}", math.pi)):
         if key in values:
             number = as_number(values[key], subject=f"{source}: {key}", least=1e-6, most=half_circle or 1e9)
@@ -105,6 +105,7 @@ def _focal_length(values: Mapping[str, Any], axis: str, side: int, source: str) 
 
 
 def _lens(values: Mapping[str, Any], source: str) -> Distortion | None:
+    """Return the distortion by camera model and coefficients; None for a pinhole."""
     other = [key for key in _PROJECTIONS if key in values and values[key] is not False and values[key] is not None]
     if other:
         raise InputError(f"{source}: lens", expected="a pinhole or a fisheye", received=other[0], remedy=_REMEDY)
@@ -115,6 +116,7 @@ def _lens(values: Mapping[str, Any], source: str) -> Distortion | None:
         received = f"{name} with is_fisheye" if name in known else name[:80]
         expected = f"one of {', '.join(known)}"
         raise InputError(f"{source}: camera_model", expected=expected, received=received, remedy=_REMEDY)
+    # Tangential terms of a fisheye, and k4 to k6 of a pinhole, have no agreed meaning.
     k, p = _coefficients(values, source)
     if (p if fisheye else k[3:]).any():
         raise InputError(
@@ -131,7 +133,7 @@ def _lens(values: Mapping[str, Any], source: str) -> Distortion | None:
 def _coefficients(
     values: Mapping[str, Any], source: str
 ) -> tuple[Float64[np.ndarray, " 6"], Float64[np.ndarray, " 2"]]:
-    """k1..k6 and p1, p2; nerfstudio's `distortion_params` (k1, k2, k3, k4, p1, p2) goes before single ones."""
+    """Return k1..k6 and p1, p2; nerfstudio's `distortion_params` (k1, k2, k3, k4, p1, p2) overrides single keys."""
     if "distortion_params" in values:
         listed = as_numbers(values["distortion_params"], (6,), subject=f"{source}: distortion_params")
         return np.append(listed[:4], [0.0, 0.0]), listed[4:]

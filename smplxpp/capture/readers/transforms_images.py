@@ -1,4 +1,4 @@
-"""Images that transforms.json names: where they lie, what else lies beside them, which camera and frame they are."""
+"""Find the images that transforms.json names, their masks, and the camera and frame of each."""
 
 from __future__ import annotations
 
@@ -19,14 +19,18 @@ from smplxpp.core.files.paths import path_inside
 
 @dataclass(frozen=True, eq=False)
 class NamedImage:
-    """An image that a file names.
+    """An image that a transforms file names.
 
     Attributes:
-        path: below the capture's folder. exists: whether it is there. mask: of its mask, or None.
-        camera, lens: as the file has them; the camera is called by the image's name.
-        frame: the number at the end of the file's name (NeuS2), or None. time: D-NeRF's, or None.
-        part: "train", "test", or "" where the file's lists name it in neither.
-        source: the file that names it.
+        path: path below the capture's folder.
+        exists: whether the file exists.
+        mask: path of its mask, or None.
+        camera: camera of the image, named like the image.
+        lens: distortion, None for a pinhole.
+        frame: number at the end of the name of the transforms file (NeuS2), or None.
+        time: time of the frame (D-NeRF), or None.
+        part: "train", "test", or "" if lists of the file name it in neither.
+        source: transforms file that names it.
     """
 
     path: PurePosixPath
@@ -41,10 +45,10 @@ class NamedImage:
 
 
 def find_image(root: Path, base: Path, name: str, *, subject: str) -> PurePosixPath:
-    """The path below `root` of the image that a file in `base` calls `name`, with or without its suffix.
+    """Return the path below `root` of the image that a file in `base` names, with or without its suffix.
 
     Raises:
-        InputError: it would lie outside of `root`.
+        InputError: a path outside of `root`.
     """
     path = path_inside(root, name, base=base, subject=subject)
     if path.suffix.lower() not in IMAGE_SUFFIXES and not os.path.isfile(path):
@@ -54,7 +58,7 @@ def find_image(root: Path, base: Path, name: str, *, subject: str) -> PurePosixP
 
 
 def mask_beside(root: Path, image: PurePosixPath) -> PurePosixPath | None:
-    """Instant-NGP's opacity of an image: `IMAGE.SUFFIX.alpha.SUFFIX` or `IMAGE.alpha.SUFFIX`."""
+    """Return Instant-NGP's mask of an image, None without one: `IMAGE.SUFFIX.alpha.SUFFIX` or `IMAGE.alpha.SUFFIX`."""
     for stem in (image.name, image.stem):
         path = image.with_name(f"{stem}.alpha{image.suffix}")
         if os.path.isfile(root / path):
@@ -63,12 +67,14 @@ def mask_beside(root: Path, image: PurePosixPath) -> PurePosixPath | None:
 
 
 def places(images: Sequence[NamedImage], *, subject: str) -> list[tuple[str, int]]:
-    """Each image's camera, by a name of its own, and its frame.
+    """Assign a camera name and a frame to each image.
 
-    Files with a number (NeuS2) give the frame, and the image's path without this number the camera. Else a folder of
-    numbered images with one pose and one lens is a camera and the numbers are frames, as is every folder where each has
-    one image alone that has nothing but a number for a name; any other image is a camera of its own, of its number's
-    frame if others stand still, and of frame 0 if none does. `time` goes before numbers: its rank is the frame.
+    1. The number of a transforms file (NeuS2) is the frame; the image path without this number is the camera.
+    2. Otherwise a folder of numbered images with one pose and one lens is a camera, and the numbers are frames. So is
+       each folder if every folder has one image whose name is a number.
+    3. Any other image is a camera. Its number is the frame if case 2 applies to others, else the frame is 0.
+
+    `time`, if given, overrides numbers: its rank is the frame.
     """
     keys, frames = _keys(images)
     names = camera_names(keys, subject=subject)
@@ -109,7 +115,7 @@ def _still(images: Sequence[NamedImage]) -> bool:
 
 
 def same_camera(a: Camera, b: Camera) -> bool:
-    """Tell whether two cameras have one pose, one size and one set of intrinsics."""
+    """Tell whether two cameras agree in pose, size and intrinsics up to rounding."""
     return (
         (a.width, a.height) == (b.width, b.height)
         and np.allclose(a.cam_from_world, b.cam_from_world, atol=1e-6)
@@ -118,10 +124,10 @@ def same_camera(a: Camera, b: Camera) -> bool:
 
 
 def _without_frames(images: Sequence[NamedImage]) -> list[PurePosixPath]:
-    """Paths without the frame's number, in the way that leaves the fewest cameras, each once a frame.
+    """Return the paths without the frame number, with the fewest cameras that have at most one image a frame.
 
     `images/000280/image_c_003_f_000280.png` -> `images/image_c_003`, `000280/003.png` -> `003`, `003/000280.png` ->
-    `003`: a folder or a name may also be a camera's number that happens to be the frame's.
+    `003`. All variants are tried, because a folder or a name may be the number of a camera that equals the frame.
     """
     views = len({(image.frame, image.path) for image in images})
     best: list[PurePosixPath] = []
@@ -144,7 +150,7 @@ def _without_frame(path: PurePosixPath, frame: int, *, folders: bool, name: bool
 
 
 def _without_mark(name: str) -> str:
-    """The name without a mark of frames at its end, `_f_` or `_frame_`."""
+    """Return the name without `_f_` or `_frame_` at its end."""
     name = name.rstrip("_-")
     for mark in ("frame", "f"):
         if name == mark or name.endswith((f"_{mark}", f"-{mark}")):

@@ -1,1 +1,1 @@
-"""Files of a capture, written: description, cameras, images, arrays."""
+"""Write the files of a capture: description, cameras, images, arrays."""

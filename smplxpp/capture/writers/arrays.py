@@ -1,4 +1,4 @@
-"""Arrays of a capture, packed as small as np.load can read."""
+"""Write parameters, meshes and keypoints of a capture as compact npz files."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from smplxpp.core.files.atomic import atomic_path
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
-# Coordinates of truth meshes are rounded to this many metres (0.06 mm): they compress better.
 QUANTUM = 2.0**-14
-# Rows of a file of parameters: 14 hours at 20 frames a second, two gigabytes.
-_MOST_ROWS = 1_000_000
+"""Metres (0.06 mm) to which coordinates of true meshes are rounded, because they then compress better."""
 
 
 def rounded(vertices: Float[np.ndarray, "*V 3"]) -> Float[np.ndarray, "*V 3"]:
-    """Return coordinates as they are stored: multiples of `QUANTUM`."""
+    """Round coordinates to multiples of `QUANTUM`, as they are stored."""
     return np.round(vertices / QUANTUM) * QUANTUM
 
 
 def save_compact(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write an npz file packed with LZMA, columns one after the other: two thirds of deflate; np.load reads it."""
+    """Write an npz file with LZMA in column order, two thirds the size of deflate; `np.load` reads it."""
     write_arrays(path, {name: np.asfortranarray(value) for name, value in arrays.items()}, packing=zipfile.ZIP_LZMA)
 
 
 def save_params_by_row(path: Path, params: Mapping[int, BodyParams]) -> None:
-    """Write parameters so that row n is frame n; NaN where a frame has none, which spoils that frame alone."""
+    """Write parameters with frame n in row n; rows of other frames are NaN, which only makes these frames empty."""
+    # 14 hours at 20 frames per second, two gigabytes.
+    max_rows = 1_000_000
     joined = BodyParams.concatenate(list(params.values()))
     rows = np.array(list(params))
-    if rows.max() >= _MOST_ROWS:
+    if rows.max() >= max_rows:
         raise InputError(
             "parameters of the capture",
-            expected=f"frames numbered below {_MOST_ROWS}: their row is the frame's number",
+            expected=f"frames numbered below {max_rows}: their row is the frame's number",
             received=f"frame {rows.max()}",
             remedy="number the frames from 0",
         )
@@ -52,19 +52,19 @@ def save_params_by_row(path: Path, params: Mapping[int, BodyParams]) -> None:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]  # numpy: the names might be `allow_pickle`
 
 
-# Pixels and confidences are rounded to these: far below what a detector knows, and files are half as large.
-_PIXEL, _CONFIDENCE = 2.0**-4, 2.0**-7
-
-
 def write_keypoints(path: Path, keypoints: Keypoints2D, extra: Mapping[str, np.ndarray] | None = None) -> None:
-    """Write one camera's keypoints, rounded to 1/16 pixel; a confidence above 0 stays above 0.
+    """Write the keypoints of one camera, rounded to 1/16 pixel; a confidence above 0 stays above 0.
 
     Args:
-        extra: arrays of other names that are written beside them; readers of keypoints pass over these.
+        path: path of the npz file.
+        keypoints: keypoints of the camera.
+        extra: further arrays for the file, which readers of keypoints ignore.
     """
-    points = np.round(keypoints.points / _PIXEL) * _PIXEL
-    confidence = np.round(keypoints.confidence / _CONFIDENCE) * _CONFIDENCE
-    confidence = np.where(keypoints.confidence > 0, np.maximum(confidence, _CONFIDENCE), 0.0)
+    # Rounding is far below the accuracy of detectors, and halves the size of the file.
+    pixel, confidence_step = 2.0**-4, 2.0**-7
+    points = np.round(keypoints.points / pixel) * pixel
+    confidence = np.round(keypoints.confidence / confidence_step) * confidence_step
+    confidence = np.where(keypoints.confidence > 0, np.maximum(confidence, confidence_step), 0.0)
     table = np.concatenate([points, confidence[..., None]], axis=2).astype(np.float32)
     names = np.array(keypoints.names, dtype=str)
     save_compact(path, {"keypoints": table, "joint_names": names, "frames": keypoints.frames, **(extra or {})})

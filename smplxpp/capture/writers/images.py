@@ -1,4 +1,4 @@
-"""Images of a capture: JPEG, 8-bit masks and labels, 16-bit normals."""
+"""Write images of a capture: JPEG, 8-bit masks and labels, 16-bit normals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image
 
 from smplxpp.core.files.atomic import atomic_write_bytes
 
-# kind of file -> folder, and what stands before the frame's number in a file's name.
+# For each kind of file its folder, and the tag before the frame number in file names.
 VIEW_FOLDERS = {
     "image": ("rgbs", "rgb"),
     "mask": ("masks", "mask"),
@@ -21,18 +21,16 @@ VIEW_FOLDERS = {
     "normal": ("normals", "normal"),
 }
 JPEG_SUFFIXES = (".jpg", ".jpeg")
-# Components of normals keep 12 bits of 16: the rest would be noise that does not compress.
-_NORMAL_STEP = 16
 
 
 def view_path(root: Path, kind: str, camera: str, frame: int, suffix: str) -> Path:
-    """Return the place of a view's file: `kind` is a key of `VIEW_FOLDERS`, `suffix` starts with a dot."""
+    """Return the path of a view's file: `kind` is a key of `VIEW_FOLDERS`, `suffix` starts with a dot."""
     folder, tag = VIEW_FOLDERS[kind]
     return root / folder / camera / f"{camera}_{tag}{frame:06d}{suffix}"
 
 
 def write_jpeg(path: Path, image: UInt8[np.ndarray, "H W 3"], *, quality: int) -> None:
-    """Write sRGB as a small JPEG file."""
+    """Write an sRGB image as an optimised JPEG file."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "JPEG", quality=quality, optimize=True)
     atomic_write_bytes(path, buffer.getvalue())
@@ -47,19 +45,21 @@ def write_gray_png(path: Path, image: UInt8[np.ndarray, "H W"]) -> None:
 
 def write_normal_png(path: Path, normals: Float[np.ndarray, "H W 3"]) -> None:
     """Write unit normals as 16-bit RGB, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
-    value = np.round((normals + 1.0) * (0.5 * 65535 / _NORMAL_STEP)) * _NORMAL_STEP
-    value = np.where((normals == 0.0).all(axis=2, keepdims=True), 0, np.clip(value, _NORMAL_STEP, 65535))
+    # 12 bits of 16 are kept, because the others are noise that does not compress.
+    step = 16
+    value = np.round((normals + 1.0) * (0.5 * 65535 / step)) * step
+    value = np.where((normals == 0.0).all(axis=2, keepdims=True), 0, np.clip(value, step, 65535))
     atomic_write_bytes(path, png16(value.astype(np.uint16)))
 
 
 def normal_codes(normals: Float[np.ndarray, "H W 3"]) -> UInt16[np.ndarray, "H W 3"]:
-    """Return all 16 bits of unit normals, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
+    """Encode unit normals with all 16 bits, n = value / 65535 * 2 - 1; zero rows (background) become 0, 0, 0."""
     codes = np.clip(np.round((normals + 1.0) * 32767.5), 1, 65535)
     return np.where(normals.any(axis=2, keepdims=True), codes, 0).astype(np.uint16)
 
 
 def encoded_image(image: UInt8[np.ndarray, "H W *D"] | UInt16[np.ndarray, "H W 3"], suffix: str, quality: int) -> bytes:
-    """Return a file's bytes: a JPEG without subsampling where the suffix is one's, else a PNG of 8 or 16 bits."""
+    """Return the bytes of an image file: JPEG without chroma subsampling by its suffixes, else PNG of 8 or 16 bits."""
     if image.dtype == np.uint16:
         return png16(image)
     buffer = io.BytesIO()
@@ -71,7 +71,7 @@ def encoded_image(image: UInt8[np.ndarray, "H W *D"] | UInt16[np.ndarray, "H W 3
 
 
 def png16(image: UInt16[np.ndarray, "H W 3"]) -> bytes:
-    """Return a 16-bit RGB PNG's bytes (Pillow writes none); every row with the `Up` filter."""
+    """Return the bytes of a 16-bit RGB PNG, which Pillow cannot write; all rows use the `Up` filter."""
     height, width = image.shape[:2]
     rows = np.ascontiguousarray(image.astype(">u2")).view(np.uint8).reshape(height, -1)
     filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)

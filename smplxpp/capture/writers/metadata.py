@@ -1,4 +1,4 @@
-"""Camera files of a capture: ours and ActorsHQ's."""
+"""Write the camera files and the description of a capture in the simple layout, and those of ActorsHQ."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy",
 
 
 def write_cameras_json(path: Path, rig: list[RigCamera]) -> None:
-    """Write cameras in OpenCV's form, with kind and split."""
+    """Write cameras.json in OpenCV's convention, with the kind and split of each camera."""
     entries = [
         {**camera_entry(item.camera, item.camera.name), "kind": item.kind, "split": "novel" if item.novel else "train"}
         for item in rig
@@ -35,13 +35,13 @@ def write_cameras_json(path: Path, rig: list[RigCamera]) -> None:
 
 
 def write_plain_cameras_json(path: Path, cameras: Mapping[str, Camera]) -> None:
-    """Write cameras by name in OpenCV's form, and nothing else about them."""
+    """Write cameras.json in OpenCV's convention, without kind and split."""
     entries = [camera_entry(camera, name) for name, camera in cameras.items()]
     atomic_write_text(path, json.dumps({"cameras": entries}, indent=1) + "\n")
 
 
 def camera_entry(camera: Camera, name: str) -> dict[str, object]:
-    """Return one camera as JSON values."""
+    """Return the entry of a camera in cameras.json."""
     return {
         "name": name,
         "w": camera.width,
@@ -53,7 +53,7 @@ def camera_entry(camera: Camera, name: str) -> dict[str, object]:
 
 
 def write_calibration_csv(path: Path, rig: list[RigCamera]) -> None:
-    """Write ActorsHQ's calibration: camera-to-world, intrinsics in units of the image's size."""
+    """Write ActorsHQ's calibration.csv: camera-to-world, intrinsics in units of the image size."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_CSV_FIELDS)
@@ -81,7 +81,7 @@ BODY, FACE = "body", "face"
 
 @dataclass(frozen=True)
 class RigCamera:
-    """A camera with what it is for: `kind` is body or face, `novel` cameras are held out."""
+    """A camera of a rig; its kind is body or face, and `novel` cameras are held out."""
 
     camera: Camera
     kind: str
@@ -89,13 +89,13 @@ class RigCamera:
 
 
 def write_description(path: Path, recording: Recording, splits: Splits, frames: Sequence[int]) -> None:
-    """Write capture.json.
+    """Write capture.json, the description of a capture in the simple layout.
 
     Args:
-        path: the file.
-        recording: gives name, frame rate, background and the set of labels.
-        splits: cameras and frames to train on and to hold out.
-        frames: all frames of the capture that is written, ascending.
+        path: path of the file.
+        recording: source of name, frame rate, background and label set.
+        splits: training and held-out cameras and frames.
+        frames: all frames of the written capture, ascending.
     """
     description: dict[str, object] = {"name": recording.name}
     if recording.fps is not None:
@@ -112,7 +112,7 @@ def write_description(path: Path, recording: Recording, splits: Splits, frames: 
 
 
 def _ranges(chosen: Sequence[int], frames: Sequence[int]) -> list[list[int]]:
-    """Return [first, last] of every run of `frames` that is chosen."""
+    """Return [first, last] of every run of consecutive `frames` that are chosen."""
     marks = np.concatenate([[0], np.isin(frames, chosen).astype(np.int8), [0]])
     starts, ends = np.flatnonzero(np.diff(marks) == 1), np.flatnonzero(np.diff(marks) == -1) - 1
     return [[int(frames[int(first)]), int(frames[int(last)])] for first, last in zip(starts, ends, strict=True)]
