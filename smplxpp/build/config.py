@@ -1,0 +1,265 @@
+"""What a build takes: its inputs, and every choice that changes its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from smplxpp.assemble import DarnConfig
+from smplxpp.capture import Capture
+from smplxpp.clean import WebConfig
+from smplxpp.clean.scan_frame import AUTO
+from smplxpp.core.errors import InputError
+from smplxpp.core.labels import LABELS
+from smplxpp.core.mesh import MeshLike
+from smplxpp.core.params import BodyParams
+from smplxpp.core.validation import require_at_least, require_between, require_choice
+
+STEPS = (
+    *("reconstruct", "locate", "register"),
+    *("capture", "body", "segment", "clean", "transfer", "unpose", "assemble", "validate"),
+)
+"""The steps of a build in their order. The first three make what is not given: a scan, and the body in it."""
+UNITS = (AUTO, "m", "cm", "mm", "inch")
+UP_AXES = (AUTO, "y", "z", "x", "-y", "-z", "-x")
+LABEL_SOURCES = (AUTO, "scan", "views", "body")
+
+
+def _default_budgets() -> dict[str, int]:
+    return {label.name: label.face_budget for label in LABELS if label.face_budget}
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """Choices of one build.
+
+    Attributes:
+        units: units of the scan, one of `UNITS`. "auto": found from the person's height where the scan comes alone,
+            else metres.
+        up: upward axis of the scan, one of `UP_AXES`. "auto": found where the scan comes alone, else +Y.
+        frame: number of the reference frame, near the T-pose.
+        protocol: the capture's protocol, which names the files that are read. None: without one.
+        keypoints: folder of keypoints that replaces the capture's own.
+        masks: folder of masks that replaces the capture's own.
+        landmarks: points placed by hand on the scan, a file or points by name. They tell where the body is.
+        corrections: file of labels corrected by hand, as `smplxpp label` writes it.
+        label_set: name of the label set that labels and label maps use, or a JSON mapping file. "auto": "capture" with
+            a capture, else "4ddress".
+        label_source: "scan" takes labels that come with the scan, "views" lets label maps vote, "body" asks the fitted
+            body and the colours. "auto": the first of views, scan and body that there is.
+        register: whether the body is registered to the capture (or to the scan), "on", "off" or "auto". "auto": where
+            the capture states that its parameters are tracked, and where it has none.
+        detector: keypoint model that finds the facing direction of a scan without parameters: "mediapipe" or an ONNX
+            file. None: the surface alone decides.
+        budgets: number of faces kept by part name.
+        remesh: method that makes the parts' faces, "quadric" or "isotropic".
+        clearance_mm: distance kept between layers, millimetres, 0.1 to 10.
+        max_influences: joints that a vertex may follow.
+        webs: settings for cutting faces that bridge two limbs; `rounds=0` disables it.
+        darning: settings for closing the holes that this leaves; `width=0` disables it.
+        method: skin-weight transfer, "ours", or "paper" for robust transfer as published.
+        samples: surface samples of the validation.
+        seed: of the samples.
+
+    Example:
+        >>> BuildConfig(budgets={"upper": 8000}).clearance_mm
+        1.0
+    """
+
+    units: str = AUTO
+    up: str = AUTO
+    frame: int = 0
+    protocol: str | None = None
+    keypoints: Path | None = None
+    masks: Path | None = None
+    landmarks: Path | Mapping[str, Any] | None = None
+    corrections: Path | None = None
+    label_set: str = AUTO
+    label_source: str = AUTO
+    register: Literal["auto", "on", "off"] = "auto"
+    detector: str | None = None
+    budgets: dict[str, int] = field(default_factory=_default_budgets)
+    remesh: str = "quadric"
+    clearance_mm: float = 1.0
+    max_influences: int = 8
+    webs: WebConfig = field(default_factory=WebConfig)
+    darning: DarnConfig = field(default_factory=DarnConfig)
+    method: str = "ours"
+    samples: int = 100_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, choices in (("units", UNITS), ("up", UP_AXES), ("label_source", LABEL_SOURCES)):
+            require_choice(f"option {name}", getattr(self, name), choices)
+        require_choice("option register", self.register, (AUTO, "on", "off"))
+        require_choice("option method", self.method, ("ours", "paper"))
+        parts = _default_budgets()
+        unknown = sorted(set(self.budgets) - set(parts))
+        if unknown:
+            raise InputError("option budgets", expected=f"parts among {', '.join(parts)}", received=", ".join(unknown))
+        require_between("option clearance-mm", self.clearance_mm, 0.1, 10.0)
+        for name, value, least in (
+            ("max-influences", self.max_influences, 1),
+            ("samples", self.samples, 1000),
+            ("seed", self.seed, 0),
+            ("frame", self.frame, 0),
+            ("budgets", min(self.budgets.values(), default=100), 100),
+        ):
+            require_at_least(f"option {name}", value, least)
+
+
+@dataclass(frozen=True)
+class BuildInputs:
+    """The inputs of one build, after it was decided which of them are used and which are made.
+
+    Attributes:
+        subject: name used in the report.
+        scan: clothed scan of the reference frame; None where it is reconstructed and no file keeps it.
+        params: body parameters. None: they are registered, or found in the scan.
+        frame: number of the frame in its capture. Trainings take this frame's photographs.
+        params_row: the frame's row in parameters of several frames.
+        labels: labels of the scan's vertices or faces. None: the scan's own, label maps, or the body decide.
+        label_maps: label image by camera name.
+        photographs: image of the frame by camera name. They tell whether the scan is mirrored.
+        cameras: camera file of label maps and photographs.
+        label_set: name of the label set that labels and label maps use, or a JSON mapping file.
+        label_source: "auto" takes the labels that there are; "body" ignores them.
+        reconstructs: whether the scan is reconstructed from photographs.
+        locates: whether the body has to be found in the scan.
+        registers: whether the parameters come from a registration.
+        motion: parameters of the capture's frames, for validation; may be None.
+        body: SMPL-X-layout body file; None for the open body.
+        protocol: of the capture, by which these files were found; None without one.
+    """
+
+    subject: str
+    scan: Path | MeshLike | None
+    params: Path | BodyParams | None
+    frame: int = 0
+    params_row: int = 0
+    labels: Path | np.ndarray | None = None
+    label_maps: dict[str, Path] = field(default_factory=dict)
+    photographs: dict[str, Path] = field(default_factory=dict)
+    cameras: Path | None = None
+    label_set: str = "4ddress"
+    label_source: str = "auto"
+    reconstructs: bool = False
+    locates: bool = False
+    registers: bool = False
+    motion: Path | BodyParams | None = None
+    body: Path | None = None
+    protocol: str | None = None
+
+    @property
+    def scan_file(self) -> Path:
+        """The scan's file, which every run has; builds in memory read `scan`."""
+        assert isinstance(self.scan, Path), "a run keeps its scan in a file"
+        return self.scan
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """The steps of the build in their order: those that make what is not given where something is missing."""
+        left_out = {"reconstruct": not self.reconstructs, "locate": not self.locates, "register": not self.registers}
+        return tuple(step for step in STEPS if not left_out.get(step, False))
+
+
+def resolved(config: BuildConfig, inputs: BuildInputs) -> BuildConfig:
+    """Return the choices with units and axis that are "auto" set to metres and +Y, unless they are to be found.
+
+    They are found from the shape of the person where the scan comes alone. Parameters, cameras and a scan share one
+    world, which is in metres.
+    """
+    if inputs.locates and not inputs.registers:
+        return config
+    return replace(
+        config, units="m" if config.units == AUTO else config.units, up="y" if config.up == AUTO else config.up
+    )
+
+
+@dataclass(frozen=True)
+class RegisterInputs:
+    """Where a registration takes its observations from: a capture, or one scan.
+
+    Attributes:
+        capture: folder of any known layout, or an open capture.
+        params: the fit to start from, which replaces the capture's own.
+        start: False: no fit is used, and the registration begins with keypoints.
+        protocol: name of the capture's files that are read, None without one.
+        frames: numbers; None for all that are trained on or held out.
+        hold_out: cameras that are not used, in the place of those that the capture holds out.
+        body: SMPL-X-layout body file, None for the open body.
+        scan: the reference frame's scan, which replaces the capture's.
+        frame: number of the reference frame.
+        labels: labels of that scan's vertices or faces. None: its frame's label maps vote.
+        label_set: of the scan's labels.
+        units: of scan files.
+        up: upward axis of scan files.
+        seed: of the points that are sampled.
+        keypoints: folder of keypoints that replaces the capture's own.
+        masks: folder of masks that replaces the capture's own.
+        scans: folder of a scan a frame that replaces the capture's own.
+    """
+
+    capture: Path | Capture | None = None
+    params: Path | BodyParams | None = None
+    start: bool = True
+    protocol: str | None = None
+    frames: tuple[int, ...] | None = None
+    hold_out: tuple[str, ...] = ()
+    body: Path | None = None
+    scan: Path | MeshLike | None = None
+    frame: int = 0
+    labels: Path | np.ndarray | None = None
+    label_set: str = "capture"
+    units: str = "m"
+    up: str = "y"
+    seed: int = 0
+    keypoints: Path | None = None
+    masks: Path | None = None
+    scans: Path | None = None
+
+    @property
+    def root(self) -> Path | None:
+        """Folder of the capture; None for a scan alone."""
+        return self.capture.root if isinstance(self.capture, Capture) else self.capture
+
+    @property
+    def scan_file(self) -> Path | None:
+        """The scan's file; None without one, or for a scan in memory."""
+        return self.scan if isinstance(self.scan, Path) else None
+
+
+@dataclass(frozen=True)
+class ReconstructInputs:
+    """Where a reconstruction takes its photographs from.
+
+    Attributes:
+        capture: folder of any known layout, or an open capture.
+        frames: numbers; None: all that are trained on.
+        hold_out: cameras that are not used, in the place of those that the capture holds out.
+        masks: folder of masks that replaces the capture's own.
+        protocol: name of the capture's files that are read, None without one.
+        refine: compare the photographs; False: the silhouettes alone.
+        cell_mm: cell size of the grid, millimetres; None: by the photographs' resolution.
+        mesh: another program's surface of the one frame, which replaces ours.
+        dissent: number of views that may see background at a point of the surface.
+    """
+
+    capture: Path | Capture
+    frames: tuple[int, ...] | None = None
+    hold_out: tuple[str, ...] = ()
+    masks: Path | None = None
+    protocol: str | None = None
+    refine: bool = True
+    cell_mm: float | None = None
+    dissent: int = 0
+    mesh: Path | None = None
+
+    @property
+    def root(self) -> Path:
+        """Folder of the capture."""
+        return self.capture.root if isinstance(self.capture, Capture) else self.capture
