@@ -1,4 +1,4 @@
-"""Frames of a refinement under way, and the passes that bring them to their photographs."""
+"""The passes of a refinement: Levenberg-Marquardt over all frames, with resets of frames whose loss grew."""
 
 from __future__ import annotations
 
@@ -11,31 +11,26 @@ from jaxtyping import Bool, Float64
 
 from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
-from avatar.training.refinement.appearance import AppearanceSums
-from avatar.training.refinement.cameras import CameraCorrections
 from avatar.training.refinement.config import Level, RefineConfig
-from avatar.training.refinement.evidence import Evidence, Photometer
+from avatar.training.refinement.nuisance import AppearanceUpdate, CameraCorrections
+from avatar.training.refinement.photometric import Linearization, PhotometricLoss
 from avatar.training.refinement.posing import PosedTemplate
-from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_trust
-from avatar.training.refinement.variables import GaussianMotion, Variables
+from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_prior
+from avatar.training.refinement.variables import CentreJacobian, Variables
 from smplxpp.register import BodyState
 
-DAMPING, CALMER, WILDER, LEAST_DAMPING = 1e-2, 0.3, 10.0, 1e-4
-"""Levenberg and Marquardt's damping: at first, after a good pass, after a bad one, and at least."""
-WORSE = 1.01
-"""A pass was bad for a frame whose loss grew by more than this factor; a little may come from the others' colours."""
-KNOWN_BYTES = 1 << 30
-"""Of photographs at the size of a level that are kept."""
 Views = Callable[[int], Sequence[View]]
-"""Gives the photographs of a frame at full size."""
+"""Returns the photographs of a frame at full size."""
 
 
 @dataclass(frozen=True)
 class PassReport:
-    """What a pass over all frames saw.
+    """Figures of one pass over all frames.
 
     Attributes:
-        halvings: of the photographs. loss: mean over the frames. bad: frames that went back to where they were.
+        halvings: of the photographs.
+        loss: mean over the frames.
+        bad: number of frames whose loss grew, and that were reset.
     """
 
     halvings: int
@@ -45,30 +40,40 @@ class PassReport:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is drawn and compared.
+    """The parts of the objective that all frames share.
 
     Attributes:
-        posed: the template. photometer: compares. config: of the refinement.
-        cameras: corrections of them, None where they are right.
-        fps: frames a second, None where not known.
+        posed: the template.
+        photometric: the loss on photographs.
+        config: of the refinement.
+        cameras: corrections of the cameras; None: they are taken as exact.
+        fps: frames a second; None where unknown.
     """
 
     posed: PosedTemplate
-    photometer: Photometer
+    photometric: PhotometricLoss
     config: RefineConfig
     cameras: CameraCorrections | None = None
     fps: float | None = None
 
 
 class Alignment:
-    """Frames that are brought to their photographs by damped Gauss-Newton steps, all frames together.
+    """Aligns the poses of frames with their photographs by damped Gauss-Newton steps, all frames together.
 
-    A pass looks at every frame through all its cameras; then poses, colours and cameras take one step each.
+    A pass renders every frame through all its cameras. Then poses, colours and cameras take one step each.
 
     Args:
-        gaussians: on the template.
-        frames: numbers, ascending. start: their registered poses, a row each. views: photographs of a frame.
-        learns_appearance: False: the Gaussians are right.
+        scene: the parts of the objective that all frames share.
+        gaussians: bound to the template.
+        frames: numbers, ascending.
+        start: registered poses of the frames, a row each.
+        views: returns the photographs of a frame.
+        learns_appearance: whether colours and depths are updated.
+
+    Attributes:
+        state: current poses.
+        gaussians: with the current colours and depths.
+        history: figures of the passes.
     """
 
     def __init__(
@@ -91,63 +96,71 @@ class Alignment:
         self._views, self._cached, self._bytes = views, dict[tuple[int, int], list[View]](), 0
         labels = scene.posed.template.vertex_labels[scene.posed.template.faces[:, 0]]
         self._groups = torch.tensor(labels, dtype=torch.int64)[gaussians.face_index]
-        self._motion = GaussianMotion(scene.posed, gaussians, self.variables)
+        self._jacobian = CentreJacobian(scene.posed, gaussians, self.variables)
 
-    def run(self, levels: Sequence[Level], told: Callable[[], None] = lambda: None) -> None:
-        """Take the passes of all levels; `told` is called after every frame of a pass."""
+    def run(self, levels: Sequence[Level], on_frame: Callable[[], None] = lambda: None) -> None:
+        """Run the passes of all levels; `on_frame` is called after every frame of a pass."""
         for level in levels:
-            self._run_level(level, told)
+            self._run_level(level, on_frame)
 
-    def losses(self, state: BodyState, told: Callable[[], None] = lambda: None) -> Float64[np.ndarray, " F"]:
-        """Return the firm loss of every frame in a state, at the finest level's size; see `Photometer.firm_loss`."""
+    def losses(self, state: BodyState, on_frame: Callable[[], None] = lambda: None) -> Float64[np.ndarray, " F"]:
+        """Return `PhotometricLoss.rigid_loss` of every frame in a state, at the size of the finest level."""
         halvings, out = self.scene.config.levels[-1].halvings, []
         for row in range(len(self.frames)):
             vertices = self.scene.posed.place(state, row).vertices.detach()
             views = self._photographs(row, halvings)
-            firm = self._motion.firmness
-            out.append(self.scene.photometer.firm_loss(self.gaussians, vertices, firm, views))
-            told()
+            rigid = self._jacobian.rigidity
+            out.append(self.scene.photometric.rigid_loss(self.gaussians, vertices, rigid, views))
+            on_frame()
         return np.array(out)
 
-    def _run_level(self, level: Level, told: Callable[[], None]) -> None:
-        """One look more than steps: what the last step gave is looked at, too."""
+    def _run_level(self, level: Level, on_frame: Callable[[], None]) -> None:
+        """Run the passes of a level: one more than steps, because the result of the last step is evaluated too."""
+        # Levenberg-Marquardt damping: initial and least value, factors after a good and after a bad pass. The loss of a
+        # bad frame grew by more than `worse`; less may come from the change of the shared colours.
+        initial_damping, least_damping, good_factor, bad_factor, worse = 1e-2, 1e-4, 0.3, 10.0, 1.01
         F = len(self.frames)
-        damping, best = np.full(F, DAMPING), np.full(F, np.inf)
+        damping, best = np.full(F, initial_damping), np.full(F, np.inf)
         kept, normal = self.state, None
         for step in range(level.steps + 1):
-            sums = AppearanceSums(self._groups, self._motion.firmness)
+            # Linearise the photometric loss of every frame about the current poses.
+            appearance = AppearanceUpdate(self._groups, self._jacobian.rigidity)
             losses, gradients, curvatures = [], [], []
             for row in range(F):
-                evidence, gradient, curvature = self._look(row, level.halvings)
-                sums.add(evidence)
-                losses.append(evidence.loss)
+                linear, gradient, curvature = self._linearize(row, level.halvings)
+                appearance.add(linear)
+                losses.append(linear.loss)
                 gradients.append(gradient)
                 curvatures.append(curvature)
-                told()
+                on_frame()
             found, loss = Normal(np.stack(gradients), np.stack(curvatures)), np.array(losses)
-            bad = loss > WORSE * best
+            # Reset frames whose loss grew, with their earlier normal equations, and damp them more.
+            bad = loss > worse * best
             if normal is not None:
                 self.state = _mixed(kept, self.state, bad)
                 found = Normal(
                     np.where(bad[:, None], normal.gradient, found.gradient),
                     np.where(bad[:, None, None], normal.curvature, found.curvature),
                 )
-                damping = np.where(bad, damping * WILDER, np.maximum(damping * CALMER, LEAST_DAMPING))
+                damping = np.where(bad, damping * bad_factor, np.maximum(damping * good_factor, least_damping))
             best = np.where(bad, best, loss)
             kept, normal = self.state, found
             self.history.append(PassReport(level.halvings, float(loss.mean()), int(bad.sum())))
+            # One step each of colours and depths, of poses, and of cameras.
             if self.learns_appearance:
-                self.gaussians = sums.learned(self.gaussians, F)
+                self.gaussians = appearance.stepped(self.gaussians, F)
             if step < level.steps:
                 self.state = self._stepped(found, damping)
                 if self.scene.cameras is not None:
                     self.scene.cameras.step()
 
-    def _look(self, row: int, halvings: int) -> tuple[Evidence, Float64[np.ndarray, " P"], Float64[np.ndarray, "P P"]]:
-        """What the photographs of a frame say, and of its variables gradient and curvature."""
+    def _linearize(
+        self, row: int, halvings: int
+    ) -> tuple[Linearization, Float64[np.ndarray, " P"], Float64[np.ndarray, "P P"]]:
+        """Return the linearised loss of a frame, and gradient and Gauss-Newton matrix of its unknowns."""
         posed, cameras = self.scene.posed, self.scene.cameras
         placed = posed.place(self.state, row)
-        evidence = self.scene.photometer.evidence(
+        linear = self.scene.photometric.linearize(
             self.gaussians,
             placed.vertices,
             self._photographs(row, halvings),
@@ -155,17 +168,18 @@ class Alignment:
             each_camera=cameras is not None,
         )
         if cameras is not None:
-            cameras.add(evidence, self._motion.firmness)
-        gradient = self.variables.packed(*posed.gradient(placed, evidence.vertices))
-        return evidence, gradient, self._motion.curvature(placed, evidence)
+            cameras.add(linear, self._jacobian.rigidity)
+        gradient = self.variables.packed(*posed.gradient(placed, linear.vertex_gradient))
+        return linear, gradient, self._jacobian.curvature(placed, linear)
 
     def _photographs(self, row: int, halvings: int) -> list[View]:
-        """The views of a frame at a level's size, through the cameras as they are corrected now."""
+        """Return the views of a frame at a level's size, with the current corrections of the cameras."""
+        cached_bytes = 1 << 30  # bound of the cached photographs
         key = (row, halvings)
         if key not in self._cached:
             views = list(halved(self._views(self.frames[row]), halvings))
             self._bytes += sum(view.foreground.numel() + view.alpha.numel() for view in views)
-            if self._bytes > KNOWN_BYTES:
+            if self._bytes > cached_bytes:
                 self._cached, self._bytes = {}, 0
             self._cached[key] = views
         views = self._cached[key]
@@ -173,22 +187,22 @@ class Alignment:
         return views if corrections is None else [corrections.corrected(view) for view in views]
 
     def _stepped(self, normal: Normal, damping: Float64[np.ndarray, " F"]) -> BodyState:
-        """The state after one step of all frames."""
+        """Return the state after one Levenberg-Marquardt step of all frames."""
         change = changes(self.variables, self.start, self.state)
         smooth = smoothness(self.variables, self.state, self.frames, self.scene.config, self.scene.fps)
-        trusted = with_trust(normal, change, self.variables.sigma)
-        return self.variables.stepped(self.state, solve(trusted, smooth, damping))
+        with_start = with_prior(normal, change, self.variables.sigma)
+        return self.variables.stepped(self.state, solve(with_start, smooth, damping))
 
 
 def halved(views: Sequence[View], times: int) -> Sequence[View]:
-    """Return views at half their size, so many times."""
+    """Return views at half their size, `times` times over."""
     for _ in range(times):
         views = [view.halved() for view in views]
     return views
 
 
 def _mixed(old: BodyState, new: BodyState, keep: Bool[np.ndarray, " F"]) -> BodyState:
-    """The new state, but for the frames of a mask."""
+    """Return the new state, with the old one in the frames of a mask."""
 
     def of(name: str) -> np.ndarray:
         values = getattr(new, name).copy()

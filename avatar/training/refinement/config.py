@@ -1,24 +1,21 @@
-"""What decides a refinement of poses."""
+"""Configuration of the refinement of poses: unknowns, noise, priors and resolution levels."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from avatar.gaussians.sampling import SamplingConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_positive
 
-CLOTH_FACTORS: Mapping[str, float] = {"upper": 1.0, "lower": 0.5, "outer": 0.5}
-"""How firmly clothes of a label sit where they touch the skin; body, hair and shoes sit with 1."""
-
 
 @dataclass(frozen=True)
 class Level:
-    """A part of the steps.
+    """A resolution of the photographs and the passes at it.
 
     Attributes:
-        halvings: of the photographs. steps: passes over all frames and cameras.
+        halvings: of the photographs' size.
+        steps: Gauss-Newton steps; each one is a pass over all frames and cameras.
     """
 
     halvings: int
@@ -31,21 +28,27 @@ class RefineConfig:
 
     Attributes:
         sampling: Gaussians that carry the appearance, one colour each.
-        levels: of all frames, from coarse to fine. reference_levels: of the reference frame alone, which comes first.
-        jaw, expression, hands: refine them beside the body's joints and the translation.
+        reference_levels: levels of the reference frame alone, which comes first.
+        levels: levels of all frames, from coarse to fine.
+        jaw: refine the jaw too.
+        expression: refine the expression too.
+        hands: refine the fingers too.
         cameras: correct the training cameras' poses too; the mean correction is zero, intrinsics stay.
-        robust: difference of colours from which a pixel counts ever less (Geman-McClure).
-        alpha: weight of the difference between opacity and mask, against a channel of colour.
-        pixel_sigma: difference of colours that a pixel is trusted to.
-        pixels_per_error: neighbouring pixels err together: so many full-size pixels count as one.
-        rotation_sigma: degrees that a joint of the start is trusted to; translation_sigma: metres;
-            expression_sigma: coefficients. camera_rotation_sigma, camera_translation_sigma: degrees, and metres at
-            the person.
-        acceleration_sigma: degrees a frame squared that a joint turns unevenly by, at 20 frames a second (it falls
-            with the square of the frame rate); translation_acceleration_sigma: metres. Beyond twice as much the
-            motion is taken for true (Student-t), so that fast motion stays.
-        reach: metres from the skin over which the pull of clothes on the body falls to 1/e.
-        seed: of the Gaussians' places.
+        robust: scale s of the Geman-McClure kernel, a difference of colours in [0, 1].
+        alpha: weight of the squared difference of opacity and mask, relative to a colour channel.
+        pixel_sigma: standard deviation of a pixel's colour.
+        pixels_per_error: number of full-size pixels with one common error.
+        rotation_sigma: standard deviation of a joint's start, degrees.
+        translation_sigma: standard deviation of the start's translation, metres.
+        expression_sigma: standard deviation of the start's expression coefficients.
+        camera_rotation_sigma: standard deviation of a camera's rotation, degrees.
+        camera_translation_sigma: standard deviation of a camera's position, metres at the person.
+        acceleration_sigma: scale of a joint's acceleration, degrees a frame squared at 20 frames a second; it falls
+            with the square of the frame rate. Accelerations beyond twice the scale cost little (Student's t), so that
+            fast motion is kept.
+        translation_acceleration_sigma: the same for the translation, metres a frame squared.
+        reach: distance from the skin over which the rigidity of clothes falls to 1/e, metres.
+        seed: of the Gaussians' positions.
     """
 
     sampling: SamplingConfig = field(

@@ -1,4 +1,4 @@
-"""Poses of a capture's frames refined on the photographs of its training cameras."""
+"""Refine the poses of a sequence on the photographs of its training cameras: training frames, and held-out frames."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from avatar.data.views import View, read_view
 from avatar.gaussians.binding import BoundGaussians
 from avatar.training.fit.initial_colors import initial_gaussians
 from avatar.training.refinement.align import Alignment, PassReport, Scene
-from avatar.training.refinement.cameras import CameraCorrections
 from avatar.training.refinement.config import RefineConfig
-from avatar.training.refinement.evidence import Photometer
-from avatar.training.refinement.firmness import firmness
-from avatar.training.refinement.posing import PosedTemplate
+from avatar.training.refinement.nuisance import CameraCorrections
+from avatar.training.refinement.photometric import PhotometricLoss
+from avatar.training.refinement.posing import PosedTemplate, rigidity
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import rotvec_from_matrix
@@ -28,17 +27,21 @@ from smplxpp.register import BodyState
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """What a refinement gives.
+    """Refined poses with their figures.
 
     Attributes:
-        frames: that were refined, ascending.
-        start, params: their parameters before and after, a row a frame; the shape is the start's, hands are complete.
-        before, after: loss of every frame with the final colours, 0 to 1 (`Photometer.firm_loss`).
-        turned: degrees that each of the joints has turned, `joints` their names. moved: millimetres of translation.
-        kept: frames that keep their start, which the photographs like better.
-        gaussians: with the colours that were learned, on the CPU.
-        cameras: corrected `cam_from_world` by name; empty where cameras were taken for right.
-        history: what the passes saw.
+        frames: numbers of the refined frames, ascending.
+        start: parameters before, a row a frame, with complete hands.
+        params: parameters after, a row a frame; the shape is the start's.
+        before: loss of every frame at the start, with the final colours, in [0, 1] (`PhotometricLoss.rigid_loss`).
+        after: loss of every frame after the refinement.
+        turned: rotation of each joint, degrees.
+        joints: names of those joints.
+        moved: translation, millimetres.
+        kept: frames that keep their start, because their photographs fit it better.
+        gaussians: with the learned colours and depths, on the CPU.
+        cameras: corrected `cam_from_world` by name; empty where cameras were not corrected.
+        history: figures of the passes.
     """
 
     frames: tuple[int, ...]
@@ -65,16 +68,18 @@ def refine_poses(
 ) -> Refinement:
     """Refine training frames: the reference frame first, then all together, with the colours of the Gaussians.
 
-    Only training cameras are looked at. The shape of the body is the template's and stays. A frame whose photographs
-    like its start better keeps it. All is computed on the CPU, whatever the sequence's device.
+    Only images of training cameras are read. The body's shape is the template's and stays. A frame whose photographs
+    fit its start better keeps the start. Everything is computed on the CPU, whatever the sequence's device.
 
     Args:
-        sequence: whose parameters are the registered start; its images are read at full size.
-        reference: frame that colours start from, None: the first. frames: some of the training frames, None: all.
-        progress: called with the share of the frames' evaluations that are done.
+        sequence: its parameters are the registered start; its images are read at full size.
+        config: of the refinement; None: the defaults.
+        reference: frame that colours start from; None: the first.
+        frames: some of the training frames; None: all.
+        progress: called with the finished share of the frames' evaluations.
 
     Raises:
-        InputError: frames that are not trained on, or a frame without parameters or photographs.
+        InputError: frames that are not training frames, or a frame without parameters or photographs.
     """
     config = config or RefineConfig()
     chosen = tuple(sorted(sequence.train_frames if frames is None else frames))
@@ -82,18 +87,22 @@ def refine_poses(
     _require_training(sequence, (*chosen, first))
     scene = _scene(sequence, config)
     start, reference_start = _start(sequence, chosen), _start(sequence, (first,))
+    # Colours of the Gaussians from the photographs of the reference frame in its registered pose.
     posed = scene.posed
     vertices = posed.place(_state(posed, reference_start), 0).vertices.detach().double().numpy()
     whole = [read_view(sequence.capture, name, first) for name in _cameras(sequence, first)]
     sampling = replace(config.sampling, seed=config.seed)
     gaussians = initial_gaussians(sequence.rig, vertices, whole, sampling).to(device="cpu")
+    # Refine the reference frame alone, which sharpens the colours.
     counter = _EvaluationCounter(progress, config, len(chosen))
     view = _training_views(sequence)
-    begun = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
-    begun.run(config.reference_levels, counter.step)
-    if scene.cameras is not None:  # one frame says too little of cameras: they begin anew with all
+    alone = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
+    alone.run(config.reference_levels, counter.step)
+    # One frame determines cameras poorly: their corrections start from zero again with all frames.
+    if scene.cameras is not None:
         scene = replace(scene, cameras=_corrections(sequence, config))
-    return _finish(Alignment(scene, begun.gaussians, chosen, _state(posed, start), view), start, sequence, counter)
+    # Refine all frames together.
+    return _finish(Alignment(scene, alone.gaussians, chosen, _state(posed, start), view), start, sequence, counter)
 
 
 def refine_held_out(
@@ -104,14 +113,17 @@ def refine_held_out(
     frames: Sequence[int] | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> Refinement:
-    """Refine held-out frames on the photographs of training cameras, everything but their poses as it is.
+    """Refine the poses of held-out frames on the photographs of training cameras; everything else stays.
 
-    Not for driving: whoever drives an avatar with a new motion has no photographs of it. An evaluation can tell with it
-    what poses cost and what the model costs.
+    For evaluations alone: with these poses they separate the error of the poses from that of the model. An avatar that
+    is driven by a new motion has no photographs of it.
 
     Args:
+        sequence: its parameters are the registered start.
         gaussians: with the colours of a refinement of training frames, on the CPU.
-        frames: some held-out frames, None: all.
+        config: of the refinement; None: the defaults. Cameras are not corrected.
+        frames: some held-out frames; None: all.
+        progress: called with the finished share of the frames' evaluations.
 
     Raises:
         InputError: frames that are not held out, none, or one without parameters or photographs.
@@ -130,7 +142,7 @@ def refine_held_out(
 
 
 class _EvaluationCounter:
-    """Counts the frames that passes have evaluated, and reports their share."""
+    """Counts evaluations of frames and reports their finished share."""
 
     def __init__(self, progress: ProgressCallback, config: RefineConfig, frames: int) -> None:
         self._progress, self._done = progress, 0
@@ -146,17 +158,20 @@ class _EvaluationCounter:
 def _finish(
     alignment: Alignment, start: BodyParams, sequence: AvatarSequence, counter: _EvaluationCounter
 ) -> Refinement:
-    """Run an alignment, compare what came out with the start, and keep the better of both."""
+    """Run an alignment of all frames, and keep for each frame the better of its start and its result."""
     scene, frames = alignment.scene, alignment.frames
     alignment.run(scene.config.levels, counter.step)
+    # Losses of start and result with the same, final colours.
     before = alignment.losses(alignment.start, counter.step)
     after = alignment.losses(alignment.state, counter.step)
     worse = ~(after < before)
+    # Parameters of the better ones.
     body = scene.posed.body
     refined = alignment.state.to_params(body, fps=start.fps)
     complete = alignment.start.to_params(body, fps=start.fps)
     rows = [(complete if bad else refined).frame(row) for row, bad in enumerate(worse)]
     params = replace(BodyParams.concatenate(rows), betas=start.betas)
+    # Figures: degrees a joint and millimetres.
     variables = alignment.variables
     change = rotvec_from_matrix(alignment.state.rotations @ alignment.start.rotations.swapaxes(-1, -2))
     turned = np.degrees(np.linalg.norm(change[:, variables.joints], axis=-1))
@@ -185,16 +200,16 @@ def _require_training(sequence: AvatarSequence, frames: Sequence[int]) -> None:
             "frames to refine",
             expected="frames that are trained on",
             received=f"frame {other[0]}",
-            remedy="held-out frames keep their registered poses; refine_held_out refines them apart",
+            remedy="held-out frames keep their registered poses; refine_held_out refines them separately",
         )
 
 
 def _scene(sequence: AvatarSequence, config: RefineConfig) -> Scene:
     template = sequence.rig.template
-    posed = PosedTemplate(template, firmness(template, config.reach))
-    photometer = Photometer(posed.faces, sequence.background.cpu(), config)
+    posed = PosedTemplate(template, rigidity(template, config.reach))
+    photometric = PhotometricLoss(posed.faces, sequence.background.cpu(), config)
     cameras = _corrections(sequence, config) if config.cameras else None
-    return Scene(posed, photometer, config, cameras, sequence.capture.fps)
+    return Scene(posed, photometric, config, cameras, sequence.capture.fps)
 
 
 def _corrections(sequence: AvatarSequence, config: RefineConfig) -> CameraCorrections:
@@ -202,7 +217,7 @@ def _corrections(sequence: AvatarSequence, config: RefineConfig) -> CameraCorrec
 
 
 def _start(sequence: AvatarSequence, frames: Sequence[int]) -> BodyParams:
-    """The registered parameters of frames."""
+    """Return the registered parameters of frames, a row each."""
     return BodyParams.concatenate([sequence.params(frame) for frame in frames])
 
 
@@ -211,7 +226,7 @@ def _state(posed: PosedTemplate, params: BodyParams) -> BodyState:
 
 
 def _cameras(sequence: AvatarSequence, frame: int) -> list[str]:
-    """Training cameras that have an image of a frame."""
+    """Return the training cameras that have an image of a frame."""
     names = [name for name in sequence.train_cameras if sequence.capture.file(name, frame) is not None]
     if not names:
         raise InputError(f"frame {frame}", expected="an image of a training camera", received="none")
@@ -219,7 +234,7 @@ def _cameras(sequence: AvatarSequence, frame: int) -> list[str]:
 
 
 def _training_views(sequence: AvatarSequence) -> Callable[[int], list[View]]:
-    """Reads the views of a frame by training cameras, cut to the person; those of nobody are left out."""
+    """Return a reader of a frame's views by training cameras, cut to the person; empty masks are left out."""
 
     def read(frame: int) -> list[View]:
         views = (read_view(sequence.capture, name, frame) for name in _cameras(sequence, frame))

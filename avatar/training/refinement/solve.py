@@ -1,4 +1,4 @@
-"""One step of all frames together: photographs, trust in the start, and smoothness in time."""
+"""The normal equations of all frames: photographs, prior about the start, smoothness in time, one banded solve."""
 
 from __future__ import annotations
 
@@ -14,18 +14,14 @@ from smplxpp.core.params import DEFAULT_FPS
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.register import BodyState
 
-TAIL = 2.0
-"""Multiples of the trusted acceleration from which an acceleration counts as motion."""
-REFERENCE_FPS = 20.0
-"""Frames per second to which `RefineConfig.acceleration_sigma` refers."""
-
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of F frames.
+    """Gradient and Gauss-Newton matrices of F frames with P unknowns each, of half a sum of squares.
 
     Attributes:
-        gradient: of half the sum of squares. curvature: its second derivative within a frame.
+        gradient: by the unknowns of each frame.
+        curvature: blocks of the frames; frames are coupled by `Smoothness` alone.
     """
 
     gradient: Float64[np.ndarray, "F P"]
@@ -33,13 +29,13 @@ class Normal:
 
 
 def changes(variables: Variables, start: BodyState, state: BodyState) -> Float64[np.ndarray, "F P"]:
-    """What has changed since the start: rotation vectors in the parents' frames, translation, expression."""
+    """Return the change since the start: rotation vectors in the parents' frames, translation, expression."""
     turned = rotvec_from_matrix(state.rotations @ start.rotations.swapaxes(-1, -2))
     return variables.packed(turned, state.transl - start.transl, state.expression - start.expression)
 
 
-def with_trust(normal: Normal, change: Float64[np.ndarray, "F P"], sigma: Float64[np.ndarray, " P"]) -> Normal:
-    """Add `sum (change / sigma)^2 / 2`: each number stays near its registered start."""
+def with_prior(normal: Normal, change: Float64[np.ndarray, "F P"], sigma: Float64[np.ndarray, " P"]) -> Normal:
+    """Add the Gaussian prior `sum (change / sigma)^2 / 2` about the registered start."""
     curvature = normal.curvature.copy()
     index = np.arange(len(sigma))
     curvature[:, index, index] += 1.0 / sigma**2
@@ -48,12 +44,12 @@ def with_trust(normal: Normal, change: Float64[np.ndarray, "F P"], sigma: Float6
 
 @dataclass(frozen=True, eq=False)
 class Smoothness:
-    """Accelerations of every three frames in a row, `a = d_next - 2 d + d_before`, and how much each counts.
+    """The smoothness term linearised: accelerations `a = d_next - 2 d + d_before` and their weights.
 
     Attributes:
-        triple: whether a frame has neighbours one frame before and after it.
-        acceleration: of the state as it is, 0 elsewhere.
-        weight: by number; Student's t with `TAIL`: `1 / (sigma^2 (1 + |a|^2 / (TAIL sigma)^2))` a joint.
+        triple: whether a frame has neighbours one frame before and one after it.
+        acceleration: of the current state, 0 elsewhere.
+        weight: of each number's squared acceleration, 0 elsewhere; see `smoothness`.
     """
 
     triple: Bool[np.ndarray, " F"]
@@ -64,21 +60,33 @@ class Smoothness:
 def smoothness(
     variables: Variables, state: BodyState, frames: tuple[int, ...], config: RefineConfig, fps: float | None
 ) -> Smoothness:
-    """Look at how unevenly a state moves.
+    """Return accelerations of a state and their weights under Student's t, for reweighted least squares.
+
+    `w = 1 / (sigma^2 (1 + |a|^2 / (tail sigma)^2))`, with |a| over the three numbers of a joint: accelerations beyond
+    `tail` sigma are fast motion and cost little.
 
     Args:
-        frames: their numbers, ascending. fps: None counts as `DEFAULT_FPS`.
+        variables: the unknowns of a frame.
+        state: poses of the frames.
+        frames: their numbers, ascending.
+        config: sigma of turns, translation and expression.
+        fps: frames a second; None counts as `DEFAULT_FPS`.
     """
+    tail = 2.0  # multiples of sigma
+    reference_fps = 20.0  # frame rate of the configuration's sigma; accelerations a frame fall with its square
     number = np.array(frames)
     F, K = len(number), len(variables.joints)
+    # Frames whose two neighbours are known.
     triple = np.zeros(F, dtype=bool)
     triple[1:-1] = (np.diff(number)[:-1] == 1) & (np.diff(number)[1:] == 1)
+    # Second differences, of rotations by rotation vectors between consecutive frames.
     acceleration = np.zeros((F, len(variables)))
     if F > 1:
         turns = rotvec_from_matrix(state.rotations[1:] @ state.rotations[:-1].swapaxes(-1, -2))
         speed = variables.packed(turns, np.diff(state.transl, axis=0), np.diff(state.expression, axis=0))
         acceleration[1:-1] = np.where(triple[1:-1, None], np.diff(speed, axis=0), 0.0)
-    slower = (REFERENCE_FPS / (fps or DEFAULT_FPS)) ** 2
+    # Standard deviation of each number at this frame rate.
+    slower = (reference_fps / (fps or DEFAULT_FPS)) ** 2
     sigma = slower * np.concatenate(
         [
             np.full(3 * K, np.radians(config.acceleration_sigma)),
@@ -86,26 +94,34 @@ def smoothness(
             np.full(variables.expressions, 0.5 * config.expression_sigma),
         ]
     )
+    # Weights of Student's t; the three numbers of a joint, and of the translation, share their norm.
     size = np.abs(acceleration)
-    for start in range(0, 3 * K + 3, 3):  # the three numbers of a joint count together
+    for start in range(0, 3 * K + 3, 3):
         size[:, start : start + 3] = np.linalg.norm(acceleration[:, start : start + 3], axis=1, keepdims=True)
-    weight = 1.0 / (sigma**2 * (1.0 + (size / (TAIL * sigma)) ** 2))
+    weight = 1.0 / (sigma**2 * (1.0 + (size / (tail * sigma)) ** 2))
     return Smoothness(triple, acceleration, np.where(triple[:, None], weight, 0.0))
 
 
 def solve(normal: Normal, smooth: Smoothness, damping: Float64[np.ndarray, " F"]) -> Float64[np.ndarray, "F P"]:
-    """Return the step of every frame, `(H + damping diag H + S) d = -(g + s)`, one banded system.
+    """Return the Levenberg-Marquardt step of every frame, `(H + damping diag H + S) d = -(g + s)`.
+
+    H and g are the frames' blocks, S = D^T W D and s = D^T W a those of the smoothness with D the second difference. S
+    couples frames up to two apart, so that the matrix is banded, with half-width 3 P.
 
     Args:
-        damping: Levenberg and Marquardt's, by frame.
+        normal: gradient and blocks of the frames.
+        smooth: accelerations and their weights.
+        damping: of each frame.
     """
     F, P = normal.gradient.shape
     band = P * min(F, 3)
     matrix = np.zeros((band, F * P))  # lower form: matrix[i - j, j]
+    # Damp the diagonal of every block.
     gradient = normal.gradient.copy()
     blocks = normal.curvature.copy()
     index = np.arange(P)
     blocks[:, index, index] *= 1.0 + damping[:, None]
+    # Smoothness of each triple: weight w times the outer product of (1, -2, 1).
     diagonal = np.arange(F * P).reshape(F, P)
     coupling = {1: np.zeros((F, P)), 2: np.zeros((F, P))}
     for t in np.flatnonzero(smooth.triple):
@@ -116,6 +132,7 @@ def solve(normal: Normal, smooth: Smoothness, damping: Float64[np.ndarray, " F"]
         coupling[1][t - 1] -= 2.0 * w
         coupling[1][t] -= 2.0 * w
         coupling[2][t - 1] += w
+    # Fill the band: diagonals of the blocks, then the couplings of frames one and two apart.
     for k in range(P):
         matrix[k, :].reshape(F, P)[:, : P - k] = blocks[:, index[k:], index[: P - k]]
     for offset, values in coupling.items():

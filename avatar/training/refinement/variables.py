@@ -1,4 +1,4 @@
-"""Which numbers of a frame are refined: their order in a vector, their steps, how points move with them."""
+"""The unknowns of a frame: their order in a vector, their steps, and the Jacobian of Gaussian centres."""
 
 from __future__ import annotations
 
@@ -11,27 +11,23 @@ from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians, corner_weights
 from avatar.training.refinement.config import RefineConfig
-from avatar.training.refinement.evidence import Evidence
+from avatar.training.refinement.photometric import Linearization
 from avatar.training.refinement.posing import Placed, PosedTemplate
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.register import BodyState
 
-NOTHING = 1e-3
-"""Share of the mean curvature below which a Gaussian says nothing."""
-SAMPLED = 6000
-"""Gaussians that a curvature is summed over, at least, where there are more: it is a mean of neighbours anyway."""
+# Joints of the SMPL-X order: the root and 21 body joints first, then the jaw, two eyes, and the fingers.
 BODY_JOINTS, JAW, FIRST_FINGER = 22, 22, 25
-"""Joints of the SMPL-X order: root and body first, then the jaw, the eyes, the fingers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Variables:
-    """The P numbers of a frame that are refined: turns of joints, translation, expression.
+    """The P unknowns of a frame, in this order: turns of K joints (3 each), translation (3), expression.
 
     Attributes:
-        joints: that turn.
-        expressions: number of coefficients.
-        sigma: what each number of the start is trusted to.
+        joints: indices of the joints that turn.
+        expressions: number of expression coefficients.
+        sigma: standard deviation of the prior about the start: radians, metres, coefficients.
     """
 
     joints: Int64[np.ndarray, " K"]
@@ -43,7 +39,7 @@ class Variables:
 
     @staticmethod
     def of_body(joint_count: int, expressions: int, config: RefineConfig) -> Variables:
-        """Choose those that a body has and the configuration asks for."""
+        """Choose the unknowns that a body has and the configuration requests."""
         joints = list(range(min(BODY_JOINTS, joint_count)))
         if config.jaw and joint_count > FIRST_FINGER:
             joints.append(JAW)
@@ -61,27 +57,27 @@ class Variables:
 
     @property
     def turns(self) -> slice:
-        """Where the turns are."""
+        """Columns of the turns in the vector of unknowns."""
         return slice(0, 3 * len(self.joints))
 
     @property
     def transl(self) -> slice:
-        """Where the translation is."""
+        """Columns of the translation in the vector of unknowns."""
         return slice(3 * len(self.joints), 3 * len(self.joints) + 3)
 
     @property
     def expression(self) -> slice:
-        """Where the expression is."""
+        """Columns of the expression in the vector of unknowns."""
         return slice(3 * len(self.joints) + 3, len(self))
 
     def packed(self, turns: np.ndarray, transl: np.ndarray, expression: np.ndarray) -> Float64[np.ndarray, "*T P"]:
-        """One vector of (..., J, 3) turns, (..., 3) translations and (..., E) coefficients."""
+        """Pack (..., J, 3) turns, (..., 3) translations and (..., E) coefficients into vectors of unknowns."""
         chosen = turns[..., self.joints, :]
         flat = chosen.reshape(*chosen.shape[:-2], -1)
         return np.concatenate([flat, transl, expression[..., : self.expressions]], axis=-1)
 
     def stepped(self, state: BodyState, steps: Float64[np.ndarray, "T P"]) -> BodyState:
-        """The state after steps, `R_j <- exp(d_j) R_j`."""
+        """Return the state after steps: `R_j <- exp(d_j) R_j`, translation and expression added."""
         rotations = state.rotations.copy()
         turned = matrix_from_rotvec(steps[:, self.turns].reshape(len(steps), -1, 3))
         rotations[:, self.joints] = turned @ rotations[:, self.joints]
@@ -90,41 +86,63 @@ class Variables:
         return BodyState(rotations, state.transl + steps[:, self.transl], state.betas, expression)
 
 
-class GaussianMotion:
-    """How the centres of Gaussians move with the variables of a frame, for the curvature of the loss.
+class CentreJacobian:
+    """Derivatives of Gaussian centres by the unknowns of a frame, for the Gauss-Newton matrix.
 
     Args:
-        posed: the template. gaussians: on it. variables: of a frame.
+        posed: the template.
+        gaussians: bound to the template.
+        variables: the unknowns of a frame.
+
+    Attributes:
+        descends: (N, K) share of a Gaussian's skin weights on each joint and its descendants.
+        rigidity: (N,) of the Gaussians.
+        facial: indices of the M Gaussians that the expression moves.
+        facial_dirs: (M, 3, E) their derivatives by the expression in the T-pose, metres a unit.
+        facial_skin: (M, J) their skin weights.
     """
 
     def __init__(self, posed: PosedTemplate, gaussians: BoundGaussians, variables: Variables) -> None:
         self.posed, self.variables = posed, variables
+        # Interpolate the weights of the triangle's corners at each Gaussian.
         corners = posed.faces[gaussians.face_index]
         weight = corner_weights(gaussians.barycentric)
         skin = (weight[..., None] * posed.weights[corners]).sum(1)
         hangs = torch.tensor(posed.kinematics.descends_from[:, variables.joints], dtype=torch.float32)
-        self.hanging = skin @ hangs
-        """(N, K): share of a Gaussian that follows each joint."""
-        self.firmness = (weight * posed.firmness[corners]).sum(1)
-        head = torch.zeros(len(posed.firmness), 3, variables.expressions)
+        self.descends = skin @ hangs
+        self.rigidity = (weight * posed.rigidity[corners]).sum(1)
+        # Gaussians of the face that the expression moves.
+        head = torch.zeros(len(posed.rigidity), 3, variables.expressions)
         head[: posed.body.vertex_count] = posed.expression_dirs[..., : variables.expressions]
         moves = head.abs().amax(dim=(1, 2))[corners].amax(1) > 0 if variables.expressions else torch.zeros(0)
         self.facial = torch.nonzero(moves).flatten()
         self.facial_dirs = (weight[self.facial, :, None, None] * head[corners[self.facial]]).sum(1)
         self.facial_skin = skin[self.facial]
 
-    def curvature(self, placed: Placed, evidence: Evidence) -> Float64[np.ndarray, "P P"]:
-        """Return `sum_i f_i J_i^T M_i J_i` over the Gaussians that say something, f their firmness."""
-        strength = evidence.curvature.diagonal(dim1=1, dim2=2).sum(-1) * self.firmness
-        rows = torch.nonzero(strength > NOTHING * strength.mean()).flatten()
-        every = max(1, len(rows) // SAMPLED)
+    def curvature(self, placed: Placed, linear: Linearization) -> Float64[np.ndarray, "P P"]:
+        """Return the Gauss-Newton matrix of a frame, `sum_i f_i J_i^T M_i J_i` over the Gaussians, f their rigidity.
+
+        Gaussians of little curvature are left out, and of the others every n-th stands for n of them, because
+        neighbours have nearly the same J.
+
+        Args:
+            placed: the template in the frame's pose.
+            linear: linearisation of the loss about that pose.
+        """
+        # Gaussians below this share of the mean curvature are left out; at least so many of the others are summed.
+        least_share, sampled = 1e-3, 6000
+        strength = linear.curvature.diagonal(dim1=1, dim2=2).sum(-1) * self.rigidity
+        rows = torch.nonzero(strength > least_share * strength.mean()).flatten()
+        every = max(1, len(rows) // sampled)
         rows = rows[::every].contiguous()
-        J = self.jacobian(placed, evidence.means, rows)
-        M = evidence.curvature[rows] * (every * self.firmness[rows, None, None])
+        # Block of turns and translation.
+        J = self.jacobian(placed, linear.means, rows)
+        M = linear.curvature[rows] * (every * self.rigidity[rows, None, None])
         moved = M @ J
         P, at = len(self.variables), self.variables.expression.start
         out = np.zeros((P, P))
         out[:at, :at] = _product(J, moved)
+        # Blocks of the expression, over the Gaussians that it moves.
         if P > at:
             facial = torch.isin(self.facial, rows)
             own = self.facial_jacobian(placed, facial)
@@ -137,15 +155,21 @@ class GaussianMotion:
     def jacobian(
         self, placed: Placed, means: Float32[Tensor, "N 3"], rows: Int64[Tensor, " n"]
     ) -> Float32[Tensor, "n 3 Q"]:
-        """Return how centres move with turns and translation, metres a unit.
+        """Return the derivatives of chosen centres by turns and translation, metres a unit.
 
-        A turn d about joint j moves a point by `s_j (P_j d) x (x - p_j)`, s_j the share of it that hangs on the joint:
-        exact where a point has one weight, good enough where it has several, for a curvature.
+        A turn d of joint j moves a point by `s_j (P_j d) x (x - p_j)`, P_j the parent's rotation, p_j the joint and s_j
+        the point's skin weight on the joint and its descendants. This is exact for points with one weight and accurate
+        enough for a curvature otherwise.
+
+        Args:
+            placed: the template in the frame's pose.
+            means: centres of all Gaussians, world, metres.
+            rows: the n chosen ones.
         """
         variables = self.variables
         joints = torch.tensor(placed.joints[variables.joints], dtype=torch.float32)
         axes = torch.tensor(placed.parent_turned[variables.joints], dtype=torch.float32)
-        arm = (means[rows, None, :] - joints) * self.hanging[rows, :, None]  # (n, K, 3)
+        arm = (means[rows, None, :] - joints) * self.descends[rows, :, None]  # (n, K, 3)
         out = means.new_zeros(len(rows), 3, variables.transl.stop)
         turns = out[:, :, variables.turns].unflatten(2, (-1, 3))  # (n, 3, K, axis)
         for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # row k of the cross product
@@ -154,11 +178,11 @@ class GaussianMotion:
         return out
 
     def facial_jacobian(self, placed: Placed, chosen: Bool[Tensor, " M"]) -> Float32[Tensor, "n 3 E"]:
-        """Return how chosen centres of `facial` move with the expression, metres a unit."""
+        """Return the derivatives of chosen centres of `facial` by the expression, metres a unit."""
         turned = torch.tensor(placed.turned, dtype=torch.float32).reshape(-1, 9)
         return (self.facial_skin[chosen] @ turned).view(-1, 3, 3) @ self.facial_dirs[chosen]
 
 
 def _product(left: Tensor, right: Tensor) -> np.ndarray:
-    """`sum_i L_i^T R_i` of (n, 3, a) and (n, 3, b)."""
+    """Return `sum_i L_i^T R_i` of (n, 3, a) and (n, 3, b), as one matrix product."""
     return (left.reshape(-1, left.shape[-1]).T @ right.reshape(-1, right.shape[-1])).double().numpy()

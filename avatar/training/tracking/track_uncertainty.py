@@ -16,7 +16,7 @@ from avatar.gaussians.gather import gather_rows
 from avatar.models.tracked_surface import TrackedAvatar
 from avatar.rig.rig import Pose
 from avatar.training.refinement.config import RefineConfig
-from avatar.training.refinement.evidence import Photometer
+from avatar.training.refinement.photometric import PhotometricLoss
 from avatar.training.tracking.cloth_prediction import CORRECTION_DECAY
 
 # Structure tensors. The kernel is flat and the weight 1, so that every full-size pixel counts once.
@@ -66,7 +66,8 @@ def structure_tensors(
         bound = avatar.gaussians.snapshot().to(device=rig.device)
     with torch.enable_grad():
         # Structure tensor of the rendering at every Gaussian, in the world.
-        seen = Photometer(rig.faces, background, _PLAIN_SUMS).evidence(bound, vertices, views, halvings=halvings)
+        loss = PhotometricLoss(rig.faces, background, _PLAIN_SUMS)
+        seen = loss.linearize(bound, vertices, views, halvings=halvings)
         # The interpolation from control points to Gaussians; its transpose distributes tensors to control points.
         table = torch.zeros(avatar.cage.count, 10, device=controls.device, requires_grad=True)
         spread = on_triangles(gather_rows(avatar.cage(table), rig.faces[bound.face_index]), bound.barycentric)

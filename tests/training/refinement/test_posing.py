@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from avatar.training.refinement.config import RefineConfig
-from avatar.training.refinement.firmness import firmness
-from avatar.training.refinement.posing import FirmSkinning, PosedTemplate
+from avatar.training.refinement.posing import PosedTemplate, RigiditySkinning, rigidity
 from avatar.training.refinement.variables import BODY_JOINTS, Variables
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.register import BodyState
@@ -20,9 +19,9 @@ CONFIG = RefineConfig()
 TURN = matrix_from_rotvec(np.array([0.0, 0.2, 0.0]))
 
 
-def posed_template(firm: np.ndarray | None = None) -> PosedTemplate:
+def posed_template(rigid: np.ndarray | None = None) -> PosedTemplate:
     it = template()
-    return PosedTemplate(it, np.ones(it.vertex_count) if firm is None else firm)
+    return PosedTemplate(it, np.ones(it.vertex_count) if rigid is None else rigid)
 
 
 def state() -> BodyState:
@@ -47,7 +46,7 @@ def test_gradients_of_skinning_are_those_of_float64_autograd():
     weights = torch.softmax(3.0 * torch.randn(V, J, generator=random), dim=1)
     pull = torch.randn(V, 3, generator=random)
     ours = rest.clone().requires_grad_(), transforms.clone().requires_grad_()
-    FirmSkinning.apply(*ours, weights, torch.ones(V)).backward(pull)
+    RigiditySkinning.apply(*ours, weights, torch.ones(V)).backward(pull)
     slow = rest.double().requires_grad_(), transforms.double().requires_grad_()
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(J, 1, 4)
     skin(slow[0], weights.double(), torch.cat([slow[1], last], dim=1)).backward(pull.double())
@@ -99,12 +98,12 @@ def test_steps_of_variables_are_the_turns_that_gradients_speak_of():
     assert list(variables.joints[:BODY_JOINTS]) == list(range(BODY_JOINTS))
 
 
-def test_what_has_no_firmness_does_not_pull_at_all():
+def test_loose_cloth_has_no_gradient_on_the_pose():
     it = template()
-    firm = firmness(it, 0.01)
-    loose = firm == 0.0
-    assert (firm[~it.cloth_mask] == 1.0).all() and loose[it.cloth_mask].mean() > 0.5
-    posed, frame = posed_template(firm), state()
+    rigid = rigidity(it, 0.01)
+    loose = rigid == 0.0
+    assert (rigid[~it.cloth_mask] == 1.0).all() and loose[it.cloth_mask].mean() > 0.5
+    posed, frame = posed_template(rigid), state()
     pull = torch.randn(it.vertex_count, 3, generator=torch.Generator().manual_seed(0))
     only_cloth = pull * torch.tensor(loose)[:, None]
     for part in posed.gradient(posed.place(frame, 0), only_cloth):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avatar.training.refinement.config import RefineConfig
-from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_trust
+from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_prior
 from avatar.training.refinement.variables import Variables
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.register import BodyState
@@ -77,7 +77,7 @@ def test_trust_pulls_back_to_the_start():
     state = VARIABLES.stepped(start, np.full((2, P), 0.01))
     change = changes(VARIABLES, start, state)
     np.testing.assert_allclose(change, 0.01, atol=1e-9)
-    normal = with_trust(Normal(np.zeros((2, P)), np.zeros((2, P, P))), change, VARIABLES.sigma)
+    normal = with_prior(Normal(np.zeros((2, P)), np.zeros((2, P, P))), change, VARIABLES.sigma)
     step = solve(normal, smoothness(VARIABLES, state, (0, 1), CONFIG, None), np.zeros(2))
     back = changes(VARIABLES, start, VARIABLES.stepped(state, step))
     assert np.abs(back).max() < 1e-4

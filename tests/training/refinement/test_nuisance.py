@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from avatar.training.refinement.cameras import CameraCorrections
+from avatar.training.refinement.nuisance import CameraCorrections
 from avatar.training.refinement.refine import refine_poses
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from tests.dolls.gesturing import gestures, sequence, write_gestures

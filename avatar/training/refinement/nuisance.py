@@ -1,0 +1,136 @@
+"""Nuisance variables: colours and depths of the Gaussians, and small corrections of the training cameras' poses.
+
+Each is summed over all views of a pass and takes one Gauss-Newton step of its own: block coordinate descent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64
+from torch import Tensor
+
+from avatar.data.views import View
+from avatar.gaussians.binding import BoundGaussians
+from avatar.training.refinement.config import RefineConfig
+from avatar.training.refinement.photometric import Linearization
+from smplxpp.core.rotations import matrix_from_rotvec
+
+
+class AppearanceUpdate:
+    """Sums over frames of what moves colours and depths, and their step.
+
+    Colours: `c <- c - sum g / sum m`, g the gradient of a colour and m the weighted mass of its pixels: the
+    simultaneous iterative reconstruction of Gilbert (1972). It needs no step size and cannot overshoot, because the
+    contributions of all Gaussians to a pixel sum to at most 1.
+
+    Depths: overlapping Gaussians draw the person too thick, the more so the coarser they and the pixels are. A body
+    whose feet a skirt hides would sink until the head fits. One shift along the normals for each group corrects that: a
+    Gauss-Newton step of one unknown, gradient `sum f n.g` and curvature `sum f n^T M n` with the rigidity f.
+
+    Args:
+        groups: of the Gaussians, numbered from 0.
+        rigidity: of the Gaussians.
+    """
+
+    def __init__(self, groups: Int64[Tensor, " N"], rigidity: Float32[Tensor, " N"]) -> None:
+        N, G = len(groups), int(groups.max()) + 1 if len(groups) else 0
+        self.groups, self.rigidity = groups, rigidity
+        self.gradient, self.mass = torch.zeros(N, 3), torch.zeros(N)
+        self._depth_gradient = torch.zeros(G, dtype=torch.float64)
+        self._depth_curvature = torch.zeros(G, dtype=torch.float64)
+
+    def add(self, linear: Linearization) -> None:
+        """Add the views of a frame to the sums."""
+        self.gradient += linear.color_gradient
+        self.mass += linear.color_mass
+        # Project gradient and curvature of the centres on the normals, and sum over each group.
+        normals, rigid = linear.normals, self.rigidity
+        gradient = rigid * (normals * linear.mean_gradient).sum(-1)
+        curvature = rigid * (normals * (linear.curvature @ normals[..., None])[..., 0]).sum(-1)
+        self._depth_gradient.index_add_(0, self.groups, gradient.double())
+        self._depth_curvature.index_add_(0, self.groups, curvature.double())
+
+    def stepped(self, gaussians: BoundGaussians, frames: int) -> BoundGaussians:
+        """Return the Gaussians after one step of colours and depths; Gaussians that no pixel shows keep their colour.
+
+        Args:
+            gaussians: of which the sums were taken.
+            frames: number of frames in the sums; it scales the prior of the depths.
+        """
+        least_mass = 1e-6  # share of the mean mass below which no pixel shows a Gaussian
+        depth_sigma, deepest, highest = 0.003, -0.012, 0.002  # metres: prior of a depth and its bounds along the normal
+        seen = self.mass > least_mass * self.mass.mean()
+        step = torch.where(seen[:, None], self.gradient / torch.where(seen, self.mass, 1.0)[:, None], 0.0)
+        # Gauss-Newton step of the depths with a Gaussian prior about 0.
+        prior = frames / depth_sigma**2
+        depth = torch.zeros_like(self._depth_gradient).index_copy_(0, self.groups, gaussians.normal_offset.double())
+        depth = depth - (self._depth_gradient + prior * depth) / (self._depth_curvature + prior)
+        depth = depth.clamp(deepest, highest)
+        return replace(gaussians, dc=(gaussians.dc - step).clamp(0.0, 1.0), normal_offset=depth[self.groups].float())
+
+
+class CameraCorrections:
+    """A rigid transform of the world for each camera, `cam_from_world <- cam_from_world X_c`; intrinsics stay.
+
+    The gauge is fixed by a zero mean of the corrections: otherwise person and cameras could drift together. Rotations
+    are about `center`, so that the translation of a correction is the shift of the person.
+
+    Args:
+        names: of the cameras.
+        center: of the person, metres.
+        config: standard deviations of rotation and translation.
+
+    Attributes:
+        motions: (C, 6) rotation vectors, radians, and translations, metres.
+    """
+
+    def __init__(self, names: Sequence[str], center: Float64[np.ndarray, " 3"], config: RefineConfig) -> None:
+        self.names, self.center, self.config = tuple(names), center, config
+        self.motions: Float64[np.ndarray, "C 6"] = np.zeros((len(self.names), 6))
+        self._sums = np.zeros((len(self.names), 6)), np.zeros((len(self.names), 6, 6))
+
+    def matrix(self, name: str) -> Float64[np.ndarray, "4 4"]:
+        """Return X of a camera as a matrix."""
+        motion = self.motions[self.names.index(name)]
+        out = np.eye(4)
+        out[:3, :3] = matrix_from_rotvec(motion[:3])
+        out[:3, 3] = self.center - out[:3, :3] @ self.center + motion[3:]
+        return out
+
+    def corrected(self, view: View) -> View:
+        """Return the view with the corrected pose of its camera."""
+        camera = view.camera
+        return replace(view, camera=replace(camera, cam_from_world=camera.cam_from_world @ self.matrix(view.name)))
+
+    def add(self, linear: Linearization, rigidity: Float32[Tensor, " N"]) -> None:
+        """Add the views of a frame to the normal equations of their cameras, `J = [-[x - center]_x, I]`."""
+        gradient, curvature = self._sums
+        arm = linear.means - torch.tensor(self.center, dtype=torch.float32)
+        zero = torch.zeros_like(arm[:, 0])
+        x, y, z = arm.unbind(-1)
+        turned = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], dim=-1).view(-1, 3, 3)
+        J = torch.cat([turned, torch.eye(3).expand(len(arm), 3, 3)], dim=-1)
+        for name, (mean_gradient, own) in linear.cameras.items():
+            row = self.names.index(name)
+            gradient[row] += torch.einsum("nij,ni,n->j", J, mean_gradient, rigidity).double().numpy()
+            moved = (own * rigidity[:, None, None]) @ J
+            curvature[row] += (J.reshape(-1, 6).T @ moved.reshape(-1, 6)).double().numpy()
+
+    def step(self) -> None:
+        """Take one Gauss-Newton step of all cameras, with a Gaussian prior about no correction, and clear the sums."""
+        gradient, curvature = self._sums
+        self._sums = np.zeros_like(gradient), np.zeros_like(curvature)
+        sigma = np.repeat([np.radians(self.config.camera_rotation_sigma), self.config.camera_translation_sigma], [3, 3])
+        prior = np.diag(1.0 / sigma**2)
+        for row in range(len(self.names)):
+            right = gradient[row] + self.motions[row] / sigma**2
+            self.motions[row] -= np.linalg.solve(curvature[row] + prior, right)
+        self.motions -= self.motions.mean(axis=0)  # the gauge
+
+    def poses(self, cam_from_world: Mapping[str, Float64[np.ndarray, "4 4"]]) -> dict[str, Float64[np.ndarray, "4 4"]]:
+        """Return the corrected `cam_from_world` of all cameras by name."""
+        return {name: cam_from_world[name] @ self.matrix(name) for name in self.names}
