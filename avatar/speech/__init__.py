@@ -1,22 +1,22 @@
-"""Speech to an avatar's face, voice and gestures: phonemes in time, mouth shapes, motion; engines that give phonemes.
+"""Speech to face, voice and gestures: phonemes in time, articulators, motion, and the engines that give phonemes.
 
-No torch, and no engine is imported before it is asked for.
+The room needs no torch, and imports an engine only when it is used.
 """
 
 from avatar.speech.coarticulation import ARTICULATORS, articulate
 from avatar.speech.face import Face
-from avatar.speech.performance import Performer, TalkConfig, idle_motion, talking_motion
 from avatar.speech.phonemes import SILENCE, Phoneme, Speech
-from avatar.speech.stance import Stance
+from avatar.speech.speech_animation import SpeechAnimator, TalkConfig, idle_motion, talking_motion
+from avatar.speech.standing_body import StandingBody
 
 __all__ = [
     "ARTICULATORS",
     "SILENCE",
     "Face",
-    "Performer",
     "Phoneme",
     "Speech",
-    "Stance",
+    "SpeechAnimator",
+    "StandingBody",
     "TalkConfig",
     "articulate",
     "idle_motion",

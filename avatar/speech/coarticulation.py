@@ -1,8 +1,8 @@
-"""Phonemes to a mouth that moves: targets of articulators, blended by dominance functions.
+"""Coarticulation: turn phonemes into articulator curves by blending viseme targets with dominance functions.
 
-Cohen and Massaro, Modeling coarticulation in synthetic visual speech (1993): every phoneme has, for every articulator
-of its own, a target and a dominance that decays away from it; the curve is `sum_i D_i(t) T_i / (sum_i D_i(t) + rest)`.
-Rounding thus spreads through consonants that do not care for it, and lips close wherever a bilabial says so.
+Cohen and Massaro, Modeling coarticulation in synthetic visual speech (1993): every phoneme has, for each articulator
+that it needs, a target and a dominance that decays with time from it; a curve is `sum_i D_i(t) T_i / (sum_i D_i(t) +
+rest)`. Rounding thus spreads through consonants without a rounding target, and lips close for every bilabial.
 """
 
 from __future__ import annotations
@@ -18,26 +18,25 @@ ARTICULATORS = ("jaw", "press", "tuck", "round", "spread", "bare")
 """Jaw hanging, lips pressed together, lower lip under the teeth, lips rounded, spread, teeth bared: 0 to 1."""
 _JAW, _PRESS, _TUCK = (ARTICULATORS.index(name) for name in ("jaw", "press", "tuck"))
 
-# Articulator -> (target, dominance). What is not named is left to the neighbours.
-_Shape = dict[str, tuple[float, float]]
-_VOWEL = 1.0
+# Articulator -> (target, dominance). Articulators that a viseme does not name follow the neighbouring phonemes.
+_Viseme = dict[str, tuple[float, float]]
 
 
-def _vowel(jaw: float, round_: float = 0.0, spread: float = 0.0) -> _Shape:
+def _vowel(jaw: float, round_: float = 0.0, spread: float = 0.0) -> _Viseme:
     return {
-        **{"jaw": (jaw, _VOWEL), "round": (round_, _VOWEL), "spread": (spread, _VOWEL)},
-        **{"press": (0.0, _VOWEL), "tuck": (0.0, _VOWEL)},
+        **{"jaw": (jaw, 1.0), "round": (round_, 1.0), "spread": (spread, 1.0)},
+        **{"press": (0.0, 1.0), "tuck": (0.0, 1.0)},
     }
 
 
-_BILABIAL: _Shape = {"jaw": (0.0, 3.0), "press": (1.0, 4.0), "tuck": (0.0, 2.0), "bare": (0.0, 2.0)}
-_LABIODENTAL: _Shape = {"jaw": (0.12, 2.0), "tuck": (1.0, 4.0), "press": (0.0, 2.0), "bare": (0.2, 1.0)}
-_DENTAL: _Shape = {"jaw": (0.25, 0.8), "bare": (0.3, 1.0), "press": (0.0, 1.0)}
-_ALVEOLAR: _Shape = {"jaw": (0.18, 0.6), "bare": (0.2, 0.5), "press": (0.0, 0.8)}
-_VELAR: _Shape = {"jaw": (0.25, 0.4), "press": (0.0, 0.8)}
-_POSTALVEOLAR: _Shape = {"jaw": (0.12, 1.2), "round": (0.7, 1.5), "bare": (0.5, 1.2), "press": (0.0, 1.0)}
-_SIBILANT: _Shape = {"jaw": (0.08, 1.4), "spread": (0.35, 0.6), "bare": (0.5, 1.2), "press": (0.0, 1.0)}
-SHAPES: dict[str, _Shape] = {
+_BILABIAL: _Viseme = {"jaw": (0.0, 3.0), "press": (1.0, 4.0), "tuck": (0.0, 2.0), "bare": (0.0, 2.0)}
+_LABIODENTAL: _Viseme = {"jaw": (0.12, 2.0), "tuck": (1.0, 4.0), "press": (0.0, 2.0), "bare": (0.2, 1.0)}
+_DENTAL: _Viseme = {"jaw": (0.25, 0.8), "bare": (0.3, 1.0), "press": (0.0, 1.0)}
+_ALVEOLAR: _Viseme = {"jaw": (0.18, 0.6), "bare": (0.2, 0.5), "press": (0.0, 0.8)}
+_VELAR: _Viseme = {"jaw": (0.25, 0.4), "press": (0.0, 0.8)}
+_POSTALVEOLAR: _Viseme = {"jaw": (0.12, 1.2), "round": (0.7, 1.5), "bare": (0.5, 1.2), "press": (0.0, 1.0)}
+_SIBILANT: _Viseme = {"jaw": (0.08, 1.4), "spread": (0.35, 0.6), "bare": (0.5, 1.2), "press": (0.0, 1.0)}
+VISEMES: dict[str, _Viseme] = {
     SILENCE: {name: (0.0, 0.6) for name in ARTICULATORS},
     **dict.fromkeys(("P", "B", "M"), _BILABIAL),
     **dict.fromkeys(("F", "V"), _LABIODENTAL),
@@ -54,20 +53,20 @@ SHAPES: dict[str, _Shape] = {
     **{"AO": _vowel(0.75, 0.55), "UH": _vowel(0.3, 0.6), "UW": _vowel(0.2, 1.0), "E": _vowel(0.45, spread=0.5)},
     "O": _vowel(0.5, 0.8),
 }
-"""Targets and dominances by sound; diphthongs are two of them."""
+"""Targets and dominances by phoneme; a diphthong is a sequence of two vowels. Tuned by eye."""
 _DIPHTHONGS = {"AY": ("AA", "IH"), "AW": ("AA", "UH"), "EY": ("E", "IY"), "OW": ("O", "UW"), "OY": ("AO", "IH")}
-_FIRST_SHARE = 0.6  # of a diphthong's time, its first vowel
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """How sounds reach over time, seconds.
+    """Time constants of coarticulation, in seconds.
 
     Attributes:
-        before, after: in which a dominance falls to 1/e ahead of a sound and behind it.
-        lead: by which the mouth is ahead of the sound.
-        closing: in which lips come together and part again.
-        rest: dominance of the mouth at rest, beside the sounds' (no unit).
+        before: time constant of a dominance's rise ahead of a phoneme.
+        after: time constant of its decay after the phoneme.
+        lead: lead of the mouth before the sound.
+        closing: time in which lips come together, and part again.
+        rest: dominance of the mouth at rest, relative to the phonemes' (no unit).
     """
 
     before: float = 0.07
@@ -82,35 +81,38 @@ def articulate(
 ) -> Float64[np.ndarray, "T 6"]:
     """Return the `ARTICULATORS` at given times, 0 to 1.
 
-    Every bilabial has at least one of the times with the lips together, if they are evenly spaced: a closure that is
-    shorter than a frame is held for one.
+    A closure shorter than a frame is held for one, so that evenly spaced frames show every bilabial with closed lips.
 
     Args:
+        speech: phonemes in time.
         times: seconds, ascending.
+        timing: time constants.
     """
     timing = timing or Timing()
-    sounds = [part for one in _with_silences(speech) for part in _parts(one)]
+    # Intervals, targets T and dominances D of all phonemes.
+    sounds = [part for one in _fill_silences(speech) for part in _split_diphthong(one)]
     starts = np.array([one.start for one in sounds]) - timing.lead
     ends = np.array([one.end for one in sounds]) - timing.lead
     target, dominance = np.zeros((2, len(sounds), len(ARTICULATORS)))
     for k, one in enumerate(sounds):
-        for name, (value, strength) in SHAPES[one.name].items():
+        for name, (value, strength) in VISEMES[one.name].items():
             target[k, ARTICULATORS.index(name)] = value
             dominance[k, ARTICULATORS.index(name)] = strength
+    # Blend the phonemes near each time: sum D T / (sum D + rest).
     curves = np.zeros((len(times), len(ARTICULATORS)))
-    reach = 12.0 * max(timing.before, timing.after)  # exp(-12) is nothing
+    reach = 12.0 * max(timing.before, timing.after)  # exp(-12) is negligible
     for row, t in enumerate(times):
         low, high = np.searchsorted(ends, t - reach), np.searchsorted(starts, t + reach)
         near = slice(low, high)
         away = np.maximum(np.maximum((starts[near] - t) / timing.before, (t - ends[near]) / timing.after), 0.0)
         weight = dominance[near] * np.exp(-away)[:, None]
         curves[row] = (weight * target[near]).sum(axis=0) / (weight.sum(axis=0) + timing.rest)
-    _close(curves, speech, times, timing)
+    _hold_closures(curves, speech, times, timing)
     return curves
 
 
-def _with_silences(speech: Speech) -> list[Phoneme]:
-    """The phonemes with silences between them, before the first and behind the last."""
+def _fill_silences(speech: Speech) -> list[Phoneme]:
+    """Return the phonemes with silences in the gaps, before the first and after the last."""
     out, last = [Phoneme(SILENCE, -1.0, 0.0)], 0.0
     for one in speech.phonemes:
         if one.start > last + 1e-6:
@@ -120,22 +122,23 @@ def _with_silences(speech: Speech) -> list[Phoneme]:
     return [*out, Phoneme(SILENCE, last, max(last, speech.seconds) + 1.0)]
 
 
-def _parts(one: Phoneme) -> list[Phoneme]:
+def _split_diphthong(one: Phoneme) -> list[Phoneme]:
     if one.name not in _DIPHTHONGS:
         return [one]
     first, second = _DIPHTHONGS[one.name]
-    middle = one.start + _FIRST_SHARE * (one.end - one.start)
+    middle = one.start + 0.6 * (one.end - one.start)  # the first vowel is the longer one
     return [Phoneme(first, one.start, middle), Phoneme(second, middle, one.end)]
 
 
-def _close(
+def _hold_closures(
     curves: Float64[np.ndarray, "T 6"], speech: Speech, times: Float64[np.ndarray, " T"], timing: Timing
 ) -> None:
-    """Bring the lips together for bilabials, and the lower lip to the teeth for labiodentals, whatever is around."""
+    """Close the lips for bilabials, and lower lip and teeth for labiodentals, whatever the neighbours blend to."""
     frame = float(np.diff(times).max(initial=0.0))
     for one in speech.phonemes:
         if one.name not in BILABIALS | LABIODENTALS:
             continue
+        # A raised-cosine window about the middle of the phoneme, 1 for at least one frame.
         middle = 0.5 * (one.start + one.end) - timing.lead
         half = max(0.35 * (one.end - one.start), 0.5001 * frame)
         away = np.maximum(np.abs(times - middle) - half, 0.0) / timing.closing

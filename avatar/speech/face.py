@@ -1,4 +1,4 @@
-"""The mouth's articulators, and ARKit's expressions, on a body's own face and its jaw joint."""
+"""Pose a body's face: articulators, ARKit's blendshapes or FLAME's expressions to its own expressions and jaw."""
 
 from __future__ import annotations
 
@@ -8,29 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from avatar.speech.arkit import ARKIT, BLINK
-from avatar.speech.bases import numbered_basis
+from avatar.speech.blendshape_transfer import transfer_blendshapes
 from avatar.speech.coarticulation import ARTICULATORS
+from avatar.speech.curves import ARKIT, BLINK
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 
 JAW_ANGLE = 0.15
-"""Radians that the jaw hangs at most beyond rest, where training saw no more."""
+"""Rotation of the jaw for an open vowel, radians, and its limit where the training did not open it further."""
+# Limits of expressions. They keep the face near what the student was trained on, at the price of weaker expressions.
 MARGIN = 0.15
-"""Of an expression (no unit) beyond what training saw of it, where it saw it move."""
+"""Extension of an expression's observed range, if the training varied it; ARKit's blendshapes run from 0 to 1."""
 MARGIN_NUMBERED = 0.5
-"""The same of a numbered one, whose unit is a standard deviation."""
-MOST = 0.8
-"""Of an expression that training did not see move, the most that is asked for."""
-MOST_NUMBERED = 2.0
-"""The same of a numbered one, either way."""
-_MOVES = 0.05  # spread from which an expression counts as seen to move; of the jaw, radians
-_JAW = 0  # of rotation axes: x, about which the jaw hangs
-_OPEN = 0.5  # ARKit's jawOpen at which the jaw hangs as far as an open vowel has it
+"""The same for a numbered expression, in standard deviations."""
+MAX_UNOBSERVED = 0.8
+"""Upper limit of an expression that the training did not vary."""
+MAX_UNOBSERVED_NUMBERED = 2.0
+"""The same for a numbered expression, on both sides, in standard deviations."""
+_JAW = 0  # the axis x, about which the jaw opens
 
-# Articulator -> ARKit's expressions at its 1.
-_ARKIT: dict[str, dict[str, float]] = {
+# Articulator -> ARKit's blendshapes at its value 1. Tuned by eye.
+_ARKIT_OF_ARTICULATOR: dict[str, dict[str, float]] = {
     "jaw": {"jawOpen": 0.25, "mouthLowerDown": 0.15},
     "press": {"mouthPress": 0.5, "mouthRollLower": 0.3, "mouthRollUpper": 0.25},
     "tuck": {"mouthRollLower": 0.7, "mouthUpperUp": 0.2},
@@ -38,22 +37,21 @@ _ARKIT: dict[str, dict[str, float]] = {
     "spread": {"mouthSmile": 0.3, "mouthStretch": 0.35},
     "bare": {"mouthLowerDown": 0.3, "mouthUpperUp": 0.2},
 }
-_JAW_ALONE = 0.6  # jawOpen of a body without a jaw joint
 
 
 def _both_sides(name: str) -> tuple[str, ...]:
     return (name,) if name in ARKIT else (f"{name}Left", f"{name}Right")
 
 
-def _named(names: list[str]) -> Float64[np.ndarray, "52 E"]:
-    """ARKit's expressions on a body that has them by name."""
-    wanted = {side for shape in _ARKIT.values() for one in shape for side in _both_sides(one)} | {*BLINK}
+def _named_basis(names: list[str]) -> Float64[np.ndarray, "52 E"]:
+    """Return the matrix that selects a body's expressions for ARKit's blendshapes, 0 for those that it lacks."""
+    wanted = {side for shape in _ARKIT_OF_ARTICULATOR.values() for one in shape for side in _both_sides(one)} | {*BLINK}
     missing = sorted(wanted - set(names))
     if missing:
         more = f" and {len(missing[3:])} more" if len(missing) > 3 else ""
         raise InputError(
             "expressions of the body",
-            expected="ARKit's names, by which a mouth is moved, or numbers",
+            expected="ARKit's names of the mouth's blendshapes, or numbers",
             received=f"{len(names)} expressions without {', '.join(missing[:3])}{more}",
         )
     return np.array([[float(name == own) for own in names] for name in ARKIT])
@@ -61,13 +59,18 @@ def _named(names: list[str]) -> Float64[np.ndarray, "52 E"]:
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """How a body's face speaks.
+    """The face of a body: bases and limits of its expressions, and its jaw.
 
     Attributes:
-        arkit: expressions of each of `ARKIT` at its 1. basis: of each articulator. blink: of closed eyes.
-        neutral: expressions at rest. lowest, highest: what is not left, whatever is asked for.
-        jaw: rotation vector of the jaw at rest. jaw_reach: how far it hangs beyond it at most, radians.
-        numbered: the expressions have no names.
+        arkit: expressions of each of `ARKIT` at its value 1.
+        basis: expressions of each articulator at its value 1.
+        blink: expressions of closed eyes.
+        neutral: expressions at rest.
+        lowest: lower limits of the expressions.
+        highest: upper limits of the expressions.
+        jaw: rotation vector of the jaw at rest.
+        jaw_reach: largest opening of the jaw from there, radians.
+        numbered: whether the expressions are numbered rather than named.
     """
 
     arkit: Float64[np.ndarray, "52 E"]
@@ -88,15 +91,17 @@ class Face:
         *,
         body: BodyModel | None = None,
     ) -> Face:
-        """Make the face of a body whose expressions have ARKit's names, or are numbered.
+        """Make the face of a body whose expressions are named after ARKit's blendshapes or numbered.
 
         Args:
-            seen: frames of the training: their mean is the face at rest; an expression that moves in them goes `MARGIN`
-                beyond their range at most, others to `MOST`. None: rest is zero.
-            body: whose numbered expressions ARKit's are solved for (`numbered_basis`); None: names are needed.
+            expression_names: of the body.
+            joint_names: of the body; without a "jaw" the mouth opens by its expression alone.
+            seen: frames of the training. Their mean is the face at rest. An expression that varies in them is limited
+                to their range and `MARGIN`, another one to `MAX_UNOBSERVED`. None: rest is zero.
+            body: the body, to transfer ARKit's blendshapes to numbered expressions; None: names are needed.
 
         Raises:
-            InputError: a body with neither, or frames of another body.
+            InputError: expressions that are neither named nor numbered, or frames of another body.
         """
         names = list(expression_names)
         E = len(names)
@@ -105,15 +110,17 @@ class Face:
                 "expressions of the training", expected=f"{E} a frame", received=str(seen.expression.shape[1])
             )
         numbered = body is not None and E > 0 and not set(ARKIT) & set(names)
-        arkit = numbered_basis(body).coefficients if numbered and body is not None else _named(names)
+        arkit = transfer_blendshapes(body).coefficients if numbered and body is not None else _named_basis(names)
+        # Articulators as combinations of ARKit's blendshapes.
         weights = np.zeros((len(ARTICULATORS), len(ARKIT)))
         for row, articulator in enumerate(ARTICULATORS):
-            for one, value in _ARKIT[articulator].items():
+            for one, value in _ARKIT_OF_ARTICULATOR[articulator].items():
                 for side in _both_sides(one):
                     weights[row, ARKIT.index(side)] = value
         has_jaw = "jaw" in joint_names
         if not has_jaw:
-            weights[ARTICULATORS.index("jaw"), ARKIT.index("jawOpen")] = _JAW_ALONE
+            weights[ARTICULATORS.index("jaw"), ARKIT.index("jawOpen")] = 0.6
+        # Rest and observed ranges.
         frames = np.zeros((1, E))
         jaw = np.zeros((1, 3))
         if seen is not None:
@@ -121,8 +128,10 @@ class Face:
             frames[:, : seen.expression.shape[1]] = seen.expression
             jaw = np.asarray(seen.jaw_pose)
         neutral, low, high = frames.mean(axis=0), frames.min(axis=0), frames.max(axis=0)
-        moved = high - low > _MOVES
-        margin, least, most = (MARGIN_NUMBERED, -MOST_NUMBERED, MOST_NUMBERED) if numbered else (MARGIN, 0.0, MOST)
+        varied = high - low > 0.05
+        margin, least, most = (MARGIN, 0.0, MAX_UNOBSERVED)
+        if numbered:
+            margin, least, most = (MARGIN_NUMBERED, -MAX_UNOBSERVED_NUMBERED, MAX_UNOBSERVED_NUMBERED)
         rest = jaw.mean(axis=0)
         seen_reach = float(jaw[:, _JAW].max() - rest[_JAW])
         return Face(
@@ -130,8 +139,8 @@ class Face:
             basis=weights @ arkit,
             blink=arkit[[ARKIT.index(side) for side in BLINK]].sum(axis=0),
             neutral=neutral,
-            lowest=np.where(moved, low - margin, np.minimum(neutral, least)),
-            highest=np.where(moved, high + margin, np.maximum(neutral, most)),
+            lowest=np.where(varied, low - margin, np.minimum(neutral, least)),
+            highest=np.where(varied, high + margin, np.maximum(neutral, most)),
             jaw=rest,
             jaw_reach=(max(seen_reach, JAW_ANGLE) if has_jaw else 0.0),
             numbered=numbered,
@@ -144,17 +153,19 @@ class Face:
         *,
         strength: float = 1.0,
     ) -> tuple[Float64[np.ndarray, "T E"], Float64[np.ndarray, "T 3"]]:
-        """Return expressions and rotation vectors of the jaw.
+        """Return expressions and rotation vectors of the jaw for articulator curves.
 
         Args:
-            curves: `ARTICULATORS`, 0 to 1. closed_eyes: 0 to 1. strength: of the mouth; closures keep theirs.
+            curves: `ARTICULATORS`, 0 to 1.
+            closed_eyes: 0 to 1.
+            strength: factor of the mouth's motion; closures of the lips are not scaled.
         """
         scale = np.where(np.isin(ARTICULATORS, ("press", "tuck")), 1.0, strength)
         asked = self.neutral + (curves * scale) @ self.basis + closed_eyes[:, None] * self.blink
         jaw = np.tile(self.jaw, (len(curves), 1))
         opening = curves[:, ARTICULATORS.index("jaw")] * strength
         jaw[:, _JAW] += np.minimum(JAW_ANGLE * opening, self.jaw_reach)
-        # A jaw that rests open has to close for bilabials.
+        # A jaw that rests open closes for bilabials.
         pressed = curves[:, ARTICULATORS.index("press")]
         jaw[:, _JAW] -= pressed * max(float(self.jaw[_JAW]), 0.0)
         return np.clip(asked, self.lowest, self.highest), jaw
@@ -162,25 +173,25 @@ class Face:
     def pose_arkit(
         self, values: Float64[np.ndarray, "T 52"], *, strength: float = 1.0
     ) -> tuple[Float64[np.ndarray, "T E"], Float64[np.ndarray, "T 3"]]:
-        """Return expressions and rotation vectors of the jaw, of curves of `ARKIT` as others give them.
+        """Return expressions and rotation vectors of the jaw for curves of `ARKIT`.
 
-        A jaw joint hangs by `jawOpen`, as far as for an open vowel at half of it, and closes by `mouthClose`; what the
-        expression does beside it is left as small as for speech.
+        `jawOpen` rotates the jaw joint, at 0.5 as far as an open vowel, and `mouthClose` closes it. The expressions of
+        the same names are scaled down as for speech, because the joint already moves the mouth.
         """
         values = strength * values
         jaw = np.tile(self.jaw, (len(values), 1))
         if self.jaw_reach:
             opening = values[:, ARKIT.index("jawOpen")]
             shut = np.minimum(values[:, ARKIT.index("mouthClose")], opening)
-            jaw[:, _JAW] += np.clip(JAW_ANGLE * (opening - shut) / _OPEN, 0.0, self.jaw_reach)
-            values[:, ARKIT.index("jawOpen")] *= _ARKIT["jaw"]["jawOpen"]
-            values[:, ARKIT.index("mouthClose")] = shut * _ARKIT["jaw"]["jawOpen"]
+            jaw[:, _JAW] += np.clip(JAW_ANGLE * (opening - shut) / 0.5, 0.0, self.jaw_reach)
+            values[:, ARKIT.index("jawOpen")] *= _ARKIT_OF_ARTICULATOR["jaw"]["jawOpen"]
+            values[:, ARKIT.index("mouthClose")] = shut * _ARKIT_OF_ARTICULATOR["jaw"]["jawOpen"]
         return np.clip(self.neutral + values @ self.arkit, self.lowest, self.highest), jaw
 
     def pose_flame(
-        self, values: Float64[np.ndarray, "T N"], turns: Float64[np.ndarray, "T 3"], *, strength: float = 1.0
+        self, values: Float64[np.ndarray, "T N"], rotations: Float64[np.ndarray, "T 3"], *, strength: float = 1.0
     ) -> tuple[Float64[np.ndarray, "T E"], Float64[np.ndarray, "T 3"]]:
-        """Return expressions and jaw, of FLAME's: a numbered body's are the first of the same.
+        """Return expressions and rotation vectors of the jaw for FLAME's, whose first expressions the body shares.
 
         Raises:
             InputError: a body whose expressions have names.
@@ -195,6 +206,6 @@ class Face:
         asked = np.zeros((len(values), len(self.neutral)))
         width = min(asked.shape[1], values.shape[1])
         asked[:, :width] = strength * values[:, :width]
-        jaw = self.jaw + strength * turns
+        jaw = self.jaw + strength * rotations
         jaw[:, _JAW] = np.minimum(jaw[:, _JAW], self.jaw[_JAW] + max(self.jaw_reach, 0.0))
         return np.clip(self.neutral + asked, self.lowest, self.highest), jaw

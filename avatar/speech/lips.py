@@ -1,10 +1,9 @@
-"""A small network from sound to the mouth, in any language and at once: what is being said, and how the lips stand.
+"""A small causal network from sound to phonemes and mouth shape, in any language and in real time.
 
-Features (`avatar.speech.sound_features`), then convolutions that see the past alone: one of width 5, and five of width
-3 that reach 1, 2, 4, 8 and 16 rows apart, each added to what it got, `h <- relu(h + W * h)` (dilated and causal as van
-den Oord et al., WaveNet, 2016). Two heads: probabilities of phonemes, and `ARTICULATORS` as `articulate` would give
-them. A row says what was said `delay` seconds before its last sample. `tools.lips` makes the weights; the page runs the
-same network (`web/src/lips/network.ts`).
+Log-mel features (`avatar.speech.audio_features`), then causal convolutions: one of width 5, and five residual ones of
+width 3 with dilations 1, 2, 4, 8 and 16, `h <- relu(h + W * h)` (van den Oord et al., WaveNet, 2016). Two heads:
+probabilities of phonemes, and `ARTICULATORS` as `articulate` gives them. A row describes the sound `delay` seconds
+before its last sample. `tools.lips` trains the weights; the page runs the same network (`web/src/lips/network.ts`).
 """
 
 from __future__ import annotations
@@ -19,10 +18,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from avatar.speech.audio_features import BANDS, FRAME, HOP, RATE, log_mel, speech_level
 from avatar.speech.coarticulation import ARTICULATORS
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
-from avatar.speech.rests import spoken_level
-from avatar.speech.sound_features import BANDS, FRAME, HOP, RATE, hear
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.files.tensor_bytes import unpack_tensors
@@ -31,22 +29,19 @@ from smplxpp.core.files.wave_file import Sound
 WEIGHTS = Path(__file__).parent / "lips.safetensors"
 """Made by `python -m tools.lips.train`; the page carries the same file."""
 PHONES = (SILENCE, *sorted(VOWELS | CONSONANTS))
-"""What the first head tells apart."""
+"""Classes of the first head."""
 VERSION = 1
+"""Version of the weight file, shared with the page."""
 _JAW, _PRESS = (ARTICULATORS.index(name) for name in ("jaw", "press"))
-_FOLLOWS = 0.5  # of what is new, a row
-_OPEN, _CLOSED = 0.3, 0.6  # of the lips' pressing: from which they begin to close; from which they are closed
-_CHANGE = 3.0  # nats that another phoneme has to be worth
-_LEAST = 1e-3  # added to probabilities: no single row refuses a text
-_EVEN = 100.0  # rows of even probabilities that are laid under a recording's mean: "five five" is little else
 
 
 @dataclass(frozen=True, eq=False)
-class Lips:
-    """What the network hears, a row every `FRAME` seconds.
+class LipPrediction:
+    """Output of the network, a row every `FRAME` seconds.
 
     Attributes:
-        times: that each row tells of, seconds of the sound. phones: probabilities of `PHONES`.
+        times: time in the sound that each row describes, seconds.
+        phones: probabilities of `PHONES`.
         mouth: `ARTICULATORS`, 0 to 1.
     """
 
@@ -56,11 +51,11 @@ class Lips:
 
 
 class LipNetwork:
-    """The network, of a file's tensors.
+    """The network, made from the tensors of its weight file.
 
     Args:
-        tensors: by layer `NAME.weight`, whole numbers (out, in, width), `NAME.scale` and `NAME.bias` (out).
-        about: `version`, `delay` in seconds, `dilations` of the layers behind the first.
+        tensors: for each layer `NAME.weight`, integers (out, in, width), `NAME.scale` and `NAME.bias` (out).
+        about: `version`, `delay` in seconds, `dilations` of the residual layers.
 
     Raises:
         InputError: another network, or another version.
@@ -86,14 +81,15 @@ class LipNetwork:
     @staticmethod
     @cache
     def shipped() -> LipNetwork:
-        """Return the network of `WEIGHTS`."""
+        """Return the network of the shipped `WEIGHTS`."""
         return LipNetwork(*unpack_tensors(read_bytes(WEIGHTS, subject="lip network"), subject="lip network"))
 
-    def __call__(self, sound: Sound) -> Lips:
-        """Return what is heard in a sound of any rate and level, the last `delay` of it included."""
+    def __call__(self, sound: Sound) -> LipPrediction:
+        """Return the prediction for a sound of any rate and level, up to its very end."""
+        # Silence after the end, so that the delayed output covers all of the sound.
         samples = sound.at_rate(RATE).samples
         behind = np.zeros(round(self.delay * RATE) + HOP, np.float32)
-        h = hear(np.concatenate([samples, behind])).T
+        h = log_mel(np.concatenate([samples, behind])).T
         for k in range(len(self._layers)):
             h = self.layer(k, h)
         logits, mouth = h[: len(PHONES)].T, h[len(PHONES) :].T
@@ -101,10 +97,10 @@ class LipNetwork:
         seen = (times >= 0.0) & (times < sound.seconds)
         grown = np.exp(logits - logits.max(axis=1, keepdims=True))
         phones = grown / grown.sum(axis=1, keepdims=True)
-        return Lips(times[seen], phones[seen], (1.0 / (1.0 + np.exp(-mouth)))[seen])
+        return LipPrediction(times[seen], phones[seen], (1.0 / (1.0 + np.exp(-mouth)))[seen])
 
     def layer(self, k: int, h: Float32[np.ndarray, "I T"]) -> Float32[np.ndarray, "O T"]:
-        """Return what layer `k` makes of all rows."""
+        """Return the output of layer `k` for all rows."""
         weight, bias = self._layers[k]
         out = _convolve(h, weight, self.dilations[k]) + bias[:, None]
         if k == len(self._layers) - 1:
@@ -112,53 +108,57 @@ class LipNetwork:
         return np.maximum(out + h if k else out, 0.0)
 
 
-def steady(mouth: Float[np.ndarray, "T 6"]) -> Float64[np.ndarray, "T 6"]:
-    """Return the network's mouth as it is shown: without jitter, about 10 ms later, with lips that close.
+def smooth_mouth(mouth: Float[np.ndarray, "T 6"]) -> Float64[np.ndarray, "T 6"]:
+    """Return the network's mouth without jitter, about 10 ms later, with lips that close completely.
 
-    Each row takes half of what is new. Lips that are likely to be pressed are, and then the jaw is not open.
+    An exponential moving average removes the jitter. Lips pressed by 0.6 or more are closed, and the jaw with them;
+    they begin to close at 0.3.
     """
     out, mean = np.zeros(mouth.shape), np.zeros(mouth.shape[1])
     for row, heard in zip(out, mouth, strict=True):
-        mean += _FOLLOWS * (heard - mean)
+        mean += 0.5 * (heard - mean)
         row[:] = mean
-    share = np.clip((out[:, _PRESS] - _OPEN) / (_CLOSED - _OPEN), 0.0, 1.0)
+    share = np.clip((out[:, _PRESS] - 0.3) / (0.6 - 0.3), 0.0, 1.0)
     closed = share * share * (3.0 - 2.0 * share)
     out[:, _PRESS] = np.maximum(out[:, _PRESS], closed)
     out[:, _JAW] *= 1.0 - closed
     return out
 
 
-def agreement(heard: Lips, speech: Speech) -> float:
-    """Return by how much phonemes fit what is heard at their times better than what is heard at any, nats a row.
+def alignment_score(heard: LipPrediction, speech: Speech) -> float:
+    """Return the mean log-likelihood ratio of phonemes at their times to the same phonemes at any time, nats a row.
 
-    The mean of `log p_t(a_t) - log mean_s p_s(a_t)` over the rows t in which a phoneme `a_t` is said: 0 is about what
-    the same phonemes have at times that know nothing of the sound. What a voice or a room does to all rows cancels.
+    The mean of `log p_t(a_t) - log mean_s p_s(a_t)` over the rows t with a phoneme `a_t`. An alignment independent of
+    the sound scores about 0. Effects of a voice or a room on all rows cancel.
     """
     names = np.zeros(len(heard.times), np.int64)
     for one in speech.spoken:
         first, behind = np.searchsorted(heard.times, (one.start, one.end))
         names[first:behind] = PHONES.index(one.name)
-    said = np.flatnonzero(names)
-    if not len(said):
+    with_phoneme = np.flatnonzero(names)
+    if not len(with_phoneme):
         return -np.inf
-    rows = heard.phones[said].astype(np.float64)
-    mean = (rows.sum(axis=0) + _EVEN / len(PHONES)) / (len(said) + _EVEN)
-    own = rows[np.arange(len(said)), names[said]]
-    return float(np.mean(np.log(own + _LEAST) - np.log(mean[names[said]] + _LEAST)))
+    # Additive smoothing keeps a single row from rejecting a text. 100 rows of uniform probabilities in the mean keep it
+    # from being dominated by a short text's own phonemes ("five five").
+    smoothing, uniform_rows = 1e-3, 100.0
+    rows = heard.phones[with_phoneme].astype(np.float64)
+    mean = (rows.sum(axis=0) + uniform_rows / len(PHONES)) / (len(with_phoneme) + uniform_rows)
+    own = rows[np.arange(len(with_phoneme)), names[with_phoneme]]
+    return float(np.mean(np.log(own + smoothing) - np.log(mean[names[with_phoneme]] + smoothing)))
 
 
-def sounds_of(sound: Sound) -> Speech:
-    """Return the likeliest phonemes of a recording in any language, without words.
+def recognise_phonemes(sound: Sound) -> Speech:
+    """Recognise the phonemes of a recording in any language, without words.
 
-    Viterbi's path through phonemes that may follow each other at will, at a price a change.
+    The Viterbi path through phonemes that may follow each other freely, at a cost of 3 nats a change.
 
     Raises:
         InputError: silence, or more than 20 minutes.
     """
-    spoken_level(sound)
+    speech_level(sound)
     seconds = sound.seconds
     heard = LipNetwork.shipped()(sound)
-    path = _best_path(np.log(heard.phones + 1e-9), _CHANGE)
+    path = _best_path(np.log(heard.phones + 1e-9), 3.0)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])
     out = []
     for first, behind in pairwise(starts):
@@ -166,21 +166,22 @@ def sounds_of(sound: Sound) -> Speech:
         if PHONES[path[first]] != SILENCE and end > start:
             out.append(Phoneme(PHONES[path[first]], start, end))
     if not out:
-        raise InputError("sound", expected="somebody who speaks", received="no sound of speech in it")
+        raise InputError("sound", expected="a recording of speech", received="no phoneme in it")
     return Speech(tuple(out), seconds)
 
 
-def _convolve(h: Float32[np.ndarray, "I T"], weight: Float32[np.ndarray, "O I W"], reach: int) -> np.ndarray:
-    """A convolution that sees the past alone, zeros before the start."""
+def _convolve(h: Float32[np.ndarray, "I T"], weight: Float32[np.ndarray, "O I W"], dilation: int) -> np.ndarray:
+    """Return a causal dilated convolution, with zeros before the start."""
     width = weight.shape[2]
-    padded = np.pad(h, ((0, 0), ((width - 1) * reach, 0)))
-    pieces = (weight[:, :, k] @ padded[:, k * reach : k * reach + h.shape[1]] for k in range(width))
+    padded = np.pad(h, ((0, 0), ((width - 1) * dilation, 0)))
+    pieces = (weight[:, :, k] @ padded[:, k * dilation : k * dilation + h.shape[1]] for k in range(width))
     return np.sum(list(pieces), axis=0)
 
 
 def _best_path(scores: Float32[np.ndarray, "T K"], change: float) -> np.ndarray:
-    """The row of states with the greatest sum of scores less `change` for each change of state."""
+    """Return the Viterbi path: states with the greatest sum of scores minus `change` for each change of state."""
     count, states = scores.shape
+    # Forward pass: a state is kept, or entered from the best one of the row before.
     came = np.zeros((count, states), np.int64)
     best = scores[0].astype(np.float64)
     for t in range(1, count):
@@ -188,6 +189,7 @@ def _best_path(scores: Float32[np.ndarray, "T K"], change: float) -> np.ndarray:
         moved = best[other] - change
         came[t] = np.where(best >= moved, np.arange(states), other)
         best = np.maximum(best, moved) + scores[t]
+    # Backtrack from the best last state.
     path = np.zeros(count, np.int64)
     path[-1] = int(best.argmax())
     for t in range(count - 1, 0, -1):

@@ -1,4 +1,4 @@
-"""Phonemes in time: what every engine gives, and what the mouth is moved by. Names are ARPAbet's, without stress."""
+"""Phonemes in time, by their ARPAbet names without stress: the result of every engine, and the input of the mouth."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ CONSONANTS = frozenset(
     )
 )
 BILABIALS = frozenset(("P", "B", "M"))
-"""The lips close for them."""
+"""Consonants for which the lips close."""
 LABIODENTALS = frozenset(("F", "V"))
-"""The lower lip meets the upper teeth for them."""
+"""Consonants for which the lower lip meets the upper teeth."""
 
 # IPA as espeak-ng and Piper write English, and the nearest sounds of other languages; longer symbols first.
 _IPA = {
@@ -43,11 +43,13 @@ _UNSTRESSED = {"AH": "ə", "ER": "ɚ", "IY": "i"}  # as espeak-ng writes these v
 
 @dataclass(frozen=True)
 class Phoneme:
-    """One sound.
+    """One phoneme with its start and end.
 
     Attributes:
-        name: ARPAbet without stress, or `SILENCE`. start, end: seconds.
-        stress: of a vowel: 1 the word's main one, 2 a lesser one, 0 none, or nobody said.
+        name: ARPAbet without stress, or `SILENCE`.
+        start: seconds.
+        end: seconds.
+        stress: of a vowel: 1 primary, 2 secondary, 0 none or unknown.
     """
 
     name: str
@@ -58,14 +60,14 @@ class Phoneme:
 
 @dataclass(frozen=True)
 class Speech:
-    """What is said, in time.
+    """The phonemes of an utterance in time.
 
     Attributes:
-        phonemes: in order; where there is none it is silent.
-        seconds: how long the sound is.
+        phonemes: in order of time; gaps are silent.
+        seconds: length of the sound.
 
     Raises:
-        InputError: phonemes that are not known, run backwards, overlap or leave the sound.
+        InputError: unknown phonemes, or times that run backwards, overlap or leave the sound.
     """
 
     phonemes: tuple[Phoneme, ...]
@@ -86,14 +88,14 @@ class Speech:
 
     @property
     def spoken(self) -> tuple[Phoneme, ...]:
-        """The phonemes that are no silence."""
+        """The phonemes that are not silences."""
         return tuple(one for one in self.phonemes if one.name != SILENCE)
 
 
 def arpabet_from_ipa(text: str, at: int) -> tuple[str, int]:
-    """Return the sound that stands at a place of an IPA text, and how many characters it takes.
+    """Return the phoneme at a position of an IPA text, and its number of characters.
 
-    A mark (length, stress, tie) or a sound that is not known is "" of one character.
+    A diacritic (length, stress, tie) or an unknown sound gives "" and one character.
     """
     for length in (2, 1):
         name = _IPA.get(text[at : at + length])

@@ -1,4 +1,4 @@
-"""Curves through time that are made as they are needed: values that go from one to the next, smooth at every joint."""
+"""Curves through time, extended on demand: minimum-jerk moves between values, with continuous acceleration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _State = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.
 
 @dataclass(frozen=True, eq=False)
 class _Move:
-    """A polynomial of fifth degree from a state to a value at rest; coefficients of the time since its start."""
+    """A quintic polynomial from a state to a value at rest, in the time since its start."""
 
     start: float
     end: float
@@ -21,17 +21,17 @@ class _Move:
 
     @staticmethod
     def to(target: Float64[np.ndarray, " n"], state: _State, start: float, end: float) -> _Move:
-        """Minimum jerk (Flash and Hogan 1985) between boundary values of place, speed and acceleration."""
-        place, speed, acceleration = state
+        """Solve for minimum jerk (Flash and Hogan 1985) with given position, velocity and acceleration at the start."""
+        position, velocity, acceleration = state
         T = end - start
-        way = target - place
-        c3 = (20.0 * way - 12.0 * speed * T - 3.0 * acceleration * T**2) / (2.0 * T**3)
-        c4 = (-30.0 * way + 16.0 * speed * T + 3.0 * acceleration * T**2) / (2.0 * T**4)
-        c5 = (12.0 * way - 6.0 * speed * T - acceleration * T**2) / (2.0 * T**5)
-        return _Move(start, end, np.stack([place, speed, 0.5 * acceleration, c3, c4, c5]))
+        delta = target - position
+        c3 = (20.0 * delta - 12.0 * velocity * T - 3.0 * acceleration * T**2) / (2.0 * T**3)
+        c4 = (-30.0 * delta + 16.0 * velocity * T + 3.0 * acceleration * T**2) / (2.0 * T**4)
+        c5 = (12.0 * delta - 6.0 * velocity * T - acceleration * T**2) / (2.0 * T**5)
+        return _Move(start, end, np.stack([position, velocity, 0.5 * acceleration, c3, c4, c5]))
 
     def state(self, times: Float64[np.ndarray, " T"]) -> list[Float64[np.ndarray, "T n"]]:
-        """Place, speed and acceleration; at rest behind the end."""
+        """Return position, velocity and acceleration at times; at rest after the end."""
         t = np.clip(times, self.start, self.end) - self.start
         moving = (times < self.end).astype(np.float64)[:, None]
         out = []
@@ -44,10 +44,10 @@ class _Move:
 
 
 class Track:
-    """Values in time: those at the start until the first move, the last move's target behind it.
+    """A piecewise minimum-jerk curve: constant before the first move and after the last one.
 
     Args:
-        value: at the start.
+        value: before the first move.
     """
 
     def __init__(self, value: Float64[np.ndarray, " n"]) -> None:
@@ -56,29 +56,29 @@ class Track:
 
     @property
     def target(self) -> Float64[np.ndarray, " n"]:
-        """Where the last move ends."""
+        """The value at the end of the last move."""
         return self._at(np.array([self.end]))[0][0]
 
     @property
     def end(self) -> float:
-        """When the last move ends, seconds."""
+        """The end of the last move, seconds."""
         return self._moves[-1].end if self._moves else 0.0
 
     def move(self, target: Float64[np.ndarray, " n"], start: float, end: float) -> None:
-        """Go to a value from wherever the track is at `start`, at its speed; what was planned behind it is dropped."""
+        """Move to a value, starting at `start` with the state there; discard moves planned for later."""
         assert end > start
-        self.drop(start)
+        self.discard_from(start)
         state = tuple(one[0] for one in self._at(np.array([start])))
         self._moves.append(_Move.to(np.asarray(target, np.float64), state, start, end))
 
-    def drop(self, start: float) -> None:
-        """Forget the moves that begin at a time or later."""
+    def discard_from(self, start: float) -> None:
+        """Discard the moves that begin at a time or later."""
         while self._moves and self._moves[-1].start >= start:
             self._moves.pop()
 
-    def forget(self, before: float) -> None:
-        """Forget moves that nobody asks for any more."""
-        while len(self._moves) > 1 and self._moves[1].start <= before:
+    def discard_before(self, time: float) -> None:
+        """Discard moves that only matter for times before `time`."""
+        while len(self._moves) > 1 and self._moves[1].start <= time:
             self._first = self._moves.pop(0).state(np.array([np.inf]))[0][0]
 
     def __call__(self, times: Float64[np.ndarray, " T"]) -> Float64[np.ndarray, "T n"]:
@@ -86,22 +86,27 @@ class Track:
         return self._at(np.asarray(times, np.float64))[0]
 
     def _at(self, times: Float64[np.ndarray, " T"]) -> list[Float64[np.ndarray, "T n"]]:
+        # Each time belongs to the last move that has begun by then.
         out = [np.zeros((len(times), len(self._first))) for _ in range(3)]
         out[0][:] = self._first
         which = np.searchsorted([one.start for one in self._moves], times, side="right") - 1
         for k, one in enumerate(self._moves):
-            mine = which == k
-            if mine.any():
-                for into, value in zip(out, one.state(times[mine]), strict=True):
-                    into[mine] = value
+            selected = which == k
+            if selected.any():
+                for into, value in zip(out, one.state(times[selected]), strict=True):
+                    into[selected] = value
         return out
 
 
-class Wandering:
-    """A track that goes on for ever between values that are drawn, the same for a seed however it is asked.
+class RandomTrack:
+    """An endless track between random values; its values do not depend on how the times are split into calls.
 
     Args:
-        draw: gives the next value. rest: at the start. moves, holds: least and most seconds on the way and in between.
+        rng: source of values and durations.
+        draw: returns the next value.
+        rest: value at the start.
+        moves: shortest and longest move, seconds.
+        holds: shortest and longest pause between moves, seconds.
     """
 
     def __init__(
@@ -123,6 +128,6 @@ class Wandering:
             self._track.move(self._draw(self._rng), start, start + self._rng.uniform(*self._moves))
         return self._track(times)
 
-    def forget(self, before: float) -> None:
-        """Forget what nobody asks for any more."""
-        self._track.forget(before)
+    def discard_before(self, time: float) -> None:
+        """Discard moves that only matter for times before `time`."""
+        self._track.discard_before(time)

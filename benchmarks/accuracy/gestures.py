@@ -5,7 +5,7 @@
 A Piper voice (extra `[talk]`) speaks for some minutes, and the embedded body, known from an A-pose alone, gestures to
 it. Measured are the path length of the feet's joints, the distance of hands from the trunk's skin, the delay of beats
 after stressed vowels, the seconds of speech until a gesture is used again, and the similarity of any two pieces of
-the arms' angles; in addition the part of ARKit's expressions that numbered ones cannot make (`avatar.speech.bases`).
+the arms' angles; in addition the part of ARKit's expressions that numbered ones cannot make (`avatar.speech.blendshape_transfer`).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import tyro
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from avatar.speech import Face, Performer, Phoneme, Speech, Stance, TalkConfig
-from avatar.speech.arkit import ARKIT
-from avatar.speech.bases import numbered_basis
+from avatar.speech import Face, Phoneme, Speech, SpeechAnimator, StandingBody, TalkConfig
+from avatar.speech.blendshape_transfer import transfer_blendshapes
+from avatar.speech.curves import ARKIT
 from avatar.speech.voice import PiperVoice
 from benchmarks.accuracy.talking import SENTENCES
 from benchmarks.support.results import store_results
@@ -51,9 +51,9 @@ class Gestures:
         for side, sign in (("left", -1.0), ("right", 1.0)):
             pose[0, 3 * SMPLX_JOINTS.index(f"{side}_shoulder") - 1] = sign * _APART
         seen = replace(rest, body_pose=pose)
-        stance = Stance.of(Skeleton.of(body), seen, surface=body.forward(rest).frame(0).vertices)
+        standing = StandingBody.of(Skeleton.of(body), seen, surface=body.forward(rest).frame(0).vertices)
         speech = said_for(60.0 * MINUTES)
-        rows = [measured(body, stance, speech, seed) for seed in SEEDS]
+        rows = [measured(body, standing, speech, seed) for seed in SEEDS]
         figures = {
             "speech": {
                 "minutes": MINUTES,
@@ -81,16 +81,16 @@ def said_for(seconds: float) -> Speech:
     return Speech(tuple(phonemes), at)
 
 
-def measured(body: BodyModel, stance: Stance, speech: Speech, seed: int) -> dict[str, float]:
+def measured(body: BodyModel, standing: StandingBody, speech: Speech, seed: int) -> dict[str, float]:
     """Return what a seed's motion is like; millimetres, milliseconds, degrees, seconds."""
     face = Face.of(body.expression_names, body.joint_names)
-    performer = Performer(face, stance, TalkConfig(seed=seed))
+    animator = SpeechAnimator(face, standing, TalkConfig(seed=seed))
     began = time.process_time()
-    motion = performer.talk(speech)
+    motion = animator.talk(speech)
     spent = time.process_time() - began
-    assert performer.gesturing is not None
-    strokes = performer.gesturing.strokes
-    feet = stance.skeleton.pose(motion)[:, stance.skeleton.at(*FEET)]
+    assert animator.gestures is not None
+    strokes = animator.gestures.strokes
+    feet = standing.skeleton.pose(motion)[:, standing.skeleton.at(*FEET)]
     stressed = np.array([one.start for one in speech.spoken if one.stress == 1])
     behind = [float((at - stressed[stressed <= at + 1e-6]).min()) for at, _ in strokes]
     again = [b - a for k, (a, one) in enumerate(strokes) for b, other in strokes[k + 1 :] if one == other]
@@ -148,11 +148,11 @@ def left_of(body: BodyModel, count: int) -> dict[str, float]:
     _, size, parts = np.linalg.svd(faces, full_matrices=False)
     directions = (parts[:count] * size[:count, None] / np.sqrt(len(drawn))).T.reshape(-1, 3, count)
     names = tuple(f"expression_{k:02d}" for k in range(count))
-    solved = numbered_basis(replace(body, exprdirs=directions, expression_names=names))
-    of = {name: round(float(solved.left[ARKIT.index(name)]), 2) for name in _MOUTH}
+    solved = transfer_blendshapes(replace(body, exprdirs=directions, expression_names=names))
+    of = {name: round(float(solved.residual[ARKIT.index(name)]), 2) for name in _MOUTH}
     closing = [ARKIT.index(name) for name in ("mouthPressLeft", "mouthPressRight", "mouthRollLower", "mouthRollUpper")]
-    gap = 1e3 * float(np.abs(solved.gap[closing]).max())
-    return {"mean": round(float(solved.left.mean()), 3), **of, "lips' gap, mm": round(gap, 2)}
+    gap = 1e3 * float(np.abs(solved.gap_error[closing]).max())
+    return {"mean": round(float(solved.residual.mean()), 3), **of, "lips' gap, mm": round(gap, 2)}
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
     python -m benchmarks given_texts [--flite PROGRAM]
 
 The voices of `benchmarks.accuracy.live_lips` speak its twenty sentences. Each recording is given its own text and six
-others. A text that the recogniser can align is accepted if `avatar.speech.lips.agreement` finds that it fits the sound.
+others. A text that the recogniser can align is accepted if `avatar.speech.lips.alignment_score` finds that it fits the
+sound.
 The gate is 0 for all voices; beside it stands the result of the gate with the fewest errors on all other voices.
 """
 
@@ -18,8 +19,8 @@ import numpy as np
 import tyro
 
 from avatar.speech import Speech
-from avatar.speech.aligner import AGREES, aligned_text, load_recogniser
-from avatar.speech.lips import LipNetwork, agreement
+from avatar.speech.forced_alignment import MIN_SCORE_OF_TEXT, force_align, load_recogniser
+from avatar.speech.lips import LipNetwork, alignment_score
 from benchmarks.accuracy.live_lips import MORE, said_by_voices
 from benchmarks.accuracy.talking import SENTENCES, milliseconds, starts_apart
 from benchmarks.support.results import store_results
@@ -48,13 +49,13 @@ class Taken:
         """Give a recording its own text and behind it others."""
         heard = LipNetwork.shipped()(sound)
         for k, text in enumerate(texts):
-            found = aligned_text(sound, text, recogniser)
+            found = force_align(sound, text, recogniser)
             self.texts[k > 0] += 1
             if found is not None:
-                (self.wrong if k else self.right).append(agreement(heard, found))
+                (self.wrong if k else self.right).append(alignment_score(heard, found))
                 self.apart += starts_apart(truth, found) if truth is not None and k == 0 else []
 
-    def errors(self, gate: float = AGREES) -> tuple[int, int]:
+    def errors(self, gate: float = MIN_SCORE_OF_TEXT) -> tuple[int, int]:
         """Return how many right texts are refused, by either, and how many wrong ones are taken."""
         return self.texts[0] - sum(one >= gate for one in self.right), sum(one >= gate for one in self.wrong)
 

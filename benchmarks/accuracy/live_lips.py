@@ -23,9 +23,9 @@ import tyro
 from scipy.signal import butter, resample_poly, sosfilt
 
 from avatar.speech import ARTICULATORS, SILENCE, Phoneme, Speech, articulate
-from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, Lips, sounds_of, steady
+from avatar.speech.audio_features import FRAME, RATE
+from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, LipPrediction, recognise_phonemes, smooth_mouth
 from avatar.speech.phonemes import BILABIALS, VOWELS
-from avatar.speech.sound_features import FRAME, RATE
 from avatar.speech.voice import PiperVoice
 from benchmarks.accuracy.talking import CLOSED, SENTENCES, VISEMES
 from benchmarks.support.other_voices import ESPEAK, FLITE, Espeak, by_flite
@@ -140,10 +140,10 @@ def measure(network: LipNetwork, utterances: list[tuple[Sound, Speech]]) -> dict
             counts.update((_shapes(heard, shapes) == _places(names, shapes))[spoken].tolist())
         coarse = {"vowel": tuple(VOWELS), "consonant": tuple(set(PHONES) - VOWELS - {SILENCE})}
         kinds.update((_shapes(heard, coarse) == _places(names, coarse)).tolist())
-        found = sounds_of(sound)
+        found = recognise_phonemes(sound)
         others = np.array([_name(found, t) for t in heard.times])
         alone.update((_places(others, VISEMES) == _places(names, VISEMES))[spoken].tolist())
-        mouth = steady(heard.mouth)
+        mouth = smooth_mouth(heard.mouth)
         truth = articulate(speech, heard.times)
         shown.append(mouth)
         wanted.append(truth)
@@ -198,7 +198,7 @@ def _places(names: np.ndarray, shapes: dict[str, tuple[str, ...]]) -> np.ndarray
     return np.array([of.get(name, 0) for name in names])
 
 
-def _shapes(heard: Lips, shapes: dict[str, tuple[str, ...]]) -> np.ndarray:
+def _shapes(heard: LipPrediction, shapes: dict[str, tuple[str, ...]]) -> np.ndarray:
     """The likeliest shape of each row: silence is 0, then they are counted."""
     places = _places(np.array(PHONES), shapes)
     sums = np.stack([heard.phones[:, places == k].sum(axis=1) for k in range(len(shapes) + 1)], axis=1)

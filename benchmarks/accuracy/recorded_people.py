@@ -23,10 +23,10 @@ import numpy as np
 import tyro
 
 from avatar.speech import Phoneme, Speech
-from avatar.speech.aligner import align, load_recogniser, recognised_words
-from avatar.speech.lips import LipNetwork, sounds_of
+from avatar.speech.forced_alignment import align, load_recogniser, recognised_words
+from avatar.speech.lips import LipNetwork, recognise_phonemes
 from avatar.speech.phonemes import CONSONANTS, VOWELS
-from avatar.speech.text import words_of
+from avatar.speech.pronunciation import words_from_text
 from benchmarks.accuracy.given_texts import Taken
 from benchmarks.accuracy.live_lips import measure
 from benchmarks.accuracy.talking import closures_apart, milliseconds, shares, starts_apart, visemes_apart
@@ -106,8 +106,8 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
         others = list(dict.fromkeys(other.text for other in everyone if other.text != one.text))
         taken.give(one.sound, [one.text, *others], recogniser)
         got = _words(one.sound, recogniser)
-        errors += word_errors(words_of(one.text), got)
-        words += len(words_of(one.text))
+        errors += word_errors(words_from_text(one.text), got)
+        words += len(words_from_text(one.text))
         try:
             given = align(one.sound, one.text, recogniser=recogniser)
         except InputError:
@@ -122,7 +122,7 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
         recognised.update(visemes_apart(given, free))
         found, lost = closures_apart(given, free)
         missed, bilabials = missed + lost, bilabials + lost + len(found)
-        sounds.update(visemes_apart(given, sounds_of(one.sound)))
+        sounds.update(visemes_apart(given, recognise_phonemes(one.sound)))
     phonemes = sum(len(speech.spoken) for _, speech in spoken)
     theirs = {"matched": len(their_starts), **milliseconds(their_starts)} if their_starts else None
     return {

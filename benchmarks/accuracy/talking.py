@@ -21,7 +21,7 @@ import tyro
 from jaxtyping import Float
 
 from avatar.speech import ARTICULATORS, Speech, articulate
-from avatar.speech.aligner import align
+from avatar.speech.forced_alignment import align
 from avatar.speech.phonemes import BILABIALS, SILENCE
 from avatar.speech.voice import PiperVoice
 from benchmarks.support.results import store_results

@@ -168,7 +168,7 @@ class _Page:
 def _cpu(cast: ChatParts, page: _Page) -> dict[str, float]:
     """Seconds of CPU of the parts on their own, means over the sentences; a block is 32 ms of sound."""
     out: dict[str, list[float]] = {}
-    activity, performer, recogniser = cast.activity(), cast.performer(), cast.recogniser
+    activity, animator, recogniser = cast.activity(), cast.animator(), cast.recogniser
     assert recogniser is not None
 
     def timed(part: str, do: Callable[[], T]) -> T:
@@ -185,7 +185,7 @@ def _cpu(cast: ChatParts, page: _Page) -> dict[str, float]:
         timed("words, at the end", recogniser.end)
         block = samples[RATE // 2 : RATE // 2 + BLOCK].astype(np.float32) / np.float32(32768.0)
         timed("voice activity, a block", lambda heard=block: activity(heard))
-        timed("frames, a sentence", lambda speech=spoken.speech: performer.talk(speech))
+        timed("frames, a sentence", lambda speech=spoken.speech: animator.talk(speech))
         timed("picture", page.draw)
     return {part: round(float(np.mean(seconds)), 4) for part, seconds in out.items()}
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Int16
 
-from avatar.speech import Performer
+from avatar.speech import SpeechAnimator
 from avatar.speech.voice import PiperVoice
 from pipelines.chat.frame_queue import FrameQueue, Line
 from pipelines.chat.hearing import Activity, Listener, Recogniser, UtterancePart
@@ -50,7 +50,7 @@ class ChatParts:
     Attributes:
         voice: synthesises speech.
         partner: answers.
-        performer: returns a new generator of motion.
+        animator: returns a new generator of motion.
         body: joints of the avatar.
         activity: returns a new detector of voice activity.
         recogniser: recognises words; None allows typing alone.
@@ -58,7 +58,7 @@ class ChatParts:
 
     voice: PiperVoice
     partner: Partner
-    performer: Callable[[], Performer]
+    animator: Callable[[], SpeechAnimator]
     body: BodyModel
     activity: Callable[[], Activity]
     recogniser: Recogniser | None
@@ -109,7 +109,7 @@ class Conversation:
         report: Callable[[Turn], None] = lambda _: None,
     ) -> None:
         self._parts, self._tell, self._report = parts, tell, report
-        self.frames = FrameQueue(parts.performer(), parts.body, show)
+        self.frames = FrameQueue(parts.animator(), parts.body, show)
         self._listener = Listener(parts.activity())
         self._turns: list[Turn] = []
         self._turn: Turn | None = None

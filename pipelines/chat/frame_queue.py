@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.speech import Performer
-from avatar.speech.voice import Spoken
+from avatar.speech import SpeechAnimator
+from avatar.speech.voice import SynthesizedSpeech
 from smplxpp.body.model import BodyModel
 from smplxpp.core.files.tensor_bytes import pack_tensors
 from smplxpp.core.params import BodyParams
@@ -47,7 +47,7 @@ class FrameQueue:
     With `sound` (N,) int16 at `rate` a sentence begins at its first frame. `now` is the present, in seconds.
 
     Args:
-        performer: generates the motion.
+        animator: generates the motion.
         body: joints of the avatar, as `avatar.runtime.skeleton.skeleton_body` gives them.
         send: called with each message.
         clock: returns seconds.
@@ -55,12 +55,12 @@ class FrameQueue:
 
     def __init__(
         self,
-        performer: Performer,
+        animator: SpeechAnimator,
         body: BodyModel,
         send: Callable[[bytes], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._performer, self._body, self._send, self._clock = performer, body, send, clock
+        self._animator, self._body, self._send, self._clock = animator, body, send, clock
         self._began = clock()
         self._lock = threading.Lock()
         self._listening = False
@@ -69,7 +69,7 @@ class FrameQueue:
     @property
     def fps(self) -> float:
         """Return the frame rate, frames a second."""
-        return self._performer.config.fps
+        return self._animator.config.fps
 
     @property
     def now(self) -> float:
@@ -84,7 +84,7 @@ class FrameQueue:
     def keep_ahead(self) -> None:
         """Add idle or listening frames until the queue reaches `AHEAD` from the present."""
         with self._lock:
-            missing = self.now + AHEAD - self._performer.seconds
+            missing = self.now + AHEAD - self._animator.seconds
             if missing > _REFILL * AHEAD:
                 self._idle(missing)
 
@@ -95,10 +95,10 @@ class FrameQueue:
                 return
             self._listening = listening
             if not self.speaking:
-                self._performer.cut(self.now + LEAD_TIME)
+                self._animator.rewind(self.now + LEAD_TIME)
                 self._idle(AHEAD)
 
-    def say(self, spoken: Spoken, line: Line, wanted: Callable[[], bool] = lambda: True) -> None:
+    def say(self, spoken: SynthesizedSpeech, line: Line, wanted: Callable[[], bool] = lambda: True) -> None:
         """Queue a sentence: at once, or after the one being spoken.
 
         Args:
@@ -109,10 +109,10 @@ class FrameQueue:
         with self._lock:
             if not wanted():
                 return
-            self._performer.cut(max(self.now + LEAD_TIME, self._speaks_until))
+            self._animator.rewind(max(self.now + LEAD_TIME, self._speaks_until))
             first = self._number
-            motion = self._performer.talk(spoken.speech, more=True)
-            self._speaks_until = self._performer.seconds
+            motion = self._animator.talk(spoken.speech, more=True)
+            self._speaks_until = self._animator.seconds
             sound = {"sound": spoken.sound.integers()}
             about = {"rate": spoken.sound.rate, "turn": line.turn, "line": line.number, "text": line.text}
             self._push(first, motion, sound, about)
@@ -123,17 +123,17 @@ class FrameQueue:
         """Stop the sentence being spoken."""
         with self._lock:
             if self.speaking:
-                self._performer.cut(self.now + LEAD_TIME)
+                self._animator.rewind(self.now + LEAD_TIME)
                 self._speaks_until = 0.0
                 self._idle(AHEAD)
 
     @property
     def _number(self) -> int:
-        return round(self._performer.seconds * self.fps)
+        return round(self._animator.seconds * self.fps)
 
     def _idle(self, seconds: float) -> None:
         first = self._number
-        self._push(first, self._performer.idle(seconds, listening=self._listening), {}, {})
+        self._push(first, self._animator.idle(seconds, listening=self._listening), {}, {})
 
     def _push(self, first: int, motion: BodyParams, more: dict[str, np.ndarray], about: dict[str, object]) -> None:
         header = {"first": first, "fps": self.fps, "now": round(self.now, 4), **about}

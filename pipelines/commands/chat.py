@@ -86,7 +86,7 @@ class Chat:
     def engines(self, bundle: AvatarBundle, partner: Partner) -> ChatParts:
         """Load the engines of the conversation."""
         from avatar.runtime.skeleton import skeleton_body
-        from avatar.speech import Performer, TalkConfig
+        from avatar.speech import SpeechAnimator, TalkConfig
         from avatar.speech.voice import PiperVoice
         from pipelines.chat.conversation import ChatParts
         from pipelines.chat.hearing import Recogniser, find_activity
@@ -99,7 +99,7 @@ class Chat:
         return ChatParts(
             voice=PiperVoice(self.voice, threads=1),
             partner=partner,
-            performer=lambda: Performer(face, stance, TalkConfig(seed=self.seed)),
+            animator=lambda: SpeechAnimator(face, stance, TalkConfig(seed=self.seed)),
             body=skeleton_body(bundle),
             activity=find_activity,
             recogniser=recogniser,

@@ -152,15 +152,15 @@ class Talk:
         require_at_least("height", self.height, _SMALLEST)
         require_at_least("seed", self.seed, 0)
         if self.text is not None:
-            from avatar.speech.text import checked_text
+            from avatar.speech.pronunciation import check_text
 
-            checked_text(self.text)
+            check_text(self.text)
         return suffix
 
     def _heard(self) -> _Heard:
         """What is heard, its phonemes, and the face's curves where another engine makes them."""
         if self.curves is not None:
-            from avatar.speech.curve_files import read_curves
+            from avatar.speech.curve_sources import read_curves
 
             curves = read_curves(self.curves)
             silence = Sound(np.zeros(round(curves.seconds * _SILENT_RATE), np.float32), _SILENT_RATE)
@@ -168,28 +168,28 @@ class Talk:
             return _Heard(sound, _lasting(curves.speech(), sound.seconds), curves=curves)
         model = None
         if self.face_model is not None:
-            from avatar.speech.face_model import FaceModel
+            from avatar.speech.curve_sources import FaceModel
 
             model = FaceModel(self.face_model)
         if self.audio is not None:
-            from avatar.speech.aligner import align, aligns
+            from avatar.speech.forced_alignment import align, aligner_installed
 
             sound = read_wave(self.audio)
             if model is not None and self.text is None:
                 curves = model(sound)
                 return _Heard(sound, _lasting(curves.speech(), sound.seconds), curves=curves)
-            if self.text is None and self.hear != "words" and (self.hear == "sounds" or not aligns()):
-                from avatar.speech.lips import sounds_of
+            if self.text is None and self.hear != "words" and (self.hear == "sounds" or not aligner_installed()):
+                from avatar.speech.lips import recognise_phonemes
 
                 said = (
                     [] if self.hear == "sounds" else ["heard by its sounds: pocketsphinx, for words, is not installed"]
                 )
-                return _Heard(sound, sounds_of(sound), said)
+                return _Heard(sound, recognise_phonemes(sound), said)
             return _Heard(sound, align(sound, self.text), curves=None if model is None else model(sound))
         from avatar.speech.voice import PiperVoice
 
         spoken = PiperVoice(self.voice).say(self.text or "")
-        return _Heard(spoken.sound, spoken.speech, spoken.said, None if model is None else model(spoken.sound))
+        return _Heard(spoken.sound, spoken.speech, spoken.notes, None if model is None else model(spoken.sound))
 
     def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
         portrait = self.view == "portrait"

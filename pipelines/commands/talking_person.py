@@ -17,21 +17,21 @@ from smplxpp.core.params import BodyParams
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
-    from avatar.speech import Face, Stance
+    from avatar.speech import Face, StandingBody
 
 
-def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, Stance]:
+def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, StandingBody]:
     """Return the face of a bundle's person and how the body stands, of what training saw."""
     from avatar.runtime.skeleton import skeleton_body
-    from avatar.speech import Stance
+    from avatar.speech import StandingBody
 
-    stance = Stance.of(
+    standing = StandingBody.of(
         Skeleton.of(skeleton_body(bundle)),
         _whole(_motion_of(bundle), len(bundle.about.expression_names)),
-        known=bundle.tensors.get("poses.known"),
+        observed_poses=bundle.tensors.get("poses.known"),
         surface=bundle.tensors["surface.vertices"].astype(np.float64),
     )
-    return face_of_bundle(bundle), stance
+    return face_of_bundle(bundle), standing
 
 
 def face_of_bundle(bundle: AvatarBundle) -> Face:
@@ -42,7 +42,7 @@ def face_of_bundle(bundle: AvatarBundle) -> Face:
     """
     from avatar.runtime.skeleton import clothed_template
     from avatar.speech import Face
-    from avatar.speech.arkit import ARKIT
+    from avatar.speech.curves import ARKIT
 
     about = bundle.about
     # Only of numbered expressions is the surface asked what they do.
@@ -60,16 +60,16 @@ def live_lips(bundle: AvatarBundle) -> bytes | None:
         return None
 
 
-def person_of_run(run: Path) -> tuple[Face, Stance]:
+def person_of_run(run: Path) -> tuple[Face, StandingBody]:
     """Return the face of a run's template and how its body stands, of the reference frame alone."""
-    from avatar.speech import Face, Stance
+    from avatar.speech import Face, StandingBody
 
     template = load_run_template(run)
     body = template.body
     seen = load_params_of_run(run) if (run / PARAMS).is_file() else None
     face = Face.of(body.expression_names, body.joint_names, seen, body=body)
     frames = _whole(seen, body.num_expressions)
-    return face, Stance.of(Skeleton.of(body, template.betas), frames, surface=template.vertices)
+    return face, StandingBody.of(Skeleton.of(body, template.betas), frames, surface=template.vertices)
 
 
 def _motion_of(bundle: AvatarBundle) -> BodyParams | None:

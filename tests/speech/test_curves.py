@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from avatar.speech import Face, talking_motion
-from avatar.speech.arkit import ARKIT
-from avatar.speech.curve_files import read_curves
-from avatar.speech.curves import Curves
+from avatar.speech.curve_sources import FaceModel, read_curves
+from avatar.speech.curves import ARKIT, Curves
 from avatar.speech.face import JAW_ANGLE
-from avatar.speech.face_model import FaceModel
 from pipelines.commands.talk import Talk
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError

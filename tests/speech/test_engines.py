@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from avatar.speech import articulate
-from avatar.speech.aligner import align, aligned_text, load_recogniser
+from avatar.speech.forced_alignment import align, force_align, load_recogniser
 from avatar.speech.phonemes import BILABIALS, SILENCE, VOWELS
-from avatar.speech.text import pronounce
+from avatar.speech.pronunciation import pronounce
 from avatar.speech.voice import PiperVoice, _symbols
 from benchmarks.accuracy.talking import starts_apart
 from benchmarks.support.other_voices import Espeak
@@ -106,7 +106,7 @@ def test_a_sound_of_the_voice_begins_with_the_pad_ahead_of_it(spoken):
 def test_words_are_recognised_and_other_words_refused(spoken, recogniser):
     heard = align(spoken.sound)
     assert len(heard.spoken) > 20 and heard.seconds == spoken.sound.seconds
-    with pytest.raises(InputError, match="says"):
+    with pytest.raises(InputError, match="words of the text"):
         align(spoken.sound, "one " * 200)
 
 
@@ -117,9 +117,9 @@ def test_a_text_through_which_the_recogniser_finds_a_way_is_refused_where_it_is_
     spoken, recogniser, text
 ):
     decoder = load_recogniser()
-    assert aligned_text(spoken.sound, TEXT, decoder) is not None
-    assert aligned_text(spoken.sound, text, decoder) is not None
-    with pytest.raises(InputError, match="what the text says"):
+    assert force_align(spoken.sound, TEXT, decoder) is not None
+    assert force_align(spoken.sound, text, decoder) is not None
+    with pytest.raises(InputError, match="words of the text"):
         align(spoken.sound, text, recogniser=decoder)
 
 

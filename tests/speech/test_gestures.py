@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar.speech import Face, Performer, Phoneme, Speech, Stance, TalkConfig, idle_motion, talking_motion
-from avatar.speech.arms import REACH, Vocabulary, posed
-from avatar.speech.rhythm import BETWEEN_BEATS, beats
-from avatar.speech.tracks import Track, Wandering
+from avatar.speech import Face, Phoneme, Speech, SpeechAnimator, StandingBody, TalkConfig, idle_motion, talking_motion
+from avatar.speech.gesture_lexicon import MAX_DEVIATION, GestureLexicon, pose_arms
+from avatar.speech.gesture_planner import MIN_BEAT_INTERVAL, find_beats
+from avatar.speech.tracks import RandomTrack, Track
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.pose_range import PoseRange
@@ -49,22 +49,22 @@ def chatter(seconds: float, seed: int = 0, *, stress: bool = True) -> Speech:
 
 
 @pytest.fixture(scope="module")
-def stance() -> Stance:
+def body() -> StandingBody:
     seen = replace(REST, body_pose=bent(left_shoulder=(0, 0, -50), right_shoulder=(0, 0, 50))[None])
-    return Stance.of(SKELETON, seen, surface=BODY.forward(REST).frame(0).vertices)
+    return StandingBody.of(SKELETON, seen, surface=BODY.forward(REST).frame(0).vertices)
 
 
 @pytest.fixture(scope="module")
-def minute(stance) -> tuple[Performer, BodyParams, Speech]:
-    performer, speech = Performer(FACE, stance, TalkConfig(seed=4)), chatter(90.0)
-    return performer, performer.talk(speech), speech
+def minute(body) -> tuple[SpeechAnimator, BodyParams, Speech]:
+    animator, speech = SpeechAnimator(FACE, body, TalkConfig(seed=4)), chatter(90.0)
+    return animator, animator.talk(speech), speech
 
 
-def test_feet_stay_while_the_hips_move_over_them(stance, minute):
+def test_feet_stay_while_the_hips_move_over_them(body, minute):
     joints = SKELETON.pose(minute[1])
     feet = joints[:, SKELETON.at(*FEET)]
     assert np.abs(feet - feet[0]).max() < 1e-9
-    still = SKELETON.pose(stance.still)[0, SKELETON.at(*FEET)]
+    still = SKELETON.pose(body.standing)[0, SKELETON.at(*FEET)]
     assert np.abs(feet[0] - still).max() < 1e-9
     assert 0.02 < np.ptp(joints[:, 0, 0]) < 0.08
     knees = minute[1].body_pose.reshape(-1, 21, 3)[:, [SMPLX_JOINTS.index(f"{s}_knee") - 1 for s in ("left", "right")]]
@@ -77,21 +77,21 @@ def test_feet_keep_the_floor_they_stood_on_when_the_frame_is_turned_bent_and_els
     seen = replace(
         REST, global_orient=np.array([[0.05, 1.1, -0.03]]), body_pose=pose[None], transl=rng.normal(size=(1, 3))
     )
-    stance = Stance.of(SKELETON, seen)
-    feet = SKELETON.pose(talking_motion(chatter(9.0), FACE, stance))[:, SKELETON.at(*FEET)]
-    assert np.abs(feet - SKELETON.pose(stance.still)[0, SKELETON.at(*FEET)]).max() < 1e-9
-    hips = SKELETON.pose(stance.still)[0, SKELETON.at("left_hip", "right_hip")]
+    body = StandingBody.of(SKELETON, seen)
+    feet = SKELETON.pose(talking_motion(chatter(9.0), FACE, body))[:, SKELETON.at(*FEET)]
+    assert np.abs(feet - SKELETON.pose(body.standing)[0, SKELETON.at(*FEET)]).max() < 1e-9
+    hips = SKELETON.pose(body.standing)[0, SKELETON.at("left_hip", "right_hip")]
     assert (hips[0] - hips[1])[0] > 0 and abs((hips[0] - hips[1])[2]) < 1e-9  # it faces +Z
-    np.testing.assert_allclose(SKELETON.pose(stance.still)[0, 0], SKELETON.pose(seen)[0, 0], atol=1e-12)
+    np.testing.assert_allclose(SKELETON.pose(body.standing)[0, 0], SKELETON.pose(seen)[0, 0], atol=1e-12)
 
 
 def test_hands_strike_on_stressed_syllables(minute):
     """At a stroke the arms have arrived; in the half second before it they were under way."""
-    performer, motion, speech = minute
+    animator, motion, speech = minute
     joints = SKELETON.pose(motion)[:, SKELETON.at("left_wrist", "right_wrist")]
     speed = 30.0 * np.linalg.norm(np.diff(joints, axis=0), axis=2).max(axis=1)
     stressed = np.array([one.start for one in speech.phonemes if one.stress == 1])
-    strokes = [time for time, _ in performer.gesturing.strokes]
+    strokes = [time for time, _ in animator.gestures.strokes]
     assert len(strokes) > 25
     for time in strokes:
         behind = time - stressed[stressed <= time]
@@ -102,12 +102,12 @@ def test_hands_strike_on_stressed_syllables(minute):
 
 def test_beats_are_on_stressed_vowels_apart_and_on_long_ones_where_nobody_says(minute):
     rng = np.random.default_rng(0)
-    found = beats(minute[2], rng)
+    found = find_beats(minute[2], rng)
     times = np.array([one.time for one in found])
-    assert np.diff(times).min() > BETWEEN_BEATS - 0.1 and sum(one.stroke for one in found) > 25
-    guessed = beats(chatter(90.0, stress=False), rng)
+    assert np.diff(times).min() > MIN_BEAT_INTERVAL - 0.1 and sum(one.stroke for one in found) > 25
+    guessed = find_beats(chatter(90.0, stress=False), rng)
     assert len(guessed) > 25
-    assert beats(Speech((), 3.0), rng) == []
+    assert find_beats(Speech((), 3.0), rng) == []
 
 
 def test_hands_keep_clear_of_the_trunk_of_the_body_itself(minute):
@@ -126,8 +126,8 @@ def test_hands_keep_clear_of_the_trunk_of_the_body_itself(minute):
 
 
 def test_nothing_is_seen_twice_within_a_minute(minute):
-    performer, motion, _ = minute
-    strokes = performer.gesturing.strokes
+    animator, motion, _ = minute
+    strokes = animator.gestures.strokes
     again = [b - a for k, (a, pair) in enumerate(strokes) for b, other in strokes[k + 1 :] if pair == other]
     assert min(again, default=np.inf) > 45.0
     arms = np.degrees(motion.body_pose.reshape(-1, 21, 3)[:, ARMS].reshape(len(motion), -1))
@@ -139,16 +139,16 @@ def test_nothing_is_seen_twice_within_a_minute(minute):
     assert far.any() and apart[far].min() > 2.0  # degrees; a clip that is played again has 0
 
 
-def test_pieces_follow_each_other_without_a_jump(stance):
-    performer = Performer(FACE, stance, TalkConfig(seed=2))
-    pieces = [performer.idle(1.3, listening=True), performer.talk(chatter(5.0), more=True)]
-    pieces += [performer.talk(chatter(4.0, 1)), performer.idle(2.0), performer.talk(chatter(3.0, 2))]
-    seconds = performer.seconds
-    performer.cut(seconds - 1.4)
+def test_pieces_follow_each_other_without_a_jump(body):
+    animator = SpeechAnimator(FACE, body, TalkConfig(seed=2))
+    pieces = [animator.idle(1.3, listening=True), animator.talk(chatter(5.0), more=True)]
+    pieces += [animator.talk(chatter(4.0, 1)), animator.idle(2.0), animator.talk(chatter(3.0, 2))]
+    seconds = animator.seconds
+    animator.rewind(seconds - 1.4)
     pieces[-1] = pieces[-1].select(slice(0, len(pieces[-1]) - 42))
-    pieces += [performer.idle(3.0, listening=True)]
+    pieces += [animator.idle(3.0, listening=True)]
     motion = BodyParams.concatenate(pieces)
-    assert performer.seconds * 30 == pytest.approx(len(motion))
+    assert animator.seconds * 30 == pytest.approx(len(motion))
     turns = matrix_from_rotvec(np.concatenate([motion.global_orient, motion.body_pose], 1).reshape(len(motion), 22, 3))
     speed = rotvec_from_matrix(np.swapaxes(turns[:-1], 2, 3) @ turns[1:]) * 30.0
     jerk = np.linalg.norm(np.diff(speed, axis=0), axis=2) * 30.0
@@ -159,30 +159,30 @@ def test_pieces_follow_each_other_without_a_jump(stance):
     assert np.abs(np.diff(motion.jaw_pose[:, 0])).max() < 0.12
 
 
-def test_pieces_are_the_same_as_one_of_their_length(stance):
-    one = idle_motion(4.0, FACE, stance)
-    performer = Performer(FACE, stance)
-    parts = BodyParams.concatenate([performer.idle(1.0), performer.idle(0.5), performer.idle(2.5)])
+def test_pieces_are_the_same_as_one_of_their_length(body):
+    one = idle_motion(4.0, FACE, body)
+    animator = SpeechAnimator(FACE, body)
+    parts = BodyParams.concatenate([animator.idle(1.0), animator.idle(0.5), animator.idle(2.5)])
     for name, value in one.as_dict().items():
         np.testing.assert_allclose(value, parts.as_dict()[name], atol=1e-12)
 
 
-def test_a_seed_gives_one_motion_and_none_of_gestures_leaves_the_arms(stance):
+def test_a_seed_gives_one_motion_and_none_of_gestures_leaves_the_arms(body):
     speech = chatter(8.0)
-    same = [talking_motion(speech, FACE, stance, TalkConfig(seed=5)) for _ in range(2)]
+    same = [talking_motion(speech, FACE, body, TalkConfig(seed=5)) for _ in range(2)]
     np.testing.assert_array_equal(same[0].body_pose, same[1].body_pose)
-    other = talking_motion(speech, FACE, stance, TalkConfig(seed=6))
+    other = talking_motion(speech, FACE, body, TalkConfig(seed=6))
     assert np.abs(other.body_pose - same[0].body_pose).max() > 0.3
-    quiet = talking_motion(speech, FACE, stance, TalkConfig(gestures=0.0))
+    quiet = talking_motion(speech, FACE, body, TalkConfig(gestures=0.0))
     arms = quiet.body_pose.reshape(-1, 21, 3)[:, ARMS]
     assert np.ptp(arms, axis=0).max() < 1e-12
-    half = talking_motion(speech, FACE, stance, TalkConfig(seed=5, gestures=0.5))
+    half = talking_motion(speech, FACE, body, TalkConfig(seed=5, gestures=0.5))
     reach = [np.ptp(one.body_pose.reshape(-1, 21, 3)[:, ARMS], axis=0).max() for one in (half, same[0])]
     assert 0.3 * reach[1] < reach[0] < 0.75 * reach[1]
 
 
-def test_somebody_who_waits_breathes_and_a_listener_nods(stance):
-    waits, listens = (idle_motion(20.0, FACE, stance, listening=flag) for flag in (False, True))
+def test_somebody_who_waits_breathes_and_a_listener_nods(body):
+    waits, listens = (idle_motion(20.0, FACE, body, listening=flag) for flag in (False, True))
     spine, head = (SMPLX_JOINTS.index(name) - 1 for name in ("spine3", "head"))
     for motion in (waits, listens):
         assert np.ptp(motion.body_pose.reshape(-1, 21, 3)[:, spine, 0]) > np.radians(0.5)
@@ -201,14 +201,14 @@ def test_arms_stay_near_what_training_saw():
             bent(left_shoulder=(16, -30, -46), right_shoulder=(16, 30, 46), right_elbow=(-14, 66, -6)),
         ]
     )
-    stance = Stance.of(SKELETON, replace(REST, body_pose=known[:1]), known=known)
-    vocabulary = Vocabulary.of(stance)
-    turns = matrix_from_rotvec(posed(stance.still, vocabulary.states, vocabulary.rest).body_pose.reshape(-1, 21, 3))
+    body = StandingBody.of(SKELETON, replace(REST, body_pose=known[:1]), observed_poses=known)
+    lexicon = GestureLexicon.of(body)
+    turns = matrix_from_rotvec(pose_arms(body.standing, lexicon.states, lexicon.rest).body_pose.reshape(-1, 21, 3))
     seen = matrix_from_rotvec(known.reshape(-1, 21, 3))
     for joint in ARMS:
         apart = rotvec_from_matrix(np.swapaxes(seen[None, :, joint], 2, 3) @ turns[:, None, joint])
-        assert np.linalg.norm(apart, axis=2).min(axis=1).max() <= REACH + 1e-9
-    motion = talking_motion(chatter(20.0), FACE, stance)
+        assert np.linalg.norm(apart, axis=2).min(axis=1).max() <= MAX_DEVIATION + 1e-9
+    motion = talking_motion(chatter(20.0), FACE, body)
     outside = PoseRange.of(known).outside(motion)
     upper = [k for k, name in enumerate(SMPLX_JOINTS[1:22]) if not any(n in name for n in ("hip", "knee", "ankle"))]
     assert not outside[:, upper].any()
@@ -218,16 +218,16 @@ def test_arms_stay_near_what_training_saw():
 def test_a_frame_in_which_a_foot_is_up_is_not_stood_in():
     poses = np.stack([bent(left_hip=(-40, 0, 0), left_knee=(60, 0, 0))] * 5 + [bent(left_shoulder=(0, 0, -20))])
     seen = replace(BodyParams.concatenate([REST] * 6), body_pose=poses)
-    np.testing.assert_array_equal(Stance.of(SKELETON, seen).still.body_pose[0], poses[5])
+    np.testing.assert_array_equal(StandingBody.of(SKELETON, seen).standing.body_pose[0], poses[5])
 
 
 def test_a_skeleton_without_legs_is_refused():
     with pytest.raises(InputError, match="joints of a skeleton"):
-        Stance.of(replace(SKELETON, names=tuple(f"bone{k}" for k in range(55))), REST)
+        StandingBody.of(replace(SKELETON, names=tuple(f"bone{k}" for k in range(55))), REST)
     with pytest.raises(InputError, match="gestures"):
-        Performer(FACE, REST, TalkConfig(gestures=1.5))
+        SpeechAnimator(FACE, REST, TalkConfig(gestures=1.5))
     with pytest.raises(InputError, match="seconds"):
-        Performer(FACE, REST).idle(float("nan"))
+        SpeechAnimator(FACE, REST).idle(float("nan"))
 
 
 # --- curves ---------------------------------------------------------------------------------------------------------
@@ -248,8 +248,8 @@ def test_a_track_goes_on_at_its_speed_and_comes_to_rest():
 
 
 def test_wandering_is_the_same_however_it_is_asked():
-    def make() -> Wandering:
-        return Wandering(
+    def make() -> RandomTrack:
+        return RandomTrack(
             np.random.default_rng(3), lambda rng: rng.normal(size=1), np.zeros(1), moves=(0.5, 1.0), holds=(0.2, 0.4)
         )
 
@@ -258,5 +258,5 @@ def test_wandering_is_the_same_however_it_is_asked():
     parts = []
     for some in np.array_split(times, 7):
         parts.append(pieces(some))
-        pieces.forget(float(some[0]))
+        pieces.discard_before(float(some[0]))
     np.testing.assert_allclose(whole, np.concatenate(parts), atol=1e-12)

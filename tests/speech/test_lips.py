@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from avatar.speech import ARTICULATORS, SILENCE, Phoneme, Speech, articulate
-from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, Lips, agreement, sounds_of, steady
+from avatar.speech.audio_features import BANDS, HOP, RATE, log_mel, mel_filters
+from avatar.speech.lips import (
+    PHONES,
+    WEIGHTS,
+    LipNetwork,
+    LipPrediction,
+    alignment_score,
+    recognise_phonemes,
+    smooth_mouth,
+)
 from avatar.speech.phonemes import BILABIALS, VOWELS
-from avatar.speech.sound_features import BANDS, HOP, RATE, hear, mel_bands
 from pipelines.commands.talk import Talk
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.tensor_bytes import unpack_tensors
@@ -26,7 +34,7 @@ def test_a_tone_is_heard_in_its_band_at_forty_decibels_above_nothing():
     """Its power in all bands is 0 dB below the loudest, which is row 0 + 40 dB, or 2 units."""
     hertz = 1127.0 * np.log1p(1000.0 / 700.0)
     lowest, highest = (1127.0 * np.log1p(one / 700.0) for one in (60.0, 7600.0))
-    row = hear(tone(1000.0))[-1]
+    row = log_mel(tone(1000.0))[-1]
     assert int(row.argmax()) == round((hertz - lowest) / (highest - lowest) * (BANDS + 1)) - 1
     power = (10.0 ** (2.0 * row - 4.0)).sum()
     assert power == pytest.approx(1.0, rel=1e-3)
@@ -34,19 +42,19 @@ def test_a_tone_is_heard_in_its_band_at_forty_decibels_above_nothing():
 
 
 def test_bands_are_triangles_that_add_up_to_one_between_their_middles():
-    bands = mel_bands()
+    bands = mel_filters()
     inside = bands[(np.arange(257) * RATE / 512 > 120.0) & (np.arange(257) * RATE / 512 < 7000.0)]
     np.testing.assert_allclose(inside.sum(axis=1), 1.0, atol=1e-9)
 
 
 def test_rows_know_nothing_of_later_samples_and_levels_nothing_of_the_gain(spoken):
     sound = spoken.sound.at_rate(RATE).samples
-    rows = hear(sound)
-    np.testing.assert_array_equal(hear(sound[: 100 * HOP]), rows[:100])
-    loud = hear(np.concatenate([tone(300.0), sound]))[50:]
-    quiet = hear(0.25 * np.concatenate([tone(300.0), sound]))[50:]
+    rows = log_mel(sound)
+    np.testing.assert_array_equal(log_mel(sound[: 100 * HOP]), rows[:100])
+    loud = log_mel(np.concatenate([tone(300.0), sound]))[50:]
+    quiet = log_mel(0.25 * np.concatenate([tone(300.0), sound]))[50:]
     np.testing.assert_allclose(loud[loud > 0.0], quiet[loud > 0.0], atol=0.01)
-    assert hear(np.zeros(HOP - 1, np.float32)).shape == (0, BANDS)
+    assert log_mel(np.zeros(HOP - 1, np.float32)).shape == (0, BANDS)
 
 
 def test_the_network_says_nothing_of_a_time_later_than_its_delay(spoken):
@@ -88,7 +96,7 @@ def test_convolutions_are_those_of_a_loop_in_double_precision():
 def test_the_mouth_closes_for_bilabials_opens_for_vowels_and_rests_in_silence(spoken):
     silence = np.zeros(spoken.sound.rate, np.float32)
     heard = LipNetwork.shipped()(Sound(np.concatenate([spoken.sound.samples, silence]), spoken.sound.rate))
-    mouth = steady(heard.mouth)
+    mouth = smooth_mouth(heard.mouth)
     closed = heard.times[mouth[:, PRESS] > 0.95]
     middles = [0.5 * (one.start + one.end) for one in spoken.speech.spoken if one.name in BILABIALS]
     near = [np.abs(closed - middle).min() < 0.1 for middle in middles]
@@ -102,18 +110,18 @@ def test_the_mouth_closes_for_bilabials_opens_for_vowels_and_rests_in_silence(sp
 def test_a_steady_mouth_follows_and_lips_that_are_likely_closed_are():
     mouth = np.zeros((40, 6), np.float32)
     mouth[10:30, PRESS], mouth[:, JAW] = 0.75, 0.8
-    out = steady(mouth)
+    out = smooth_mouth(mouth)
     assert out[29, PRESS] == pytest.approx(1.0, abs=1e-6) and out[29, JAW] == pytest.approx(0.0, abs=1e-6)
     assert out[9, PRESS] == 0.0 and out[39, PRESS] == pytest.approx(0.0, abs=1e-2)
     assert out[9, JAW] == pytest.approx(0.8, abs=1e-2) and out[39, JAW] == pytest.approx(0.8, abs=1e-2)
     mouth[:, PRESS] = 0.25  # not likely: as it is
-    np.testing.assert_allclose(steady(mouth)[-1, [JAW, PRESS]], [0.8, 0.25], atol=1e-6)
+    np.testing.assert_allclose(smooth_mouth(mouth)[-1, [JAW, PRESS]], [0.8, 0.25], atol=1e-6)
 
 
 def test_sounds_are_found_without_words(spoken):
     """Most of the time the vowels are where they are said, at another rate and level too."""
     for sound in (spoken.sound, Sound(0.1 * spoken.sound.at_rate(48_000).samples, 48_000)):
-        speech = sounds_of(sound)
+        speech = recognise_phonemes(sound)
         assert speech.seconds == pytest.approx(sound.seconds) and len(speech.spoken) > 15
         times = np.arange(0.0, sound.seconds, 0.01)
 
@@ -129,12 +137,12 @@ def test_sounds_are_found_without_words(spoken):
     [
         (np.zeros(16_000), "silence"),
         (np.zeros(10), "seconds"),
-        (0.05 * np.random.default_rng(0).standard_normal(32_000), "no sound of speech"),
+        (0.05 * np.random.default_rng(0).standard_normal(32_000), "no phoneme"),
     ],
 )
 def test_what_says_nothing_is_refused(samples, word):
     with pytest.raises(InputError, match=word):
-        sounds_of(Sound(np.asarray(samples, np.float32), RATE))
+        recognise_phonemes(Sound(np.asarray(samples, np.float32), RATE))
 
 
 def test_another_version_is_refused():
@@ -156,14 +164,16 @@ def test_phonemes_agree_with_what_is_heard_at_their_times_alone():
     phones = np.full((5 * rows, len(PHONES)), 1e-6, np.float32)
     for k, name in enumerate(names):
         phones[k * rows : (k + 1) * rows, PHONES.index(name)] = 1.0
-    heard = Lips((np.arange(len(phones)) + 0.5) * 0.01, phones, np.zeros((len(phones), len(ARTICULATORS)), np.float32))
+    heard = LipPrediction(
+        (np.arange(len(phones)) + 0.5) * 0.01, phones, np.zeros((len(phones), len(ARTICULATORS)), np.float32)
+    )
 
     def said(order):
         each = rows * 0.01
         spoken = tuple(Phoneme(name, k * each, (k + 1) * each) for k, name in enumerate(order))
-        return agreement(heard, Speech(spoken, 5 * each))
+        return alignment_score(heard, Speech(spoken, 5 * each))
 
     even = (rows + 100.0 / len(PHONES)) / (5 * rows + 100.0)
     assert said(names) == pytest.approx(-np.log(even), abs=0.01)
     assert said(names[1:] + names[:1]) < -3.0
-    assert agreement(heard, Speech((), 2.0)) == -np.inf
+    assert alignment_score(heard, Speech((), 2.0)) == -np.inf

@@ -9,7 +9,7 @@ import pytest
 
 from avatar.speech import ARTICULATORS, Face, Phoneme, Speech, TalkConfig, articulate, talking_motion
 from avatar.speech.coarticulation import Timing
-from avatar.speech.face import JAW_ANGLE, MARGIN, MOST
+from avatar.speech.face import JAW_ANGLE, MARGIN, MAX_UNOBSERVED
 from avatar.speech.phonemes import CONSONANTS, VOWELS, arpabet_from_ipa, ipa_from_arpabet
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -105,7 +105,7 @@ def test_the_face_keeps_to_what_training_saw():
     np.testing.assert_allclose(face.neutral, expression.mean(axis=0))
     motion = talking_motion(spoken(*(["M", "AA", "UW"] * 9)), face, still(), TalkConfig(strength=2.0))
     assert motion.expression[:, pressed].max() == pytest.approx(0.2 + MARGIN)
-    assert motion.expression.max() <= MOST + 1e-12 and motion.expression.min() >= 0.0
+    assert motion.expression.max() <= MAX_UNOBSERVED + 1e-12 and motion.expression.min() >= 0.0
     assert motion.jaw_pose[:, 0].max() <= 0.02 + JAW_ANGLE + 1e-12
     assert motion.jaw_pose[:, 0].min() == pytest.approx(0.0, abs=0.002)  # lips close though the jaw rests open
     np.testing.assert_allclose(motion.expression[-1], face.neutral, atol=0.02)
@@ -122,7 +122,7 @@ def test_eyes_blink_and_nothing_else_moves():
     motion = talking_motion(speech, Face.of(NAMES, ("jaw",)), still(), TalkConfig(lively=0.0))
     lids = motion.expression[:, NAMES.index("eyeBlinkLeft")]
     starts = int((np.diff((lids > 0.5).astype(int)) == 1).sum())
-    assert 3 <= starts <= 12 and lids.max() == pytest.approx(MOST)
+    assert 3 <= starts <= 12 and lids.max() == pytest.approx(MAX_UNOBSERVED)
     others = [k for k, name in enumerate(NAMES) if not name.startswith("eyeBlink")]
     assert not motion.expression[:, others].any() and not motion.body_pose.any() and not motion.leye_pose.any()
 

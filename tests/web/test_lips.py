@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from avatar.speech import ARTICULATORS, Face
-from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, steady
-from avatar.speech.sound_features import FRAME, RATE, hear
+from avatar.speech.audio_features import FRAME, RATE, log_mel
+from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, smooth_mouth
 from pipelines.commands.talking_page import write_talking_page
 from pipelines.web.page import PageContent, lips_of, page_files, single_page
 from pipelines.web.server import PageServer
@@ -65,7 +65,7 @@ def test_the_page_hears_what_python_hears(tmp_path):
       });
     }"""
     found = node(script, given={"weights": str(WEIGHTS), "sound": str(tmp_path / "sound")})
-    rows = hear(sound.samples)
+    rows = log_mel(sound.samples)
     np.testing.assert_allclose(found["rows"], rows, atol=1e-4)
     network = LipNetwork.shipped()
     heard = network(sound)
@@ -76,7 +76,7 @@ def test_the_page_hears_what_python_hears(tmp_path):
     np.testing.assert_allclose(np.array(found["phones"])[skipped:], heard.phones[:count], atol=1e-4)
     np.testing.assert_allclose(np.array(found["mouth"])[skipped:], heard.mouth[:count], atol=1e-4)
     assert np.ptp(heard.mouth[:, JAW]) > 0.2
-    np.testing.assert_allclose(found["steady"], steady(np.array(found["mouth"])), atol=1e-5)
+    np.testing.assert_allclose(found["steady"], smooth_mouth(np.array(found["mouth"])), atol=1e-5)
 
 
 @NEEDS_BUILD
@@ -203,7 +203,7 @@ def test_a_file_is_heard_and_the_mouth_is_with_it(listening, avatar):
         listening.evaluate("clearInterval(watch); 0")
         answers = np.array(listening.evaluate("answers"), float)
         heard = LipNetwork.shipped()(sound)
-        truth = steady(heard.mouth)[:, JAW]
+        truth = smooth_mouth(heard.mouth)[:, JAW]
         inside = (answers[:, 0] > 0.1) & (answers[:, 0] < 2.8)
         assert inside.sum() > 5 and np.ptp(truth) > 0.2
         wanted = np.interp(answers[inside, 0], heard.times, truth)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.signal import butter, fftconvolve, lfilter, resample_poly, sosfilt
 
-from avatar.speech.sound_features import RATE
+from avatar.speech.audio_features import RATE
 
 _FACTORS = (0.75, 1.45)  # of pitch, formants and tempo at once
 _OTHER_SOURCE, _ROOM, _TELEPHONE, _NOISY = 0.5, 0.4, 0.15, 0.6  # shares of sentences

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from avatar.speech import SILENCE, Speech, articulate
+from avatar.speech.audio_features import RATE
 from avatar.speech.phonemes import CONSONANTS, VOWELS, ipa_from_arpabet
-from avatar.speech.sound_features import RATE
-from avatar.speech.text import cmu_dictionary, phones_of
+from avatar.speech.pronunciation import cmu_dictionary, phones_from_word
 from avatar.speech.voice import PiperVoice
 
 STEP = 0.01
@@ -57,7 +57,7 @@ def make_sentences(count: int, rng: np.random.Generator) -> list[str]:
         chosen = rng.integers(*_WORDS, endpoint=True)
         for k in range(chosen):
             word = str(rng.choice(_COMMON)) if rng.random() < _SHARE_COMMON else words[rng.choice(len(words), p=share)]
-            said += (" " if said else "") + ipa_from_arpabet(phones_of(word)[0])
+            said += (" " if said else "") + ipa_from_arpabet(phones_from_word(word)[0])
             if k + 1 < chosen and rng.random() < _COMMA:
                 said += ","
         out.append(said + ".")

@@ -20,10 +20,10 @@ from jaxtyping import Float, Int
 from rich.console import Console
 from torch import Tensor, nn
 
+from avatar.speech.audio_features import BANDS, FRAME, log_mel
 from avatar.speech.coarticulation import ARTICULATORS
 from avatar.speech.lips import PHONES, VERSION, WEIGHTS
 from avatar.speech.phonemes import Speech
-from avatar.speech.sound_features import BANDS, FRAME, hear
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.tensor_bytes import pack_tensors
 from tools.lips.augment import disguise, vary
@@ -132,7 +132,7 @@ def _heard(utterances: list[Utterance], rng: np.random.Generator, delay: float) 
     for k in rng.permutation(len(utterances)):
         one = utterances[k]
         got = vary(one.samples, rng)
-        rows.append(disguise(hear(got.samples.astype(np.float32)), rng))
+        rows.append(disguise(log_mel(got.samples.astype(np.float32)), rng))
         times = ((np.arange(len(rows[-1])) + 1) * FRAME - delay - got.ahead) * got.faster
         phones.append(_labels(one.speech, times))
         at = np.arange(len(one.mouth)) * STEP

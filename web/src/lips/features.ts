@@ -1,4 +1,4 @@
-/** Sound to what the lips' network hears of it: `avatar.speech.sound_features`, as the samples come. */
+/** Sound to what the lips' network hears of it: `avatar.speech.audio_features`, as the samples come. */
 
 export const RATE = 16000;
 /** Samples from a row to the next, and that one row sees. */

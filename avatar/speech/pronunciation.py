@@ -1,4 +1,4 @@
-"""Text to the sounds of its words: by espeak-ng where it is installed, else the CMU dictionary of pocketsphinx."""
+"""Grapheme-to-phoneme conversion: by espeak-ng where it is installed, else by the CMU dictionary of pocketsphinx."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from avatar.speech.phonemes import ipa_from_arpabet
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.paths import read_text
 
-MOST_CHARACTERS = 20_000
-"""Of a text that is spoken at once: some twenty minutes."""
+MAX_CHARACTERS = 20_000
+"""Longest text that is spoken at once: about twenty minutes."""
 PAUSES = ".,;:!?"
+"""Punctuation marks that are spoken as pauses."""
 EXTRA = "talk"
-# Marks at which a sentence breaks: not within numbers, behind one letter or behind a title.
+"""The optional dependencies of this room."""
+# Marks at which a sentence breaks, except within numbers, after a single letter and after a title.
 _POINT = "".join(rf"(?<!\b{title})" for title in ("[A-Za-z]", "Dr", "Mr", "Ms", "St", "Mrs", "Prof")) + r"\."
 _BREAK = re.compile(rf"((?:{_POINT}|[,;:!?])[{re.escape(PAUSES)}]*)(?=[\s\"'”’)\]]|$)")
-_WAIT = 60.0  # seconds for espeak-ng
 _ONES = (
     "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen "
     "eighteen nineteen"
 ).split()
 _TENS = "twenty thirty forty fifty sixty seventy eighty ninety".split()
 
-_SELDOM = ("AH", "ER", "IH")
-# Words that carry no stress in a sentence.
-_WEAK = frozenset(
+# Function words, which carry no stress in a sentence.
+_UNSTRESSED_WORDS = frozenset(
     "a an the and or but nor as at by for from in into of on to with than that if is are was were be been am do does "
     "did has have had he him his i it its me my she her them they their us we our you your can could shall should will "
     "would may might must there some".split()
 )
 
-# Spelling to sound for words that no dictionary has; longer spellings first.
-_LETTERS = {
+# Spelling rules for words that are not in the dictionary; longer spellings are tried first.
+_SPELLING_RULES = {
     **{"tion": "SH AH0 N", "igh": "AY1", "tch": "CH", "ch": "CH", "sh": "SH", "th": "TH", "ph": "F", "ck": "K"},
     **{"ng": "NG", "qu": "K W", "wh": "W", "ee": "IY1", "ea": "IY1", "oo": "UW1", "ou": "AW1", "ow": "OW1"},
     **{"ai": "EY1", "ay": "EY1", "oi": "OY1", "oy": "OY1", "au": "AO1", "aw": "AO1", "er": "ER0", "ar": "AA1 R"},
@@ -51,11 +51,12 @@ _LETTERS = {
 
 @dataclass
 class Pronunciation:
-    """A text as a voice reads it.
+    """The pronunciation of a text in IPA.
 
     Attributes:
-        ipa: in espeak-ng's manner, words apart, with the text's pauses. guessed: words spelled out by rules.
-        foreign: words left out, whose letters the language does not have.
+        ipa: as espeak-ng writes it, words separated by spaces, with the text's pauses.
+        guessed: words pronounced by spelling rules.
+        foreign: words left out, because the language does not have their letters.
     """
 
     ipa: str
@@ -63,19 +64,19 @@ class Pronunciation:
     foreign: list[str] = field(default_factory=list)
 
 
-def checked_text(text: str) -> str:
-    """Return a text with single spaces.
+def check_text(text: str) -> str:
+    """Return a text with single spaces, checked to have something to speak.
 
     Raises:
-        InputError: nothing to say in it, or too much.
+        InputError: no word, or more than `MAX_CHARACTERS`.
     """
     text = " ".join(text.split())
     if not any(one.isalnum() for one in text):
         raise InputError("text", expected="at least one word", received=repr(text[:40]) if text else "none")
-    if len(text) > MOST_CHARACTERS:
+    if len(text) > MAX_CHARACTERS:
         raise InputError(
             "text",
-            expected=f"at most {MOST_CHARACTERS} characters",
+            expected=f"at most {MAX_CHARACTERS} characters",
             received=str(len(text)),
             remedy="speak it in parts; the films can be joined",
         )
@@ -83,62 +84,65 @@ def checked_text(text: str) -> str:
 
 
 def pronounce(text: str, *, language: str = "en-us") -> Pronunciation:
-    """Return the sounds of a text.
+    """Return the pronunciation of a text.
 
     Args:
-        language: espeak-ng's name of it; the dictionary has American English alone.
+        text: words of the language.
+        language: as espeak-ng names it; the dictionary has American English only.
 
     Raises:
-        InputError: nothing to say, a language that cannot be pronounced, an espeak-ng that fails.
+        InputError: no word, a language that cannot be pronounced, an espeak-ng that fails.
         MissingExtraError: neither the program nor the dictionary is installed.
     """
-    text, foreign = _legible(checked_text(text), language)
+    text, foreign = _drop_foreign_words(check_text(text), language)
     program = shutil.which("espeak-ng")
     if program is not None:
         return Pronunciation(_by_espeak(program, text, language), foreign=foreign)
     if not language.startswith("en"):
         raise InputError(
             f"language {language}",
-            expected="English, which the dictionary has",
-            received="no program espeak-ng on this machine for others",
+            expected="English, the language of the dictionary",
+            received="another language, without the program espeak-ng",
             remedy="apt-get install espeak-ng",
         )
     return replace(_by_dictionary(text), foreign=foreign)
 
 
-def no_words(text: str) -> InputError:
-    """What to say of a text in which nothing can be pronounced."""
+def no_words_error(text: str) -> InputError:
+    """Return the error for a text without a word that can be pronounced."""
     return InputError(
         "text",
         expected="words that the voice's language has",
         received=repr(text[:40]),
-        remedy="a recording in any language is followed by its sounds (--audio), and --voice names another voice",
+        remedy="give a recording, whose sounds are followed in any language (--audio), or another --voice",
     )
 
 
-def words_of(text: str) -> list[str]:
-    """Return the words of a text as the dictionary spells them, numbers in words."""
-    return [word for token in _tokens(text) if token not in PAUSES for word in [token]]
+def words_from_text(text: str) -> list[str]:
+    """Return the words of a text as the dictionary spells them, numbers spelled out."""
+    return [token for token in _tokens(text) if token not in PAUSES]
 
 
-def phones_of(word: str) -> tuple[list[str], bool]:
-    """Return the ARPAbet phones of a word, with stress, and whether they were guessed from its spelling.
+def phones_from_word(word: str) -> tuple[list[str], bool]:
+    """Return the ARPAbet phones of a word, with stress, and whether spelling rules guessed them.
 
     Raises:
         MissingExtraError: pocketsphinx, whose dictionary is read, is not installed.
     """
+    # The dictionary, with the possessive taken off where needed.
     known = cmu_dictionary().get(word)
-    if known is not None and word in _WEAK:
+    if known is not None and word in _UNSTRESSED_WORDS:
         return [one + "0" if one[0] in "AEIOU" else one for one in known.split()], False
     if known is not None:
-        return _stressed(known), False
+        return _add_stress(known), False
     if word.endswith("'s") and word[:-2] in cmu_dictionary():
-        return [*_stressed(cmu_dictionary()[word[:-2]]), "Z"], False
+        return [*_add_stress(cmu_dictionary()[word[:-2]]), "Z"], False
+    # Spelling rules, the longest that matches first.
     phones: list[str] = []
     at = 0
     while at < len(word):
         for length in (4, 3, 2, 1):
-            sound = _LETTERS.get(word[at : at + length])
+            sound = _SPELLING_RULES.get(word[at : at + length])
             if sound is not None:
                 phones += sound.split()
                 break
@@ -162,13 +166,13 @@ def cmu_dictionary() -> dict[str, str]:
     return {row[0]: row[1].strip() for row in rows if len(row) == 2}
 
 
-def _legible(text: str, language: str) -> tuple[str, list[str]]:
-    """The text without words in letters that English does not have, and these; others' letters are not known here.
+def _drop_foreign_words(text: str, language: str) -> tuple[str, list[str]]:
+    """Split an English text into what can be pronounced and the words in foreign scripts.
 
-    espeak-ng would say the names of such letters.
+    espeak-ng would spell such words letter by letter. Texts of other languages are returned whole.
 
     Raises:
-        InputError: no other word.
+        InputError: all words are foreign.
     """
     if not language.startswith("en"):
         return text, []
@@ -176,43 +180,43 @@ def _legible(text: str, language: str) -> tuple[str, list[str]]:
     foreign = [word for word in words if _is_foreign(word)]
     left = " ".join(word for word in words if word not in foreign)
     if foreign and not any(one.isalnum() for one in left):
-        raise no_words(text)
+        raise no_words_error(text)
     return left, [word.strip(PAUSES) for word in foreign]
 
 
 def _is_foreign(word: str) -> bool:
-    """Whether letters are of another script; one Greek letter alone is a sign, whose name is said."""
+    """Return whether a word has letters of another script; a single Greek letter is a symbol with a name."""
     letters = [unicodedata.name(one, "") for one in word if unicodedata.category(one) in ("Lu", "Ll", "Lt", "Lo")]
     strange = [name for name in letters if not name.startswith(("LATIN", "MICRO", "FEMININE", "MASCULINE"))]
     return bool(strange) and not (len(letters) == 1 and strange[0].startswith("GREEK"))
 
 
-def _stressed(phones: str) -> list[str]:
-    """Give a word its likely stress, which the dictionary leaves out: on its first full vowel, or its first.
+def _add_stress(phones: str) -> list[str]:
+    """Add the likely stress, which the dictionary lacks: on the first full vowel, or else the first vowel.
 
-    AH, ER and IH are seldom full, nor is IY at the end.
+    AH, ER, IH and a final IY are counted as reduced vowels.
     """
     out = phones.split()
     vowels = [k for k, one in enumerate(out) if one[0] in "AEIOU"]
-    full = [k for k in vowels if out[k] not in _SELDOM and (k, out[k]) != (len(out) - 1, "IY")]
+    full = [k for k in vowels if out[k] not in ("AH", "ER", "IH") and (k, out[k]) != (len(out) - 1, "IY")]
     for k in vowels:
         out[k] += "1" if k == (full or vowels)[0] else "0"
     return out
 
 
 def _by_espeak(program: str, text: str, language: str) -> str:
-    """Ask the user's own espeak-ng; pauses are kept, which it drops."""
+    """Run espeak-ng on the parts between pauses, because it drops the pauses."""
     parts = _BREAK.split(text)
     spoken = [part.strip() for part in parts[::2]]
     command = [program, "-q", "--ipa", "-b", "1", "-v", language, "--stdin"]
     out = ""
     for k, part in enumerate(spoken):
         if part:
-            done = subprocess.run(command, input=part.encode(), capture_output=True, timeout=_WAIT, check=False)
+            done = subprocess.run(command, input=part.encode(), capture_output=True, timeout=60.0, check=False)
             if done.returncode:
-                said = done.stderr.decode(errors="replace").strip().splitlines() or ["it says nothing"]
-                raise InputError(f"language {language}", expected="one that espeak-ng speaks", received=said[-1])
-            # Names of languages in brackets say where it changes to another for a word.
+                message = done.stderr.decode(errors="replace").strip().splitlines() or ["an error without a message"]
+                raise InputError(f"language {language}", expected="one that espeak-ng speaks", received=message[-1])
+            # Remove the names of languages in brackets, which mark words of another language.
             out += " " + " ".join(re.sub(r"\([a-z-]+\)", "", done.stdout.decode(errors="replace")).split())
         if 2 * k + 1 < len(parts):
             out += parts[2 * k + 1][0]
@@ -220,30 +224,30 @@ def _by_espeak(program: str, text: str, language: str) -> str:
 
 
 def _by_dictionary(text: str) -> Pronunciation:
-    it = Pronunciation("")
+    out = Pronunciation("")
     for token in _tokens(text):
         if token in PAUSES:
-            it.ipa += token
+            out.ipa += token
             continue
-        phones, guessed = phones_of(token)
-        it.guessed += [token] if guessed and token not in it.guessed else []
-        it.ipa += (" " if it.ipa else "") + ipa_from_arpabet(phones)
-    if not it.ipa.strip(f" {PAUSES}"):
-        raise no_words(text)
-    return it
-
-
-def _tokens(text: str) -> list[str]:
-    """Words in lower case without accents, and pauses; numbers in words."""
-    out: list[str] = []
-    plain = "".join(one for one in unicodedata.normalize("NFKD", text) if not unicodedata.combining(one))
-    for token in re.findall(rf"[a-z]+(?:'[a-z]+)?|\d+|[{re.escape(PAUSES)}]", plain.lower().replace("’", "'")):
-        out += _in_words(token) if token.isdigit() else [token]
+        phones, guessed = phones_from_word(token)
+        out.guessed += [token] if guessed and token not in out.guessed else []
+        out.ipa += (" " if out.ipa else "") + ipa_from_arpabet(phones)
+    if not out.ipa.strip(f" {PAUSES}"):
+        raise no_words_error(text)
     return out
 
 
-def _in_words(digits: str) -> list[str]:
-    """A number in words below a million, its digits one by one from there."""
+def _tokens(text: str) -> list[str]:
+    """Return words in lower case without accents, numbers spelled out, and pauses."""
+    out: list[str] = []
+    plain = "".join(one for one in unicodedata.normalize("NFKD", text) if not unicodedata.combining(one))
+    for token in re.findall(rf"[a-z]+(?:'[a-z]+)?|\d+|[{re.escape(PAUSES)}]", plain.lower().replace("’", "'")):
+        out += _spell_number(token) if token.isdigit() else [token]
+    return out
+
+
+def _spell_number(digits: str) -> list[str]:
+    """Spell a number below a million in words; spell larger ones, and those with leading zeros, digit by digit."""
     value = int(digits) if len(digits) < 7 else 10**6
     if value >= 10**6 or (len(digits) > 1 and digits[0] == "0"):
         return [_ONES[int(one)] for one in digits]
@@ -252,5 +256,5 @@ def _in_words(digits: str) -> list[str]:
     if value < 100:
         return [_TENS[value // 10 - 2], *([_ONES[value % 10]] if value % 10 else [])]
     unit, name = (100, "hundred") if value < 1000 else (1000, "thousand")
-    rest = _in_words(str(value % unit)) if value % unit else []
-    return [*_in_words(str(value // unit)), name, *rest]
+    rest = _spell_number(str(value % unit)) if value % unit else []
+    return [*_spell_number(str(value // unit)), name, *rest]

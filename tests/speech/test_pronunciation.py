@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from avatar.speech.text import MOST_CHARACTERS, checked_text, phones_of, pronounce, words_of
+from avatar.speech.pronunciation import MAX_CHARACTERS, check_text, phones_from_word, pronounce, words_from_text
 from smplxpp.core.errors import InputError
 
 
@@ -15,8 +15,8 @@ from smplxpp.core.errors import InputError
 )
 def test_nothing_to_say_and_too_much_is_refused(text, word):
     with pytest.raises(InputError, match=word):
-        checked_text(text)
-    assert len(checked_text("a" * MOST_CHARACTERS)) == MOST_CHARACTERS
+        check_text(text)
+    assert len(check_text("a" * MAX_CHARACTERS)) == MAX_CHARACTERS
 
 
 @pytest.mark.parametrize(
@@ -31,14 +31,14 @@ def test_nothing_to_say_and_too_much_is_refused(text, word):
     ],
 )
 def test_words(text, words):
-    assert words_of(text) == words.split()
+    assert words_from_text(text) == words.split()
 
 
 def test_words_of_the_dictionary_and_others():
     pytest.importorskip("pocketsphinx", reason="the dictionary is part of the extra talk")
-    assert phones_of("hello") == (["HH", "AH0", "L", "OW1"], False)
-    assert phones_of("dog's")[0][-1] == "Z"
-    phones, guessed = phones_of("brimblesh")
+    assert phones_from_word("hello") == (["HH", "AH0", "L", "OW1"], False)
+    assert phones_from_word("dog's")[0][-1] == "Z"
+    phones, guessed = phones_from_word("brimblesh")
     assert guessed and [one.rstrip("012") for one in phones] == ["B", "R", "IH", "M", "B", "L", "EH", "SH"]
     if shutil.which("espeak-ng") is None:
         said = pronounce("Hello, brimblesh.")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from avatar.speech import ARTICULATORS, Face, Phoneme, Speech, talking_motion
-from avatar.speech.arkit import ARKIT
-from avatar.speech.bases import FaceSurface, numbered_basis
-from avatar.speech.face import MOST_NUMBERED
+from avatar.speech.blendshape_transfer import FaceSurface, transfer_blendshapes
+from avatar.speech.curves import ARKIT
+from avatar.speech.face import MAX_UNOBSERVED_NUMBERED
 from smplxpp.body import load_body
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
@@ -47,19 +47,19 @@ def test_arkit_has_the_names_of_the_embedded_body():
 def test_a_mixture_of_all_directions_is_undone():
     directions, truth = turned()
     body = numbered(directions)
-    solved = numbered_basis(body)
+    solved = transfer_blendshapes(body)
     face = FaceSurface.of(body).directions
     off, size = (np.linalg.norm(face @ one.T, axis=(0, 1)) for one in (solved.coefficients - truth, truth))
     visible = size > 1e-3  # the tongue's is not on the face
     assert visible.sum() == 51 and (off < 0.08 * size)[visible].all()
-    assert solved.left[visible].max() < 0.08 and np.abs(solved.gap).max() < 1e-4
+    assert solved.residual[visible].max() < 0.08 and np.abs(solved.gap_error).max() < 1e-4
 
 
 @pytest.mark.parametrize(("count", "most"), [(10, 0.62), (20, 0.45), (50, 0.06)])
 def test_more_principal_directions_leave_less_and_lips_close_all_the_same(count, most):
-    solved = numbered_basis(numbered(principal(count)))
-    assert solved.left.mean() < most
-    assert np.abs(solved.gap[LIPS]).max() < 0.5e-3
+    solved = transfer_blendshapes(numbered(principal(count)))
+    assert solved.residual.mean() < most
+    assert np.abs(solved.gap_error[LIPS]).max() < 0.5e-3
 
 
 def test_another_head_gets_the_same_up_to_its_size():
@@ -67,7 +67,7 @@ def test_another_head_gets_the_same_up_to_its_size():
     betas = np.zeros(BODY.shapedirs.shape[2])
     betas[:10] = 1.5 * np.random.default_rng(2).normal(size=10)
     body = numbered(directions, v_template=BODY.v_template + BODY.shapedirs @ betas)
-    solved, face = numbered_basis(body), FaceSurface.of(body).directions
+    solved, face = transfer_blendshapes(body), FaceSurface.of(body).directions
     for name in ("mouthPucker", "mouthSmileLeft", "mouthPressLeft", "mouthRollLower", "mouthFunnel", "jawOpen"):
         own, true = (one[ARKIT.index(name)] for one in (solved.coefficients, truth))
         moved, wanted = ((face @ one).ravel() for one in (own, true))
@@ -77,7 +77,7 @@ def test_another_head_gets_the_same_up_to_its_size():
 def test_a_numbered_body_speaks_and_its_lips_meet_for_bilabials():
     body = numbered(principal(20))
     face = Face.of(body.expression_names, body.joint_names, body=body)
-    assert face.numbered and face.highest.max() == MOST_NUMBERED
+    assert face.numbered and face.highest.max() == MAX_UNOBSERVED_NUMBERED
     surface = FaceSurface.of(body)
     pairs = surface.lips
     speech = Speech((Phoneme("AA", 0.1, 0.3), Phoneme("M", 0.3, 0.4), Phoneme("UW", 0.4, 0.7)), 0.9)
@@ -90,7 +90,7 @@ def test_a_numbered_body_speaks_and_its_lips_meet_for_bilabials():
     closed = round(0.34 * 30)
     assert abs(gap[closed] - wanted[ARTICULATORS.index("press")]) < 0.6e-3
     assert motion.jaw_pose[closed, 0] < 0.02 < motion.jaw_pose[6, 0]
-    assert np.abs(motion.expression).max() <= MOST_NUMBERED
+    assert np.abs(motion.expression).max() <= MAX_UNOBSERVED_NUMBERED
     # Rounded lips are forward.
     lip = motion.expression[[0, 17]] @ surface.directions[pairs[:, 0], 2].mean(axis=0)
     assert lip[1] > lip[0] + 1e-3
@@ -104,4 +104,4 @@ def test_a_body_without_a_face_is_refused():
     cut = np.array(BODY.v_template)
     cut[BODY.weights[:, BODY.joint_names.index("jaw")] > 0.5, 1] -= 0.05
     with pytest.raises(InputError, match="lips"):
-        numbered_basis(numbered(principal(5), v_template=cut))
+        transfer_blendshapes(numbered(principal(5), v_template=cut))

@@ -1,4 +1,4 @@
-"""Files of face curves that other programs write: Live Link Face, Audio2Face, and arrays of 52 or of FLAME."""
+"""Face curves of other engines: files of Live Link Face, Audio2Face and FLAME, and ONNX networks from sound to face."""
 
 from __future__ import annotations
 
@@ -10,37 +10,36 @@ from typing import Any
 
 import numpy as np
 
-from avatar.speech.arkit import ARKIT
-from avatar.speech.curves import FLAME, Curves
+from avatar.speech.curves import ARKIT, FLAME_EXPRESSIONS, Curves
+from avatar.speech.pronunciation import EXTRA
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.json_file import as_list, as_number, as_numbers, as_object, as_text, read_json
+from smplxpp.core.files.onnx_file import OnnxModel
 from smplxpp.core.files.paths import read_text
+from smplxpp.core.files.wave_file import Sound
 from smplxpp.core.params import DEFAULT_FPS
 
-_MOST_ROWS = 200_000
-_MOST_BYTES = 1 << 28
-_TIMES = ("timecode", "time", "timestamp", "seconds")
-_LOWER = {name.lower(): k for k, name in enumerate(ARKIT)}
-_ARRAYS = ("arkit", "blendshapes", "blendshape", "bs", "weights")
-_EXPRESSIONS = ("expression", "exp", "expr", "flame_expression")
-_JAWS = ("jaw_pose", "jaw", "jaw_rot")
+_MAX_ROWS = 200_000  # of a table: 55 minutes at 60 frames a second
+_INDEX_OF_NAME = {name.lower(): k for k, name in enumerate(ARKIT)}
 
 
 def read_curves(path: str | Path, *, fps: float | None = None) -> Curves:
-    """Read curves by the suffix of their file.
+    """Read face curves in the format of the file's suffix.
 
-    - `.csv`: a row a frame, columns by ARKit's names in any case, with or without words before a point (Live Link
-      Face, Audio2Face-3D); other columns are left out. A column of times: seconds, or hours:minutes:seconds:frames.
+    - `.csv`: a row a frame, columns by ARKit's names in any case, with or without a prefix that ends in a point (Live
+      Link Face, Audio2Face-3D); other columns are left out. A column of times: seconds, or
+      hours:minutes:seconds:frames.
     - `.json`: Audio2Face's export: `facsNames`, `weightMat`, `exportFps`.
     - `.npz`: `blendshapes` (T, 52) with `names` of the columns, or `expression` (T, up to 50) and `jaw_pose` (T, 3) of
       FLAME; `fps`.
 
     Args:
+        path: the file.
         fps: frames a second where the file does not state them; None: `DEFAULT_FPS`.
 
     Raises:
-        InputError: another suffix, a file that is none of these, and what `Curves` refuses.
+        InputError: another suffix, a file in none of these formats, or values that `Curves` refuses.
     """
     path = Path(path)
     readers: dict[str, Callable[[Path, float], Curves]] = {".csv": _csv, ".json": _json, ".npz": _npz}
@@ -53,13 +52,14 @@ def read_curves(path: str | Path, *, fps: float | None = None) -> Curves:
 def _csv(path: Path, fps: float) -> Curves:
     subject = f"curves {path}"
     try:
-        rows = list(csv.reader(read_text(path, subject="curves", most=_MOST_BYTES).splitlines()))
+        rows = list(csv.reader(read_text(path, subject="curves", most=1 << 28).splitlines()))
     except csv.Error as error:
         raise InputError(subject, expected="comma-separated values", received=str(error)) from None
     rows = [row for row in rows if row]
-    if not 2 <= len(rows) <= _MOST_ROWS:
-        expected = f"a row of names and up to {_MOST_ROWS} of numbers"
+    if not 2 <= len(rows) <= _MAX_ROWS:
+        expected = f"a row of names and up to {_MAX_ROWS} of numbers"
         raise InputError(subject, expected=expected, received=f"{len(rows)} rows")
+    # Columns of ARKit's blendshapes, whatever else the program writes beside them.
     names = [name.strip().rsplit(".", 1)[-1].lower() for name in rows[0]]
     where = _columns(names, subject)
     for number, row in enumerate(rows[1:], start=2):
@@ -68,7 +68,9 @@ def _csv(path: Path, fps: float) -> Curves:
     values = np.zeros((len(rows) - 1, len(ARKIT)))
     for column, k in where:
         values[:, k] = _floats([row[column] for row in rows[1:]], f"{subject}, column {rows[0][column]}")
-    clock = next((names.index(one) for one in _TIMES if one in names), None)
+    # Times of the frames, or a constant rate where there is no such column.
+    time_columns = ("timecode", "time", "timestamp", "seconds")
+    clock = next((names.index(one) for one in time_columns if one in names), None)
     if clock is None:
         return Curves.evenly(values, fps)
     times = _clock([row[clock] for row in rows[1:]], f"{subject}, column {rows[0][clock]}")
@@ -77,8 +79,8 @@ def _csv(path: Path, fps: float) -> Curves:
 
 
 def _columns(names: Sequence[str], subject: str) -> list[tuple[int, int]]:
-    """The columns of a table that are ARKit's, and which."""
-    where = [(column, _LOWER[name]) for column, name in enumerate(names) if name in _LOWER]
+    """Return the columns of a table that are ARKit's, each with its index in `ARKIT`."""
+    where = [(column, _INDEX_OF_NAME[name]) for column, name in enumerate(names) if name in _INDEX_OF_NAME]
     if "jawopen" not in names or len(where) < 10:
         received = ", ".join(names[:6])[:120] or "none"
         raise InputError(subject, expected="columns of ARKit's names, jawOpen among them", received=received)
@@ -95,7 +97,7 @@ def _floats(texts: Sequence[str], subject: str) -> np.ndarray:
 
 
 def _clock(texts: Sequence[str], subject: str) -> np.ndarray:
-    """Seconds, of seconds or of timecodes hours:minutes:seconds:frames at 60 frames a second, as phones write them."""
+    """Parse seconds, or timecodes hours:minutes:seconds:frames at 60 frames a second as Live Link Face writes them."""
     if not any(":" in text for text in texts):
         return _floats(texts, subject)
     out = []
@@ -116,10 +118,10 @@ def _json(path: Path, fps: float) -> Curves:
     matrix = as_numbers(stored.get("weightMat"), (None, len(names)), subject=f"{subject}: weightMat")
     if "exportFps" in stored:
         fps = as_number(stored["exportFps"], subject=f"{subject}: exportFps")
-    return Curves.evenly(_placed(matrix, where), fps)
+    return Curves.evenly(_reorder(matrix, where), fps)
 
 
-def _placed(matrix: np.ndarray, where: Sequence[tuple[int, int]]) -> np.ndarray:
+def _reorder(matrix: np.ndarray, where: Sequence[tuple[int, int]]) -> np.ndarray:
     values = np.zeros((len(matrix), len(ARKIT)))
     for column, k in where:
         values[:, k] = matrix[:, column]
@@ -135,12 +137,15 @@ def _npz(path: Path, fps: float) -> Curves:
     def take(wanted: Sequence[str]) -> Any:
         return next((arrays[name] for name in wanted if name in arrays), None)
 
-    shapes, expression, jaw = take(_ARRAYS), take(_EXPRESSIONS), take(_JAWS)
+    # Names under which common tools store the same arrays.
+    shapes = take(("arkit", "blendshapes", "blendshape", "bs", "weights"))
+    expression = take(("expression", "exp", "expr", "flame_expression"))
+    jaw = take(("jaw_pose", "jaw", "jaw_rot"))
     if shapes is not None:
         names = [str(one) for one in np.ravel(arrays["names"])] if "names" in arrays else []
         where = _columns([name.lower() for name in names], subject) if names else [(k, k) for k in range(len(ARKIT))]
         width = len(names) or len(ARKIT)
-        return Curves.evenly(_placed(as_numbers(shapes, (None, width), subject=subject), where), fps)
+        return Curves.evenly(_reorder(as_numbers(shapes, (None, width), subject=subject), where), fps)
     if expression is None or jaw is None:
         raise InputError(
             subject,
@@ -148,4 +153,58 @@ def _npz(path: Path, fps: float) -> Curves:
             received=", ".join(sorted(arrays)[:8]) or "nothing",
         )
     values = as_numbers(expression, (None, None), subject=f"{subject}: expression")
-    return Curves.evenly(values[:, :FLAME], fps, as_numbers(jaw, (len(values), 3), subject=f"{subject}: jaw_pose"))
+    return Curves.evenly(
+        values[:, :FLAME_EXPRESSIONS], fps, as_numbers(jaw, (len(values), 3), subject=f"{subject}: jaw_pose")
+    )
+
+
+class FaceModel:
+    """Any ONNX network from sound to ARKit's blendshapes.
+
+    Signature: one input of samples, float32 (1, N), mono; one output, float32 (1, T, 52) or (T, 52), T frames evenly
+    over the sound. The model's metadata may give `sample_rate` (Hz; 16000 by default) and `names` (of the 52, separated
+    by commas; alphabetical by default).
+
+    Args:
+        path: the ONNX file.
+        threads: of the runtime.
+
+    Raises:
+        MissingExtraError: onnxruntime is not installed.
+        InputError: a missing model, or another signature.
+    """
+
+    def __init__(self, path: Path, *, threads: int = 2) -> None:
+        self._model = OnnxModel(path, kind="face model", extra=EXTRA, threads=threads)
+        inputs, outputs, metadata = self._model.inputs, self._model.outputs, self._model.metadata
+        if len(inputs) != 1 or len(inputs[0].shape) != 2 or inputs[0].type != "tensor(float)" or len(outputs) != 1:
+            raise InputError(
+                self._model.subject,
+                expected="one input of samples, float32 (1, N), and one output",
+                received=f"{[(one.name, one.type, one.shape) for one in inputs]}, {len(outputs)} outputs",
+            )
+        try:
+            self.rate = int(metadata.get("sample_rate", 16_000))
+        except ValueError:
+            self.rate = 0
+        if not 4000 <= self.rate <= 192_000:
+            raise InputError(
+                f"{self._model.subject}: sample_rate", expected="4000 to 192000", received=repr(metadata["sample_rate"])
+            )
+        self._names = [one.strip() for one in metadata["names"].split(",")] if "names" in metadata else list(ARKIT)
+        if sorted(self._names) != list(ARKIT):
+            raise InputError(f"{self._model.subject}: names", expected="ARKit's 52, each once", received="others")
+
+    def __call__(self, sound: Sound) -> Curves:
+        """Return the face curves of a sound.
+
+        Raises:
+            InputError: a model that fails, or whose output has another shape.
+        """
+        samples = sound.at_rate(self.rate).samples.astype(np.float32)
+        output = np.asarray(self._model.run({self._model.inputs[0].name: samples[None]})[0])
+        values = output[0] if output.ndim == 3 and len(output) == 1 else output
+        if values.ndim != 2 or values.shape[1] != len(ARKIT) or not len(values):
+            raise InputError(self._model.subject, expected="an output (1, T, 52)", received=f"shape {output.shape}")
+        order = [self._names.index(name) for name in ARKIT]
+        return Curves.evenly(values[:, order].astype(np.float64), len(values) / max(sound.seconds, 1e-3))

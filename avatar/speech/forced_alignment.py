@@ -1,0 +1,181 @@
+"""Forced alignment by pocketsphinx: phonemes in time of a recording whose words are given or recognised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from avatar.speech.audio_features import clear_pauses, find_pauses, speech_level
+from avatar.speech.lips import LipNetwork, alignment_score
+from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
+from avatar.speech.pronunciation import EXTRA, check_text, no_words_error, phones_from_word, words_from_text
+from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.files.wave_file import Sound
+
+_RATE = 16_000
+# Gates on `alignment_score`, in nats a row of 10 ms; `python -m benchmarks given_texts` measures right and wrong texts.
+MIN_SCORE_OF_TEXT = 0.0
+"""A given text that scores less belongs to another recording."""
+MIN_SCORE_OF_RECOGNISED = -0.35
+"""The same for recognised words: some may be wrong, while most of their phonemes are right."""
+
+
+def aligner_installed() -> bool:
+    """Return whether the recogniser, pocketsphinx, is installed."""
+    return find_spec("pocketsphinx") is not None
+
+
+def load_recogniser() -> Any:
+    """Return pocketsphinx's `Decoder` of English, to share between several calls of `align`.
+
+    Raises:
+        MissingExtraError: pocketsphinx is not installed.
+    """
+    try:
+        import pocketsphinx
+    except ImportError:
+        raise MissingExtraError("pocketsphinx", extra=EXTRA, purpose="phonemes of a recording") from None
+    return pocketsphinx.Decoder(samprate=float(_RATE), loglevel="FATAL")
+
+
+def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = None) -> Speech:
+    """Return the phonemes of a recording of English by forced alignment.
+
+    Words, given or recognised, are accepted if the recogniser can align them and their phonemes match those that the
+    network of `avatar.speech.lips` recognises at their times (`alignment_score`). Without this check, tones would be
+    recognised as words.
+
+    Args:
+        sound: the recording.
+        text: its words; None: they are recognised.
+        recogniser: of `load_recogniser`; None: loaded for this call, which takes a second.
+
+    Raises:
+        MissingExtraError: pocketsphinx is not installed.
+        InputError: silence, a recording without words, a text without English words or of another recording, more than
+            20 minutes.
+    """
+    speech_level(sound)
+    decoder = load_recogniser() if recogniser is None else recogniser
+    words = recognised_words(sound, decoder) if text is None else _checked_words(text)
+    found = _align_words(decoder, sound, words)
+    least = MIN_SCORE_OF_RECOGNISED if text is None else MIN_SCORE_OF_TEXT
+    if found is None or alignment_score(LipNetwork.shipped()(sound), found) < least:
+        raise _no_words_heard() if text is None else _other_text()
+    speech = Speech(tuple(clear_pauses(found.phonemes, find_pauses(sound))), sound.seconds)
+    if not speech.spoken:  # all phonemes lay in pauses, so the words were noise
+        raise _no_words_heard()
+    return speech
+
+
+def force_align(sound: Sound, text: str, recogniser: Any) -> Speech | None:
+    """Align a text with a recording, whatever its score; None where the recogniser cannot align it."""
+    return _align_words(recogniser, sound, _checked_words(text))
+
+
+def recognised_words(sound: Sound, recogniser: Any) -> list[str]:
+    """Return the English words that the recogniser finds, as its dictionary spells them.
+
+    Raises:
+        InputError: silence, no words, more than 20 minutes.
+    """
+    recogniser.config["bestpath"] = True
+    recogniser.activate_search()
+    _process(recogniser, _samples(sound))
+    words = [one.word.split("(")[0] for one in recogniser.seg() or ()]
+    words = [word for word in words if word[0] not in "<["]
+    if not words:
+        raise _no_words_heard()
+    return words
+
+
+def _checked_words(text: str) -> list[str]:
+    words = words_from_text(check_text(text))
+    if not words:
+        raise no_words_error(text)
+    return words
+
+
+def _no_words_heard() -> InputError:
+    return InputError(
+        "sound",
+        expected="words of English",
+        received="none that the recogniser knows (music, noise or another language)",
+        remedy="give its words as --text, or --hear sounds, which follows any language",
+    )
+
+
+def _other_text() -> InputError:
+    return InputError(
+        "sound",
+        expected="the words of the text",
+        received="a recording of something else",
+        remedy="leave out --text: the words are then recognised",
+    )
+
+
+def _samples(sound: Sound, noise_level: float = 0.0) -> bytes:
+    """Return samples for the recogniser at a root mean square of 0.1, with white noise of a given one."""
+    samples = sound.at_rate(_RATE).samples * np.float32(0.1 / speech_level(sound))
+    noise = np.random.default_rng(0).normal(scale=noise_level, size=len(samples)).astype(np.float32)
+    return Sound(samples + noise, _RATE).integers().tobytes()
+
+
+def _process(decoder: Any, data: bytes) -> None:
+    decoder.start_utt()
+    decoder.process_raw(data, full_utt=True)
+    decoder.end_utt()
+
+
+def _align_words(decoder: Any, sound: Sound, words: list[str]) -> Speech | None:
+    """Align words, then the phones in them, in two passes; None where they do not fit the sound.
+
+    The first pass takes the best path of its search, not that through its lattice (`bestpath`): the lattice, meant for
+    language models, has lost the path of many sentences that the search has found.
+    """
+    # Faint noise, because the stops of a synthetic voice are exact zeros, which the recogniser cannot score.
+    data = _samples(sound, 1e-3)
+    for word in dict.fromkeys(words):
+        if decoder.lookup_word(word) is None:
+            decoder.add_word(word, " ".join(one.rstrip("012") for one in phones_from_word(word)[0]), True)
+    decoder.config["bestpath"] = False
+    try:
+        decoder.set_align_text(" ".join(words))
+        _process(decoder, data)
+        decoder.set_alignment()
+        _process(decoder, data)
+        alignment = decoder.get_alignment()
+    except RuntimeError:
+        return None
+    if alignment is None:
+        return None
+    # A frame of 10 ms is computed from a window of 25.625 ms that starts at its time, so it describes the middle of
+    # that window.
+    frame, window = 0.01, 0.025625  # seconds
+    offset = 0.5 * (window - frame)
+    out = []
+    for word in alignment:
+        phones = [phone for phone in word if phone.duration > 0]
+        vowels = [phone.name for phone in phones if phone.name in VOWELS]
+        stresses = iter(_stresses(word.name.split("(")[0], len(vowels)))
+        for phone in phones:
+            known = phone.name in VOWELS | CONSONANTS
+            start = phone.start * frame + offset
+            stress = next(stresses) if phone.name in VOWELS else 0
+            out.append(Phoneme(phone.name if known else SILENCE, start, start + phone.duration * frame, stress))
+    return Speech(tuple(_clip_to_sound(out, sound.seconds)), sound.seconds)
+
+
+def _stresses(word: str, count: int) -> list[int]:
+    """Return the stress of a word's vowels by the dictionary; 0 where it has another number of vowels."""
+    known = [int(one[-1]) for one in phones_from_word(word)[0] if one[-1].isdigit()]
+    return known if len(known) == count else [0] * count
+
+
+def _clip_to_sound(phonemes: list[Phoneme], seconds: float) -> list[Phoneme]:
+    """Clip phonemes to the sound, which the first and the last frame may exceed."""
+    held = [replace(one, start=max(one.start, 0.0), end=min(one.end, seconds)) for one in phonemes]
+    return [one for one in held if one.end > one.start]
