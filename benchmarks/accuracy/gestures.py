@@ -5,7 +5,8 @@
 A Piper voice (extra `[talk]`) speaks for some minutes, and the embedded body, known from an A-pose alone, gestures to
 it. Measured are the path length of the feet's joints, the distance of hands from the trunk's skin, the delay of beats
 after stressed vowels, the seconds of speech until a gesture is used again, and the similarity of any two pieces of
-the arms' angles; in addition the part of ARKit's expressions that numbered ones cannot make (`avatar.speech.blendshape_transfer`).
+the arms' angles; in addition the part of ARKit's expressions that numbered ones cannot make
+(`avatar.speech.blendshape_transfer`).
 """
 
 from __future__ import annotations
