@@ -40,7 +40,7 @@ from smplxpp.capture import Capture, open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.detect import load_detector
-from smplxpp.detect.person_mask import PersonSegmenter
+from smplxpp.detect.mediapipe_detector import PersonSegmenter
 from smplxpp.detect.plates import PlateModel
 from smplxpp.metrics.pose_error import pose_error
 from smplxpp.register import LandmarkModel, Observations, RegisterConfig, register, triangulate

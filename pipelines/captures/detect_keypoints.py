@@ -263,7 +263,7 @@ def _chosen(people: Sequence[DetectedPerson], box: Box | None) -> DetectedPerson
     """The surest, of those who fill the box best where there is one."""
     if not people or box is None:
         return next(iter(people), None)
-    return max(people, key=lambda one: (round(_overlap(one.box, box), 1), one.certainty))
+    return max(people, key=lambda one: (round(_overlap(one.box, box), 1), one.total_confidence))
 
 
 def _overlap(a: Box, b: Box) -> float:

@@ -314,7 +314,7 @@ class CaptureMasks:
 
             model, identity = MattingModel(self.matting), f"matting model {sha256_file(self.matting)}"
         else:
-            from smplxpp.detect.person_mask import PersonSegmenter
+            from smplxpp.detect.mediapipe_detector import PersonSegmenter
 
             model = segmenter = PersonSegmenter()
             identity = segmenter.identity

@@ -1,4 +1,4 @@
-"""A detector by the name that a user gives."""
+"""Load a detector by the name that a user gives."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from smplxpp.detect.mediapipe_detector import MediaPipeDetector
 from smplxpp.detect.onnx_detector import OnnxDetector
 
 MEDIAPIPE = "mediapipe"
+"""Name of MediaPipe's detector."""
 
 
 def load_detector(name: str | Path = MEDIAPIPE) -> Detector:
-    """MediaPipe, or the ONNX model of a path.
+    """Load MediaPipe's detector, or the ONNX model at a path.
 
     Raises:
-        MissingExtraError: what it needs is not installed.
-        InputError: neither, or a model that cannot be used.
+        MissingExtraError: a package that it needs is not installed.
+        InputError: another name, or a model that cannot be used.
     """
     if str(name) == MEDIAPIPE:
         return MediaPipeDetector()

@@ -1,4 +1,4 @@
-"""What a keypoint model in ONNX wants and gives: a JSON file of the model's name beside it, or what its shapes say."""
+"""Describe the input and output of a keypoint model in ONNX, by a JSON file beside the model or by default."""
 
 from __future__ import annotations
 
@@ -22,25 +22,27 @@ LAYOUTS: dict[str, Order] = {
     "halpe-136": BY_COUNT[136],
 }
 """Orders of keypoints that a model card may name."""
-_MOST_POINTS = 4096
-_LARGEST_SIDE = 8192
+LARGEST_SIDE = 8192
+"""Largest side of a model's input, pixels."""
 
 
 @dataclass(frozen=True)
 class ModelCard:
-    """How images are put to a keypoint model, and what its outputs are. The defaults are mmpose's (RTMPose, ViTPose,
-    HRNet), which Sapiens shares.
+    """Input and output conventions of a keypoint model. The defaults are those of mmpose (RTMPose, ViTPose, HRNet),
+    which Sapiens shares.
 
     Attributes:
-        names: of its points in our vocabulary, None for one that has no name here; None: by their number.
+        names: of its points in the vocabulary of `smplxpp.core.keypoints`, None for a point that has no name there;
+            None instead of a list to choose the names by the number of points.
         size: width and height of the input, for models that leave it free.
-        mean, std: of the normalisation, on the scale 0 to 255, in the order of `channels`.
+        mean: of the normalisation, on the scale 0 to 255, in the order of `channels`.
+        std: of the normalisation, likewise.
         channels: "rgb" or "bgr".
-        padding: the person's box is taken this many times as large.
-        simcc_split: bins of a simcc output a pixel of the input; None: by the shapes.
+        padding: factor by which the person's box is enlarged.
+        simcc_split: bins of a simcc output a pixel of the input; None to derive it from the shapes.
         alignment: "corners" for heatmaps whose outermost cells lie on the outermost pixels (UDP: ViTPose, Sapiens,
             RTMO), "stride" for those whose cell k lies on pixel k times the stride.
-        least_confidence: points below do not say that somebody is there.
+        least_confidence: confidence from which a point is evidence of a person.
     """
 
     names: Order | None = None
@@ -59,7 +61,7 @@ class ModelCard:
         require_between("padding", self.padding, 1.0, 4.0)
         require_between("least_confidence", self.least_confidence, 0.0, 1.0)
         for side in self.size:
-            require_between("size", side, 8, _LARGEST_SIDE)
+            require_between("size", side, 8, LARGEST_SIDE)
         for value in self.std:
             require_between("std", value, 1e-6, 1e6)
         if self.simcc_split is not None:
@@ -69,12 +71,12 @@ class ModelCard:
 
 
 def card_path(model: Path) -> Path:
-    """Where the card of a model lies."""
+    """Return the path of a model's card, beside the model."""
     return model.with_suffix(".json")
 
 
 def load_card(model: Path) -> ModelCard:
-    """The card beside a model; the defaults where there is none.
+    """Read the card beside a model; the defaults if there is none.
 
     `{"layout": "coco-17"}` or `{"names": ["nose", null, ...]}` names the points; `size`, `mean`, `std`, `channels`,
     `padding`, `simcc_split`, `alignment` and `least_confidence` are those of `ModelCard`.
@@ -98,11 +100,12 @@ def load_card(model: Path) -> ModelCard:
 
 
 def card_identity(card: ModelCard) -> str:
-    """The card as text: the same for the same settings."""
+    """Return a card as text that is the same for the same settings."""
     return repr(sorted(asdict(card).items()))
 
 
 def _values(content: Mapping[str, Any], subject: str) -> dict[str, Any]:
+    """Convert the values of a card's file, with errors that name the key."""
     out: dict[str, Any] = {}
     if "layout" in content:
         name = as_text(content["layout"], subject=f"{subject}: layout")
@@ -125,9 +128,11 @@ def _values(content: Mapping[str, Any], subject: str) -> dict[str, Any]:
 
 
 def _check_names(names: Order) -> None:
+    """Refuse unknown and repeated names, and more points than any model has."""
+    most_points = 4096
     named = [name for name in names if name is not None]
     unknown = [name for name in named if name not in VOCABULARY]
-    if unknown or len(set(named)) < len(named) or not named or len(names) > _MOST_POINTS:
+    if unknown or len(set(named)) < len(named) or not named or len(names) > most_points:
         raise InputError(
             "names of keypoints",
             expected="names of docs/captures.md, each once, null for a point that has none there",

@@ -1,4 +1,4 @@
-"""Masks where the rig was photographed empty: what differs from the empty plates, and is no shadow on them."""
+"""Segment a person against photographs of the empty rig: what differs from these plates and is no shadow on them."""
 
 from __future__ import annotations
 
@@ -12,28 +12,21 @@ from jaxtyping import Bool, Float32, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_between, require_positive
 
-# Holes of at most this share of the largest piece are filled: larger ones are between an arm and the body.
-_HOLE = 0.002
-# Share of a neighbourhood that has to be the person for its colour to count.
-_LEAST_SHARE = 0.02
-# Exposure: pixels of the blur that takes the noise out, how many pixels vote and propose, what counts as one ratio, and
-# the largest change that is believed.
-_GAIN_BLUR, _GAIN_VOTERS, _GAIN_PROPOSALS, _SAME_GAIN, _MOST_GAIN = 2.0, 10_000, 200, 0.02, 1.3
-
 
 @dataclass(frozen=True)
 class PlateConfig:
-    """How a photograph is told from the empty plate.
+    """Options of the segmentation against empty plates.
 
     Attributes:
-        least_noise: standard deviation of a value of 255 that a camera has at least; one plate alone tells none.
-        threshold: deviations from which a pixel is the person for sure.
-        weak: share of the threshold from which a pixel is the person if it hangs on one that is for sure.
-        darkest_shadow: share of a plate's light that is left in a shadow; what is darker is the person.
-        shadow_colour: deviations of colour, brightness set aside, that a shadow may have.
-        blur: pixels, of the differences: noise is averaged and thin gaps are closed.
-        edge: pixels about the outline in which the matte is soft.
-        least_share: of the largest piece, from which another piece of the person is kept (a foot behind a chair).
+        least_noise: lower bound of a pixel's standard deviation, in grey levels of 255; a single plate shows none.
+        threshold: standard deviations from which a pixel belongs to the person.
+        weak: share of the threshold from which a pixel belongs to the person if it is connected to one that exceeds the
+            threshold (hysteresis).
+        darkest_shadow: smallest share of a plate's light that a shadow leaves; darker pixels belong to the person.
+        shadow_colour: standard deviations by which the chromaticity of a shadow may differ from the plate's.
+        blur: standard deviation of the Gaussian blur, pixels, which averages noise and closes thin gaps.
+        edge: width of the soft outline, pixels.
+        least_share: size relative to the largest component, from which another one is kept (a foot behind a chair).
     """
 
     least_noise: float = 2.5
@@ -55,9 +48,9 @@ class PlateConfig:
 
 
 class PlateModel:
-    """The empty background of one camera: the median of its plates and the noise about it.
+    """The background model of one camera: the median of its empty plates and the noise around it.
 
-    A person who is in front of a background of their own colour cannot be told from it.
+    A person cannot be distinguished from a background of the same colour.
 
     Raises:
         InputError: no plates, or plates of several sizes.
@@ -74,13 +67,14 @@ class PlateModel:
         self.config = config or PlateConfig()
         stack = np.stack(plates).astype(np.float32)
         self._mean: Float32[np.ndarray, "H W 3"] = np.median(stack, axis=0)
-        # 1.4826 of the median distance is a normal's deviation; few plates tell it badly, so neighbours share theirs.
+        # 1.4826 times the median absolute deviation is a Gaussian's standard deviation; few plates estimate it badly,
+        # so it is averaged over 9 x 9 pixels.
         spread = 1.4826 * np.median(np.abs(stack - self._mean), axis=0)
         spread = np.sqrt(scipy.ndimage.uniform_filter(np.square(spread).mean(axis=2), 9, mode="nearest"))
         self._noise: Float32[np.ndarray, "H W"] = np.maximum(spread, self.config.least_noise).astype(np.float32)
 
     def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
-        """The opacity of whatever stands in front of the background.
+        """Return the opacity of whatever stands in front of the background.
 
         Raises:
             InputError: a photograph of another size than the plates.
@@ -91,28 +85,31 @@ class PlateModel:
                 expected=f"{self._mean.shape[1]} x {self._mean.shape[0]} pixels",
                 received=f"{image.shape[1]} x {image.shape[0]}",
             )
+        # Hysteresis threshold: connected components of weak pixels that contain a strong one.
         config = self.config
         shown = image.astype(np.float32) / self._gain(image)
         score, changed = self._deviations(shown)
-        sure, weak = score > 1.0, score > config.weak
+        strong, weak = score > 1.0, score > config.weak
         pieces, _ = scipy.ndimage.label(weak, structure=np.ones((3, 3)))
-        kept = np.isin(pieces, np.unique(pieces[sure & weak])) & weak
+        kept = np.isin(pieces, np.unique(pieces[strong & weak])) & weak
         person = cleaned(kept, least_share=config.least_share)
-        # Clothes of a shadow's colour leave holes in which nothing is the plate's; behind an arm it is.
+        # Cloth of a shadow's colour leaves holes in which nothing looks like the plate, unlike the gap beside an arm.
         person |= _changed_holes(person, changed > 1.0)
         return np.round(255.0 * self._opacity(shown, person)).astype(np.uint8)
 
     def _opacity(
         self, image: Float32[np.ndarray, "H W 3"], person: Bool[np.ndarray, "H W"]
     ) -> Float32[np.ndarray, "H W"]:
-        """The matte: near the outline, how far a pixel is from the plate towards the person's colour inside.
+        """Return the matte: near the outline, the projection of a pixel onto the line from plate to foreground colour.
 
-        With I the image, B the plate and F the mean of what is surely the person nearby,
-        `a = (I - B) . (F - B) / |F - B|^2`. Where F is too near B, or nothing inside is near, the outline stays hard.
+        With I the image, B the plate and F the mean colour of the person's inside nearby, the opacity is
+        `a = (I - B) . (F - B) / |F - B|^2`. Where F is too near to B, or no inside is near, the outline stays hard.
         """
+        least_inside = 0.02  # share of a neighbourhood that must be inside for its mean colour to count
         out = person.astype(np.float32)
         if not self.config.edge or not person.any():
             return out
+        # The band around the outline, and the local mean colour of the eroded inside.
         inner = scipy.ndimage.binary_erosion(person, iterations=self.config.edge)
         band = scipy.ndimage.binary_dilation(person) & ~inner
         share = scipy.ndimage.gaussian_filter(inner.astype(np.float32), self.config.edge)
@@ -120,41 +117,45 @@ class PlateModel:
             np.stack(
                 [scipy.ndimage.gaussian_filter(image[..., k] * inner, self.config.edge) for k in range(3)], axis=-1
             )
-            / np.maximum(share, _LEAST_SHARE)[..., None]
+            / np.maximum(share, least_inside)[..., None]
         )
         apart = near - self._mean
         length = (apart * apart).sum(axis=2)
         alpha = ((image - self._mean) * apart).sum(axis=2) / np.maximum(length, 1.0)
-        told = band & (share > _LEAST_SHARE) & (length > np.square(2.0 * self.config.threshold * self._noise))
-        out[told] = np.clip(alpha[told], 0.0, 1.0)
+        known = band & (share > least_inside) & (length > np.square(2.0 * self.config.threshold * self._noise))
+        out[known] = np.clip(alpha[known], 0.0, 1.0)
         return out
 
     def _gain(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " 3"]:
-        """What exposure and white balance have changed since the plate: of the ratios that some pixel proposes the one
-        that most pixels agree with. A person may fill most of the image: what covers the plate has no common ratio.
+        """Estimate the change of exposure and white balance since the plate by a consensus over pixels (RANSAC).
+
+        Pixels propose the ratio of their colours to the plate's, and the ratio with which most pixels agree within 2 %
+        wins. The person may fill most of the image, because pixels that cover the plate have no common ratio.
         """
-        blur = (_GAIN_BLUR, _GAIN_BLUR, 0)
+        # Blur against noise, then drop pixels that are too dark, saturated, or changed by more than 1.3.
+        most_gain, same_gain = 1.3, 0.02
+        blur = (2.0, 2.0, 0)
         shown, plate = (scipy.ndimage.gaussian_filter(x.astype(np.float32), blur) for x in (image, self._mean))
         usable = ((plate > 16) & (plate < 240) & (shown < 250)).all(axis=2)
         ratios = (shown[usable] / plate[usable]).astype(np.float32)
-        ratios = ratios[((ratios > 1 / _MOST_GAIN) & (ratios < _MOST_GAIN)).all(axis=1)]
+        ratios = ratios[((ratios > 1 / most_gain) & (ratios < most_gain)).all(axis=1)]
         if not len(ratios):
             return np.ones(3, dtype=np.float32)
+        # 10,000 random pixels vote on no change and on the ratios of the first 200 of them.
         rng = np.random.default_rng(0)
-        voters = ratios[rng.permutation(len(ratios))[:_GAIN_VOTERS]]
-        proposals = np.concatenate([np.ones((1, 3), dtype=np.float32), voters[:_GAIN_PROPOSALS]])
-        votes = np.array([(np.abs(voters / one - 1.0) < _SAME_GAIN).all(axis=1).sum() for one in proposals])
+        voters = ratios[rng.permutation(len(ratios))[:10_000]]
+        proposals = np.concatenate([np.ones((1, 3), dtype=np.float32), voters[:200]])
+        votes = np.array([(np.abs(voters / one - 1.0) < same_gain).all(axis=1).sum() for one in proposals])
         best = proposals[votes.argmax()]
-        return np.median(voters[(np.abs(voters / best - 1.0) < _SAME_GAIN).all(axis=1)], axis=0)
+        return np.median(voters[(np.abs(voters / best - 1.0) < same_gain).all(axis=1)], axis=0)
 
     def _deviations(
         self, image: Float32[np.ndarray, "H W 3"]
     ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-        """How far pixels are from the background and any shadow on it, and from the background alone, in units of the
-        thresholds.
+        """Return the distances of pixels from the background with any shadow on it, and without, in thresholds.
 
-        The image is split as Horprasert et al. (1999) do: a pixel is the plate's colour times a brightness, and what is
-        left is colour. A brightness between `darkest_shadow` and 1 with little colour left is a shadow.
+        After Horprasert et al. (1999), a pixel is the plate's colour times a brightness, plus a rest that is its
+        difference of chromaticity. A brightness between `darkest_shadow` and 1 with a small rest is a shadow.
         """
         config, mean = self.config, self._mean
         if config.blur:
@@ -163,7 +164,7 @@ class PlateModel:
         brightness = (image * mean).sum(axis=2) / square
         colour = np.linalg.norm(image - brightness[..., None] * mean, axis=2) / self._noise
         length = np.linalg.norm(image - mean, axis=2) / self._noise
-        # Dark plates have no colour to compare: a shadow on them is within the noise anyhow.
+        # On dark plates the brightness is unreliable, but there a shadow is within the noise.
         lit = (brightness <= 1.0) & (brightness >= config.darkest_shadow)
         changed = (length / config.threshold).astype(np.float32)
         score = np.where(lit, np.minimum(colour / config.shadow_colour, changed), changed)
@@ -171,7 +172,10 @@ class PlateModel:
 
 
 def cleaned(person: Bool[np.ndarray, "H W"], *, least_share: float = 0.05) -> Bool[np.ndarray, "H W"]:
-    """The largest piece of a mask and others at least `least_share` of it, without specks, small holes filled."""
+    """Keep a mask's largest component and others of at least `least_share` of it, without specks and small holes.
+
+    Holes of up to 0.2 % of the largest component are filled; larger ones are gaps between an arm and the body.
+    """
     opened = scipy.ndimage.binary_opening(person, structure=np.ones((3, 3)))
     pieces, count = scipy.ndimage.label(opened)
     if not count:
@@ -179,11 +183,11 @@ def cleaned(person: Bool[np.ndarray, "H W"], *, least_share: float = 0.05) -> Bo
     sizes = np.bincount(pieces.ravel())[1:]
     kept = np.isin(pieces, 1 + np.flatnonzero(sizes >= max(least_share, 1e-9) * sizes.max()))
     closed = scipy.ndimage.binary_closing(np.pad(kept, 2))[2:-2, 2:-2] | kept
-    return closed | _small_holes(closed, int(_HOLE * sizes.max()))
+    return closed | _small_holes(closed, int(0.002 * sizes.max()))
 
 
 def _small_holes(mask: Bool[np.ndarray, "H W"], most: int) -> Bool[np.ndarray, "H W"]:
-    """Holes of at most so many pixels."""
+    """Return the holes of a mask that have at most `most` pixels."""
     holes, _ = scipy.ndimage.label(~mask)
     sizes = np.bincount(holes.ravel())
     small = np.flatnonzero(sizes <= most)
@@ -191,7 +195,7 @@ def _small_holes(mask: Bool[np.ndarray, "H W"], most: int) -> Bool[np.ndarray, "
 
 
 def _changed_holes(mask: Bool[np.ndarray, "H W"], changed: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Holes of which most pixels are not the plate's."""
+    """Return the holes of a mask in which most pixels differ from the plate."""
     outside = ~scipy.ndimage.binary_fill_holes(mask)
     holes, count = scipy.ndimage.label(~mask & ~outside)
     if not count:

@@ -82,7 +82,7 @@ def test_two_people_are_told_and_the_surest_comes_first(detector, photograph):
     both[:, width:] = photograph[:, ::-1]
     people = detector(both)
     assert len(people) == 2
-    assert people[0].certainty >= people[1].certainty
+    assert people[0].total_confidence >= people[1].total_confidence
     middles = sorted(0.5 * (one.box[0] + one.box[2]) / width for one in people)
     assert 0 < middles[0] < 1 < middles[1] < 2
     apart = detector(both, people[1].box)
@@ -95,7 +95,7 @@ def test_the_same_image_gives_the_same_points(detector, photograph):
 
 
 def test_the_person_is_cut_out(detector):
-    from smplxpp.detect.person_mask import PersonSegmenter
+    from smplxpp.detect.mediapipe_detector import PersonSegmenter
 
     capture = open_capture(FIXTURE)
     image = np.round(255 * capture.composited(CAMERA, 0, (GREY / 255,) * 3)).astype(np.uint8)
@@ -120,8 +120,7 @@ def test_a_head_from_behind_has_its_left_ear_on_the_left(turn, behind, degrees):
 
 
 def test_what_is_missing_is_said_with_the_command_to_type(monkeypatch):
-    from smplxpp.detect.mediapipe_detector import MediaPipeDetector
-    from smplxpp.detect.person_mask import PersonSegmenter
+    from smplxpp.detect.mediapipe_detector import MediaPipeDetector, PersonSegmenter
 
     monkeypatch.setitem(sys.modules, "mediapipe", None)
     for make in (MediaPipeDetector, PersonSegmenter):

@@ -12,7 +12,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.detect import load_detector, mask_box
 from smplxpp.detect.detector import grown
 from smplxpp.detect.model_card import ModelCard, load_card
-from smplxpp.detect.onnx_outputs import points_of
+from smplxpp.detect.onnx_detector import points_of
 from tests.detect.keypoint_models import NAMES, spotted, write_card, write_model
 
 pytest.importorskip("onnx")
