@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import smplxpp
-from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.metrics import stretch_report, weight_report
 from smplxpp.skinning import pose, unpose

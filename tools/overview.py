@@ -19,7 +19,7 @@ from pipelines.figures.comparison import read_tiles
 from pipelines.runs.artefacts import load_params_of_run, load_scan
 from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest
-from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.labels import display_colors

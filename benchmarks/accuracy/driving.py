@@ -26,7 +26,7 @@ from benchmarks.peers.transfer_speed import load_peer, run_peer
 from benchmarks.support.capture_truth import CaptureTruth, TruePart, find_captures, read_capture_truth
 from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
-from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams

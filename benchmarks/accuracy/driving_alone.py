@@ -30,7 +30,7 @@ from pipelines.commands.options import OptionalPath
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import TEMPLATE, VALIDATE_STAGE
 from smplxpp.body import load_body, load_params
-from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.mesh import TriangleMesh

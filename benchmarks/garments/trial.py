@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from benchmarks.garments.wardrobe import Case
 from smplxpp.body import BodyModel
-from smplxpp.body.stress_poses import stress_poses
+from smplxpp.body.named_poses import stress_poses
 from smplxpp.skinning import UnposeConfig, skin, unpose
 
 _ANY_DETERMINANT = UnposeConfig(warn_below=-np.inf, fail_below=-np.inf)  # baselines may fold a vertex: measure it

@@ -42,7 +42,7 @@ from avatar.losses.psnr import psnr_from_mse
 from avatar.rendering import rasterize
 from benchmarks.support.results import FIXTURE, store_results
 from pipelines.runs import layout
-from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template

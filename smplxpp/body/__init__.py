@@ -3,7 +3,7 @@
 from smplxpp.body.importers import LayoutName, UpAxis, detect_layout, load_params, params_from_content
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel, PosedBody
-from smplxpp.body.stress_poses import stress_poses
+from smplxpp.body.named_poses import stress_poses
 
 __all__ = [
     "BodyModel",

@@ -1,4 +1,4 @@
-"""Motions of other skeletons: Biovision's text files (.bvh), as mocap libraries and animation programs write them."""
+"""Read motions of other skeletons from Biovision files (.bvh), as mocap libraries and animation programs write them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_text
 
-_MOST_BYTES, _MOST_JOINTS, _MOST_FRAMES = 1 << 29, 1000, 1_000_000
-_FARTHEST = 1e6
+# Limits that no motion reaches, so that damaged files are refused before they fill the memory.
+_MOST_BYTES, _MOST_JOINTS, _MOST_FRAMES, _FARTHEST = 1 << 29, 1000, 1_000_000, 1e6
 _EXPECTED = "a BVH file: HIERARCHY, then MOTION"
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 
@@ -23,9 +23,11 @@ class BvhMotion:
     """A skeleton and its motion, in the file's own units and axes.
 
     Attributes:
-        names, parents: of the J joints, every parent before its children, -1 for the root; end sites are left out.
-        offsets: of each joint from its parent, at rest; the root's from the origin.
-        rotations: relative to the parent. root: where the root is.
+        names: of the J joints, every parent before its children; end sites are left out.
+        parents: index of each joint's parent, -1 for the root.
+        offsets: of each joint from its parent at rest; that of the root from the origin.
+        rotations: of each joint relative to its parent.
+        root: position of the root.
         fps: frames a second.
     """
 
@@ -38,7 +40,7 @@ class BvhMotion:
 
     @property
     def rest(self) -> Float64[np.ndarray, "J 3"]:
-        """Where the joints are at rest, the root at its offset."""
+        """The positions of the joints at rest, with the root at its offset."""
         places = np.zeros_like(self.offsets)
         for joint, parent in enumerate(self.parents):
             places[joint] = self.offsets[joint] + (places[parent] if parent >= 0 else 0.0)
@@ -46,7 +48,7 @@ class BvhMotion:
 
 
 def read_bvh(path: str | Path) -> BvhMotion:
-    """Read a BVH file. Positions of joints below the root, which some programs write, are not read.
+    """Read a BVH file; positions of joints other than the root, which some programs write, are ignored.
 
     Raises:
         InputError: missing, damaged or foreign; numbers that are not finite; no frame.
@@ -55,7 +57,7 @@ def read_bvh(path: str | Path) -> BvhMotion:
 
 
 class _Reader:
-    """Reads the words of one file, one after the other."""
+    """A recursive-descent reader of the words of one file."""
 
     def __init__(self, text: str, subject: str) -> None:
         head, found, self._motion = text.partition("MOTION")
@@ -68,20 +70,21 @@ class _Reader:
             raise InputError(subject, expected=_EXPECTED, received=text[:40].strip() or "nothing")
 
     def read(self) -> BvhMotion:
-        """Read all of it."""
+        """Parse the skeleton and convert the channels of all frames to rotations and root positions."""
         self._at = 1
         self._skeleton()
         widths = [len(channels) for channels in self._channels]
         values, fps = self._numbers(sum(widths))
         first = np.concatenate([[0], np.cumsum(widths)])
+        # Every joint has its columns in the frames; Euler angles are applied in the order of the channels.
         rotations = np.tile(np.eye(3), (len(values), len(widths), 1, 1))
         root = np.repeat(np.array(self._offsets[:1], dtype=np.float64), len(values), axis=0)
         for joint, channels in enumerate(self._channels):
             own = values[:, first[joint] : first[joint + 1]]
-            turns = [k for k, name in enumerate(channels) if name.endswith("rotation")]
-            if turns:
-                axes = "".join(channels[k][0] for k in turns)
-                rotations[:, joint] = Rotation.from_euler(axes, own[:, turns], degrees=True).as_matrix()
+            rotating = [k for k, name in enumerate(channels) if name.endswith("rotation")]
+            if rotating:
+                axes = "".join(channels[k][0] for k in rotating)
+                rotations[:, joint] = Rotation.from_euler(axes, own[:, rotating], degrees=True).as_matrix()
             for k, name in enumerate(channels):
                 if joint == 0 and name.endswith("position"):
                     root[:, "XYZ".index(name[0])] = own[:, k]
@@ -89,6 +92,7 @@ class _Reader:
         return BvhMotion(tuple(self._names), parents, offsets, rotations, root, fps)
 
     def _skeleton(self) -> None:
+        """Parse the hierarchy; `open_joints` is the stack of braces, None for end sites."""
         open_joints: list[int | None] = []
         current: int | None = None
         while self._at < len(self._words):
@@ -118,8 +122,12 @@ class _Reader:
             elif word == "CHANNELS" and current is not None:
                 count = self._next()
                 names = [self._next() for _ in range(int(count))] if count in "0123456" else [count]
-                turns = [name for name in names if name.endswith("rotation")]
-                if not set(names) <= set(_CHANNELS) or len(set(names)) != len(names) or len(turns) not in (0, 1, 2, 3):
+                rotating = [name for name in names if name.endswith("rotation")]
+                if (
+                    not set(names) <= set(_CHANNELS)
+                    or len(set(names)) != len(names)
+                    or len(rotating) not in (0, 1, 2, 3)
+                ):
                     raise self._wrong("up to six different channels", " ".join(names)[:80])
                 self._channels[current] = names
             else:
@@ -128,7 +136,7 @@ class _Reader:
             raise self._wrong("as many { as }", "fewer }")
 
     def _name(self) -> str:
-        """A joint's name, up to the brace: some have blanks."""
+        """Read a joint's name up to the brace, since some names have blanks."""
         words = []
         while self._at < len(self._words) and self._words[self._at] != "{":
             words.append(self._next())
@@ -138,20 +146,20 @@ class _Reader:
         return name
 
     def _numbers(self, width: int) -> tuple[Float64[np.ndarray, "T C"], float]:
-        """The frames' numbers, and how many frames a second has."""
+        """Parse the numbers of all frames, and return them with the frame rate."""
         frames_word, _, rest = self._motion.partition("Frame Time:")
-        told = frames_word.replace(":", " ").split()
-        if len(told) != 2 or told[0] != "Frames" or not told[1].isdigit() or not rest:
-            raise self._wrong("Frames: and Frame Time:", " ".join(told)[:40] or "none")
+        header = frames_word.replace(":", " ").split()
+        if len(header) != 2 or header[0] != "Frames" or not header[1].isdigit() or not rest:
+            raise self._wrong("Frames: and Frame Time:", " ".join(header)[:40] or "none")
         try:
             values = np.array(rest.split(), dtype=np.float64)
         except ValueError:
             raise self._wrong("numbers after Frame Time:", "others") from None
-        count = int(told[1]) if len(told[1]) < 9 else _MOST_FRAMES + 1
+        count = int(header[1]) if len(header[1]) < 9 else _MOST_FRAMES + 1
         if not 1 <= count <= _MOST_FRAMES or len(values) != 1 + count * width:
-            raise self._wrong(f"1 to {_MOST_FRAMES} frames of {width} numbers", f"{told[1][:20]}: {len(values) - 1}")
+            raise self._wrong(f"1 to {_MOST_FRAMES} frames of {width} numbers", f"{header[1][:20]}: {len(values) - 1}")
         if not (np.isfinite(values).all() and np.abs(values).max() <= _FARTHEST and values[0] > 1e-6):
-            raise self._wrong(f"numbers within {_FARTHEST:g} and time that goes on", "others")
+            raise self._wrong(f"numbers within {_FARTHEST:g} and a positive frame time", "others")
         return values[1:].reshape(count, width), float(1.0 / values[0])
 
     def _next(self) -> str:

@@ -1,4 +1,4 @@
-"""A BVH motion as parameters of a body: which of its joints are ours, and how its rest pose differs from a T-pose."""
+"""Convert a BVH motion to parameters of a body: match joint names and account for its own rest pose."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from smplxpp.core.rotations import rotvec_from_matrix
 
 _FINGERS = SMPLX_JOINTS[25:]
 OURS = (*SMPLX_JOINTS[:22], *_FINGERS)
-"""Joints that a motion can turn: the body's and the fingers'."""
+"""Joints that a motion can rotate: those of the body and of the fingers."""
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
 NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in _LIMBS))
-# Ours -> what others call them, without blanks, dashes, prefixes and capitals; `S` is left or right, or l or r. The
-# first that a file has counts.
+# Names that other programs use for our joints, in lower case without blanks, dashes and prefixes; `S` stands for left
+# or right, or l or r. The first name that a file has is taken.
 _MIDDLE = {
     "pelvis": "hips hip pelvis root bip01 bip01pelvis",
     "spine1": "spine lowerback spine01 abdomen bip01spine chest torso",
@@ -43,7 +43,7 @@ _SIDES = {
     "elbow": "Sforearm lowerarmS Slowarm Slowerarm Selbow",
     "wrist": "Shand handS Swrist",
 }
-# A finger's bones count from the hand, in these ways: Mixamo's and CMU's, Unreal's, Poser's and DAZ's.
+# Bones of a finger are numbered from the hand: in the patterns of Mixamo and CMU, Unreal, Poser, and DAZ.
 _FINGER_NAMES = {
     "index": ["index"],
     "middle": ["middle", "mid"],
@@ -51,21 +51,23 @@ _FINGER_NAMES = {
     "ring": ["ring"],
     "thumb": ["thumb"],
 }
-_FINGER_WAYS = ("Shand{finger}{bone}", "{finger}0{bone}S", "S{finger}{bone}", "{finger}{bone}S")
-_SPOKEN = {"left": ("left", "l"), "right": ("right", "r")}
+_FINGER_PATTERNS = ("Shand{finger}{bone}", "{finger}0{bone}S", "S{finger}{bone}", "{finger}{bone}S")
+_SIDE_NAMES = {"left": ("left", "l"), "right": ("right", "r")}
 _FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
 _CHILD = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 _CHILD |= {f"{finger}{bone}": f"{finger}{bone + 1}" for finger in _FINGER_NAMES for bone in (1, 2)}
 
 
 def load_bvh(path: str | Path, body: Skeleton, *, joint_map: Mapping[str, str] | None = None) -> BodyParams:
-    """Read a BVH motion for a body: its limbs point where the file's do, its ways are in proportion to its legs.
+    """Read a BVH motion for a body: limbs point where the file's do, and steps are scaled by the length of the legs.
 
     Args:
-        joint_map: the file's names to ours, in the place of those that are known.
+        path: of the file.
+        body: skeleton that shall move.
+        joint_map: our name for each of the file's names; None for the known names.
 
     Raises:
-        InputError: what `read_bvh` refuses, and joints that are needed and not found.
+        InputError: what `read_bvh` refuses, or required joints that are missing.
     """
     motion = read_bvh(path)
     found = named_joints(motion.names, joint_map, subject=f"motion {path}")
@@ -73,10 +75,10 @@ def load_bvh(path: str | Path, body: Skeleton, *, joint_map: Mapping[str, str] |
 
 
 def read_joint_map(path: str | Path) -> dict[str, str]:
-    """Read a JSON file of another skeleton's names and ours: `{"LeftUpLeg": "left_hip", ...}`.
+    """Read a JSON object with our name for each joint of another skeleton: `{"LeftUpLeg": "left_hip", ...}`.
 
     Raises:
-        InputError: damaged, or a joint that we do not have.
+        InputError: a damaged file, or a joint that a body does not have.
     """
     subject = f"joint map {path}"
     values = as_object(read_json(path, subject="joint map"), subject=subject)
@@ -89,10 +91,10 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
 def named_joints(
     names: tuple[str, ...], joint_map: Mapping[str, str] | None, *, subject: str = "motion"
 ) -> dict[str, int]:
-    """Return the file's joint of each of ours that it has.
+    """Return the index of the file's joint for each of our joints that it has.
 
     Raises:
-        InputError: one of those needed is not among them.
+        InputError: a required joint is missing.
     """
     if joint_map is not None:
         unknown = [name for name in joint_map if name not in names]
@@ -117,7 +119,7 @@ def named_joints(
 
 
 def _known(names: tuple[str, ...]) -> dict[str, int]:
-    """Joints by the names of others."""
+    """Match joints by the names that other programs use."""
     plain = [re.sub(r"[\s_.\-]", "", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
     found: dict[str, int] = {}
 
@@ -129,26 +131,28 @@ def _known(names: tuple[str, ...]) -> dict[str, int]:
 
     for ours, words in _MIDDLE.items():
         take(ours, words.split())
-    for side, spoken in _SPOKEN.items():
-        # The shoulder first: what is called so is a collar where there is an arm beside it.
+    for side, spoken in _SIDE_NAMES.items():
+        # The shoulder comes first: a joint of that name is a collar if the file also has an arm.
         for part in ("shoulder", *(name for name in _SIDES if name != "shoulder")):
             take(f"{side}_{part}", [word.replace("S", one) for one in spoken for word in _SIDES[part].split()])
         for finger, called in _FINGER_NAMES.items():
             for bone in (1, 2, 3):
-                ways = [way.format(finger=one, bone=bone) for one in called for way in _FINGER_WAYS]
-                take(f"{side}_{finger}{bone}", [way.replace("S", one) for one in spoken for way in ways])
+                patterns = [p.format(finger=one, bone=bone) for one in called for p in _FINGER_PATTERNS]
+                take(f"{side}_{finger}{bone}", [p.replace("S", one) for one in spoken for p in patterns])
     return found
 
 
 def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton) -> BodyParams:
     """Return the parameters of a body that moves as the skeleton does.
 
-    A joint's turn in the world is the file's, times what takes our rest pose to theirs: for hips, knees, shoulders,
-    elbows and fingers the smallest turn between the directions of their bones, for all others that between both
-    trunks. So arms that hang at rest there hang here. Fingers that the file lacks go on as their hands, or, where it
-    has none at all, rest. Ways are scaled by the legs' lengths, which takes care of units too; the lowest
-    foot comes to where the feet are at rest, the first frame above the origin.
+    A joint's rotation in world coordinates is the file's, times the rotation from our rest pose to the file's. For
+    hips, knees, shoulders, elbows and fingers this is the smallest rotation between the directions of their bones; for
+    all others it is the rotation between the trunks. So arms that hang in the file's rest pose hang here too. Fingers
+    that the file lacks follow their hands or, if it has none at all, stay at rest. Translations are scaled by the ratio
+    of the legs' lengths, which also converts units. The lowest foot is put at the height of the feet at rest, and the
+    first frame above the origin.
     """
+    # Rotations of the file in world coordinates, and the rotations between both rest poses.
     world = _in_world(motion)
     rest = motion.rest
     trunk = _trunk(rest, joints, body)
@@ -156,7 +160,7 @@ def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton) -> 
     pose = np.zeros((len(world), len(SMPLX_JOINTS), 3))
     away: dict[str, Float64[np.ndarray, "3 3"]] = {}
     whole: dict[str, Float64[np.ndarray, "T 3 3"]] = {}
-    # Parents first; a face is not read, fingers only where there are some.
+    # Parents before children; without a face, and fingers only if the file has some.
     fingers = any(name in joints and name in body.names for name in _FINGERS)
     for name in OURS if fingers else OURS[:22]:
         k = body.at(name)[0]
@@ -164,7 +168,7 @@ def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton) -> 
         parent = whole.get(above, np.broadcast_to(np.eye(3), (len(world), 3, 3)))
         whole[name] = parent
         if name in joints:
-            away[name] = _away(name, rest, joints, body, away.get(above, trunk) if name in _FINGERS else trunk)
+            away[name] = _rest_rotation(name, rest, joints, body, away.get(above, trunk) if name in _FINGERS else trunk)
             whole[name] = upright @ world[:, joints[name]] @ away[name]
         pose[:, SMPLX_JOINTS.index(name)] = rotvec_from_matrix(np.swapaxes(parent, 1, 2) @ whole[name])
     params = BodyParams.from_full_pose(
@@ -180,7 +184,8 @@ def _placed(
     body: Skeleton,
     upright: Float64[np.ndarray, "3 3"],
 ) -> BodyParams:
-    """The parameters on their way, feet held as `retarget` holds them."""
+    """Return the parameters with their translation, with planted feet held as `retarget` holds them."""
+    # Scale the pelvis' path, remove the sliding of planted feet, then put the lowest foot on the floor.
     places = _places(motion) @ upright.T
     scale = body.leg / _leg(motion.rest, joints)
     root = places[:, joints["pelvis"]]
@@ -194,6 +199,7 @@ def _placed(
 
 
 def _leg(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> float:
+    """Return the length of the file's leg from hip to ankle, mean of both."""
     total = 0.0
     for side in ("left", "right"):
         hip, knee, ankle = (rest[joints[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
@@ -204,6 +210,7 @@ def _leg(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> float:
 
 
 def _in_world(motion: BvhMotion) -> Float64[np.ndarray, "T J 3 3"]:
+    """Return the rotations of all joints in world coordinates."""
     out = motion.rotations.copy()
     for joint, parent in enumerate(motion.parents):
         if parent >= 0:
@@ -212,6 +219,7 @@ def _in_world(motion: BvhMotion) -> Float64[np.ndarray, "T J 3 3"]:
 
 
 def _places(motion: BvhMotion) -> Float64[np.ndarray, "T J 3"]:
+    """Return the positions of all joints by forward kinematics."""
     world = _in_world(motion)
     out = np.empty((len(motion.root), len(motion.names), 3))
     for joint, parent in enumerate(motion.parents):
@@ -220,16 +228,16 @@ def _places(motion: BvhMotion) -> Float64[np.ndarray, "T J 3"]:
 
 
 def _upright(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> Float64[np.ndarray, "3 3"]:
-    """The turn that brings the axis along which the skeleton stands at rest to +Y."""
+    """Return the rotation that takes the axis along which the skeleton stands at rest to +Y."""
     up = rest[joints["pelvis"]] - 0.5 * (rest[joints["left_ankle"]] + rest[joints["right_ankle"]])
     axis = int(np.argmax(np.abs(up)))
-    way = np.zeros(3)
-    way[axis] = np.sign(up[axis]) or 1.0
-    return _between(way, np.array([0.0, 1.0, 0.0]))
+    direction = np.zeros(3)
+    direction[axis] = np.sign(up[axis]) or 1.0
+    return _between(direction, np.array([0.0, 1.0, 0.0]))
 
 
 def _trunk(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int], body: Skeleton) -> Float64[np.ndarray, "3 3"]:
-    """The rotation of our trunk at rest onto theirs: hips, shoulders and neck, each set about its own middle."""
+    """Return the least-squares rotation (Kabsch) of our trunk at rest onto the file's: hips, shoulders and neck."""
     shared = [name for name in _FRAME if name in joints]
     ours, theirs = body.places[body.at(*shared)], rest[[joints[name] for name in shared]]
     ours, theirs = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
@@ -237,16 +245,16 @@ def _trunk(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int], body: Sk
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
-def _away(
+def _rest_rotation(
     name: str,
     rest: Float64[np.ndarray, "J 3"],
     joints: Mapping[str, int],
     body: Skeleton,
     above: Float64[np.ndarray, "3 3"],
 ) -> Float64[np.ndarray, "3 3"]:
-    """What takes a joint of ours at rest to theirs: `above`, and what its bone is turned beyond that."""
+    """Return the rotation of a joint from our rest pose to the file's: `above`, then the smallest one for its bone."""
     side, _, part = name.rpartition("_")
-    # A hand goes on as its forearm is.
+    # A hand continues the direction of its forearm.
     bone = (f"{side}_elbow", name) if part == "wrist" else (name, f"{side}_{_CHILD.get(part)}")
     if any(end not in joints for end in bone):
         return above
@@ -255,7 +263,7 @@ def _away(
 
 
 def _between(a: Float64[np.ndarray, " 3"], b: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The smallest rotation that takes one direction to another; none where one has no length."""
+    """Return the smallest rotation that takes one direction to another; the identity if one has no length."""
     lengths = np.linalg.norm(a) * np.linalg.norm(b)
     if not lengths > 0.0:
         return np.eye(3)

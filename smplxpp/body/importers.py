@@ -1,4 +1,4 @@
-"""Body parameters from files of others: `load_params`."""
+"""Read body parameters from files in the layouts of other programs and data sets: `load_params`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 LayoutName = Literal["auto", "smplx", "amass", "easymocap", "avatarrex", "talkbody4d"]
 _SUFFIXES = (".npz", ".json", ".pkl")
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
-# Axis-angle of the turn that brings an axis to +y, about x or z; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
+# Axis-angle of the rotation about x or z that takes an axis to +y; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
 _Y_UP_FROM: dict[UpAxis, tuple[float, float, float]] = {
     "x": (0.0, 0.0, np.pi / 2),
     "-x": (0.0, 0.0, -np.pi / 2),
@@ -30,7 +30,7 @@ _Y_UP_FROM: dict[UpAxis, tuple[float, float, float]] = {
     "z": (-np.pi / 2, 0.0, 0.0),
     "-z": (np.pi / 2, 0.0, 0.0),
 }
-# What a layout's own files have up, where that is always the same and not y.
+# The axis that points up in a layout's own files, where that is always the same and not y.
 _OWN_UP: dict[str, UpAxis] = {"talkbody4d": "-y"}
 
 
@@ -49,20 +49,20 @@ def load_params(
 
     Layouts, told apart by their keys: `smplx` (SMPL-X names in npz or pickle: our own files, 4D-Dress), `amass`
     (SMPL+H and SMPL-X), `easymocap`, `avatarrex` (and THuman4), `talkbody4d`. A folder is read as one frame (or more)
-    a file: all files whose names differ in their numbers alone, in the order of these; others are left aside.
+    a file: all files whose names differ in their numbers alone, in the order of these; other files are ignored.
 
-    EasyMocap and TalkBody4D turn and move the posed body about the origin, `x = R(Rh) X + Th`, SMPL-X about its root
-    joint J0. With the inner pose (R_g, t): `global_orient = R(Rh) R_g`, `transl = R(Rh) (J0 + t) + Th - J0`.
+    EasyMocap and TalkBody4D rotate and translate the posed body about the origin, `x = R(Rh) X + Th`, SMPL-X about its
+    root joint J0. With the inner pose (R_g, t): `global_orient = R(Rh) R_g`, `transl = R(Rh) (J0 + t) + Th - J0`.
 
     Args:
         path: a file or a folder.
         layout: name of the layout, or "auto".
         body: the body that the parameters will pose; gives J0 where it is needed. None: the open body.
         person: id of the person, for files with several.
-        up: the axis that points up in the file, which is turned to our y. None: that of the layout, -y for TalkBody4D
-            and y for all others (AMASS has z up, its layout's other users have not).
+        up: the axis that points up in the file, which is rotated to y; None for that of the layout, which is -y for
+            TalkBody4D and y for all others (AMASS has z up, but other users of its layout have not).
         flat_hand_mean: overrides what the layout implies (see `BodyParams`).
-        max_betas: keep the first so many betas, for a body that has no more.
+        max_betas: number of betas to keep, for a body that has no more; None keeps all.
         holes: takes the frames of a file of several that hold NaN or infinity; another frame stands in each of them.
             None: they are refused.
 
@@ -74,11 +74,13 @@ def load_params(
         GeometryWarning: frames without the chosen person, which are left out; betas that are cut and not zero, with
             their share; what a layout has that is not read.
     """
+    # Files of the frames, and the layout that the first of them has.
     path = Path(path)
     files = _frame_files(path)
     name = detect_layout(path) if layout == "auto" else layout
     if name not in LAYOUTS:
         raise InputError("layout", expected=f"auto, {', '.join(LAYOUTS)}", received=name)
+    # Read file by file; frames without the person are noted.
     parts: list[Frames] = []
     absent: list[str] = []
     for file in files:
@@ -106,7 +108,8 @@ def load_params(
 def params_from_content(
     content: Any, *, source: str, layout: LayoutName = "auto", body: BodyModel | None = None
 ) -> BodyParams:
-    """Body parameters of a file that is read already: its arrays by name, or its JSON; see `load_params`.
+    """Convert the content of a file that was read already, arrays by name or JSON, to body parameters; see
+    `load_params`.
 
     Args:
         content: what the file holds.
@@ -123,7 +126,7 @@ def params_from_content(
 
 
 def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
-    """The first betas alone. Only a body with all directions could say millimetres; their share can be said here."""
+    """Keep the first betas and warn about the share that is lost; millimetres would need a body with all directions."""
     if max_betas is None:
         return parts
     if max_betas < 0:
@@ -159,7 +162,7 @@ def _joined(parts: list[Frames], body: BodyModel | None, up: UpAxis) -> BodyPara
 
 
 def detect_layout(path: str | Path) -> str:
-    """The layout of a file, or of the first file of a folder (its other files must have the same).
+    """Detect the layout of a file, or of the first file of a folder (whose other files must have the same).
 
     Raises:
         InputError: nothing readable, an unknown or ambiguous layout.
@@ -169,7 +172,7 @@ def detect_layout(path: str | Path) -> str:
 
 
 def _moved(params: BodyParams, body: BodyModel, rotvec: np.ndarray, shift: np.ndarray) -> BodyParams:
-    """Parameters of the posed body after `x -> R x + t` about the origin."""
+    """Return the parameters of the posed body after `x -> R x + t` about the origin."""
     rotation = matrix_from_rotvec(rotvec)
     root = body.rest_joints(params)[:, 0]
     turned = (rotation @ (root + params.transl)[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Reading body model files: SMPL-X, SMPL-H and SMPL as npz or pickle, and the embedded open body."""
+"""Read body model files of SMPL-X, SMPL-H and SMPL as npz or pickle, and the embedded open body."""
 
 from __future__ import annotations
 
@@ -32,27 +32,21 @@ _OPTIONAL = (
     "lmk_faces_idx",
     "lmk_bary_coords",
 )
-# SMPL-X's own files: from this many directions on, the first 300 are shape and the rest expression; shorter ones
-# hold 10 and 10.
-_LONG_BASIS, _LONG_SHAPE, _SHORT_SHAPE, _SHORT_EXPRESSION = 400, 300, 10, 10
-# Weights come as float16 or float32: rows within this of 1 are rounding, beyond it another file.
-_WEIGHT_SUM_TOLERANCE = 1e-3
-# COCO's points near joints of the body are not these joints.
+# COCO's keypoints near these joints are not the joints themselves, so their names get a prefix.
 _COCO, _COCO_JOINTS = "coco_", ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-# dlib's 68 points without the contour.
-_FACE_LANDMARKS, _FIRST_FACE_LANDMARK = 51, 17
 
 
 def load_body(
     path: str | Path | None = None, *, num_betas: int | None = None, num_expressions: int | None = None
 ) -> BodyModel:
-    """Read a body model.
+    """Read a body model of the SMPL family from a file.
 
     Args:
         path: an npz or pkl file in the layout of SMPL-X (55 joints), SMPL-H (52) or SMPL (24), told apart by their
             joints. None: the open body that comes with the package (55 joints, 20 betas, 52 expressions).
             Pickles are read without executing anything from them.
-        num_betas, num_expressions: keep the first so many directions; None keeps all.
+        num_betas: number of shape directions to keep; None keeps all.
+        num_expressions: number of expression directions to keep; None keeps all.
 
     Raises:
         InputError: a missing key, a wrong shape, weights that do not sum to 1, more directions asked than there are.
@@ -74,7 +68,7 @@ def load_body(
 
 @lru_cache(maxsize=4)
 def _open_body(num_betas: int | None, num_expressions: int | None) -> BodyModel:
-    """The embedded body; its arrays are read-only, so that whoever asks again may have the same."""
+    """Return the embedded body, cached; its arrays are read-only, so that callers can share them."""
     with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as embedded:
         return load_body(embedded, num_betas=num_betas, num_expressions=num_expressions)
 
@@ -92,12 +86,14 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 class _Builder:
-    """One file's raw values on their way to a BodyModel."""
+    """A converter of the raw values of one file to a BodyModel, with errors that name the key."""
 
     def __init__(self, path: Path, raw: dict[str, Any]) -> None:
         self.path, self.raw = path, raw
 
     def build(self, num_betas: int | None, num_expressions: int | None) -> BodyModel:
+        """Check and convert all arrays, whose sizes follow from the skinning weights."""
+        # The number of joints decides the family; bases are split into shape and expression.
         weights = self._array("weights", (None, None))
         vertex_count, joint_count = weights.shape
         if joint_count not in JOINT_NAMES:
@@ -130,6 +126,7 @@ class _Builder:
             landmarks=self._landmarks(faces, vertex_count),
             expression_names=(self._names("expr_names", exprdirs.shape[2]) or ())[: kept_expressions.shape[2]],
         )
+        # Read-only arrays let callers share one model.
         for value in (*vars(model).values(), *(array for pair in model.landmarks.values() for array in pair)):
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -164,7 +161,10 @@ class _Builder:
         return names
 
     def _bases(self, vertex_count: int, joint_count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Shape and expression directions: by the file's own counts, else by SMPL-X's convention."""
+        """Split the directions into shape and expression by the file's own counts, else by SMPL-X's convention.
+
+        SMPL-X files of 400 directions and more have 300 of the shape; shorter ones have 10 and 10.
+        """
         basis = self._array("shapedirs", (vertex_count, 3, None))
         width = basis.shape[2]
         if "num_betas" in self.raw:
@@ -172,10 +172,10 @@ class _Builder:
             expression = int(np.asarray(self.raw.get("num_expressions", width - shape)))
         elif joint_count != max(JOINT_NAMES):
             shape, expression = width, 0
-        elif width >= _LONG_BASIS:
-            shape, expression = _LONG_SHAPE, width - _LONG_SHAPE
+        elif width >= 400:
+            shape, expression = 300, width - 300
         else:
-            shape, expression = _SHORT_SHAPE, _SHORT_EXPRESSION
+            shape, expression = 10, 10
         if shape + expression > width:
             raise self._error("shapedirs", f"{shape} shape and {expression} expression directions", f"{width}")
         return basis[..., :shape], basis[..., shape : shape + expression]
@@ -204,7 +204,7 @@ class _Builder:
         return parents
 
     def _landmarks(self, faces: np.ndarray, vertex_count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """What the file says of detectors' points: COCO's (the open body), dlib's from 17 on (it and SMPL-X)."""
+        """Return detectors' keypoints in the file: COCO's (open body), and dlib's from 17 on (open body and SMPL-X)."""
         found = {}
         if "coco_regressor" in self.raw and "coco_names" in self.raw:
             regressor = self._array("coco_regressor", (None, vertex_count))
@@ -215,16 +215,20 @@ class _Builder:
         if "lmk_faces_idx" in self.raw and "lmk_bary_coords" in self.raw:
             corners = self._array("lmk_faces_idx", (None,)).astype(np.int64)
             weights = self._array("lmk_bary_coords", (len(corners), 3))
-            if len(corners) == _FACE_LANDMARKS and corners.min() >= 0 and corners.max() < len(faces):
+            # The 51 points of dlib's 68 without the contour, which are the first 17.
+            if len(corners) == 51 and corners.min() >= 0 and corners.max() < len(faces):
                 for k, (corner, weight) in enumerate(zip(corners, weights, strict=True)):
-                    found[f"face_{_FIRST_FACE_LANDMARK + k}"] = (faces[corner], weight / weight.sum())
+                    found[f"face_{17 + k}"] = (faces[corner], weight / weight.sum())
         return found
 
     def _normalised(self, weights: np.ndarray) -> np.ndarray:
-        """Rows that sum to 1 in float64, so that a translation within the transforms is exact."""
+        """Normalise rows to sum to 1 in float64, so that a translation in the transforms is exact.
+
+        Sums within 1e-3 of 1 are the rounding of float16; others are errors of the file.
+        """
         total = weights.sum(axis=1)
         worst = int(np.argmax(np.abs(total - 1.0)))
-        if weights.min() < 0 or abs(total[worst] - 1.0) > _WEIGHT_SUM_TOLERANCE:
+        if weights.min() < 0 or abs(total[worst] - 1.0) > 1e-3:
             raise self._error(
                 "weights",
                 "non-negative rows that sum to 1",

@@ -1,4 +1,4 @@
-"""BodyModel: a body of the SMPL family, posed in numpy or, differentiably, in torch."""
+"""Pose a body of the SMPL family in numpy or, differentiably, in torch: `BodyModel`."""
 
 from __future__ import annotations
 
@@ -72,8 +72,10 @@ class BodyModel:
         parents: -1 at the root.
         joint_names: J names.
         weights: rows sum to 1.
-        left_hand_components, right_hand_components: rows are principal components; None where absent.
-        left_hand_mean, right_hand_mean: axis-angle; None where absent.
+        left_hand_components: principal components of the hand pose as rows; None where absent.
+        right_hand_components: likewise.
+        left_hand_mean: mean hand pose, axis-angle; None where absent.
+        right_hand_mean: likewise.
         part_labels: indices into `part_label_names`: the file's own labels, else the joint of most weight.
         part_label_names: names of the parts.
         expression_names: E names; numbered where the file gives none.
@@ -142,6 +144,7 @@ class BodyModel:
             raise self._unfit("joint_names", f"{J} names", f"{len(self.joint_names)}")
         if not (J and self.parents[0] == -1 and all(0 <= p < j for j, p in enumerate(self.parents.tolist()) if j)):
             raise self._unfit("parents", "one root first (-1), every parent before its children", "others")
+        # Indices of labels and landmarks must exist.
         labels, names = self.part_labels, len(self.part_label_names)
         if labels.size and (labels.min() < 0 or labels.max() >= names):
             raise self._unfit("part_labels", f"indices in [0, {names})", "others")
@@ -169,11 +172,11 @@ class BodyModel:
         return self.exprdirs.shape[2]
 
     def mesh(self, vertices: Float[np.ndarray, "V 3"] | None = None) -> TriangleMesh:
-        """The body's faces on the given (V, 3) vertices, or on the mean shape."""
+        """Return the body's faces on the given vertices, or on the mean shape."""
         return TriangleMesh(self.v_template if vertices is None else vertices, self.faces)
 
     def forward(self, params: BodyParams | Mapping[str, Array], *, flat_hand_mean: bool | None = None) -> PosedBody:
-        """Pose the body.
+        """Pose the body by linear blend skinning.
 
         `v = v_template + shapedirs betas + v_shape + exprdirs expression`, `J = joint_regressor v`,
         `rest = v + posedirs vec(R_1.. - I)`, `x = sum_j w_j G_j(J, R) rest + transl`; the root turns about `J_0`.
@@ -208,15 +211,15 @@ class BodyModel:
         return PosedBody(vertices, joints, rest, rest_joints, posed_from_rest, offsets)
 
     def axis_angles(self, params: BodyParams) -> Float64[np.ndarray, "T J 3"]:
-        """Every joint's axis-angle vector relative to its parent's frame, hands complete (mean and PCA included)."""
+        """Return every joint's axis-angle vector relative to its parent's frame, including the mean hand and PCA."""
         return self._axis_angles(_checked_arrays(params), params.flat_hand_mean)
 
     def joint_rotations(self, params: BodyParams) -> Float64[np.ndarray, "T J 3 3"]:
-        """Every joint's rotation relative to its parent's frame, hands complete (mean and PCA included)."""
+        """Return every joint's rotation relative to its parent's frame, hands complete (mean and PCA included)."""
         return matrix_from_rotvec(self.axis_angles(params))
 
     def rest_joints(self, params: BodyParams | Mapping[str, Array]) -> Float[Array, "T J 3"]:
-        """The joints of the shaped body before posing, metres."""
+        """Return the joints of the shaped body before posing, metres."""
         return self._shaped(_checked_arrays(params))[1]
 
     def _shaped(self, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
@@ -239,7 +242,7 @@ class BodyModel:
         return offsets
 
     def _blend(self, basis_name: str, coefficients: Array, subject: str) -> Array:
-        """Offsets (T, V, 3) of the first n directions by (T, n) coefficients."""
+        """Return offsets (T, V, 3) of the first n directions for (T, n) coefficients."""
         basis = self._constant(basis_name, coefficients)
         used, known = coefficients.shape[-1], basis.shape[-1]
         if used > known:
@@ -261,7 +264,7 @@ class BodyModel:
         return self._blend("posedirs", feature.reshape(len(rotations), -1), "pose")
 
     def _axis_angles(self, arrays: Mapping[str, Array], flat_hand_mean: bool) -> Array:
-        """The axis-angle vectors (T, J, 3) of all joints."""
+        """Return the axis-angle vectors (T, J, 3) of all joints."""
         blocks = []
         for name in POSE_NAMES[self.joint_count]:
             value = arrays[name]
@@ -290,7 +293,7 @@ class BodyModel:
         return value if mean is None else value + mean
 
     def _constant(self, name: str, like: Array) -> Array:
-        """A field as an array of the kind, type and device of `like`."""
+        """Return a field as an array of the kind, type and device of `like`."""
         value = getattr(self, name)
         if value is None or isinstance(like, np.ndarray):
             return value
@@ -304,7 +307,7 @@ class BodyModel:
 
 
 def _checked_arrays(params: BodyParams | Mapping[str, Array]) -> dict[str, Array]:
-    """Every array by name with T rows, missing ones zero."""
+    """Return every array by name with T rows; missing ones are zero."""
     if isinstance(params, BodyParams):
         arrays = {name: getattr(params, name) for name in ARRAY_NAMES}
         return arrays if params.v_shape is None else {**arrays, "v_shape": params.v_shape}

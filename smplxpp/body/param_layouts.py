@@ -1,4 +1,4 @@
-"""The layouts in which others write body parameters: how each is recognised and what its numbers mean.
+"""Recognise and read the layouts in which other programs and data sets write body parameters.
 
 A reader turns the content of one file into `Frames`: parameters as SMPL-X understands them and, where the source
 moves the posed body as a whole, that outer motion, still to be composed (it needs the body's root joint).
@@ -20,7 +20,7 @@ from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
 
 _JOINTS = dict(POSE_BLOCKS)
 _EASYMOCAP_HAND_PCA = 6
-# Radians and metres: nobody turns or goes farther.
+# Largest number of radians or metres that is accepted; larger ones are damage.
 _FARTHEST = 1e6
 # Arrays that have a row a frame, one of which every layout of stacked frames has.
 _STACKED = ("global_orient", "body_pose", "poses")
@@ -30,7 +30,7 @@ _EASYMOCAP_COMPLETE, _EASYMOCAP_EMBEDDING = (156, 165), 32
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What a reader returns.
+    """Body parameters with an outer motion, as a reader returns them.
 
     Attributes:
         params: T frames.
@@ -64,12 +64,12 @@ def without_holes(content: Any) -> tuple[Any, list[int]]:
 
 @dataclass(frozen=True)
 class Layout:
-    """A known layout.
+    """A layout of body parameters with its reader.
 
     Attributes:
-        name: what the user calls it.
-        recognises: by the keys of a record; `is_list` tells a list of records.
-        read: content, chosen person -> frames; None where the person is not in the file.
+        name: that users choose.
+        recognises: whether keys of a record, and whether it is in a list of records, fit the layout.
+        read: from content and chosen person to frames; None if the person is not in the file.
     """
 
     name: str
@@ -200,7 +200,7 @@ LAYOUTS: dict[str, Layout] = {
 
 
 def recognise(content: Any, *, source: str) -> str:
-    """The name of the one layout that fits a file's content.
+    """Return the name of the one layout that fits a file's content.
 
     Raises:
         InputError: none fits, or several.
@@ -209,7 +209,7 @@ def recognise(content: Any, *, source: str) -> str:
     record = next(iter(content), {}) if is_list else content
     keys = set(map(str, record)) if isinstance(record, Mapping) else set()
     fitting = [layout.name for layout in LAYOUTS.values() if layout.recognises(keys, is_list)]
-    # An EasyMocap frame in which nobody was seen is an empty list.
+    # An EasyMocap frame without people is an empty list.
     if is_list and not content:
         fitting = ["easymocap"]
     if len(fitting) != 1:
@@ -228,7 +228,7 @@ def recognise(content: Any, *, source: str) -> str:
 
 
 def _split(poses: np.ndarray, *, face_first: bool) -> dict[str, np.ndarray]:
-    """Rows of concatenated joints to blocks: root, body, then face and hands in either order, as far as they go.
+    """Split rows of concatenated joints into blocks: root, body, then face and hands in either order, if present.
 
     Hands share what the face leaves: 45 axis-angle numbers each, or PCA coefficients. 156 = no face.
     """
@@ -261,7 +261,7 @@ def _outer(record: Mapping[str, Any], frames: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _flat_joints(name: str, value: Any) -> np.ndarray:
-    """(..., joints, 3) or (..., 1, 3) blocks to one row a frame."""
+    """Flatten blocks of shape (..., joints, 3) or (..., 1, 3) to one row a frame."""
     value = np.asarray(value)
     joints = _JOINTS.get(name)
     if joints and value.ndim >= 2 and value.shape[-2:] == (joints, 3) and (joints > 1 or value.ndim == 3):

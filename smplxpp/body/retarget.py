@@ -1,8 +1,8 @@
-"""A motion of one body on another: turns as they are, ways in proportion to the legs, feet that stand where they stood.
+"""Retarget a motion: copy joint rotations, scale root translation by leg length, keep planted feet planted.
 
-SMPL's bodies share their rest pose, so that the turns of joints are carried over as they are. What differs is how far a
-step reaches: the root's way is scaled by the legs' length, and where a foot stood on the source it is held on the
-target, by what the rest of the proportions would make it slide.
+Bodies of the SMPL family share their rest pose, so that joint rotations are copied. Steps differ in length: the root's
+translation is scaled by the ratio of the legs' lengths, and where a foot is planted on the source, the sliding that
+other proportions would cause on the target is subtracted from the root.
 """
 
 from __future__ import annotations
@@ -20,18 +20,17 @@ from smplxpp.skinning.linear_blend import forward_kinematics
 
 _LEG = ("hip", "knee", "ankle")
 FEET = ("left_foot", "right_foot", "left_ankle", "right_ankle")
-"""Joints by which contact with the floor is told."""
-_SLOW, _LOW = 0.35, 0.06
-"""A foot stands where it moves by less than so many leg lengths a second, so many of them above its lowest."""
-_BRACE = 0.05
+"""Joints by which contact with the floor is recognised."""
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Joints at rest.
+    """The joints of a body at rest.
 
     Attributes:
-        names: SMPL's. places: metres.
+        names: of the joints, as SMPL's.
+        parents: index of each joint's parent, -1 for the root.
+        places: positions, metres.
     """
 
     names: tuple[str, ...]
@@ -40,7 +39,7 @@ class Skeleton:
 
     @staticmethod
     def of(body: BodyModel, betas: Float64[np.ndarray, " B"] | None = None) -> Skeleton:
-        """Return that of a body of a shape; None: its mean one.
+        """Return the skeleton of a body with the given shape, None for its mean shape.
 
         Raises:
             InputError: more betas than the body has.
@@ -49,10 +48,10 @@ class Skeleton:
         return Skeleton(tuple(body.joint_names), np.asarray(body.parents), np.asarray(body.rest_joints(shape))[0])
 
     def at(self, *names: str) -> list[int]:
-        """Return the numbers of joints.
+        """Return the indices of joints by name.
 
         Raises:
-            InputError: one that it lacks.
+            InputError: a joint that the skeleton does not have.
         """
         missing = [name for name in names if name not in self.names]
         if missing:
@@ -61,7 +60,7 @@ class Skeleton:
 
     @property
     def leg(self) -> float:
-        """Length of a leg from hip to ankle, the mean of both.
+        """The length of a leg from hip to ankle, mean of both, metres.
 
         Raises:
             InputError: joints that are missing, or legs of no length.
@@ -75,7 +74,7 @@ class Skeleton:
         return float(np.mean(lengths))
 
     def pose(self, params: BodyParams) -> Float64[np.ndarray, "T J 3"]:
-        """Return where the joints are, metres; fingers and face as they are at rest."""
+        """Return the positions of the joints, metres, with fingers and face at rest."""
         count = len(self.names)
         rotations = np.tile(np.eye(3), (len(params), count, 1, 1))
         turned = np.concatenate([params.global_orient, params.body_pose], axis=1).reshape(len(params), -1, 3)
@@ -85,11 +84,14 @@ class Skeleton:
 
 
 def retarget(params: BodyParams, source: Skeleton, target: Skeleton) -> BodyParams:
-    """Return a motion of `source` as `target` makes it; the same body's comes back as it was.
+    """Return a motion of `source` for `target`; retargeting to the same skeleton returns the motion unchanged.
 
     Args:
         params: T frames of the source; their shape is dropped.
+        source: skeleton of the motion.
+        target: skeleton that shall move.
     """
+    # Scale the pelvis' path about its first position on the floor.
     scale = target.leg / source.leg
     own = source.pose(params)
     pelvis = own[:, 0]
@@ -98,6 +100,7 @@ def retarget(params: BodyParams, source: Skeleton, target: Skeleton) -> BodyPara
     places = start + scale * (pelvis - start)
     moved = places - target.places[0]
     out = replace(params.without_shape(), transl=moved)
+    # Keep planted feet planted, then put the lowest foot on the floor.
     feet, theirs = target.pose(out)[:, target.at(*FEET)], scale * own[:, source.at(*FEET)]
     moved = moved + held_feet(theirs, feet, target.leg, params.fps or DEFAULT_FPS)
     lowest = target.pose(replace(out, transl=moved))[:, target.at(*FEET), 1].min()
@@ -106,22 +109,31 @@ def retarget(params: BodyParams, source: Skeleton, target: Skeleton) -> BodyPara
 
 
 def standing(feet: Float64[np.ndarray, "T K 3"], leg: float, fps: float) -> Float64[np.ndarray, "T-1 K"]:
-    """Return how much each foot stands between a frame and the next, in [0, 1], by its speed and its height."""
-    speed = np.linalg.norm(np.diff(feet, axis=0), axis=2) * fps / (_SLOW * leg)
+    """Return how firmly each foot is planted between a frame and the next, in [0, 1], by its speed and its height.
+
+    The weight `exp(-s^4) exp(-h^4)` is near 1 below 0.35 leg lengths a second and 0.06 leg lengths above the lowest
+    height, and falls steeply above.
+    """
+    slow, low_height = 0.35, 0.06
+    speed = np.linalg.norm(np.diff(feet, axis=0), axis=2) * fps / (slow * leg)
     height = feet[..., 1] - feet[..., 1].min(axis=0)
-    low = np.maximum(height[:-1], height[1:]) / (_LOW * leg)
+    low = np.maximum(height[:-1], height[1:]) / (low_height * leg)
     return np.exp(-(speed**4)) * np.exp(-(low**4))
 
 
 def held_feet(
     source: Float64[np.ndarray, "T K 3"], target: Float64[np.ndarray, "T K 3"], leg: float, fps: float
 ) -> Float64[np.ndarray, "T 3"]:
-    """Return by how much the target goes on beyond its way, so that feet that stand move as the source's do.
+    """Return the correction of the target's root that makes planted feet move as the source's do.
 
     Args:
-        source: its feet, scaled to the target's size. leg: of the target, metres.
+        source: feet of the source, scaled to the target's size, metres.
+        target: feet of the target, metres.
+        leg: length of the target's leg, metres.
+        fps: frames a second.
     """
+    # The mean sliding of planted feet in each step; the constant damps steps in which no foot is planted.
     share = standing(source, leg, fps)[..., None]
     too_far = np.diff(source, axis=0) - np.diff(target, axis=0)
-    step = (share * too_far).sum(axis=1) / (share.sum(axis=1) + _BRACE)
+    step = (share * too_far).sum(axis=1) / (share.sum(axis=1) + 0.05)
     return np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)]) * [1.0, 0.0, 1.0]

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.build.completeness import completeness_checks, photograph_checks
 from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PreparedScan

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.body.keypoint_names import (
+from smplxpp.body.layout import (
     BODY_25B,
     BY_COUNT,
     FACE,

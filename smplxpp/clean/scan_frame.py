@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int, Num
 
 from smplxpp.body import load_body
-from smplxpp.body.standing_poses import standing_poses
+from smplxpp.body.named_poses import standing_poses
 from smplxpp.clean.units import METRES_PER_UNIT, convert_points
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh

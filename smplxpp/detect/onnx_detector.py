@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 
-from smplxpp.body.keypoint_names import BY_COUNT, Order
+from smplxpp.body.layout import BY_COUNT, Order
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.onnx_file import OnnxModel
 from smplxpp.core.files.paths import read_bytes

@@ -326,7 +326,7 @@ def test_unknown_joints_are_named_and_a_map_helps(file, tmp_path):
         (lambda text: text.replace("}", "", 1), "}"),
         (lambda text: text.replace("Zrotation", "Wrotation", 1), "channels"),
         (lambda text: text.replace("JOINT left_hip", "JOINT right_hip", 1), "different names"),
-        (lambda text: text.replace("Frame Time: 0.0", "Frame Time: -0.0"), "goes on"),
+        (lambda text: text.replace("Frame Time: 0.0", "Frame Time: -0.0"), "positive frame time"),
         (lambda text: text.replace("OFFSET", "OFFSET nan", 1), "within"),
         (lambda text: text.rsplit(" ", 1)[0] + " inf\n", "within"),
     ],

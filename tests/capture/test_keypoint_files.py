@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from smplxpp.body.keypoint_names import (
+from smplxpp.body.layout import (
     BODY_25,
     BODY_25B,
     BODY_135,

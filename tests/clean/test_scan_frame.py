@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.standing_poses import standing_poses
+from smplxpp.body.named_poses import standing_poses
 from smplxpp.clean.scan_frame import find_scan_frame
 from smplxpp.clean.units import METRES_PER_UNIT, convert_points
 from smplxpp.core.errors import InputError

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from smplxpp.body.keypoint_names import COCO_17, HALPE_26, WHOLE_BODY_133
+from smplxpp.body.layout import COCO_17, HALPE_26, WHOLE_BODY_133
 from smplxpp.core.errors import InputError
 from smplxpp.detect import load_detector, mask_box
 from smplxpp.detect.detector import grown

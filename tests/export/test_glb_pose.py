@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.body.stress_poses import stress_poses
+from smplxpp.body.named_poses import stress_poses
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights

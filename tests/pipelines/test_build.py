@@ -23,7 +23,7 @@ from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from smplxpp.assemble import DarnConfig
 from smplxpp.body import load_params
-from smplxpp.body.stress_poses import stress_poses
+from smplxpp.body.named_poses import stress_poses
 from smplxpp.clean import WebConfig, simplify
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.labels import CLOTH_LABELS, HAIR

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.keypoint_names import VOCABULARY
+from smplxpp.body.layout import VOCABULARY
 from smplxpp.core.params import BodyParams
 from smplxpp.register.landmarks import LandmarkModel
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.stress_poses import stress_poses
+from smplxpp.body.named_poses import stress_poses
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 from tests.template.test_template import template_of

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.stress_poses import stress_poses
+from smplxpp.body.named_poses import stress_poses
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN, UPPER
 from smplxpp.core.params import BodyParams

@@ -23,7 +23,7 @@ from pipelines.runs.layout import SCAN_LABELS
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.run_inputs import motion_of_build
-from smplxpp.body.stress_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.files.json_file import as_list, as_text
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.body.standing_poses import standing_poses
+from smplxpp.body.named_poses import standing_poses
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.core.surface_points import SurfacePoints, truncated_distance
 from smplxpp.register.kinematics import BodyState, Kinematics

@@ -1,0 +1,138 @@
+"""Provide named poses: standing poses of people who are scanned, and stress poses that test a template's skinning.
+
+Angles follow SMPL-X's T-pose (x to the person's left, y up, z to the front; joint frames are the world's axes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from jaxtyping import Float64
+
+from smplxpp.body.layout import JOINT_NAMES, SMPLX_JOINTS
+from smplxpp.core.params import BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+
+_Rotations = Mapping[str, tuple[tuple[float, float, float], ...]]
+# Rotation vectors of the left side's joints, degrees, of which the first is applied last; the right side is the mirror
+# image. Arms of the T-pose point along x: a rotation about -z lowers them, about x twists them, about -y takes them
+# forwards.
+_ARMS: Mapping[str, _Rotations] = {
+    "hanging": {"shoulder": ((0, 0, -76),), "elbow": ((0, -12, 0),)},
+    "lowered": {"shoulder": ((0, 0, -48),)},
+    "spread": {"shoulder": ((0, 0, -8),)},
+    "raised": {"shoulder": ((0, 0, 68),)},
+    "bent": {"shoulder": ((0, 0, -68),), "elbow": ((0, -80, 0),)},
+    "on hips": {"shoulder": ((0, 0, -50), (70, 0, 0)), "elbow": ((0, -95, 0),)},
+    "crossed": {"shoulder": ((0, -30, 0), (0, 0, -65), (50, 0, 0)), "elbow": ((0, -105, 0),)},
+    "forwards": {"shoulder": ((0, -75, 0), (0, 0, -15))},
+}
+# Pairs of different left and right arms.
+_ASYMMETRIC = (("hanging", "raised"), ("hanging", "bent"), ("hanging", "on hips"), ("hanging", "forwards"))
+_LEGS: Mapping[str, tuple[_Rotations, _Rotations]] = {
+    "apart": ({}, {}),
+    "close": ({"hip": ((0, 0, -9),)}, {"hip": ((0, 0, -9),)}),
+    "walking": (
+        {"hip": ((-22, 0, 0), (0, 0, -8)), "knee": ((12, 0, 0),)},
+        {"hip": ((12, 0, 0), (0, 0, -8)), "knee": ((20, 0, 0),)},
+    ),
+    "knees bent": (
+        {"hip": ((-55, 0, 0),), "knee": ((75, 0, 0),), "ankle": ((-18, 0, 0),)},
+        {"hip": ((-55, 0, 0),), "knee": ((75, 0, 0),), "ankle": ((-18, 0, 0),)},
+    ),
+}
+
+
+def standing_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, "J 3"]]]:
+    """Yield names and axis-angle vectors, radians, of poses in which people stand while they are scanned.
+
+    Args:
+        joint_count: of a body of the SMPL family; its pelvis is not rotated.
+    """
+    arms = [(name, name) for name in _ARMS] + [*_ASYMMETRIC, *((b, a) for a, b in _ASYMMETRIC)]
+    for left, right in arms:
+        for name, (one, other) in _LEGS.items():
+            title = f"arms {left}, legs {name}" if left == right else f"left arm {left}, right {right}, legs {name}"
+            yield title, _pose_of(joint_count, _ARMS[left], _ARMS[right], one, other)
+            if one != other:
+                yield f"{title}, the other way", _pose_of(joint_count, _ARMS[left], _ARMS[right], other, one)
+
+
+def _pose_of(joint_count: int, *parts: _Rotations) -> Float64[np.ndarray, "J 3"]:
+    """Return the axis-angle vectors of left arm, right arm, left leg and right leg, all other joints at rest."""
+    mirror = np.array([1.0, -1.0, -1.0])
+    place = {name: k for k, name in enumerate(JOINT_NAMES[joint_count])}
+    out = np.tile(np.eye(3), (joint_count, 1, 1))
+    for side, rotations in zip(("left", "right", "left", "right"), parts, strict=True):
+        for joint, vectors in rotations.items():
+            for vector in vectors:
+                degrees = np.array(vector, dtype=np.float64) * (1.0 if side == "left" else mirror)
+                k = place[f"{side}_{joint}"]
+                out[k] = out[k] @ matrix_from_rotvec(np.radians(degrees))
+    return rotvec_from_matrix(out)
+
+
+# Axis-angle vectors of joints, degrees. Each pose bends what is hard for clothes to follow.
+STRESS_POSES: dict[str, dict[str, tuple[float, float, float]]] = {
+    "squat": {
+        "left_hip": (-95, 0, 15),
+        "right_hip": (-95, 0, -15),
+        "left_knee": (110, 0, 0),
+        "right_knee": (110, 0, 0),
+        "left_ankle": (-25, 0, 0),
+        "right_ankle": (-25, 0, 0),
+        "spine1": (15, 0, 0),
+        "spine2": (10, 0, 0),
+        "left_shoulder": (0, -60, -20),
+        "right_shoulder": (0, 60, 20),
+    },
+    "high_step": {
+        "left_hip": (-90, 0, 5),
+        "left_knee": (95, 0, 0),
+        "right_hip": (10, 0, 0),
+        "left_shoulder": (0, 0, -60),
+        "right_shoulder": (0, 0, 60),
+        "right_elbow": (0, 60, 0),
+    },
+    "arms_overhead": {
+        "left_collar": (0, 0, 20),
+        "right_collar": (0, 0, -20),
+        "left_shoulder": (0, 0, 60),
+        "right_shoulder": (0, 0, -60),
+        "left_elbow": (0, 0, 10),
+        "right_elbow": (0, 0, -10),
+    },
+    "twist": {
+        "spine1": (0, 15, 0),
+        "spine2": (0, 20, 0),
+        "spine3": (0, 15, 0),
+        "neck": (0, 15, 0),
+        "head": (0, 20, 0),
+        "left_shoulder": (0, 0, -65),
+        "right_shoulder": (0, 0, 65),
+    },
+}
+
+
+def stress_poses(reference: BodyParams) -> BodyParams:
+    """Return the poses of `STRESS_POSES`, in order, with the shape and translation of the reference's first frame.
+
+    Args:
+        reference: the person; only the first frame is used.
+
+    Returns:
+        BodyParams of `len(STRESS_POSES)` frames with a neutral face and hands at rest (zero).
+    """
+    first = reference.frame(0)
+    count = len(STRESS_POSES)
+    pose = np.zeros((count, 55, 3))
+    for row, joints in enumerate(STRESS_POSES.values()):
+        for joint, degrees in joints.items():
+            pose[row, SMPLX_JOINTS.index(joint)] = np.radians(degrees)
+    return BodyParams.from_full_pose(
+        pose,
+        betas=np.repeat(first.betas, count, axis=0),
+        expression=np.zeros((count, first.expression.shape[1])),
+        transl=np.repeat(first.transl, count, axis=0),
+    )
