@@ -28,20 +28,20 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.core.spread import spread
 
-# Frames before and after that are tried where images and parameters may not be of one clock.
+# Frame offsets that are tried where images and parameters may not be synchronised.
 _SHIFTS = (-3, -2, -1, 1, 2, 3)
-# Posed bodies held in memory.
+# Number of posed bodies that are kept in memory.
 _KEPT = 32
 
 
 @dataclass(frozen=True)
 class CheckConfig:
-    """How much is looked at.
+    """Extent of the check of a capture.
 
     Attributes:
-        frames: frames whose images are opened; None: as many, evenly spread, as make `max_views` views. Missing
-            files and parameters are told of all frames in any case.
-        max_views: see `frames`.
+        frames: frames whose images are opened; None: evenly spaced frames with `max_views` views in all. Missing files
+            and parameters are reported for all frames in any case.
+        max_views: number of views without `frames`.
         size: pixels of the longer side at which masks and silhouettes are compared.
     """
 

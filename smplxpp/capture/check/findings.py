@@ -13,7 +13,7 @@ Area = Literal["files", "splits", "masks", "parameters", "calibration"]
 
 # kind -> (area, status, what to do). Each kind has a paragraph in docs/capture_check.md.
 KINDS: dict[str, tuple[Area, Status, str]] = {
-    "file-damaged": ("files", "fail", "copy the file anew from its source, or delete it: the view is then left out"),
+    "file-damaged": ("files", "fail", "copy the file from its source again, or delete it to leave the view out"),
     "file-size": ("files", "fail", "give images, masks and calibration of one resolution"),
     "file-other": ("files", "fail", "correct the file, or delete it"),
     "left-aside": ("files", "warn", "docs/captures.md says what each layout's reader leaves aside, and why"),
@@ -26,8 +26,8 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "split-leftover": ("splits", "warn", "add them to one of the splits in capture.json if they should be used"),
     "masks-none": ("masks", "fail", "make mattes with any tool and name their folder with --masks"),
     "mask-missing": ("masks", "fail", "make the missing mattes; views without one cannot be trained on"),
-    "mask-empty": ("masks", "fail", "make these mattes anew, or delete these views' images"),
-    "mask-full": ("masks", "fail", "make these mattes anew: nothing was cut out"),
+    "mask-empty": ("masks", "fail", "make these mattes again, or delete these views' images"),
+    "mask-full": ("masks", "fail", "make these mattes again: nothing was cut out"),
     "mask-inverted": ("masks", "fail", "invert these masks: 255 is the person, 0 the background"),
     "mask-mismatch": ("masks", "fail", "check that image and mask show the same frame, and that nothing is cut off"),
     "background": ("masks", "fail", 'photographs are declared with `"background": null` in capture.json'),
@@ -39,7 +39,7 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
         "fit the body and bring it here with `smplxpp params convert`, or name a file with --params",
     ),
     "params-missing": ("parameters", "fail", "fit these frames too, or delete their images"),
-    "params-broken": ("parameters", "fail", "fit these frames anew; they are left out"),
+    "params-broken": ("parameters", "fail", "fit these frames again; they are left out"),
     "params-body": ("parameters", "fail", "name the body model that the parameters were fitted with: --body FILE"),
     "params-betas": (
         "parameters",
@@ -50,7 +50,7 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "params-expression": ("parameters", "fail", "check the file's layout and the body model, or regularise the fit"),
     "params-angles": ("parameters", "fail", "write rotation vectors in radians"),
     "params-units": ("parameters", "fail", "write cameras and parameters in metres, in one world"),
-    "params-jump": ("parameters", "fail", "fit these frames anew, or check that frames are numbered in time's order"),
+    "params-jump": ("parameters", "fail", "fit these frames again, or check that frames are numbered in time's order"),
     "world-up": (
         "calibration",
         "warn",
@@ -70,7 +70,7 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "calibration-frame": (
         "calibration",
         "fail",
-        "fit these frames anew, or check that cameras and parameters show one moment",
+        "fit these frames again, or check that cameras and parameters show one moment",
     ),
     "lens-loss": (
         "calibration",

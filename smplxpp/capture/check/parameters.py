@@ -1,4 +1,4 @@
-"""Body parameters that no person has, or that are in other units than the cameras."""
+"""Find implausible body parameters, and parameters in other units than the cameras."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _BETAS_VARY = 0.01
 # Coefficients of learned expressions, and weights of named blend shapes, whose own range is 0 to 1.
 _EXPRESSION_LIMITS = (-8.0, 8.0)
 _BLEND_SHAPE_LIMITS = (-1.0, 2.0)
-# More than a full turn: nobody's rotation vector; 7 degrees of a joint, though, are common.
+# Radians. A longer rotation vector is more than a full turn; in degrees 7 would be common.
 _ANGLE_LIMIT = 7.0
 _SPEED_LIMIT = 12.0
 _STEP_LIMIT = 0.5
-# Beyond this many times the rig's radius, and some, the person is outside of any room.
+# A person farther from the rig than 4 times its radius plus 10 m is outside of any room.
 _FAR, _FAR_METRES = 4.0, 10.0
 _UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (100.0, "hectometres"))
 

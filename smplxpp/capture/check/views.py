@@ -1,4 +1,4 @@
-"""One view: its files opened, its mask looked at, the body's silhouette held against it."""
+"""Check one view: open its files, test its mask, and compare the mask with the body's silhouette."""
 
 from __future__ import annotations
 
@@ -16,32 +16,30 @@ from smplxpp.capture.check.silhouettes import MIN_SHARE, SilhouetteFit, body_sil
 from smplxpp.core.errors import InputError
 
 OPAQUE = 127
-_FULL = 0.995
-# A mask is inverted if the body is this much outside of it and overlaps this much with the rest of the image.
-_INVERTED_OUTSIDE, _INVERTED_IOU = 0.7, 0.5
-# Without a body: opaque at this share of the image's rim, less within.
-_INVERTED_RIM = 0.6
+"""Opacity, of 255, above which a pixel of a mask counts as the person."""
 # Of 255. The median of what lies outside the mask may differ this much from the declared colour (JPEG's is about 1);
 # a pixel that differs by more than the second shows something.
 _BACKGROUND_TOLERANCE, _SHOWS_SOMETHING = 16, 48
 # Area outside the mask that shows something, as a share of the mask's.
 _MISMATCH = 0.05
-# Photographs whose 95th percentile outside the mask is within this of their median are on a plain colour: no lens and
-# no wall is that even, JPEG of one colour is.
+# A photograph is on a plain colour if the 95th percentile of the difference from the median colour outside the mask
+# is at most this, of 255. Lenses and walls vary more, a JPEG of one colour does not.
 _PLAIN = 2
-# Pixels about the mask that do not count: the soft edge, and JPEG's ringing.
-_EDGE = 3
-_STEP = 2
+# Pixels around the mask that are ignored (soft edge, ringing of JPEG), and the sampling step in pixels.
+_EDGE, _STEP = 3, 2
 
 
 @dataclass(frozen=True)
 class ViewCheck:
-    """What one view shows.
+    """Findings and measurements of one view.
 
     Attributes:
+        camera: name of the camera.
+        frame: number of the frame.
+        findings: defects of the view.
         mask_share: share of the image that the mask covers; None without a usable mask.
-        fit: None without a body, without a usable mask, or where there is nobody.
-        plain: the plain colour that a photograph is on, else None.
+        fit: silhouette of the body against the mask; None without a body, a usable mask, or a visible person.
+        plain: plain background colour of a photograph, else None.
     """
 
     camera: str
@@ -110,20 +108,22 @@ def check_view(
 def _wrong_mask(mask: Bool[np.ndarray, "H W"], silhouette: Bool[np.ndarray, "H W"] | None) -> tuple[str, str] | None:
     """Return kind and words of a mask that cannot be one of the person, else None."""
     share = float(mask.mean())
-    if share > _FULL:
+    if share > 0.995:
         return "mask-full", f"covers {share:.1%} of the image"
     visible = None if silhouette is None else float(silhouette.mean())
     if share < MIN_SHARE / 10:
-        # Without a body nobody can say whether the camera sees the person.
+        # Without a body it is unknown whether the camera sees the person.
         seen = visible is not None and visible > 2 * MIN_SHARE
         return ("mask-empty", f"is empty, but the body covers {visible:.1%} of the image") if seen else None
     if silhouette is not None and visible is not None and visible > MIN_SHARE:
         fit, inverse = compare_silhouettes(silhouette, mask), compare_silhouettes(silhouette, ~mask)
         assert fit is not None and inverse is not None  # the body is large enough to say something
-        inverted = fit.outside > _INVERTED_OUTSIDE and inverse.iou > _INVERTED_IOU
+        # Inverted: most of the body is outside of the mask, and it overlaps with the complement.
+        inverted = fit.outside > 0.7 and inverse.iou > 0.5
     else:
         rim = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
-        inverted = rim > _INVERTED_RIM and share > 0.5 and rim > share
+        # Without a body: most of the rim is opaque, more than of the whole image.
+        inverted = rim > 0.6 and share > 0.5 and rim > share
     return ("mask-inverted", "covers the background, not the person") if inverted else None
 
 
