@@ -92,7 +92,7 @@ def measure(scan: PersonScan, body: BodyModel, seed: int) -> list[dict]:
                 "accuracy": float(area @ right / area.sum()),
                 "accuracy_faces": float(right[scan.seen].mean()),
                 "worst": _worst(wrong),
-                "doubts": list(found.doubts),
+                "notes": list(found.notes),
                 "bin_area": np.bincount(bins, area / area.sum(), minlength=len(BINS) - 1).tolist(),
                 "bin_right": np.bincount(bins, area * right / area.sum(), minlength=len(BINS) - 1).tolist(),
                 "seconds": seconds,

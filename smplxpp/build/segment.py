@@ -131,7 +131,7 @@ def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str) -> Stage
     assert result.corrected is not None
     numbers = {
         "labels_from": source,
-        "doubts": list(labelled.before.doubts),
+        "notes": list(labelled.before.notes),
         "corrected_by_hand": float(areas @ result.corrected),
         "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)},
     }
@@ -174,7 +174,7 @@ def _by_views(scan: PreparedScan, inputs: BuildInputs, body: BodyModel, params: 
     colors = scan.own_colors
     prior = label_by_body(scan.mesh, body, params, colors=colors)
     result = segment_scan(scan.mesh, votes=agreed.votes, colors=colors, prior=prior)
-    return replace(result, doubts=(*notes, *result.doubts))
+    return replace(result, notes=(*notes, *result.notes))
 
 
 def _by_file(scan: PreparedScan, inputs: BuildInputs, file: ScanFile | None) -> SegmentedScan:

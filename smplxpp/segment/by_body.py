@@ -1,4 +1,27 @@
-"""Labels of a clothed scan from its geometry, its colours and the body fitted to it: no parser, no photographs."""
+"""Label a clothed scan from its geometry, its colours and the fitted body, without a parser or photographs.
+
+The labels L minimise the Potts energy `sum_i C_i(l_i) + sum_(i,j) w_ij [l_i != l_j]` over the scan's faces, where the
+unary cost is the negative log posterior of a label at a face,
+
+    C_i(l) = -log P(l | place_i) - log P(colour_i | l) - [l = skin] log-ratio of the distance to the body
+
+The terms are found one after the other:
+
+1. `by_body_chart`: every face gets a place on the body (region, height along the column of feet, legs and trunk, reach
+   along the arm, azimuth, signed distance) from the body vertex that is nearest in position and normal.
+2. `by_body_colors`: a palette of the scan (k-means in OKLab), and a normal distribution of this person's skin colour
+   from the face and the hands, whose log-likelihood ratio tells skin from other colours.
+3. `by_body_layers`: long hair, open coats and bibs, as connected faces whose colours are nearer to the layer's
+   histogram than to all others; they are left out of the next step, which they would disturb.
+4. `by_body_outfit`: the outline of the clothes. The unknowns are the four borders between shoe, skin, lower, skin and
+   upper along the column, and the end of the sleeve. Their cost sums the KL divergence of each ring's colours from its
+   run's, likelihood ratios of skin by colour and distance, and priors on usual clothes. Dynamic programming over rings
+   gives the exact minimum; the sum over all outlines (forward-backward) gives P(label) of every ring.
+5. `by_body_prior`: P(label | place), the outline softened by the uncertainty of its borders.
+6. `by_body_colors.label_costs`: P(colour | label) by expectation maximisation, averaged over neighbours of like colour.
+7. `graph_cut`: alpha-expansion of the energy, with weights w that prefer concave folds and edges of colour.
+8. `by_body_confidence`: confidence of each face, at most the probability of the outline that it depends on, and notes.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +37,9 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.topology import face_adjacency
 from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.raster import outer_visible_points
-from smplxpp.segment.by_body_appearance import Blend, label_costs
-from smplxpp.segment.by_body_certainty import most_certain
 from smplxpp.segment.by_body_chart import TRUNK, BodyChart, chart_of_scan
-from smplxpp.segment.by_body_colors import Palette, SkinModel, fit_skin, has_colors
-from smplxpp.segment.by_body_doubts import AWAY, find_doubts
+from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
+from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
 from smplxpp.segment.by_body_layers import Layers, find_layers
 from smplxpp.segment.by_body_outfit import (
     ARM_END,
@@ -36,27 +57,22 @@ from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.segment import SegmentedScan
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors, likeness
 
-_SEEN_WITHIN = 0.005  # metres
-_MOST_NATS = 12.0
-# Cloth lies above the body by some millimetres and up to some centimetres.
-_ABOVE = 0.012
-# A scan has a chest if this share of its area lies above this height of the trunk, standard metres.
-_CHEST, _SOME = 1.05, 0.01
-
 
 @dataclass(frozen=True)
 class ByBodyConfig:
-    """Options of `label_by_body`.
+    """Options of `label_by_body`, chosen on the procedural people of the benchmark `labels_by_body`.
 
     Attributes:
-        softness: metres by which a hem may hang lower or higher than the ring where it is looked for.
-        body_softness: metres by which the body may be misplaced at the head.
-        rounds: of learning the labels' colours.
-        color_cap: nats that the colour of a face may cost a label at most.
-        blend_steps: rings of faces over which costs of colour are averaged.
-        distance: weight of a face's distance to the body with colours; `distance_alone` without.
-        temperature: nats of cost that are a nat of confidence.
-        outfit: costs of the outline. smoothing: of the graph cut.
+        softness: standard deviation, in metres, of a hem about its ring.
+        body_softness: standard deviation, in metres, of the body's place at the head.
+        rounds: rounds of expectation maximisation of the labels' colours.
+        color_cap: upper bound, in nats, of a face's cost of colour, so that one odd colour cannot decide.
+        blend_steps: rings of faces over which costs of colour are averaged, against noise of the texture.
+        distance: weight of a face's distance to the body where the scan has colours.
+        distance_alone: the same where it has none.
+        temperature: nats of cost for one nat of confidence, because the costs of a face are not independent.
+        outfit: costs of the outline.
+        smoothing: weights of the graph cut.
     """
 
     softness: float = 0.035
@@ -78,12 +94,15 @@ class ByBodyConfig:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What was found on the way to the labels.
+    """Intermediate results of `label_by_body`.
 
     Attributes:
-        chart: places on the body. outfit: the outline. skin: the skin model; None without colours.
-        layers: what lies over the rest. misfit: metres by which the body misses bare skin.
-        costs: (M, L) nats.
+        chart: places of the faces on the body.
+        outfit: outline of the clothes.
+        skin: model of skin colour; None without colours.
+        layers: layers over other clothes.
+        misfit: robust standard deviation, in metres, of bare skin's distance to the body.
+        costs: unary costs of all labels, nats.
     """
 
     chart: BodyChart
@@ -102,18 +121,17 @@ def label_by_body(
     colors: Num[np.ndarray, "N C"] | None = None,
     config: ByBodyConfig | None = None,
 ) -> SegmentedScan:
-    """Label every face of a clothed scan.
+    """Label every face of a clothed scan; the module's docstring gives the energy and the steps.
 
-    The body says where face, hands, feet and skull are. The face and the hands give this person's skin colour; the
-    outline of the clothes (`find_outfit`) gives each place its likely label; labels learn their colours from it; a
-    graph cut along folds and edges of colour settles the borders.
-
-    Confidence is P(label) of a face given all that, over the faces around it, and not above the probability of the
-    outline that it rests on. `doubts` says what cannot be known.
+    The confidence of a face is the posterior of its label, averaged over neighbours, and at most the probability of the
+    outline that it depends on. `notes` lists what cannot be decided.
 
     Args:
-        params: one frame, in the pose of the scan. colors: sRGB of the vertices, bytes or 0..1; without them labels
-            rest on the distance to the body alone, and the doubts say so.
+        mesh: the scan, metres, +Y up.
+        body: the body model.
+        params: one frame, in the pose of the scan.
+        colors: sRGB of the vertices, bytes or 0..1; without them labels depend on the distance to the body alone.
+        config: options.
 
     Raises:
         InputError: no faces, several frames, colours of another number of vertices or out of range.
@@ -122,26 +140,31 @@ def label_by_body(
     if not mesh.face_count:
         raise InputError("scan to be labelled", expected="a mesh with faces", received="none")
     config = config or ByBodyConfig()
+    # Colours that are one grey carry no information.
     pairs, ends = face_adjacency(mesh.faces)
     lab = None if colors is None else face_colors(mesh, colors)
     if lab is not None and not has_colors(lab):
         lab = None
     found = weigh_evidence(mesh, body, params, lab, config)
+    # Minimise the Potts energy. Unary costs are capped at 12 nats, so that a single face can be overruled by its patch.
     cost = found.costs - found.costs.min(axis=1, keepdims=True)
     weights = edge_weights(mesh, pairs, ends, config.smoothing, lab=lab)
-    problem = PottsProblem.from_costs(np.minimum(cost, _MOST_NATS), pairs, weights)
+    problem = PottsProblem.from_costs(np.minimum(cost, 12.0), pairs, weights)
     before = problem.energy(cost.argmin(axis=1))
     cut, after = minimize_potts(problem)
+    # Posterior of each label at a temperature; patches that are too small take their neighbours' label.
     share = np.exp(-cost / config.temperature)
     share /= share.sum(axis=1, keepdims=True)
     rows = np.arange(len(cut))
     labels = absorb_islands(mesh, cut, share[rows, cut], pairs, ends, config.smoothing)
-    own = np.minimum(share[rows, labels], most_certain(found.chart, labels, found.outfit, found.layers))
-    confidence = own * min(1.0, AWAY / max(found.misfit, 1e-9))
-    seen = outer_visible_points(mesh, mesh.face_centers, tolerance=_SEEN_WITHIN)
-    doubts = find_doubts(mesh, labels, confidence, found.outfit, found.skin, misfit=found.misfit)
+    # Confidence is bounded by the outline's and falls with the body's misfit. 5 mm is the tolerance of visibility: less
+    # than the gap between layers of clothes, more than the scan's noise.
+    own = np.minimum(share[rows, labels], confidence_bound(found.chart, labels, found.outfit, found.layers))
+    confidence = own * min(1.0, BODY_ELSEWHERE / max(found.misfit, 1e-9))
+    seen = outer_visible_points(mesh, mesh.face_centers, tolerance=0.005)
+    notes = notes_on_labels(mesh, labels, confidence, found.outfit, found.skin, misfit=found.misfit)
     return SegmentedScan(
-        labels, confidence, seen, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE, doubts=doubts
+        labels, confidence, seen, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE, notes=notes
     )
 
 
@@ -152,13 +175,15 @@ def weigh_evidence(
     lab: Float64[np.ndarray, "M 3"] | None,
     config: ByBodyConfig,
 ) -> Evidence:
-    """The costs of all labels at all faces, and what they were made of; `lab`: colours of the faces."""
+    """Return the unary costs of all labels at all faces with their ingredients; `lab` is (M, 3) colours in OKLab."""
+    # The misfit of the body is the robust spread (1.4826 MAD) of the distances of face and hands.
     chart = chart_of_scan(mesh, body, params)
     area = mesh.face_areas
     pairs, _ = face_adjacency(mesh.faces)
     bare = chart.face_core | chart.hand_core
     misfit = float(1.4826 * np.median(np.abs(chart.distance[bare if bare.any() else slice(None)])))
     misplaced = float(np.clip(misfit, 0.003, 0.02))
+    # Colours: the palette, the skin model, and layers that hang over other clothes.
     skin, palette = None, None
     ratio = np.zeros(mesh.face_count)
     layers = Layers.none(mesh.face_count)
@@ -183,12 +208,15 @@ def weigh_evidence(
             used=~over[mask],
         )
 
+    # The outline of the clothes, from rings of the column and the arms. Without colours, habits of dress replace them.
+    # A scan has a chest if 1 % of its area lies above 1.05 m of the standard trunk.
     column = rings(in_column(chart), layers.hair | layers.coat, chart.height, 0.0, COLUMN_END)
     arm = rings(in_arm(chart), layers.hair, chart.reach, ARM_START, ARM_END)
     outline = config.outfit if lab is not None else replace(config.outfit, habit=1.0)
-    chest = (chart.region == TRUNK) & (chart.height > _CHEST)
-    outfit = find_outfit(column, arm, outline, misfit=misplaced, chest=area[chest].sum() > _SOME * area.sum())
+    chest = (chart.region == TRUNK) & (chart.height > 1.05)
+    outfit = find_outfit(column, arm, outline, misfit=misplaced, chest=area[chest].sum() > 0.01 * area.sum())
     prior = place_prior(chart, outfit, layers, softness=config.softness, body_softness=config.body_softness)
+    # Costs of colour are averaged over faces of like colour, and the distance to the body is added.
     blend = Blend.of(
         pairs,
         np.ones(len(pairs)) if lab is None else likeness(lab, pairs),
@@ -211,8 +239,14 @@ def weigh_evidence(
 
 
 def _cloth_by_distance(distance: np.ndarray, misfit: float) -> np.ndarray:
-    """Log ratio of distances for something worn against skin: a normal distribution against a shifted one."""
+    """Return the log ratio of distances for cloth against skin.
+
+    Skin has a normal distribution about 0, whose spread is the body's misfit; cloth an exponential distribution of mean
+    12 mm above the body, because cloth lies from some millimetres to some centimetres above it. The ratio is bounded
+    to [-0.5, 3] nats, because distances err together.
+    """
+    above = 0.012
     spread = np.hypot(misfit, 0.004)
     z = distance / spread
-    ratio = 0.5 * z**2 - np.maximum(distance, 0.0) / _ABOVE - np.log(_ABOVE / spread)
+    ratio = 0.5 * z**2 - np.maximum(distance, 0.0) / above - np.log(above / spread)
     return np.where(z < 0, -0.5, np.clip(ratio, -0.5, 3.0))

@@ -1,7 +1,7 @@
-"""Where every face of a scan lies on the fitted body: region, place along the limb, direction on the head, distance.
+"""Locate every face of a scan on the fitted body: region, place along the limb, azimuth, distance.
 
-Places are in metres of a standard person (joints at fixed heights), so that rules about clothes hold for everyone: a
-sleeve is as long as a share of the arm.
+Places are in metres of a standard person whose joints have fixed heights, so that rules about clothes hold for every
+size: a sleeve's length is a share of the arm.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ REGION_NAMES = ("head", "neck", "trunk", "arm", "hand", "leg", "foot")
 # Heights of the standard person's joints; arms are measured outwards from the shoulder joint.
 SOLE, ANKLE, KNEE, HIP, NECK_BASE, HEAD_BASE, TOP = 0.0, 0.08, 0.48, 0.90, 1.45, 1.54, 1.75
 ELBOW, WRIST, FINGERTIP = 0.26, 0.50, 0.68
-# A turn of the surface's normal by 180 degrees weighs like 2 x this many metres in the search for the body's place.
+# Weight of normals in the search for the nearest body vertex, metres: opposite normals count as 12 cm of distance, so
+# that an arm beside the trunk is not taken for it.
 _NORMAL_WEIGHT = 0.06
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb", "_hand")
 
 
 @dataclass(frozen=True, eq=False)
 class BodyChart:
-    """Places on a body, of its vertices or of a scan's faces.
+    """Places on a body, for its vertices or a scan's faces.
 
     Attributes:
         region: one of `HEAD` to `FOOT`.
@@ -56,24 +57,25 @@ class BodyChart:
 
     @property
     def face_core(self) -> Bool[np.ndarray, " n"]:
-        """Well within the face, between chin and brows."""
+        """Return the places well within the face, between chin and brows."""
         inside = (self.face_height > 0.05) & (self.face_height < 0.62)
         return (self.region == HEAD) & (np.abs(self.azimuth) < 0.8) & inside
 
     @property
     def hand_core(self) -> Bool[np.ndarray, " n"]:
-        """Well within the hands."""
+        """Return the places well within the hands, 4 cm from the wrist on."""
         return (self.region == HAND) & (self.reach > WRIST + 0.04)
 
     @property
     def skull_cap(self) -> Bool[np.ndarray, " n"]:
-        """Where hair grows on those who have any: the top and the back of the head."""
+        """Return the places where hair grows: the top and the back of the head."""
         back = (np.abs(self.azimuth) > 2.0) & (self.face_height > 0.4)
         return (self.region == HEAD) & (back | (self.face_height > 0.9))
 
 
 def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
-    """The places of a body's own vertices, from its joints and weights in the rest pose (one frame's shape)."""
+    """Return the places of a body's own vertices, from its joints and weights in the rest pose of one frame's shape."""
+    # The region of a vertex is that of the joints with the largest sum of skin weights.
     rest = body.forward(params)
     vertices, joints = rest.rest_vertices[0], rest.rest_joints[0]
     names = list(body.joint_names)
@@ -99,6 +101,7 @@ def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
     head = region == HEAD
     if not head.any():
         raise InputError("body model", expected="vertices that follow a head", received=f"none in {body.name!r}")
+    # Heights are interpolated between the joints' heights and the standard ones; so is the reach along each arm.
     mean = {name: 0.5 * (at[f"left_{name}"] + at[f"right_{name}"]) for name in ("hip", "knee", "ankle")}
     knots = [y.min(), mean["ankle"][1], mean["knee"][1], mean["hip"][1], at["neck"][1], at["head"][1], y.max()]
     height = np.interp(y, np.maximum.accumulate(knots), [SOLE, ANKLE, KNEE, HIP, NECK_BASE, HEAD_BASE, TOP])
@@ -110,6 +113,7 @@ def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
         wrist = elbow + float(np.linalg.norm(at[f"{side}_wrist"] - at[f"{side}_elbow"]))
         tip = max((sign * x).max(), wrist + 0.01)
         reach[own] = np.interp(sign * x[own], [0.0, start, elbow, wrist, tip], [-start, 0.0, ELBOW, WRIST, FINGERTIP])
+    # Azimuth about the middle of the head, on the trunk about the spine; face height from the chin to the top.
     middle = 0.5 * (z[head].min() + z[head].max())
     azimuth = np.where(region >= TRUNK, np.arctan2(x, z - at["spine2"][2]), np.arctan2(x, z - middle))
     chin = y[head & (z > middle)].min()
@@ -119,7 +123,7 @@ def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
 
 
 def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> BodyChart:
-    """The places of a scan's faces: those of the body's vertex that is nearest in position and normal together.
+    """Return the places of a scan's faces, from the body vertex that is nearest in position and normal.
 
     Args:
         mesh: the scan, posed as `params` (one frame) poses the body, metres.
@@ -137,7 +141,7 @@ def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> Bo
     _, nearest = tree.query(np.concatenate([points, _NORMAL_WEIGHT * mesh.face_normals], axis=1))
     offset = points - posed.vertices[nearest]
     along = np.einsum("ij,ij->i", offset, normals[nearest])
-    # Near the body the plane through the vertex tells, far from it the way to the vertex.
+    # Near the body the distance is that to the vertex's tangent plane, farther than 4 cm that to the vertex.
     far = row_lengths(offset)
     distance = np.where(far < 0.04, along, np.copysign(far, along))
     place = own[nearest]

@@ -1,4 +1,8 @@
-"""What colours say of labels: a palette of the scan, histograms on it, and a model of this person's skin."""
+"""Estimate labels from colours: a palette of the scan, a model of this person's skin, and the cost of every label.
+
+The palette is k-means in OKLab; skin is a normal distribution fitted to face and hands; P(colour | label) comes from a
+few rounds of expectation maximisation, in which faces with a certain label give histograms, which give new posteriors.
+"""
 
 from __future__ import annotations
 
@@ -6,38 +10,35 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from smplxpp.core.labels import HAIR, LABELS, SKIN
 from smplxpp.segment.smoothing import COLOR_STEP
 
-_PALETTE_SIZE, _PALETTE_SAMPLE, _PALETTE_STEPS = 48, 20_000, 12
-# Colours this near in OKLab count as one another's: what light, noise and blur do to one dye. Lightness changes most.
+# Spread of one dye's colour in OKLab under changing light, noise and blur: nearer colours count as one. Lightness
+# varies most.
 _BLUR = COLOR_STEP
-_BLUR_SHARE = 0.15  # of a histogram, spread evenly over the palette
-# Skin of people in OKLab, any light without a strong tint: hue in degrees, chroma, lightness.
-_SKIN_HUE, _SKIN_HUE_SPREAD, _SKIN_CHROMA = 50.0, 22.0, (0.012, 0.16)
-_SKIN_LIGHT = (0.2, 0.97)
+# Range of human skin in OKLab under light without a strong tint: hue and its half width in degrees.
+_SKIN_HUE, _SKIN_HUE_SPREAD = 50.0, 22.0
+# Bounds of the spread of one person's skin in OKLab.
 _LEAST_SPREAD = np.array([0.05, 0.012, 0.012])
 _MOST_SPREAD = np.array([0.12, 0.03, 0.03])
-# The skin of face and hands differs by less.
-_ONE_SKIN = np.array([0.2, 0.04, 0.04])
-_FACE_SHARE = 0.25
-# Density of colours of things at large, within the colours that a screen can show.
-_ANY_COLOR = 10.0
-_GREY_SPREAD = 0.012
 
 
 def has_colors(lab: Float64[np.ndarray, "M 3"]) -> bool:
-    """Whether these are colours of a photograph, not one grey for everything."""
-    return bool(np.percentile(np.abs(lab - np.median(lab, axis=0)).max(axis=1), 90) > _GREY_SPREAD)
+    """Return whether colours vary as in a photograph: the 90th percentile differs from the median by 0.012 in OKLab."""
+    return bool(np.percentile(np.abs(lab - np.median(lab, axis=0)).max(axis=1), 90) > 0.012)
 
 
 @dataclass(frozen=True, eq=False)
 class Palette:
-    """A scan's K colours.
+    """A scan's palette of K colours.
 
     Attributes:
-        centers: (K, 3) OKLab. index: (M,) the colour of each face. near: (K, K) how much each counts for each.
+        centers: OKLab.
+        index: the colour of each face.
+        near: smoothing matrix between colours; columns sum to 1.
     """
 
     centers: Float64[np.ndarray, "K 3"]
@@ -46,15 +47,18 @@ class Palette:
 
     @staticmethod
     def of(lab: Float64[np.ndarray, "M 3"], *, seed: int = 0) -> Palette:
-        """Colours by k-means on a sample (Lloyd, from k-means++ centres); fewer where the scan has fewer."""
+        """Cluster colours by k-means: 12 steps of Lloyd from k-means++ centres on 20,000 faces.
+
+        There are at most 48 colours: more than the dyes and shades of an outfit, few enough for dense histograms.
+        """
         rng = np.random.default_rng(seed)
-        sample = lab[rng.permutation(len(lab))[:_PALETTE_SAMPLE]] / _BLUR
+        sample = lab[rng.permutation(len(lab))[:20_000]] / _BLUR
         centers = sample[:1]
         squared = ((sample - centers[0]) ** 2).sum(axis=1)
-        while len(centers) < _PALETTE_SIZE and squared.max() > 1e-6:
+        while len(centers) < 48 and squared.max() > 1e-6:
             centers = np.concatenate([centers, sample[rng.choice(len(sample), 1, p=squared / squared.sum())]])
             squared = np.minimum(squared, ((sample - centers[-1]) ** 2).sum(axis=1))
-        for _ in range(_PALETTE_STEPS):
+        for _ in range(12):
             index = cKDTree(centers).query(sample)[1]
             count = np.bincount(index, minlength=len(centers))
             sums = np.stack([np.bincount(index, x, minlength=len(centers)) for x in sample.T], axis=1)
@@ -67,21 +71,26 @@ class Palette:
         return len(self.centers)
 
     def histogram(self, weights: Float64[np.ndarray, " M"]) -> Float64[np.ndarray, " K"]:
-        """The share of each colour among faces of these weights, smoothed over colours that are near; sums to 1."""
+        """Return the share of each colour among weighted faces, smoothed over near colours; it sums to 1.
+
+        15 % are spread evenly over the palette, so that no colour is impossible.
+        """
         counts = np.bincount(self.index, weights, minlength=self.size)
         spread = self.near @ counts
         total = spread.sum()
         even = np.full(self.size, 1.0 / self.size)
-        return (1 - _BLUR_SHARE) * (spread / total if total > 0 else even) + _BLUR_SHARE * even
+        return (1 - 0.15) * (spread / total if total > 0 else even) + 0.15 * even
 
 
 @dataclass(frozen=True, eq=False)
 class SkinModel:
-    """This person's skin: a normal distribution in OKLab.
+    """Normal distribution of one person's skin colour in OKLab.
 
     Attributes:
-        center, spread: OKLab. found: whether the face or the hands gave it; else it is people's skin at large.
-        hands: whether the hands have it (not: gloves, or a face that is covered); None where there are no hands.
+        center: mean colour.
+        spread: standard deviations.
+        found: whether the face or the hands gave it; otherwise it is the generic range of skin.
+        hands: whether the hands have the same colour (False: gloves or a covered face); None without hands.
     """
 
     center: Float64[np.ndarray, " 3"]
@@ -90,23 +99,21 @@ class SkinModel:
     hands: bool | None
 
     def log_ratio(self, lab: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, " M"]:
-        """log p(colour | this skin) / p(colour | anything), between -4 and 4."""
+        """Return log p(colour | skin) / p(colour | anything), bounded to [-4, 4].
+
+        Other colours have the density 10, even over the colours that a screen can show.
+        """
         z = ((lab - self.center) / self.spread) ** 2
         log_density = -0.5 * z.sum(axis=1) - np.log(self.spread).sum() - 1.5 * np.log(2 * np.pi)
-        return np.clip(log_density - np.log(_ANY_COLOR), -4.0, 4.0)
+        return np.clip(log_density - np.log(10.0), -4.0, 4.0)
 
 
 def looks_like_skin(lab: Float64[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
-    """Whether colours are such as some people's skin has; much else has them, too."""
+    """Return whether colours lie in the range of human skin; many other things do, too."""
     hue = np.degrees(np.arctan2(lab[:, 2], lab[:, 1]))
     chroma = np.hypot(lab[:, 1], lab[:, 2])
-    light = (lab[:, 0] > _SKIN_LIGHT[0]) & (lab[:, 0] < _SKIN_LIGHT[1])
-    return (
-        light
-        & (np.abs(hue - _SKIN_HUE) < 1.6 * _SKIN_HUE_SPREAD)
-        & (chroma > _SKIN_CHROMA[0])
-        & (chroma < _SKIN_CHROMA[1])
-    )
+    light = (lab[:, 0] > 0.2) & (lab[:, 0] < 0.97)
+    return light & (np.abs(hue - _SKIN_HUE) < 1.6 * _SKIN_HUE_SPREAD) & (chroma > 0.012) & (chroma < 0.16)
 
 
 def fit_skin(
@@ -115,17 +122,21 @@ def fit_skin(
     hands: Bool[np.ndarray, " M"],
     area: Float64[np.ndarray, " M"],
 ) -> SkinModel:
-    """The skin of face and hands, each asked for its main colour; hands that disagree with the face wear gloves.
+    """Fit the skin colour from the main colours of face and hands; hands that differ from the face wear gloves.
 
     Args:
-        face, hands: faces that lie well within these regions of the body.
+        lab: colours in OKLab.
+        face: faces well within the face.
+        hands: faces well within the hands.
+        area: areas of the faces.
     """
     of_face, of_hands = _main_color(lab[face], area[face]), _main_color(lab[hands], area[hands])
     agree = False
     if of_face is not None and of_hands is not None:
-        # Hair over the face, or a body turned by some degrees: then part of the face alone has the hands' colour.
-        like_hands = (np.abs(lab - of_hands[0]) < _ONE_SKIN).all(axis=1)
-        agree = bool(area[face & like_hands].sum() > _FACE_SHARE * area[face].sum())
+        # Hair over the face, or a body turned by some degrees, leaves the hands' colour to part of the face: a quarter
+        # is enough. Skin of one person differs by at most 0.2 in lightness and 0.04 in chroma.
+        like_hands = (np.abs(lab - of_hands[0]) < np.array([0.2, 0.04, 0.04])).all(axis=1)
+        agree = bool(area[face & like_hands].sum() > 0.25 * area[face].sum())
         face = face & like_hands if agree else face
     chosen = (face | hands) if agree else face if of_face is not None else hands
     main = _main_color(lab[chosen], area[chosen]) or of_face or of_hands
@@ -142,12 +153,12 @@ def fit_skin(
 
 
 def _main_color(lab: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Centre and spread of the skin-like colours, without the outer ones; None where a third of the area has none."""
+    """Return centre and spread of the main skin-like colour; None if less than a third of the area looks like skin."""
     skin = looks_like_skin(lab)
     if len(lab) < 10 or area[skin].sum() < 0.33 * area.sum():
         return None
     lab = lab[skin]
-    # The densest place, then the mean of what is around it.
+    # Start at the densest place, then iterate the mean of the colours within 2.5 robust standard deviations.
     sample = lab[:: max(1, len(lab) // 500)] / COLOR_STEP
     near = cKDTree(sample).query_ball_point(sample, 1.5, return_length=True)
     center = sample[int(near.argmax())] * COLOR_STEP
@@ -158,3 +169,101 @@ def _main_color(lab: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarr
             break
         center = lab[near].mean(axis=0)
     return center, 1.15 * lab[near].std(axis=0) if near.any() else spread
+
+
+@dataclass(frozen=True, eq=False)
+class Blend:
+    """Average over neighbouring faces that stops at edges of colour.
+
+    Attributes:
+        matrix: (M, M), rows sum to 1.
+        steps: how often it is applied.
+    """
+
+    matrix: csr_matrix
+    steps: int
+
+    @staticmethod
+    def of(pairs: Int64[np.ndarray, "P 2"], alike: Float64[np.ndarray, " P"], count: int, *, steps: int) -> Blend:
+        """Build the averaging matrix.
+
+        Args:
+            pairs: faces that share an edge.
+            alike: weight of each pair, 0 to 1.
+            count: number of faces.
+            steps: how often the matrix is applied.
+        """
+        here, there = np.concatenate([pairs, pairs[:, ::-1]]).T
+        own = np.arange(count)
+        values = np.concatenate([np.tile(alike, 2), np.full(count, 0.2)])
+        matrix = csr_matrix((values, (np.concatenate([here, own]), np.concatenate([there, own]))), shape=(count, count))
+        share = 1.0 / np.asarray(matrix.sum(axis=1)).ravel()
+        matrix.data *= np.repeat(share, np.diff(matrix.indptr))
+        return Blend(matrix, steps)
+
+    def __call__(self, values: Float64[np.ndarray, "M L"]) -> Float64[np.ndarray, "M L"]:
+        for _ in range(self.steps):
+            values = self.matrix @ values
+        return values
+
+
+def label_costs(
+    prior: Float64[np.ndarray, "M L"],
+    palette: Palette | None,
+    skin_like: Float64[np.ndarray, " M"],
+    *,
+    area: Float64[np.ndarray, " M"],
+    far: Float64[np.ndarray, " M"],
+    blend: Blend,
+    bald: bool,
+    rounds: int,
+    cap: float,
+) -> Float64[np.ndarray, "M L"]:
+    """Return -log P(label | place, colours around, distance) up to a constant a face, in nats.
+
+    Args:
+        prior: P(label | place).
+        palette: palette of the scan; None without colours.
+        skin_like: probability that a face's colour is skin.
+        area: areas of the faces.
+        far: log ratio of the distance to the body for cloth or hair against skin.
+        blend: average over neighbours.
+        bald: whether the skull has the colour of skin.
+        rounds: rounds of expectation maximisation.
+        cap: upper bound of the cost of colour.
+    """
+    base = -np.log(prior)
+    base[:, SKIN.id] += far
+    if palette is None:
+        return blend(base)
+    posterior = prior.copy()
+    posterior[:, SKIN.id] *= skin_like
+    discount = np.ones((palette.size, len(LABELS)))
+    cost = base
+    for _ in range(rounds):
+        # M step: histograms of colour from faces with a certain label. Skin counts by its own model, and skin-like
+        # colours hardly count for hair.
+        certain = posterior * np.maximum(posterior - 0.5, 0.0) * discount[palette.index] * area[:, None]
+        certain[:, SKIN.id] *= skin_like
+        if not bald:
+            certain[:, HAIR.id] *= 1.0 - 0.9 * skin_like
+        table = _color_shares(palette, certain, area)
+        # Colours that are more typical of another label count less for this one: a braid is no part of the shirt.
+        discount = table / table.max(axis=1, keepdims=True)
+        # E step: posteriors from the capped cost of colour, averaged over neighbours, and the other terms.
+        of_color = -np.log(table)
+        of_color = np.minimum(of_color - of_color.min(axis=1, keepdims=True), cap)
+        cost = blend(of_color[palette.index]) + base
+        posterior = np.exp(cost.min(axis=1, keepdims=True) - cost)
+        posterior /= posterior.sum(axis=1, keepdims=True)
+    return cost
+
+
+def _color_shares(palette: Palette, certain: np.ndarray, area: np.ndarray) -> Float64[np.ndarray, "K L"]:
+    """Return P(colour | label), tiny for labels that no face certainly has."""
+    worn = certain.sum(axis=0) > 1e-4 * area.sum()
+    shares = [
+        palette.histogram(certain[:, k]) if worn[k] else np.full(palette.size, 1e-3 / palette.size)
+        for k in range(len(LABELS))
+    ]
+    return np.stack(shares, axis=1)

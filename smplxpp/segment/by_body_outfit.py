@@ -1,9 +1,16 @@
-"""What somebody wears, in outline: where shoes, legs, trousers, shirt and sleeves begin and end along the body.
+"""Find the outline of the clothes: where shoes, legs, trousers, shirt and sleeves begin and end along the body.
 
-The column of feet, legs and trunk is cut into a run of shoe, skin, lower, skin and upper, the arm into sleeve and skin;
-any of them may be empty. Each way to cut has a cost: how badly the colours within a run go together, how much skin lies
-in cloth and how much else in skin, and how usual such clothes are. The cheapest is found exactly (dynamic programming
-over rings of the body).
+The column of feet, legs and trunk is cut into runs of shoe, skin, lower, skin and upper, the arm into sleeve and skin;
+any run may be empty. The unknowns are the borders b_1..b_4 of the runs. The cost of an outline, in nats, is the sum
+over runs r of
+
+    sum_(rings in r) n KL(ring's colours | run's colours)        colours within a run belong together
+    + likelihood ratios of skin by colour and by distance        skin in cloth, and other things in skin
+    + priors on the places and lengths of r                      usual clothes, folds at hems
+
+Dynamic programming over rings of 1.5 cm finds the exact minimum; the sum of exp(-cost / NAT) over all outlines gives
+the probability of every label in every ring. Constants were chosen on the procedural people of the benchmark
+`labels_by_body`, always without the person who is measured.
 """
 
 from __future__ import annotations
@@ -16,17 +23,14 @@ from jaxtyping import Float64
 from smplxpp.core.labels import LABELS, LOWER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HIP, KNEE, LEG, TRUNK, WRIST, BodyChart
 
-STEP = 0.015  # of a ring, standard metres
+# Rings in standard metres: their length, the end of the column, and the ends of the arm.
+STEP = 0.015
 COLUMN_END, ARM_START, ARM_END = 1.32, -0.06, 0.62
-# Trousers that end below this, metres, and look like skin by more than these nats; a low shoe's top.
-_LONG, _SKIN_COLORED, _LOW_SHOE = 0.13, 1.0, 0.09
-_SKIRT = 0.025  # metres: what is about the thighs and lies farther from them on the mean
-# Habits: a waist here, two garments rather than one (nats), legs covered (nats a ring), at least short sleeves.
-_WAIST, _TWO_PIECES, _BARE_LEG, _SHORT_SLEEVE = 0.98, 10.0, 0.7, 0.15
-_COVERS_FOOT = 8.0  # nats of a ring of a foot in trousers or a dress
+# Height of the usual waist, standard metres.
+_WAIST = 0.98
 NAT = 8.0
-"""Nats of an outline's cost that are a nat of its probability: rings are not independent, and clothes are not all as
-usual. Chosen on the people of `benchmarks.people`, always without the one who is measured (6 to 8 for 36 of 38)."""
+"""Nats of an outline's cost for one nat of its probability, because rings are not independent and clothes vary (6 to 8
+for 36 of 38 people)."""
 RUNS = (SHOE, SKIN, LOWER, SKIN, UPPER)
 
 
@@ -35,16 +39,19 @@ class OutfitConfig:
     """Costs of `find_outfit`, in nats.
 
     Attributes:
-        samples: independent samples of colour that a ring is worth.
-        skin_in_cloth: a sample of cloth that looks like skin, a nat of log ratio; in all at most `skin_colored`, what
-            it costs that a garment has the colour of skin; `skin_colored_top`, `skin_colored_shoe` for those.
-        other_in_skin: a sample of skin that does not look like it, a nat of log ratio.
-        distance: a ring's mean distance to the body, a nat of log ratio.
-        bare_pelvis: a ring of skin about the pelvis.
-        split: of two garments where one would do, about legs that a skirt hides; `split_at_legs` about legs that show
-            (a suit of one colour is more usual than a jumpsuit). midriff: of skin between two garments.
-        crease: bonus of a border with a full step of the distance to the body.
-        habit: 0 to 1, how far what people mostly wear (sleeves, trousers, a waist at the waist) stands in for colours.
+        samples: number of independent samples of colour in a ring.
+        skin_in_cloth: cost of a sample of cloth that looks like skin, a nat of log ratio; bounded by `skin_colored`.
+        skin_colored: cost of a garment in the colour of skin.
+        skin_colored_top: the same for an upper garment.
+        skin_colored_shoe: the same for shoes.
+        other_in_skin: cost of a sample of skin that does not look like it, a nat of log ratio.
+        distance: cost of a ring's mean distance to the body, a nat of log ratio.
+        bare_pelvis: cost of a ring of skin about the pelvis.
+        split: cost of two garments instead of one, about legs that a skirt hides.
+        split_at_legs: the same about visible legs, lower because a suit of one colour is more usual than a jumpsuit.
+        midriff: cost of skin between two garments.
+        crease: bonus of a border with a full step (10 mm) of the distance to the body.
+        habit: 0 to 1, weight of usual clothes (sleeves, trousers, a waist at the waist), for scans without colours.
     """
 
     samples: float = 8.0
@@ -64,13 +71,15 @@ class OutfitConfig:
 
 @dataclass(frozen=True, eq=False)
 class Rings:
-    """What is seen along a column or an arm, a row a ring of `STEP`.
+    """Observations along a column or an arm, a row for each ring of `STEP`.
 
     Attributes:
-        start: of the first ring. weight: 0 to 1, how much of the ring is seen. colors: histograms; rows sum to 1.
-        skin: mean log ratio for skin, positive and negative parts: (R, 2), none negative.
-        distance: mean to the body, metres: a body that is a little misplaced is too near on one side and too far on the
-            other, which leaves the mean.
+        start: place of the first ring.
+        weight: visible share of the ring, 0 to 1.
+        colors: histograms; rows sum to 1.
+        skin: means of the positive and the negative part of the log ratio for skin, both as positive numbers.
+        distance: mean distance to the body, metres. A misplaced body is too near on one side and too far on the other,
+            which leaves the mean.
     """
 
     start: float
@@ -95,9 +104,17 @@ class Rings:
         """Gather faces by their place along the column.
 
         Args:
-            place, area, skin, distance: of some faces; skin: log ratios. color: their palette index. used: which of
-                them count; a ring of which little is left has little weight.
+            place: places of some faces.
+            start: place of the first ring.
+            end: place where the last ring ends.
+            area: areas of the faces.
+            color: palette index of the faces.
+            color_count: number of colours of the palette.
+            skin: log ratio of the faces' colours for skin.
+            distance: distances to the body.
+            used: which faces count; a ring with few of them left has a small weight.
         """
+        # Area-weighted histograms and means of the used faces. A ring weighs 1 if half of its usual area is used.
         count = round((end - start) / STEP)
         ring = np.floor((place - start) / STEP).astype(np.int64)
         inside = (ring >= 0) & (ring < count)
@@ -122,24 +139,28 @@ class Rings:
 
     @property
     def places(self) -> Float64[np.ndarray, " R1"]:
-        """Where rings begin, and where the last one ends."""
+        """Return the starts of the rings and the end of the last one."""
         return self.start + STEP * np.arange(len(self) + 1)
 
     def looks_like_skin(self, low: float, high: float) -> bool:
-        """Whether the rings between two places have, on the whole, the colour of skin."""
+        """Return whether the rings between two places look like skin, by more than 1 nat on average."""
         between = (self.places[:-1] >= low) & (self.places[:-1] < high)
-        return bool(between.any() and self.skin[between, 0].mean() > _SKIN_COLORED)
+        return bool(between.any() and self.skin[between, 0].mean() > 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Outfit:
-    """Borders in standard metres.
+    """Outline of the clothes, with borders in standard metres.
 
     Attributes:
-        shoe_top: 0 for bare feet. lower_start: the lower hem. lower_end: its upper end; not above `lower_start` where
-            there is no lower garment. upper_start: the upper garment's hem. cuff: the sleeve's end along the arm.
-        margins: by border, what the next best clothes with another border (by more than 6 cm) cost more, nats.
-        column: P(label) in the column's rings over all outlines. sleeve: P(sleeve) in the arm's.
+        shoe_top: top of the shoes, 0 for bare feet.
+        lower_start: lower hem of the lower garment.
+        lower_end: its upper end; not above `lower_start` without a lower garment.
+        upper_start: hem of the upper garment.
+        cuff: end of the sleeve along the arm.
+        margins: by border, the additional cost of the best outline whose border is more than 6 cm away, nats.
+        column: P(label) in the column's rings, over all outlines.
+        sleeve: P(sleeve) in the arm's rings.
     """
 
     shoe_top: float
@@ -157,15 +178,19 @@ class Outfit:
 
     @property
     def one_piece(self) -> bool:
-        """Whether one garment covers trunk and thighs: a dress, a jumpsuit."""
+        """Return whether one garment covers trunk and thighs, such as a dress or a jumpsuit."""
         return not self.has_lower and self.upper_start < HIP - 0.1
 
 
 def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: float, chest: bool = True) -> Outfit:
-    """The cheapest borders of a column (from the soles up) and an arm (from the shoulder out).
+    """Find the cheapest borders of a column (from the soles up) and an arm (from the shoulder out).
 
     Args:
-        misfit: metres by which the body usually misses bare skin. chest: whether there is any surface about it.
+        column: rings of feet, legs and trunk.
+        arm: rings of both arms.
+        config: costs.
+        misfit: typical distance between body and bare skin, metres.
+        chest: whether the scan reaches the chest.
     """
     order = _column_costs(column, config, misfit, chest=chest)
     borders, margins = _cut_column(column.places, order)
@@ -173,16 +198,17 @@ def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: floa
     of_arm = _arm_costs(arm, config, misfit, skin_colored=column.looks_like_skin(upper_start, COLUMN_END))
     best = int(of_arm.argmin())
     cuff, margins["cuff"] = float(arm.places[best]), _margin(of_arm, arm.places, best)
-    if shoe_top == 0.0 and lower_start < _LONG and column.looks_like_skin(lower_start, lower_end):
-        # Trousers of the colour of skin: so may shoes be, and bare feet below trousers are rare.
-        borders, margins["shoe_top"] = (_LOW_SHOE, max(_LOW_SHOE, lower_start), *borders[2:]), 0.0
+    # Long trousers (hem below 13 cm) in the colour of skin hide the border of shoes in the same colour. Bare feet below
+    # trousers are rare, so that a low shoe, 9 cm high, is assumed with no margin.
+    if shoe_top == 0.0 and lower_start < 0.13 and column.looks_like_skin(lower_start, lower_end):
+        borders, margins["shoe_top"] = (0.09, max(0.09, lower_start), *borders[2:]), 0.0
     ends = np.exp((of_arm.min() - of_arm) / NAT)
     return Outfit(*borders, cuff, margins, label_shares(order), 1.0 - np.cumsum(ends)[:-1] / ends.sum())
 
 
 @dataclass(frozen=True, eq=False)
 class _RunCosts:
-    """(R + 1, R + 1) each: at [i, j] what rings i..j-1 cost as that; infinite where i > j."""
+    """Costs of runs, (R + 1, R + 1) each: at [i, j] those of rings i..j-1 as one kind of garment, inf for i > j."""
 
     shoe: np.ndarray
     top: np.ndarray
@@ -191,6 +217,8 @@ class _RunCosts:
 
     @staticmethod
     def of(rings: Rings, config: OutfitConfig, misfit: float) -> _RunCosts:
+        # A run costs the spread of its colours, plus likelihood ratios of skin by colour and distance. The cost of a
+        # garment in the colour of skin is bounded, because such garments exist.
         n = rings.weight * config.samples
         cross = _cross_costs(rings, n)
         cloth_far, skin_far = _distance_costs(rings, config, misfit)
@@ -204,13 +232,13 @@ class _RunCosts:
 
 
 def _between(ring: np.ndarray) -> np.ndarray:
-    """At [i, j]: the sum over rings i..j-1."""
+    """Return the sums over rings i..j-1 at [i, j]."""
     total = np.concatenate([[0.0], np.cumsum(ring)])
     return total[None, :] - total[:, None]
 
 
 def _cross_costs(rings: Rings, n: np.ndarray) -> Float64[np.ndarray, "R1 R1"]:
-    """At [i, j]: sum over rings i..j-1 of n KL(ring's colours | colours of them all)."""
+    """Return, at [i, j], the sum over rings i..j-1 of n KL(ring's colours | colours of the run)."""
     count = len(rings)
 
     def plogp(p: np.ndarray) -> np.ndarray:
@@ -228,36 +256,39 @@ def _cross_costs(rings: Rings, n: np.ndarray) -> Float64[np.ndarray, "R1 R1"]:
 
 
 def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[np.ndarray, np.ndarray]:
-    """(R,) nats of each ring as cloth and as skin: skin lies on the body, cloth some way above it."""
+    """Return (R,) nats of each ring as cloth and as skin, because skin lies on the body and cloth above it."""
     spread = np.hypot(0.5 * misfit, 0.003)
     z = rings.distance / spread
-    # A normal distribution against one shifted outwards by an exponential one of 12 mm, up to where it is flat.
+    # A normal distribution for skin against an exponential one of mean 12 mm for cloth, bounded to [-0.7, 3] nats.
     ratio = np.clip(0.5 * z**2 - np.maximum(rings.distance, 0) / 0.012 - np.log(0.012 / spread), -0.7, 3.0)
     ratio = np.where(z < 0, -0.7, ratio) * config.distance * rings.weight
     return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
 
 
 def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: bool) -> list[np.ndarray]:
-    """(R + 1, R + 1) each, of the column's `RUNS`: at [i, j] what rings i..j-1 cost as that."""
+    """Return the costs of each of the column's `RUNS`, (R + 1, R + 1): at [i, j] those of rings i..j-1."""
     place = rings.places
     runs = _RunCosts.of(rings, config, misfit)
     i, j = np.indices(runs.cloth.shape)
     empty, length = i == j, place[j] - place[i]
-    # Steps of the distance to the body: hems.
+    # Hems show as steps of the distance to the body; a step of 10 mm gives the full bonus.
     mean = np.convolve(rings.distance, np.ones(2) / 2, mode="valid")
     jump = np.concatenate([[0.0, 0.0], np.abs(mean[2:] - mean[:-2]), [0.0, 0.0]])
     fold = config.crease * np.clip(jump / 0.010, 0.0, 1.0)
     middle = 0.5 * (place[1:] + place[:-1])
-    on_foot = _between(_COVERS_FOOT * (middle < 0.045))
+    on_foot = _between(8.0 * (middle < 0.045))  # nats of a ring of the foot in trousers or a dress
     skin = runs.skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
-    # What is usual of the place and length of each run.
+    # Priors on the place and length of each run: linear penalties outside of the usual range, and a waist at its
+    # height.
     shoe = runs.shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
     usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
     usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
     at_waist = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0)
-    legs_show = float(rings.distance[(middle > 0.5) & (middle < 0.75)].mean()) < _SKIRT
+    # Visible legs: cloth within 25 mm of the thighs on average, where a skirt hangs farther.
+    legs_show = float(rings.distance[(middle > 0.5) & (middle < 0.75)].mean()) < 0.025
     split = at_waist + config.split_at_legs if legs_show else config.split
-    habit = at_waist - _TWO_PIECES + _between(np.where(middle < _WAIST, _BARE_LEG, 0.0))[0][i]
+    # Habits: two garments rather than one (10 nats), and covered legs (0.7 nats a ring).
+    habit = at_waist - 10.0 + _between(np.where(middle < _WAIST, 0.7, 0.0))[0][i]
     split = (1.0 - config.habit) * split + config.habit * habit
     # Where a scan ends below the chest, one garment about the legs is the lower one.
     first, second = (split, 0.0) if chest else (0.0, np.where(_between(rings.weight) > 0, config.split, 0.0))
@@ -270,9 +301,10 @@ def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: b
 def _cut_column(
     place: np.ndarray, order: list[np.ndarray]
 ) -> tuple[tuple[float, float, float, float], dict[str, float]]:
-    """The cheapest borders between the runs, and their margins."""
+    """Return the cheapest borders between the runs, and their margins, by dynamic programming."""
     count = len(place) - 1
-    # forward[k][j]: runs before k end at j. backward[k][i]: runs from k on start at i.
+    # forward[k][j] is the least cost of the runs before k if they end at j, backward[k][i] that of the runs from k on
+    # if they start at i. The borders are traced back from the end.
     forward = [np.where(np.arange(count + 1) == 0, 0.0, np.inf)]
     for cost in order:
         forward.append((forward[-1][:, None] + cost).min(axis=0))
@@ -294,11 +326,11 @@ def _cut_column(
 
 
 def label_shares(order: list[np.ndarray]) -> Float64[np.ndarray, "R L"]:
-    """P(label) of every ring: the sum over all ways to cut the column, exp(-cost / `NAT`) each."""
+    """Return P(label) of every ring, the sum of exp(-cost / `NAT`) over all outlines (forward-backward)."""
     log = [-cost / NAT for cost in order]
     count = len(log[0]) - 1
     ends = np.arange(count + 1)
-    # before[k][j]: runs before k end at j. after[k][i]: runs from k on start at i.
+    # Log sums: before[k][j] over runs before k that end at j, after[k][i] over runs from k on that start at i.
     before, after = [np.where(ends == 0, 0.0, -np.inf)], [np.where(ends == count, 0.0, -np.inf)]
     for of_run in log:
         before.append(np.logaddexp.reduce(before[-1][:, None] + of_run, axis=0))
@@ -307,37 +339,37 @@ def label_shares(order: list[np.ndarray]) -> Float64[np.ndarray, "R L"]:
     after.reverse()
     shares = np.zeros((count, len(LABELS)))
     for k, (label, of_run) in enumerate(zip(RUNS, log, strict=True)):
-        # P(the run is i..j-1): it begins to count at i and ceases to at j.
+        # P(the run is i..j-1) is added at i and subtracted at j, so that the cumulative sum is P(ring in the run).
         cut = np.exp(before[k][:, None] + of_run + after[k + 1][None, :] - before[-1][-1])
         shares[:, label.id] += np.cumsum(cut.sum(axis=1) - cut.sum(axis=0))[:-1]
     return np.clip(shares, 0.0, 1.0)
 
 
 def _arm_costs(rings: Rings, config: OutfitConfig, misfit: float, *, skin_colored: bool) -> Float64[np.ndarray, " R1"]:
-    """What it costs that the sleeve ends where each ring begins, or the last one ends."""
+    """Return the cost of a sleeve that ends at each start of a ring, or at the end of the last one."""
     runs = _RunCosts.of(rings, config, misfit)
-    # A shirt of another colour than skin has no sleeves of the colour of skin.
+    # A shirt in another colour than skin has no sleeves in the colour of skin, so that these cost as much as shoes do.
     sleeve = runs.cloth if skin_colored else runs.shoe
     cost = sleeve[0] + runs.skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
-    return cost + config.habit * _usual(rings.places, _SHORT_SLEEVE, 1.0, 20.0)
+    return cost + config.habit * _usual(rings.places, 0.15, 1.0, 20.0)  # at least short sleeves
 
 
 def _margin(cost: np.ndarray, place: np.ndarray, best: int) -> float:
-    """What the cheapest cost farther than 6 cm away is above the best."""
+    """Return the difference between the least cost more than 6 cm away and the best."""
     elsewhere = np.abs(place - place[best]) > 0.06
     return float(cost[elsewhere].min() - cost[best])
 
 
 def _usual(place: np.ndarray, low: float, high: float, nats: float) -> np.ndarray:
-    """0 between, `nats` at 20 cm beyond, linear."""
+    """Return a penalty of 0 within a range, which rises linearly to `nats` at 20 cm outside of it."""
     return nats * np.maximum(np.maximum(low - place, place - high), 0.0) / 0.2
 
 
 def in_column(chart: BodyChart) -> np.ndarray:
-    """Faces of feet, legs and trunk."""
+    """Return the faces of feet, legs and trunk."""
     return np.isin(chart.region, (FOOT, LEG, TRUNK))
 
 
 def in_arm(chart: BodyChart) -> np.ndarray:
-    """Faces of arms and hands."""
+    """Return the faces of arms and hands."""
     return np.isin(chart.region, (ARM, HAND))

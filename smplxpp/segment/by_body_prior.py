@@ -1,4 +1,4 @@
-"""How likely each label is at a place on the body, given in outline what somebody wears."""
+"""Compute P(label | place on the body) from the outline of the clothes and the layers over them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HEAD, LEG, NECK, NECK
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import Outfit
 
-# What else may be there, by region, whatever the outline says: a share of the whole, over all labels.
+# Probability of each label in a region independent of the outline: the frequency of exceptions (a bag, a rolled
+# sleeve).
 _ELSE: dict[int, dict[int, float]] = {
     TRUNK: {SKIN.id: 0.03, HAIR.id: 0.02, UPPER.id: 0.03, LOWER.id: 0.02, OUTER.id: 0.005},
     ARM: {SKIN.id: 0.03, HAIR.id: 0.003, UPPER.id: 0.04, LOWER.id: 0.0005, OUTER.id: 0.005},
@@ -18,20 +19,23 @@ _ELSE: dict[int, dict[int, float]] = {
     LEG: {SKIN.id: 0.04, SHOE.id: 0.01, UPPER.id: 0.02, LOWER.id: 0.04, OUTER.id: 0.003},
     FOOT: {SKIN.id: 0.03, SHOE.id: 0.06, LOWER.id: 0.02, UPPER.id: 0.001},
 }
-_NEVER = 1e-6
-# Hair where the skull is bald, and what may be wrong about a layer that was found.
-_BALD_HAIR, _UNLAYERED = 0.02, 0.2
+_NEVER = 1e-6  # probability of labels that do not occur in a region; keeps logarithms finite
+_UNLAYERED = 0.2  # probability that a layer that was found is none
 
 
 def place_prior(
     chart: BodyChart, outfit: Outfit, layers: Layers, *, softness: float, body_softness: float
 ) -> Float64[np.ndarray, "M L"]:
-    """P(label) at each face's place, before its colour is looked at; rows sum to 1.
+    """Return P(label) at each face's place, before its colour is used; rows sum to 1.
 
     Args:
-        softness: metres by which a hem may hang lower or higher than its ring. body_softness: by which regions of the
-            head and hands may be misplaced.
+        chart: places of the faces.
+        outfit: outline of the clothes.
+        layers: layers over other clothes.
+        softness: standard deviation of a hem about its ring, metres.
+        body_softness: standard deviation of the body's place at head and hands, metres.
     """
+    # Exceptions first; the outline shares out the rest.
     out = np.full((len(chart.region), len(LABELS)), _NEVER)
     for region, shares in _ELSE.items():
         here = chart.region == region
@@ -40,10 +44,11 @@ def place_prior(
     column, arm = np.isin(chart.region, (TRUNK, LEG, FOOT)), chart.region == ARM
     rest = 1.0 - out.sum(axis=1)
     out[column] += rest[column, None] * _column(chart.height[column], outfit, softness)
-    # Where trunk meets neck: necklines.
+    # Necklines: where the trunk meets the neck, skin replaces up to 45 % of the shirt.
     top = chart.region == TRUNK
     bare = 0.45 * _above(chart.height[top], NECK_BASE - 0.05, 0.03)
     out[top, SKIN.id], out[top, UPPER.id] = out[top, SKIN.id] + bare, out[top, UPPER.id] * (1 - bare)
+    # Arms and hands: sleeve up to the cuff, then skin.
     sleeve = 1.0 - _above(chart.reach[arm], outfit.cuff, softness)
     out[arm, UPPER.id] += rest[arm] * sleeve
     out[arm, SKIN.id] += rest[arm] * (1 - sleeve)
@@ -51,13 +56,15 @@ def place_prior(
     sleeve = 1.0 - _above(chart.reach[hand], min(outfit.cuff, WRIST) + 0.02, softness)
     out[hand, UPPER.id] += rest[hand] * sleeve
     out[hand, SKIN.id] += rest[hand] * (1 - sleeve)
+    # Neck and head do not depend on the outline.
     neck = chart.region == NECK
     out[neck] += _neck(chart.azimuth[neck])
     head = chart.region == HEAD
     out[head] += _head(chart.azimuth[head], chart.face_height[head], body_softness)
     out /= out.sum(axis=1, keepdims=True)
+    # Layers replace the outline where they were found.
     if layers.bald:
-        out[:, HAIR.id] *= _BALD_HAIR
+        out[:, HAIR.id] *= 0.02
     if layers.bib:
         front = top & (np.abs(chart.azimuth) < 1.2)
         out[front] = 0.6 * out[front] + 0.4 * _only(LOWER.id)
@@ -79,7 +86,7 @@ def _column(height: np.ndarray, outfit: Outfit, softness: float) -> np.ndarray:
     borders = [outfit.shoe_top, outfit.lower_start, outfit.lower_end, outfit.upper_start]
     above = [np.ones(len(height))]
     for k, border in enumerate(borders):
-        # Nothing below what is not worn.
+        # A garment that is not worn has no border.
         never = (k == 0 and outfit.shoe_top <= 0) or (k == 3 and outfit.upper_start <= 0)
         above.append(np.ones(len(height)) if never else _above(height, border, softness))
     above.append(np.zeros(len(height)))
@@ -98,7 +105,7 @@ def _neck(azimuth: np.ndarray) -> np.ndarray:
 
 
 def _head(azimuth: np.ndarray, height: np.ndarray, softness: float) -> np.ndarray:
-    """Face, ears and nape are skin, the cap is hair; between them the colour decides."""
+    """Return P(label) on the head: face, ears and nape are skin, the cap is hair; between them the colour decides."""
     side = np.abs(azimuth)
     # The hairline: over the forehead in front, before and behind the ears, down to the nape.
     line = np.interp(side, [0.0, 0.8, 1.2, 1.5, 2.0, np.pi], [0.82, 0.76, 0.62, 0.50, 0.15, 0.02])

@@ -1,4 +1,4 @@
-"""A labelled scan: votes or given labels, smoothed along the surface."""
+"""Label a scan from votes or given labels by minimising a Potts energy along its surface."""
 
 from __future__ import annotations
 
@@ -15,15 +15,7 @@ from smplxpp.core.topology import face_adjacency
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors
 
-_LOOKS_DOWN = -0.3
-"""Height of a unit normal below which a face looks down; +Y is up."""
-_SURE_PRIOR = 0.6
-# Share of the area whose votes weigh as much as the prior's own word for what it labels.
-_OWN_WORD = 0.01
-# Share of the votes on what a prior labels alike, above which a label is one of several that it may mean.
-_ALIKE = 0.15
-# Share of the area without a vote from which the prior's doubts are those of the labels.
-_MUCH_LEFT = 0.05
+_CERTAIN_PRIOR = 0.6  # confidence from which a prior's label counts as known
 
 
 @dataclass(frozen=True)
@@ -31,14 +23,14 @@ class SegmentConfig(SmoothingConfig):
     """Options of `segment_scan`, beside those of smoothing.
 
     Attributes:
-        pseudo_votes: added to every label, so that no probability is zero.
+        pseudo_votes: votes added to every label, so that no probability is zero.
         full_votes: sum of votes from which a face is trusted fully.
-        rings: of neighbours whose votes speak for a face's confidence where its own are fewer than that: a pixel is
-            often larger than a face, and then votes fall on one face of several.
+        rings: rings of neighbours whose votes count for a face's confidence if its own are fewer. A pixel is often
+            larger than a face, so that its vote falls on one face of several.
         label_trust: weight of the labels given with the scan, as a share of full votes.
-        underside: cost, over sqrt(M), of any label but skin for a face that no vote fell on and that looks down (+Y is
-            up). A scan closes a skirt from below; that surface is no cloth, and the hem is a fold as the legs are.
-        prior_weight: nats of a prior that count where votes are certain, as a share of those where there are none.
+        underside: cost, over sqrt(M), of any label but skin for a face without a vote that looks down (+Y is up). A
+            scan closes a skirt from below; that surface is no cloth.
+        prior_weight: weight of a prior where votes are certain, as a share of its weight where there are none.
     """
 
     pseudo_votes: float = 0.1
@@ -51,17 +43,18 @@ class SegmentConfig(SmoothingConfig):
 
 @dataclass(frozen=True, eq=False)
 class SegmentedScan:
-    """Labels of a scan's faces.
+    """Labels of a scan's faces with their confidence.
 
     Attributes:
         face_labels: (M,) int64 label ids.
-        confidence: (M,) in [0, 1]: the share of the votes that the label has, times how far the votes sum up to full
-            trust; of a face with fewer votes than that, they are counted with those around it. 0 where no vote is near.
-        seen: (M,) bool: some vote fell on the face.
-        island_faces: faces relabelled because their patch was too small.
-        energy_before, energy_after: of the cheapest label of every face, and of the labels after the graph cut.
-        corrected: (M,) bool: a hand has set the label (`Corrections.apply`); None: nobody was asked.
-        doubts: what is not sure, in words for the user; empty where labels were given, or votes all over the surface.
+        confidence: (M,) in [0, 1]: the label's share of the votes, times their sum relative to full trust. Faces with
+            fewer votes count those of their neighbours. 0 where no vote is near.
+        seen: (M,) bool: whether a vote fell on the face.
+        island_faces: number of faces relabelled because their patch was too small.
+        energy_before: energy of the cheapest label of every face.
+        energy_after: energy after the graph cut.
+        corrected: (M,) bool: whether the label was set by hand (`Corrections.apply`); None without corrections.
+        notes: remarks on uncertain labels; empty where labels were given, or votes cover the surface.
     """
 
     face_labels: Int64[np.ndarray, " M"]
@@ -71,7 +64,7 @@ class SegmentedScan:
     energy_before: float
     energy_after: float
     corrected: Bool[np.ndarray, " M"] | None = None
-    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def segment_scan(
@@ -93,11 +86,15 @@ def segment_scan(
     `label_trust`; -1 is no vote.
 
     Args:
-        votes: (M, L) of `vote_on_faces`. vertex_labels: (N,). face_labels: (M,). In our ids.
-        colors: sRGB of the vertices, bytes or 0..1: borders then settle on edges of colour, too.
-        prior: of the same mesh (`label_by_body`): what holds where no vote fell or votes are few. What it means by a
-            label is what the votes call it where both speak: of a dress that views call a lower garment, the rest is
-            lower, too.
+        mesh: the scan.
+        votes: (M, L) of `vote_on_faces`, in our ids.
+        vertex_labels: (N,), in our ids.
+        face_labels: (M,), in our ids.
+        colors: sRGB of the vertices, bytes or 0..1; borders then settle on edges of colour, too.
+        prior: labels of the same mesh by `label_by_body`, used where votes are few. Its labels are translated to what
+            the votes call them where both exist: of a dress that views call a lower garment, the rest becomes lower,
+            too.
+        config: options.
 
     Raises:
         InputError: none or several of the three, other lengths, unknown ids, or not a single label.
@@ -121,6 +118,7 @@ def segment_scan(
     if not votes.any():
         raise InputError("labels", expected="at least one labelled face", received="none")
 
+    # The prior is translated into the votes' terms.
     likely = None
     if prior is not None:
         _check_prior(mesh, prior)
@@ -132,15 +130,17 @@ def segment_scan(
     certainty = np.minimum(total, config.full_votes) / config.full_votes
     pairs, ends = face_adjacency(mesh.faces)
     weights = edge_weights(mesh, pairs, ends, config, lab=lab)
-    # A label that nobody voted for anywhere cannot win, but for what the prior knows.
+    # Unary costs: -log of the vote share, weighted by certainty, and the prior where votes are few. A label without any
+    # vote cannot win unless the prior knows it.
     candidates = np.flatnonzero(votes.any(axis=0) | _known_to(likely))
     unary = -np.log(share) * (trust * certainty)[:, None]
     if likely is not None:
         unary += (1.0 - (1.0 - config.prior_weight) * certainty)[:, None] * -np.log(likely)
-    below = (total == 0) & (mesh.face_normals[:, 1] < _LOOKS_DOWN)
-    # Borders have about sqrt(faces) edges: so that a finer scan is cut in the same place.
+    below = (total == 0) & (mesh.face_normals[:, 1] < -0.3)  # a normal more than 17 degrees below the horizon
+    # Borders have about sqrt(faces) edges; dividing by it cuts a finer scan in the same place.
     unary[below] += config.underside / np.sqrt(mesh.face_count) * (np.arange(len(LABELS)) != SKIN.id)
     unary = unary[:, candidates]
+    # Minimise the energy by graph cuts, and relabel patches that are too small.
     problem = PottsProblem.from_costs(unary, pairs, weights)
     before = problem.energy(unary.argmin(axis=1))
     index, after = minimize_potts(problem)
@@ -156,7 +156,8 @@ def segment_scan(
         int((labels != cut).sum()),
         before / COST_SCALE,
         after / COST_SCALE,
-        doubts=() if prior is None or _left_to_prior(mesh, total) < _MUCH_LEFT else prior.doubts,
+        # The prior's notes hold for the labels if 5 % of the area and more have no vote.
+        notes=() if prior is None or _left_to_prior(mesh, total) < 0.05 else prior.notes,
     )
 
 
@@ -168,30 +169,30 @@ def _check_prior(mesh: TriangleMesh, prior: SegmentedScan) -> None:
 
 
 def _left_to_prior(mesh: TriangleMesh, votes: np.ndarray) -> float:
-    """Share of the area that faces without a vote have."""
+    """Return the share of the area without a vote."""
     return float(mesh.face_areas @ (votes == 0) / mesh.face_areas.sum())
 
 
 def _known_to(likely: np.ndarray | None) -> Bool[np.ndarray, " L"]:
-    """Labels of which a prior is sure somewhere."""
+    """Return the labels that a prior is certain of somewhere."""
     if likely is None:
         return np.zeros(len(LABELS), dtype=bool)
-    return np.asarray((likely > _SURE_PRIOR).any(axis=0))
+    return np.asarray((likely > _CERTAIN_PRIOR).any(axis=0))
 
 
 def _prior_as_voted(
     prior: SegmentedScan, votes: Float64[np.ndarray, "M L"], area: Float64[np.ndarray, " M"]
 ) -> Float64[np.ndarray, "M L"]:
-    """P(label) of every face: the prior's confidence goes to what voted faces that it labels alike are called."""
+    """Return P(label) of every face; the prior's confidence goes to the voted label of faces that it labels alike."""
     own, rows = prior.face_labels, np.arange(len(area))
-    # A tie is no objection.
+    # How votes translate each label of the prior. Its own word counts as votes on 1 % of the area; ties agree with it.
     called = np.where(votes[rows, own] >= votes.max(axis=1), own, votes.argmax(axis=1))
     voted = votes.any(axis=1)
-    meaning = _OWN_WORD * area.sum() * np.eye(len(LABELS))
+    meaning = 0.01 * area.sum() * np.eye(len(LABELS))
     np.add.at(meaning, (own[voted], called[voted]), area[voted])
     meaning /= meaning.sum(axis=1, keepdims=True)
-    # What views call now one and now the other, the prior does not tell apart.
-    alike = meaning > _ALIKE
+    # Labels with more than 15 % of the votes are equal meanings, because the prior does not tell them apart.
+    alike = meaning > 0.15
     meaning = np.where(alike, (meaning * alike).sum(axis=1, keepdims=True) / alike.sum(axis=1, keepdims=True), meaning)
     share = np.clip(prior.confidence, 1.0 / len(LABELS), 0.99)[:, None]
     rest = (1.0 - share) / (len(LABELS) - 1)
@@ -199,9 +200,12 @@ def _prior_as_voted(
 
 
 def _votes_with_outer(votes: np.ndarray, prior: SegmentedScan) -> np.ndarray:
-    """Where votes never name outer clothes, their set may not tell coats from shirts: the prior does."""
-    sure = (prior.face_labels == OUTER.id) & (prior.confidence > _SURE_PRIOR)
-    if votes[:, OUTER.id].any() or not sure.any():
+    """Copy the votes of upper to outer clothes if votes never name these and the prior does.
+
+    Such a label set may not distinguish coats from shirts; the prior decides between the two.
+    """
+    certain = (prior.face_labels == OUTER.id) & (prior.confidence > _CERTAIN_PRIOR)
+    if votes[:, OUTER.id].any() or not certain.any():
         return votes
     votes = votes.copy()
     votes[:, OUTER.id] = votes[:, UPPER.id]
@@ -211,7 +215,7 @@ def _votes_with_outer(votes: np.ndarray, prior: SegmentedScan) -> np.ndarray:
 def _confidence(
     votes: Float64[np.ndarray, "M L"], labels: Int64[np.ndarray, " M"], pairs: np.ndarray, config: SegmentConfig
 ) -> Float64[np.ndarray, " M"]:
-    """How clearly the votes on each face, or on it and the rings around it, speak for its label."""
+    """Return the share of votes for each face's label, over as many rings around it as full trust needs."""
     own = np.stack([votes.sum(axis=1), votes[np.arange(len(labels)), labels]], axis=1)
     few = np.flatnonzero(own[:, 0] < config.full_votes)
     ones = np.ones(len(pairs), dtype=np.int8)
@@ -234,7 +238,7 @@ def _confidence(
 def _votes_of_labels(
     mesh: TriangleMesh, vertex_labels: np.ndarray | None, face_labels: np.ndarray | None
 ) -> np.ndarray:
-    """Three votes (M, L) a face, fewer where corners are unlabelled."""
+    """Return (M, L) votes of given labels: three a face, fewer where corners are unlabelled."""
     name, labels, count = (
         ("vertex labels", vertex_labels, mesh.vertex_count)
         if face_labels is None

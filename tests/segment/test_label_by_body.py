@@ -77,7 +77,7 @@ def test_without_colours_it_says_so(body, scanned):
     mesh, colors, _, params = scanned
     for given in (None, np.full_like(colors, 128)):
         result = label_by_body(mesh, body, params, colors=given)
-        assert any("no colours" in doubt for doubt in result.doubts)
+        assert any("no colours" in note for note in result.notes)
 
 
 def painted(body: BodyModel, paint: dict[str, tuple]) -> tuple[TriangleMesh, np.ndarray, BodyParams]:
@@ -165,7 +165,7 @@ def test_a_body_that_is_not_in_the_scan_leaves_nothing_sure(body, scanned):
     elsewhere = replace(params, transl=params.transl + 0.5)
     result = label_by_body(mesh, body, elsewhere, colors=colors)
     assert result.confidence.max() < 0.5
-    assert any("no label can be trusted" in doubt for doubt in result.doubts)
+    assert any("no label can be trusted" in note for note in result.notes)
 
 
 def test_a_head_alone_is_labelled_and_nothing_at_all_is_refused(body, scanned):

@@ -66,14 +66,19 @@ def scan_section(
     cameras: list[Camera],
     checks: tuple[CheckRow, ...],
 ) -> Section:
-    """Show the scan, its colours and its labels, and in which of these there is doubt.
+    """Show the scan, its colours, its labels and their uncertainty.
 
     Args:
-        record: of the stage that labelled it.
+        run: folder of the run.
+        record: the stage that labelled the scan.
+        scan: the scan.
+        colors: its colours.
+        cameras: cameras of the pictures.
+        checks: checks of the stage.
     """
     with values_of(record):
         source = as_text(record.manifest["numbers"].get("labels_from", "file"), subject="labels_from")
-        doubts = as_list(record.manifest["numbers"].get("doubts", []), subject="doubts")
+        notes = as_list(record.manifest["numbers"].get("notes", []), subject="notes")
     labels, confidence = read_named(run / SCAN_LABELS, "face_labels", "confidence")
     heat = [
         render_heat(scan, camera, confidence, cmap="weight", limits=(0.0, 1.0), bar=camera is cameras[-1])
@@ -91,7 +96,7 @@ def scan_section(
             Picture("labels", _sheet(scan, cameras, face_colors=display_colors(labels))),
             Picture("confidence of the labels", encode_jpeg(row(heat))),
         ),
-        tables=(Table(("doubtful labels",), tuple((str(words),) for words in doubts)),) if doubts else (),
+        tables=(Table(("uncertain labels",), tuple((str(note),) for note in notes)),) if notes else (),
         legend=tuple((label.name, label.display_rgb) for label in present),
         checks=checks,
     )
@@ -99,7 +104,7 @@ def scan_section(
 
 _METHODS = {
     "quadric": "simplified to their budgets by quadric edge collapse (fast-simplification)",
-    "isotropic": "covered anew with faces of one size by isotropic remeshing (pymeshlab, which is under the GPL 3)",
+    "isotropic": "covered with faces of one size by isotropic remeshing (pymeshlab, which is under the GPL 3)",
 }
 
 

@@ -1,0 +1,109 @@
+"""Bound the confidence of labels by that of the outline, and note what cannot be decided."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.ndimage import maximum_filter1d
+
+from smplxpp.core.labels import LABELS, SKIN, UPPER
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.segment.by_body_chart import LEG, TRUNK, BodyChart
+from smplxpp.segment.by_body_colors import SkinModel
+from smplxpp.segment.by_body_layers import Layers
+from smplxpp.segment.by_body_outfit import ARM_START, RUNS, STEP, Outfit, in_arm, in_column
+
+_NEAR = 2  # rings by which a hem may lie beside its ring
+# Precision of two rules on the procedural people of the benchmark `labels_by_body`: an `upper` without a coat is no
+# jacket, cape or waistcoat; one garment over trunk and legs is `upper` (a truth may call a dress lower, or two garments
+# of one
+# cloth look like one).
+_NO_JACKET, _ONE_PIECE = 0.93, 0.55
+_CLOSE_CALL = 6.0  # nats between two outlines, below which a note mentions the border
+_LOW, _MUCH = 0.6, 0.15  # confidence of an uncertain face; share of a label's area that is worth a note
+BODY_ELSEWHERE = 0.05
+"""Distance, in metres, between body and bare skin from which the body is not the scan's."""
+_BORDERS = {
+    "shoe_top": "where shoes or socks end",
+    "lower_start": "where the lower garment's hem is",
+    "lower_end": "where the lower garment's waist is",
+    "upper_start": "where the upper garment's hem is",
+    "cuff": "where the sleeves end",
+}
+
+
+def confidence_bound(
+    chart: BodyChart, labels: Int64[np.ndarray, " M"], outfit: Outfit, layers: Layers
+) -> Float64[np.ndarray, " M"]:
+    """Return the upper bound of each face's confidence: P(its label) over all outlines of the clothes.
+
+    A face whose label does not come from the outline (a neckline, a bib) was decided by its colour: its bound is 1.
+    """
+    most = np.ones(len(labels))
+    column, arm = in_column(chart), in_arm(chart)
+    # Column: the bound is the ring's probability where the chosen outline has the label in the ring or near it.
+    told, shares = _labels_of_outline(outfit), _around(outfit.column)
+    ring = np.clip(np.floor(chart.height[column] / STEP).astype(np.int64), 0, len(shares) - 1)
+    own = labels[column]
+    most[column] = np.where(told[ring, own], shares[ring, own], 1.0)
+    # Arms: the bound is the probability of sleeve or of bare skin.
+    sleeve, bare = _around(outfit.sleeve), _around(1.0 - outfit.sleeve)
+    ring = np.clip(np.floor((chart.reach[arm] - ARM_START) / STEP).astype(np.int64), 0, len(sleeve) - 1)
+    own = labels[arm]
+    most[arm] = np.where(own == UPPER.id, sleeve[ring], np.where(own == SKIN.id, bare[ring], 1.0))
+    upper = labels == UPPER.id
+    if outfit.one_piece:
+        most[upper & np.isin(chart.region, (TRUNK, LEG))] *= _ONE_PIECE
+    if not layers.coat.any():
+        most[upper] *= _NO_JACKET
+    return most
+
+
+def _labels_of_outline(outfit: Outfit) -> np.ndarray:
+    """Return (R, L) bools: whether the chosen outline has the label in the ring or near it."""
+    middle = STEP * (np.arange(len(outfit.column)) + 0.5)
+    borders = (outfit.shoe_top, outfit.lower_start, outfit.lower_end, outfit.upper_start)
+    label = np.array([label.id for label in RUNS])[np.searchsorted(borders, middle, side="right")]
+    return _around((label[:, None] == np.arange(len(LABELS))).astype(np.float64)) > 0
+
+
+def _around(shares: np.ndarray) -> np.ndarray:
+    """Return the maximum over the rings around each ring."""
+    return np.asarray(maximum_filter1d(shares, 2 * _NEAR + 1, axis=0, mode="nearest"))
+
+
+def notes_on_labels(
+    mesh: TriangleMesh,
+    labels: Int64[np.ndarray, " M"],
+    confidence: Float64[np.ndarray, " M"],
+    outfit: Outfit,
+    skin: SkinModel | None,
+    *,
+    misfit: float,
+) -> tuple[str, ...]:
+    """Return notes on labels that are uncertain, for the user; empty where everything is clear."""
+    # Colours and skin: what the labels depend on.
+    out = []
+    if skin is None:
+        out.append("the scan has no colours: labels rest on the distance to the body alone")
+    elif not skin.found:
+        out.append("neither the face nor the hands show skin: a generic range of skin colours is used")
+    elif skin.hands is False:
+        out.append("hands and face differ in colour (gloves, a covered face): skin has the colour of the face")
+    # The body: distances above 12 mm cannot tell skin from thin cloth.
+    if misfit > BODY_ELSEWHERE:
+        out.append(f"the body lies {1e3 * misfit:.0f} mm from the scan's face and hands: no label can be trusted")
+    elif misfit > 0.012:
+        out.append(f"the body misses face and hands by {1e3 * misfit:.0f} mm: clothes are recognised by colour alone")
+    # The outline: borders for which another place costs nearly as little.
+    close = [_BORDERS[name] for name, margin in outfit.margins.items() if margin < _CLOSE_CALL]
+    out.extend(f"it is a close call {words}" for words in dict.fromkeys(close))
+    if outfit.one_piece:
+        out.append("no seam at the waist: taken as one garment (dress, jumpsuit), labelled upper")
+    area = mesh.face_areas
+    for label in LABELS:
+        own = labels == label.id
+        total = area[own].sum()
+        if total > 0 and (low := area[own & (confidence < _LOW)].sum()) > _MUCH * total:
+            out.append(f"{low / total:.0%} of the faces labelled {label.name} are uncertain")
+    return tuple(out)
