@@ -40,7 +40,7 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"rendering"},
         {"losses"},
         {"metrics", "models"},
-        {"export"},
+        {"export", "driving"},
         {"training"},
         {"baselines"},
         {"evaluation"},

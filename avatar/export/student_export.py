@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,9 +18,10 @@ from avatar.models.open_student import load
 from avatar.models.student import Student
 from avatar.runtime import AvatarBundle, AvatarPlayer, load_bundle
 from avatar.runtime.bundle import SUFFIX
+from smplxpp import __version__
 from smplxpp.cloth.following import ways
 from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 
 _WRITERS = {
     ".ply": "avatar.formats.ply:write_splat_ply",
@@ -90,8 +90,6 @@ def export_student(
     return {"out": str(path), "bytes": path.stat().st_size, "frames": frames}
 
 
-DEFAULT_FPS = 20.0
-"""Frames a second of poses that do not say how fast they come."""
 PRE_ROLL = 0.7
 """Seconds of a motion before its first frame that loose clothes follow, so that they hang when it begins."""
 
@@ -125,7 +123,7 @@ def posed_splats_of(
         if k in rows:
             yield world_splats(posed)
     if notes is not None:
-        notes += player.said
+        notes += player.notes
 
 
 def export_bundle(
@@ -156,7 +154,7 @@ def export_bundle(
     extras = BundleExtras(
         name=name or origin.name,
         licence=licence,
-        provenance={"made by": f"smplxpp {version('smplxpp')}", **origin.digests} if provenance is None else provenance,
+        provenance={"made by": f"smplxpp {__version__}", **origin.digests} if provenance is None else provenance,
         garments=origin.garments,
         motion=motion,
     )

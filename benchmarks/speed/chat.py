@@ -61,9 +61,9 @@ class ChatBenchmark:
     def run(self) -> None:
         """Print and store the figures."""
         command = Chat(self.avatar)
-        from pipelines.commands.animate_student import open_student
+        import avatar
 
-        bundle = open_student(self.avatar)
+        bundle = avatar.open_bundle(self.avatar)
         cast = command.engines(bundle, command.partner())
         cast.voice.say("Hello.")
         turns: list[dict[str, float]] = []

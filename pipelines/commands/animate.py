@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import track
 
-from pipelines.commands.animate_student import StudentFilm, open_student, student_frames
+from pipelines.commands.animate_student import StudentFilm, student_frames
 from pipelines.commands.driving import Driving, unshaped
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import ClothMode, Lighting, OptionalFloat, OptionalInt
@@ -121,10 +121,11 @@ class Animate:
 
     def _student_film(self) -> dict:
         """Draw the student frame by frame and write the film."""
+        import avatar
         from avatar.runtime.motion import resampled
         from avatar.runtime.skeleton import skeleton_body
 
-        bundle = open_student(self.run_folder)
+        bundle = avatar.open_bundle(self.run_folder)
         given = self.driving.load(self.params, skeleton_body(bundle))
         chosen, fps, whole = self._chosen(given)
         motion = replace(whole, fps=fps * self.step)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
@@ -14,7 +12,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipelines.commands.driving import Driving
-from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.options import ClothMode
 from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
 from smplxpp.cloth.following import ways
@@ -52,33 +49,6 @@ class StudentFilm:
     numbered_from: int | None = None
     relighting: Relighting | None = None
     below: float | None = None
-
-
-def open_student(source: Path, *, exact: bool = False) -> AvatarBundle:
-    """Read a bundle, or make one of a run's student.
-
-    Args:
-        exact: make it with every number in float32.
-
-    Raises:
-        InputError: neither.
-    """
-    from avatar.runtime import load_bundle
-
-    with student_file(source, exact=exact) as path:
-        return load_bundle(path)
-
-
-@contextmanager
-def student_file(source: Path, *, exact: bool = False) -> Iterator[Path]:
-    """The file of a bundle: the source itself, or one made of a run's student, for as long as it is needed."""
-    if source.suffix.lower() == SUFFIX:
-        yield source
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"student{SUFFIX}"
-        export_bundle(source, path, name=None, licence="", params=None, exact=exact)
-        yield path
 
 
 def motion_for(bundle: AvatarBundle, path: Path) -> BodyParams:

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from pipelines.commands.animate_student import open_student, student_file
 from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
-from pipelines.commands.talking_person import person_of_bundle
 from smplxpp.core.errors import MissingExtraError
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.validation import require_at_least, require_between
@@ -55,8 +53,10 @@ class Chat:
         require_between("option port", self.port, 1, LARGEST_PORT)
         require_at_least("seed", self.seed, 0)
         partner = self.partner()
-        with student_file(self.source) as path:
-            bundle, data = open_student(path), read_bytes(path, subject="avatar", most=MOST_AVATAR_BYTES)
+        import avatar
+
+        with avatar.bundle_file(self.source) as path:
+            bundle, data = avatar.open_bundle(path), read_bytes(path, subject="avatar", most=MOST_AVATAR_BYTES)
         engines = self.engines(bundle, partner)
         console = Console(stderr=self.json)
         seconds = engines.voice.say("Hello.").sound.seconds  # the first sentence loads the rest of the voice
@@ -85,6 +85,7 @@ class Chat:
 
     def engines(self, bundle: AvatarBundle, partner: Partner) -> ChatParts:
         """Load the engines of the conversation."""
+        from avatar.driving import person_of_bundle
         from avatar.runtime.skeleton import skeleton_body
         from avatar.speech import SpeechAnimator, TalkConfig
         from avatar.speech.voice import PiperVoice

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from pipelines.commands.animate_student import motion_for, open_student
+from pipelines.commands.animate_student import motion_for
 from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
 from pipelines.commands.options import ClothMode
 from smplxpp.cloth.following import ways
@@ -34,9 +34,10 @@ def splat_writers(
     Raises:
         InputError: no student, parameters of another body, rows that are not there.
     """
+    import avatar
     from avatar.runtime import AvatarPlayer
 
-    bundle = open_student(request.source, exact=True)
+    bundle = avatar.open_bundle(request.source, exact=True)
     player = AvatarPlayer(bundle)
     motion = player.motion if request.params is None else motion_for(bundle, request.params)
     motion = BodyParams.rest(betas=0, expressions=0) if motion is None else motion
@@ -119,7 +120,9 @@ def step_writers(request: FileRequest) -> tuple[None, Iterator[tuple[int, Callab
     Raises:
         InputError: no student.
     """
-    bundle = open_student(request.source, exact=True)
+    import avatar
+
+    bundle = avatar.open_bundle(request.source, exact=True)
     if request.format == "onnx":
         from avatar.formats.onnx_step import write_onnx
 

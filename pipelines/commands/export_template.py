@@ -12,7 +12,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
-from pipelines.commands.animate_student import motion_for, open_student
+from pipelines.commands.animate_student import motion_for
 from pipelines.commands.export_bundle import SUFFIX
 from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
 from pipelines.commands.templates import load_params_for, load_run_template
@@ -105,7 +105,9 @@ def motion_writers(request: FileRequest) -> tuple[float, Iterator[tuple[int, Cal
     if request.source.suffix.lower() == SUFFIX:
         from avatar.runtime.skeleton import skeleton_body
 
-        bundle = open_student(request.source)
+        import avatar
+
+        bundle = avatar.open_bundle(request.source)
         body = skeleton_body(bundle)
         joints, params = body.v_template, motion_for(bundle, request.params)
     else:

@@ -3,35 +3,31 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
 
-from pipelines.commands.animate_student import StudentFilm, open_student, student_file, student_frames
+from pipelines.commands.animate_student import StudentFilm, student_frames
 from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import ClothMode, OptionalPath, OptionalText
-from pipelines.commands.talking_page import check_page_path, write_talking_page
-from pipelines.commands.talking_person import live_lips, person_of_bundle, person_of_run
+from pipelines.commands.talking_page import check_page_path, live_lips, write_talking_page
+from pipelines.commands.templates import person_of_run
 from pipelines.figures.film import write_film
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
+from smplxpp.core.files.wave_file import Sound, wave_bytes
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
-    from avatar.speech import Speech
-    from avatar.speech.curves import Curves
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows
-_SILENT_RATE = 16_000  # hertz, of the sound of silence
 _HANGING = 0.7  # seconds
 _SMALLEST = 16  # pixels of a picture
 
@@ -82,19 +78,28 @@ class Talk:
     def run(self) -> dict[str, Any]:
         """Find out what is said when, make the motion, write the result whole or not at all."""
         suffix = self._check()
+        import avatar
+        from avatar.driving import hear, person_of_bundle
         from avatar.speech import TalkConfig, talking_motion
 
         with ExitStack() as stack:
             file = None
             if suffix == FILM or self.web is not None or self.source.suffix.lower() == BUNDLE:
-                file = stack.enter_context(student_file(self.source))
-            bundle = None if file is None else open_student(file)
+                file = stack.enter_context(avatar.bundle_file(self.source))
+            bundle = None if file is None else avatar.open_bundle(file)
             face, stance = person_of_run(self.source) if bundle is None else person_of_bundle(bundle)
             config = TalkConfig(
                 fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively, gestures=self.gestures
             )
-            heard = self._heard()
-            sound, speech, said = heard.sound, heard.speech, heard.said
+            heard = hear(
+                text=self.text,
+                audio=self.audio,
+                curves=self.curves,
+                face_model=self.face_model,
+                voice=self.voice,
+                follow=self.hear,
+            )
+            sound, speech, said = heard.sound, heard.speech, heard.notes
             motion = talking_motion(speech, face, stance, config, curves=heard.curves)
             if self.sound_out is not None:
                 atomic_write_bytes(self.sound_out, wave_bytes(sound))
@@ -157,40 +162,6 @@ class Talk:
             check_text(self.text)
         return suffix
 
-    def _heard(self) -> _Heard:
-        """What is heard, its phonemes, and the face's curves where another engine makes them."""
-        if self.curves is not None:
-            from avatar.speech.curve_sources import read_curves
-
-            curves = read_curves(self.curves)
-            silence = Sound(np.zeros(round(curves.seconds * _SILENT_RATE), np.float32), _SILENT_RATE)
-            sound = silence if self.audio is None else read_wave(self.audio)
-            return _Heard(sound, _lasting(curves.speech(), sound.seconds), curves=curves)
-        model = None
-        if self.face_model is not None:
-            from avatar.speech.curve_sources import FaceModel
-
-            model = FaceModel(self.face_model)
-        if self.audio is not None:
-            from avatar.speech.forced_alignment import align, aligner_installed
-
-            sound = read_wave(self.audio)
-            if model is not None and self.text is None:
-                curves = model(sound)
-                return _Heard(sound, _lasting(curves.speech(), sound.seconds), curves=curves)
-            if self.text is None and self.hear != "words" and (self.hear == "sounds" or not aligner_installed()):
-                from avatar.speech.lips import recognise_phonemes
-
-                said = (
-                    [] if self.hear == "sounds" else ["heard by its sounds: pocketsphinx, for words, is not installed"]
-                )
-                return _Heard(sound, recognise_phonemes(sound), said)
-            return _Heard(sound, align(sound, self.text), curves=None if model is None else model(sound))
-        from avatar.speech.voice import PiperVoice
-
-        spoken = PiperVoice(self.voice).say(self.text or "")
-        return _Heard(spoken.sound, spoken.speech, spoken.notes, None if model is None else model(spoken.sound))
-
     def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
         portrait = self.view == "portrait"
         simulate = bool(bundle.garments) and self.cloth == "simulate"
@@ -208,18 +179,3 @@ class Talk:
         cameras, frames = student_frames(bundle, motion, range(lead, len(motion)), film, said)
         shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)
         write_film(out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)
-
-
-@dataclass(frozen=True)
-class _Heard:
-    """What is heard. curves: of the face, in the place of the phonemes'."""
-
-    sound: Sound
-    speech: Speech
-    said: list[str] = field(default_factory=list)
-    curves: Curves | None = None
-
-
-def _lasting(speech: Speech, seconds: float) -> Speech:
-    """The part of a speech that its sound lasts for, and silence where the sound is longer."""
-    return replace(speech, phonemes=tuple(one for one in speech.phonemes if one.end <= seconds), seconds=seconds)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.files.wave_file import Sound, wave_bytes
 from smplxpp.core.params import BodyParams
+
+if TYPE_CHECKING:
+    from avatar.runtime import AvatarBundle
 
 PAGES = (".html", ".htm")
 """Suffixes of a page in one file."""
@@ -25,6 +29,17 @@ def check_page_path(path: Path) -> None:
         raise InputError(f"output {path}", expected="NAME.html or a folder", received=path.suffix)
     if not path.suffix and path.exists() and not path.is_dir():
         raise InputError(f"output {path}", expected="a folder, or nothing yet", received="a file")
+
+
+def live_lips(bundle: AvatarBundle) -> bytes | None:
+    """Return what moves a bundle's mouth by live sound in a page; None for a face whose mouth cannot speak."""
+    from avatar.driving import face_of_bundle
+    from pipelines.web.page import lips_of
+
+    try:
+        return lips_of(face_of_bundle(bundle))
+    except InputError:
+        return None
 
 
 def write_talking_page(

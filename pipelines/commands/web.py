@@ -13,8 +13,7 @@ from rich.console import Console
 
 from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, Lighting, OptionalPath, OptionalText
-from pipelines.commands.talking_page import PAGES
-from pipelines.commands.talking_person import live_lips
+from pipelines.commands.talking_page import PAGES, live_lips
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_bytes

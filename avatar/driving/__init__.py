@@ -1,0 +1,6 @@
+"""What drives an avatar: its person's face and stance, and what is heard of a text or a recording; no torch."""
+
+from avatar.driving.hearing import Heard, hear
+from avatar.driving.person import face_of_bundle, person_of_bundle, person_of_template
+
+__all__ = ["Heard", "face_of_bundle", "hear", "person_of_bundle", "person_of_template"]

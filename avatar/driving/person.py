@@ -1,0 +1,73 @@
+"""Face and stance of the person of a bundle or of a template, by the poses that training saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from avatar.runtime import AvatarBundle
+from avatar.runtime.skeleton import clothed_template, skeleton_body
+from avatar.speech import Face, StandingBody
+from avatar.speech.curves import ARKIT
+from smplxpp.body.retarget import Skeleton
+from smplxpp.core.params import BodyParams
+from smplxpp.template.template import Template
+
+
+def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, StandingBody]:
+    """Return the face of a bundle's person and how the body stands.
+
+    Raises:
+        InputError: expressions by which no mouth can be moved.
+    """
+    standing = StandingBody.of(
+        Skeleton.of(skeleton_body(bundle)),
+        _with_expressions(_motion_of(bundle), len(bundle.about.expression_names)),
+        observed_poses=bundle.tensors.get("poses.known"),
+        surface=bundle.tensors["surface.vertices"].astype(np.float64),
+    )
+    return face_of_bundle(bundle), standing
+
+
+def face_of_bundle(bundle: AvatarBundle) -> Face:
+    """Return the face of a bundle's person.
+
+    Raises:
+        InputError: expressions by which no mouth can be moved.
+    """
+    about = bundle.about
+    # Numbered expressions have no meaning by name: what they do to the surface is measured.
+    body = None if set(ARKIT) & set(about.expression_names) else clothed_template(bundle)[0].body
+    return Face.of(about.expression_names, about.joint_names, _motion_of(bundle), body=body)
+
+
+def person_of_template(template: Template, seen: BodyParams | None = None) -> tuple[Face, StandingBody]:
+    """Return the face of a template and how its body stands.
+
+    Args:
+        template: the clothed body.
+        seen: parameters of frames that show how the person stands; None: the T-pose.
+
+    Raises:
+        InputError: expressions by which no mouth can be moved.
+    """
+    body = template.body
+    face = Face.of(body.expression_names, body.joint_names, seen, body=body)
+    frames = _with_expressions(seen, body.num_expressions)
+    return face, StandingBody.of(Skeleton.of(body, template.betas), frames, surface=template.vertices)
+
+
+def _motion_of(bundle: AvatarBundle) -> BodyParams | None:
+    if not bundle.motion:
+        return None
+    arrays = {name: np.asarray(value, np.float64) for name, value in bundle.motion.items()}
+    return BodyParams.from_mapping(arrays, source="motion of the bundle")
+
+
+def _with_expressions(seen: BodyParams | None, expressions: int) -> BodyParams:
+    """Return frames padded to all expressions of the body; one frame at rest where there are none."""
+    if seen is None:
+        return BodyParams.rest(betas=0, expressions=expressions)
+    missing = expressions - seen.expression.shape[1]
+    return replace(seen.without_shape(), expression=np.pad(seen.expression, ((0, 0), (0, missing))))
