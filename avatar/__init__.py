@@ -5,9 +5,7 @@ The names below are loaded when they are first used, so that importing the packa
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
-
+from smplxpp.core.lazy import lazy_exports
 from smplxpp.native import let_workers_sleep
 
 let_workers_sleep()
@@ -25,7 +23,7 @@ _EXPORTS: dict[str, str] = {
     "TrainConfig": "avatar.training.recipe",
     "TeacherAvatar": "avatar.models.teacher_avatar",
     "bake": "avatar.training.student.bake",
-    "bundle_file": "avatar.export.student_export",
+    "bundle_file": "avatar.export.open_bundle",
     "compensate": "avatar.training.student.compensate",
     "export_student": "avatar.export.student_export",
     "evaluate_models": "avatar.evaluation.evaluate",
@@ -34,7 +32,7 @@ _EXPORTS: dict[str, str] = {
     "load": "avatar.models.open_student",
     "load_avatar": "avatar.models.model_file",
     "mean_quality": "avatar.metrics.view_quality",
-    "open_bundle": "avatar.export.student_export",
+    "open_bundle": "avatar.export.open_bundle",
     "rasterize": "avatar.rendering",
     "read_views": "avatar.data.views",
     "render": "avatar.rendering.picture",
@@ -49,13 +47,4 @@ _EXPORTS: dict[str, str] = {
 __all__ = [*_EXPORTS]
 
 
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        return import_module("smplxpp").__version__
-    if name in _EXPORTS:
-        return getattr(import_module(_EXPORTS[name]), name)
-    raise AttributeError(f"module 'avatar' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__, "__version__"])
+__getattr__, __dir__ = lazy_exports("avatar", _EXPORTS)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import avatar
 import smplxpp
 from pipelines.cli import COMMANDS
 
@@ -130,7 +132,17 @@ def violations(folder: str, forbidden: set[str]) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "module", ["smplxpp", "smplxpp.metrics", "smplxpp.body", "smplxpp.transfer", "avatar", "pipelines.cli"]
+    "module",
+    [
+        "smplxpp",
+        "smplxpp.metrics",
+        "smplxpp.body",
+        "smplxpp.transfer",
+        "avatar",
+        "avatar.training",
+        "avatar.rendering",
+        "pipelines.cli",
+    ],
 )
 def test_importing_is_light(module):
     heavy = ("torch", "trimesh", "PIL", "anny", "pygltflib")
@@ -154,6 +166,17 @@ def test_every_public_name_resolves():
     assert all(getattr(smplxpp, name) is not None for name in smplxpp.__all__)
     with pytest.raises(AttributeError, match="nonsense"):
         _ = smplxpp.nonsense
+
+
+@pytest.mark.parametrize("name", sorted({room(module) for module in modules_of("avatar")} - {""}))
+def test_rooms_of_avatar_export_names_that_resolve_and_name_no_module(name):
+    exported = importlib.import_module(f"avatar.{name}")
+    modules = {path.stem for path in (ROOT / "avatar" / name).iterdir()}
+    assert exported.__all__
+    assert not modules & set(getattr(exported, "_EXPORTS", ()))  # a module that is imported would hide the name
+    assert all(getattr(exported, one) is not None for one in exported.__all__)
+    assert all(getattr(avatar, one) is not None for one in avatar.__all__)
+    assert not {path.name for path in (ROOT / "avatar").iterdir()} & set(avatar.__all__)
 
 
 def test_every_room_is_a_stage_or_shared():

@@ -1,1 +1,13 @@
 """How good an avatar is: images, surface, speed and size, measured the same way for every model."""
+
+from smplxpp.core.lazy import lazy_exports
+
+_EXPORTS = {
+    "EvalReport": "avatar.evaluation.report",
+    "Evaluation": "avatar.evaluation.evaluate",
+    "EvaluationConfig": "avatar.evaluation.evaluate",
+    "ProtocolConfig": "avatar.evaluation.protocol",
+    "evaluate_models": "avatar.evaluation.evaluate",
+}
+__all__ = [*_EXPORTS]
+__getattr__, __dir__ = lazy_exports("avatar.evaluation", _EXPORTS)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -13,13 +12,11 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.export.bundle import BundleConfig, BundleExtras, write_bundle
-from avatar.formats.splats import Splats, world_splats
-from avatar.models.open_student import load
+from avatar.formats.splats_along import splats_along
 from avatar.models.student import Student
 from avatar.runtime import AvatarBundle, AvatarPlayer, load_bundle
 from avatar.runtime.bundle import SUFFIX
 from smplxpp import __version__
-from smplxpp.cloth.following import ways
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import DEFAULT_FPS, BodyParams
 
@@ -80,7 +77,7 @@ def export_student(
             frames = len(motion)
         # Poses of the training are no motion in time: nothing is simulated along them.
         mode = cloth if params is not None or cloth != "simulate" else "field"
-        splats = posed_splats_of(player, motion, range(frames), cloth=mode)
+        splats = splats_along(player, motion, range(frames), cloth=mode)
         if suffix in _MOVING:
             fps = (motion.fps or DEFAULT_FPS) if frames > 1 else None
             import_module("avatar.formats.splat_usd").write_splat_usd(path, frames=splats, fps=fps)
@@ -88,42 +85,6 @@ def export_student(
             module, function = _WRITERS[suffix].split(":")
             getattr(import_module(module), function)(path, splats=next(splats))
     return {"out": str(path), "bytes": path.stat().st_size, "frames": frames}
-
-
-PRE_ROLL = 0.7
-"""Seconds of a motion before its first frame that loose clothes follow, so that they hang when it begins."""
-
-
-def posed_splats_of(
-    player: AvatarPlayer,
-    motion: BodyParams,
-    rows: range,
-    *,
-    cloth: str = "simulate",
-    notes: list[str] | None = None,
-) -> Iterator[Splats]:
-    """Yield the splats of rows of a motion; simulated clothes follow it from a moment before the first row.
-
-    Args:
-        player: of the avatar.
-        motion: body parameters.
-        rows: ascending.
-        cloth: what moves loose clothes: "simulate", "field" or "skin".
-        notes: receives the player's remarks on the simulation after the last row.
-    """
-    rate = motion.fps or DEFAULT_FPS
-    if cloth != "simulate" or not player.has_clothes:
-        skinned = player.skinned_clothes if cloth == "skin" else None
-        for k in rows:
-            yield world_splats(player.pose(motion.frame(k), cloth=skinned))
-        return
-    begin = max(0, rows[0] - round(PRE_ROLL * rate))
-    for k, way in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
-        posed = player.step(motion.frame(k), 1.0 / rate, way=way)
-        if k in rows:
-            yield world_splats(posed)
-    if notes is not None:
-        notes += player.notes
 
 
 def export_bundle(
@@ -184,35 +145,3 @@ def bundle_of_student(student: Student, *, exact: bool = False) -> AvatarBundle:
         path = Path(folder) / f"student{SUFFIX}"
         export_bundle(student, path, exact=exact)
         return load_bundle(path)
-
-
-def open_bundle(source: Path, *, exact: bool = False) -> AvatarBundle:
-    """Read a bundle, or make one in memory of the student in a folder.
-
-    Args:
-        source: a bundle NAME.avatar, or a folder that `avatar.train` or `smplxpp train` wrote.
-        exact: make it with every number in float32.
-
-    Raises:
-        InputError: neither of them.
-    """
-    with bundle_file(source, exact=exact) as path:
-        return load_bundle(path)
-
-
-@contextmanager
-def bundle_file(source: Path, *, exact: bool = False) -> Iterator[Path]:
-    """Give the file of a bundle: the source itself, or one made of the student in a folder for the block.
-
-    Args:
-        source, exact: see `open_bundle`.
-    """
-    if source.suffix.lower() == SUFFIX:
-        yield source
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"student{SUFFIX}"
-        student = load(source)
-        assert isinstance(student, Student)  # a folder holds no bundle
-        export_bundle(student, path, exact=exact)
-        yield path

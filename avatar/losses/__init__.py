@@ -1,1 +1,14 @@
 """Losses that the trainer minimises, and the image metrics it reports."""
+
+from smplxpp.core.lazy import lazy_exports
+
+_EXPORTS = {
+    "PerceptualDistance": "avatar.losses.perceptual",
+    "ReconstructionWeights": "avatar.losses.reconstruction",
+    "Target": "avatar.losses.reconstruction",
+    "load_metric": "avatar.losses.perceptual",
+    "reconstruction_loss": "avatar.losses.reconstruction",
+    "ssim_map": "avatar.losses.ssim",
+}
+__all__ = [*_EXPORTS]
+__getattr__, __dir__ = lazy_exports("avatar.losses", _EXPORTS)

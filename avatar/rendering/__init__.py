@@ -1,6 +1,14 @@
 """Differentiable rasterisation: one signature, the backend chosen by the tensors' device."""
 
-from avatar.rendering.api import rasterize
-from avatar.rendering.settings import RasterMeta, RasterSettings
+from smplxpp.core.lazy import lazy_exports
 
-__all__ = ["RasterMeta", "RasterSettings", "rasterize"]
+_EXPORTS = {
+    "RasterMeta": "avatar.rendering.settings",
+    "RasterSettings": "avatar.rendering.settings",
+    "Rendering": "avatar.rendering.avatar_view",
+    "rasterize": "avatar.rendering.api",
+    "render": "avatar.rendering.picture",
+    "render_view": "avatar.rendering.avatar_view",
+}
+__all__ = [*_EXPORTS]
+__getattr__, __dir__ = lazy_exports("avatar.rendering", _EXPORTS)

@@ -1,1 +1,14 @@
 """A template that torch can pose, and what a posed avatar is."""
+
+from smplxpp.core.lazy import lazy_exports
+
+_EXPORTS = {
+    "AvatarModel": "avatar.rig.posed",
+    "Pose": "avatar.rig.rig",
+    "PosedAvatar": "avatar.rig.posed",
+    "Rig": "avatar.rig.rig",
+    "SimulatedCloth": "avatar.rig.rig",
+    "at_rest": "avatar.rig.posed",
+}
+__all__ = [*_EXPORTS]
+__getattr__, __dir__ = lazy_exports("avatar.rig", _EXPORTS)

@@ -12,14 +12,12 @@ from rich.console import Console
 from rich.progress import track
 
 from pipelines.commands.animate_student import motion_for
-from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
-from pipelines.commands.options import ClothMode
-from smplxpp.cloth.following import ways
+from pipelines.commands.export_request import FileRequest
 from smplxpp.core.params import BodyParams
 
 if TYPE_CHECKING:
     from avatar.formats import Splats
-    from avatar.runtime import AvatarBundle, AvatarPlayer
+    from avatar.runtime import AvatarBundle
 
 
 # Rotations from +y to the upward axis of the file.
@@ -35,6 +33,7 @@ def splat_writers(
         InputError: no student, parameters of another body, rows that are not there.
     """
     import avatar
+    from avatar.formats.splats_along import splats_along
     from avatar.runtime import AvatarPlayer
 
     bundle = avatar.open_bundle(request.source, exact=True)
@@ -46,7 +45,7 @@ def splat_writers(
     fps = request.rate(motion) if moves and len(rows) > 1 else None
     notes = [] if request.params is None else _far_poses(bundle, motion.select(list(rows)))
     cloth = request.cloth if request.params is not None or request.cloth != "simulate" else "field"
-    splats = _posed(player, motion, rows, cloth=cloth, notes=notes)
+    splats = splats_along(player, motion, rows, cloth=cloth, notes=notes)
     shown = track(
         splats,
         total=len(rows),
@@ -74,26 +73,6 @@ def _far_poses(bundle: AvatarBundle, shown: BodyParams) -> list[str]:
     return [
         f"{int(outside.sum())} of {len(shown)} frames{first} turn joints more than 10 degrees farther than training saw"
     ]
-
-
-def _posed(
-    player: AvatarPlayer, motion: BodyParams, rows: range, *, cloth: ClothMode, notes: list[str]
-) -> Iterator[Splats]:
-    """Yield the splats of the chosen rows; loose clothes are simulated from `PRE_ROLL` before the first."""
-    from avatar.formats import world_splats
-
-    rate = frames_a_second(motion)
-    if cloth != "simulate" or not player.has_clothes:
-        skinned = player.skinned_clothes if cloth == "skin" else None
-        for k in rows:
-            yield world_splats(player.pose(motion.frame(k), cloth=skinned))
-        return
-    begin = max(0, rows[0] - round(PRE_ROLL * rate))
-    for k, way in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
-        posed = player.step(motion.frame(k), 1.0 / rate, way=way)
-        if k in rows:
-            yield world_splats(posed)
-    notes += player.notes
 
 
 def _writer(request: FileRequest) -> Callable[..., None]:

@@ -103,9 +103,8 @@ def motion_writers(request: FileRequest) -> tuple[float, Iterator[tuple[int, Cal
     if request.params is None:
         raise InputError("option params", expected=f"a motion to write as {request.format}", received="none")
     if request.source.suffix.lower() == SUFFIX:
-        from avatar.runtime.skeleton import skeleton_body
-
         import avatar
+        from avatar.runtime.skeleton import skeleton_body
 
         bundle = avatar.open_bundle(request.source)
         body = skeleton_body(bundle)
