@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from smplxpp.build.config import BuildConfig
 
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
@@ -16,6 +15,7 @@ from pipelines.runs.folders import keep_out_of_capture, take_file
 from pipelines.runs.layout import BUILD_STAGES, CORRECTIONS_FILE, LANDMARKS_FILE, REGISTER_STAGE, reconstructed_scan
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import load_reconstruct, load_register, stages_of
+from smplxpp.build.config import BuildConfig
 from smplxpp.build.inputs import BuildPlan, BuildRequest, plan_build
 from smplxpp.clean.remesh import require_remesher
 from smplxpp.core.files.json_file import read_json

@@ -115,9 +115,8 @@ class Register:
         Raises:
             InputError: neither a capture nor a scan, a missing file, frames that the capture has not.
         """
-        from smplxpp.build.config import RegisterInputs
-
         from pipelines.commands.capture import selected_frames
+        from smplxpp.build.config import RegisterInputs
         from smplxpp.build.inputs import named_params
         from smplxpp.capture import open_capture
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from smplxpp.build.data import LocatedInScan, Part, PosedFit, PreparedScan
 
 from pipelines.runs.layout import (
     CANONICAL,
@@ -23,6 +22,7 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.stage import MANIFEST, StageRecord
 from smplxpp.body import BodyModel, load_params
+from smplxpp.build.data import LocatedInScan, Part, PosedFit, PreparedScan
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.files.json_file import as_integer, as_numbers

@@ -11,8 +11,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from smplxpp.build.config import ReconstructInputs, RegisterInputs, resolved
-
 from pipelines.runs import layout
 from pipelines.runs.code import sha256_file
 from pipelines.runs.folders import own_run_folder
@@ -22,6 +20,7 @@ from pipelines.stages import template_stages
 from pipelines.stages.build_config import BuildConfig, BuildContext, BuildInputs, save_build, stages_of
 from pipelines.stages.reconstruct import reconstruct_capture
 from pipelines.stages.register_capture import register_capture
+from smplxpp.build.config import ReconstructInputs, RegisterInputs, resolved
 from smplxpp.build.inputs import check_inputs
 from smplxpp.core.checks import StageOutput
 from smplxpp.core.errors import InputError

@@ -9,12 +9,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
-
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, RECONSTRUCT_FILE, REGISTER_FILE
 from pipelines.runs.manifest import require_plain_fields
 from smplxpp.assemble import DarnConfig
+from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.clean import WebConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text

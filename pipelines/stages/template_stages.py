@@ -9,7 +9,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-from smplxpp.build.data import RestPart
 
 from pipelines.figures.colors import blend_joint_colors
 from pipelines.runs.artefacts import (
@@ -42,6 +41,7 @@ from pipelines.stages.build_config import BuildContext
 from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body import load_body, load_params
 from smplxpp.build.assemble import assemble_parts
+from smplxpp.build.data import RestPart
 from smplxpp.build.locate import locate_in_scan
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
 from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame

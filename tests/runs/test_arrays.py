@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from smplxpp.build.data import Part
 
 from pipelines.runs.artefacts import (
     load_arrays,
@@ -23,6 +22,7 @@ from pipelines.runs.artefacts import (
     save_arrays,
 )
 from pipelines.runs.layout import CANONICAL, PARTS_WITHOUT_WEBS, SCAN, SCAN_LABELS, WEIGHTS
+from smplxpp.build.data import Part
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.skin_weights import SkinWeights
