@@ -59,7 +59,7 @@ def capture_of_run(run: Path, given: Path | None) -> Capture | None:
 def _remembered(run: Path) -> list[Path]:
     """Folders that a run's own records name."""
     registered, built = load_register(run), load_build(run)
-    folders = [] if registered is None or registered.capture is None else [registered.capture]
+    folders = [] if registered is None or registered.root is None else [registered.root]
     if built is not None and built[0].cameras is not None:
         folders += [built[0].cameras.parent]
     return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]

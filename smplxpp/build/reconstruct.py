@@ -144,8 +144,7 @@ def surface_maker(inputs: ReconstructInputs) -> Maker:
     """Return what makes the surface of a moment: our sweep, or the adoption of another program's mesh."""
     if inputs.mesh is None:
         return partial(_sweep, config=config_of(inputs))
-    root = inputs.capture.root if isinstance(inputs.capture, Capture) else inputs.capture
-    return partial(_adopt, mesh=inputs.mesh, root=root)
+    return partial(_adopt, mesh=inputs.mesh, root=inputs.root)
 
 
 def reconstruct_frame(

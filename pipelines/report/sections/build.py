@@ -53,7 +53,7 @@ from pipelines.runs.layout import (
     VALIDATE_STAGE,
 )
 from pipelines.runs.stage import MANIFEST, StageRecord, require_stage
-from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build
+from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, stages_of
 from smplxpp.body import load_body
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.labels import CLOTH_LABELS
@@ -207,4 +207,4 @@ def rewrite_report(run: Path) -> Path | None:
     build = load_build(run)
     if build is None:
         return None
-    return write_build_report(run, *build, {name: require_stage(run, name) for name in build[0].stages})
+    return write_build_report(run, *build, {name: require_stage(run, name) for name in stages_of(build[0])})

@@ -87,7 +87,7 @@ def write_reconstruct_report(path: Path, run: Path, record: StageRecord) -> None
     section = readable(record, "Reconstruction", lambda: reconstruct_section(run, record))
     inputs = load_reconstruct(run)
     report = Report(
-        subject=run.name if inputs is None else inputs.capture.resolve().stem,
+        subject=run.name if inputs is None else inputs.root.resolve().stem,
         summary="A person's surface from photographs, cameras and masks alone.",
         key_numbers=readable_numbers(record, lambda: reconstruct_key_numbers(record)),
         checks=section.checks,

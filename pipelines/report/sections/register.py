@@ -92,7 +92,7 @@ def write_register_report(path: Path, run: Path, record: StageRecord) -> None:
     """Write a page on a registration alone."""
     section = readable(record, "Registration", lambda: register_section(run, record))
     inputs = load_register(run)
-    source = None if inputs is None else inputs.capture or inputs.scan
+    source = None if inputs is None else inputs.root or inputs.scan_file
     report = Report(
         subject=run.name if source is None else source.resolve().stem,
         summary="The body registered to what was seen of a person.",
@@ -133,8 +133,8 @@ def _pictures(inputs: RegisterInputs, fits: _Fits, content: Mapping[str, Any]) -
         for frame, count, why in chosen:
             for name in _cameras_shown(capture, content["cameras"], frame, fits)[:count]:
                 pictures.append(_on_photograph(capture, name, frame, fits, why))
-    scans = {} if inputs.capture is None else find_scans(inputs.capture)
-    scans |= {} if inputs.scan is None else {inputs.frame: inputs.scan}
+    scans = {} if inputs.root is None else find_scans(inputs.root)
+    scans |= {} if inputs.scan_file is None else {inputs.frame: inputs.scan_file}
     if reference in scans:
         pictures.append(_on_scan(scans[reference], inputs, reference, fits))
     return pictures
