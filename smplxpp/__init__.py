@@ -1,6 +1,12 @@
 """SMPLX++: personalised clothed body templates from scans, measured at every step.
 
-The names below are loaded when they are first used, so that importing the package, or its metrics alone, is quick.
+`build_template` makes a template of a scan or a capture; the other names are its parts. They are loaded when they are
+first used, so that importing the package, or its metrics alone, is quick.
+
+Example:
+    >>> result = smplxpp.build_template("scan.ply")  # doctest: +SKIP
+    >>> print(result.report)  # doctest: +SKIP
+    >>> result.template.export("anna.glb")  # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -13,6 +19,9 @@ let_workers_sleep()
 _EXPORTS: dict[str, str] = {
     "BodyModel": "smplxpp.body",
     "BodyParams": "smplxpp.core",
+    "BuildConfig": "smplxpp.build",
+    "BuildReport": "smplxpp.build",
+    "BuildResult": "smplxpp.build",
     "Camera": "smplxpp.core",
     "Capture": "smplxpp.capture",
     "GeometryWarning": "smplxpp.core",
@@ -21,11 +30,14 @@ _EXPORTS: dict[str, str] = {
     "Template": "smplxpp.template",
     "TransferConfig": "smplxpp.transfer",
     "TriangleMesh": "smplxpp.core",
+    "as_mesh": "smplxpp.core.mesh",
+    "build_template": "smplxpp.build",
     "load_body": "smplxpp.body",
     "load_params": "smplxpp.body",
     "open_capture": "smplxpp.capture",
     "pose": "smplxpp.skinning",
     "read_mesh": "smplxpp.core",
+    "read_scan": "smplxpp.build",
     "transfer_weights": "smplxpp.transfer",
     "unpose": "smplxpp.skinning",
     "write_glb": "smplxpp.export",

@@ -73,6 +73,11 @@ def load_params(
     Warns:
         GeometryWarning: frames without the chosen person, which are left out; betas that are cut and not zero, with
             their share; what a layout has that is not read.
+
+    Example:
+        >>> params = smplxpp.load_params("data/fixtures/person/params/params.npz")
+        >>> len(params)
+        16
     """
     # Files of the frames, and the layout that the first of them has.
     path = Path(path)

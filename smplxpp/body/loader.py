@@ -50,6 +50,11 @@ def load_body(
 
     Raises:
         InputError: a missing key, a wrong shape, weights that do not sum to 1, more directions asked than there are.
+
+    Example:
+        >>> body = smplxpp.load_body()
+        >>> body.forward(smplxpp.BodyParams.rest(betas=0)).vertices.shape == (1, body.vertex_count, 3)
+        True
     """
     if path is None:
         return _open_body(num_betas, num_expressions)

@@ -81,6 +81,10 @@ class BodyModel:
         expression_names: E names; numbered where the file gives none.
         landmarks: points that detectors mark, by the names of `Keypoints2D`, as weighted means of vertices: indices and
             weights that sum to 1. Those that the file has: COCO's of the open body, faces of SMPL-X; else none.
+
+    Example:
+        >>> smplxpp.load_body()
+        BodyModel('open_body', 13,886 vertices, 27,676 faces, 55 joints, 20 betas, 52 expressions)
     """
 
     name: str

@@ -66,7 +66,7 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -
     Example:
         >>> scan = smplxpp.read_scan("data/fixtures/person/scans/scan_000000.ply")
         >>> scan.clean.mesh
-        TriangleMesh(29,934 vertices, 59,804 faces)
+        TriangleMesh(39,966 vertices, 80,000 faces)
     """
     if isinstance(scan, str | Path):
         path: Path | None = Path(scan)

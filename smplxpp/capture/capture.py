@@ -43,6 +43,11 @@ class Capture:
         windows: shown part of each camera's image, and its size.
         cache: cache of decoded images.
         excluded: pairs (camera, frame) that are left out; None stands for all.
+
+    Example:
+        >>> capture = smplxpp.open_capture("data/fixtures/person")
+        >>> capture.image("Cam001", 0).shape
+        (320, 256, 3)
     """
 
     recording: Recording

@@ -65,6 +65,11 @@ def open_capture(
     Raises:
         InputError: no such folder, no matching layout or several, an unknown protocol or one with missing files, or
             what the reader refuses.
+
+    Example:
+        >>> capture = smplxpp.open_capture("data/fixtures/person", protocol="tracked")
+        >>> len(capture.cameras), len(capture.frames)
+        (8, 16)
     """
     # Absolute, because a worker of a data loader may have another working directory.
     root = Path(path).absolute()

@@ -21,6 +21,12 @@ class Camera:
         height: of the image in pixels.
         orthographic: parallel projection instead of a pinhole.
         name: for messages and files.
+
+    Example:
+        >>> K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> camera = smplxpp.Camera(K, np.eye(4), 640, 480)
+        >>> camera.screen_from_world(np.array([[0.0, 0.0, 2.0]]))[0, :2]
+        array([320., 240.])
     """
 
     K: Float64[np.ndarray, "3 3"]

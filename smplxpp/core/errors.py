@@ -21,6 +21,13 @@ class InputError(ValueError):
         expected: what would have been accepted.
         received: what was found instead.
         remedy: what the user can do about it (optional).
+
+    Example:
+        >>> try:
+        ...     smplxpp.load_body("nothing.npz")
+        ... except smplxpp.InputError as error:
+        ...     print(error.expected)
+        an existing file
     """
 
     def __init__(self, subject: str, *, expected: str, received: str, remedy: str = "") -> None:
@@ -30,7 +37,13 @@ class InputError(ValueError):
 
 
 class GeometryWarning(UserWarning):
-    """A repair that was made or a questionable quantity: the result is usable, but should be looked at."""
+    """A repair that was made or a questionable quantity: the result is usable, but should be looked at.
+
+    Example:
+        >>> with warnings.catch_warnings():
+        ...     warnings.simplefilter("error", smplxpp.GeometryWarning)  # a repair is an error here
+        ...     scan = smplxpp.read_scan("data/fixtures/person/scans/scan_000000.ply")
+    """
 
 
 class MissingExtraError(ImportError):

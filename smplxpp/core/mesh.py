@@ -30,6 +30,11 @@ class TriangleMesh:
 
     Raises:
         InputError: wrong shapes, NaN or infinite coordinates, indices out of range.
+
+    Example:
+        >>> mesh = smplxpp.TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+        >>> mesh.face_normals
+        array([[0., 0., 1.]])
     """
 
     vertices: Float64[np.ndarray, "N 3"]

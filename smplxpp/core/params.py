@@ -55,6 +55,10 @@ class BodyParams:
 
     Raises:
         InputError: wrong widths, unequal numbers of frames (one frame stands for all), NaN or infinity.
+
+    Example:
+        >>> smplxpp.load_params("data/fixtures/person/params/params.npz").frame(3)
+        BodyParams(1 frames at 10 a second, 20 betas, 52 expressions)
     """
 
     global_orient: Float64[np.ndarray, "T 3"]

@@ -23,6 +23,13 @@ class SkinWeights:
         angle: (N,) float64 radians between the normals there (NaN where unknown).
         component: (N,) int32 connected component of each vertex.
         policies: the policy taken for each component ("matched", "nearest", "rigid:head", ...).
+
+    Example:
+        >>> weights = smplxpp.SkinWeights.from_dense(np.array([[0.25, 0.75], [1.0, 0.0]]))
+        >>> weights
+        SkinWeights(2 vertices over 2 joints, at most 2 a vertex)
+        >>> weights.dense()[0]
+        array([0.25, 0.75])
     """
 
     joint_indices: Int32[np.ndarray, "N K"]

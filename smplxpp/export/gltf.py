@@ -38,6 +38,9 @@ def write_glb(
 
     Warns:
         GeometryWarning: an animation of a template with pose correctives, which glTF's skinning leaves out.
+
+    Example:
+        >>> smplxpp.write_glb("anna.glb", template, animation=params)  # doctest: +SKIP
     """
     gltf = pygltflib.GLTF2(
         asset=pygltflib.Asset(version="2.0", generator=f"smplxpp {metadata.version('smplxpp')}"), scene=0

@@ -83,6 +83,12 @@ def pose(
 
     Raises:
         InputError: shapes that do not fit, NaN, transforms that are not affine.
+
+    Example:
+        >>> vertices, weights = np.array([[0.0, 1.0, 0.0]]), np.array([[1.0]])
+        >>> moved = np.eye(4)[None] + [[[0, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]]
+        >>> smplxpp.pose(vertices, weights, moved)
+        array([[2., 1., 0.]])
     """
     rest, dense, transforms, offsets = _checked("rest vertices", rest_vertices, weights, posed_from_rest, rest_offsets)
     return skin(rest + offsets, dense, transforms)
@@ -121,8 +127,11 @@ def unpose(
         GeometryWarning: a determinant below `config.warn_below`.
 
     Example:
-        >>> posed = body.forward(params).frame(0)
-        >>> unpose(posed.vertices, body.weights, posed.posed_from_rest).vertices  # posed.rest_vertices, to 1e-9
+        >>> body = smplxpp.load_body()
+        >>> posed = body.forward(smplxpp.load_params("data/fixtures/person/params/params.npz")).frame(0)
+        >>> found = smplxpp.unpose(posed.vertices, body.weights, posed.posed_from_rest)
+        >>> bool(np.allclose(found.vertices, posed.rest_vertices, atol=1e-9))
+        True
     """
     config = config or UnposeConfig()
     posed, dense, transforms, offsets = _checked(

@@ -65,6 +65,12 @@ class Template:
 
     Raises:
         InputError: arrays that do not fit each other.
+
+    Example:
+        >>> template = smplxpp.Template.load("anna.npz")  # doctest: +SKIP
+        >>> template.pose(smplxpp.load_params("walk.npz")).shape  # doctest: +SKIP
+        (120, 24400, 3)
+        >>> template.export("anna.usdc")  # doctest: +SKIP
     """
 
     body: BodyModel

@@ -51,6 +51,10 @@ class TransferConfig:
         averaging_steps: Jacobi averaging over unmatched vertices at the end (rate 0.2).
         joint_names: names for `allowed_joints` and `unmatched`; None takes the names of the SMPL family by the number
             of joints.
+
+    Example:
+        >>> smplxpp.TransferConfig.for_label("lower").max_influences
+        8
     """
 
     falloff: float | None = 6.0

@@ -68,8 +68,12 @@ def transfer_weights(
         GeometryWarning: repaired winding, a part inside out, components without a match that took the nearest weights.
 
     Example:
-        >>> weights = transfer_weights(body_mesh, body.weights, skirt, config=TransferConfig.for_label("lower"))
-        >>> weights.dense().sum(axis=1)  # all 1
+        >>> body = smplxpp.load_body()
+        >>> shirt = body.mesh(1.02 * body.v_template).submesh(np.arange(0, 2000))[0]
+        >>> config = smplxpp.TransferConfig.for_label("upper")
+        >>> weights = smplxpp.transfer_weights(body.mesh(), body.weights, shirt, config=config)
+        >>> bool(np.allclose(weights.dense().sum(axis=1), 1.0))
+        True
     """
     source = as_mesh(source, subject="source mesh")
     target = as_mesh(target, subject="target mesh")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.stages import register_capture
 from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.build import register as register_step
 from smplxpp.capture import Capture
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.params import BodyParams
@@ -68,7 +68,7 @@ def joints_in(capture: Capture, camera: str) -> Keypoints2D:
 def use_solver(monkeypatch, **choices) -> Solver:
     """Let registrations be made by a `Solver`."""
     solver = Solver(**choices)
-    monkeypatch.setattr(register_capture, "register", solver)
+    monkeypatch.setattr(register_step, "register", solver)
     return solver
 
 

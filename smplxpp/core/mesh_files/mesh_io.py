@@ -43,6 +43,10 @@ def read_mesh(path: str | Path) -> MeshFile:
 
     Raises:
         InputError: missing, unknown or unreadable file, no faces, or what `TriangleMesh` refuses.
+
+    Example:
+        >>> smplxpp.read_mesh("data/fixtures/person/scans/scan_000000.ply").mesh
+        TriangleMesh(39,966 vertices, 80,000 faces)
     """
     raw = read_raw_mesh(path)
     try:

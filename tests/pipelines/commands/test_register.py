@@ -12,6 +12,7 @@ from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.register import Register
 from pipelines.stages.build_config import RegisterInputs, load_register, save_register
+from pipelines.stages.register_capture import observed_digests
 from smplxpp.core.errors import InputError
 from tests.pipelines.registrations import FIXTURE, use_keypoints, use_solver
 
@@ -92,7 +93,7 @@ def test_named_landmarks_are_kept_in_the_run(tmp_path, solver, capsys):
 
 def registration_of(out, **options) -> RegisterInputs | None:
     command = Build(out=out, capture=options.pop("capture", FIXTURE), **options)
-    return command.registration(command.inputs())
+    return command.plan().registration
 
 
 def test_a_build_registers_where_the_capture_says_that_its_parameters_are_tracked(tmp_path):
@@ -109,10 +110,10 @@ def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
     capture = shutil.copytree(FIXTURE, tmp_path / "capture", ignore=unused)
     with pytest.raises(InputError, match=r"params/000000\.npz"):
         registration_of(tmp_path, capture=capture, register="off")
-    without = Build(out=tmp_path / "run", capture=capture).inputs()
+    without = Build(out=tmp_path / "run", capture=capture).plan().inputs
     assert without.stages[:2] == ("03_locate", "05_register")
     (capture / "keypoints").mkdir()
-    found = Build(out=tmp_path / "run", capture=capture).inputs()
+    found = Build(out=tmp_path / "run", capture=capture).plan().inputs
     assert found.params is None and found.motion is None and found.stages[0] == "05_register"
     assert registration_of(tmp_path, capture=capture).start
 
@@ -140,7 +141,7 @@ def test_a_scan_is_registered_when_asked(tmp_path):
 
 def test_options_reach_the_inputs(tmp_path):
     command = Register(out=tmp_path, capture=FIXTURE, initial="none", frames="0:4:2", hold_out=("Cam001",), frame=2)
-    inputs = command.inputs()
+    inputs = command.plan().inputs
     assert (inputs.start, inputs.frames, inputs.hold_out, inputs.frame) == (False, (0, 2), ("Cam001",), 2)
 
 
@@ -175,7 +176,9 @@ def test_a_folder_of_scans_takes_the_place_of_the_captures(tmp_path):
     inputs = Register(out=tmp_path / "run", capture=FIXTURE, frames="0:4", scans=folder).inputs()
     body = load_body()
     seen = observe(inputs, body)
-    assert set(seen.observations.scans) == {0, 2} and "scan of frame 2" in seen.digests
+    assert set(seen.observations.scans) == {0, 2} and "scan of frame 2" in observed_digests(
+        seen, inputs, landmarks=None
+    )
     (tmp_path / "run").mkdir()
     save_register(tmp_path / "run", inputs)
     assert load_register(tmp_path / "run") == inputs

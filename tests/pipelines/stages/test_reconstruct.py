@@ -81,7 +81,7 @@ def test_it_stands_and_is_made_anew_for_other_options(run):
 
 def test_frames_that_were_finished_before_a_kill_are_not_made_again(tmp_path, monkeypatch):
     inputs = ReconstructInputs(FIXTURE, (0, 2), refine=False, cell_mm=40.0)
-    made, whole = [], stage_module._make_frame
+    made, whole = [], stage_module._keep_frame
 
     def killed(folder, capture, cameras, frame, *rest):
         if made:
@@ -89,7 +89,7 @@ def test_frames_that_were_finished_before_a_kill_are_not_made_again(tmp_path, mo
         made.append(frame)
         whole(folder, capture, cameras, frame, *rest)
 
-    monkeypatch.setattr(stage_module, "_make_frame", killed)
+    monkeypatch.setattr(stage_module, "_keep_frame", killed)
     with pytest.raises(KeyboardInterrupt):
         reconstruct_capture(tmp_path, inputs)
 
@@ -97,7 +97,7 @@ def test_frames_that_were_finished_before_a_kill_are_not_made_again(tmp_path, mo
         made.append(frame)
         whole(folder, capture, cameras, frame, *rest)
 
-    monkeypatch.setattr(stage_module, "_make_frame", counted)
+    monkeypatch.setattr(stage_module, "_keep_frame", counted)
     record = reconstruct_capture(tmp_path, inputs)
     assert made == [0, 2]
     assert record.manifest["numbers"]["seen"]["frames"] == [0, 2]
