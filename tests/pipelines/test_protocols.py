@@ -123,7 +123,7 @@ def test_label_maps_come_first_and_the_scans_own_labels_only_when_asked_for(root
     (root / "scans" / "scan_000000_labels.npz").unlink()
     assert inputs().labels is None and inputs().label_maps == {}  # the body in the scan is to tell
     with pytest.raises(InputError, match="with --capture"):
-        Build(out=tmp_path, scan=root / "scans" / "scan_000000.ply", protocol="tracked").plan().inputs
+        Build(out=tmp_path, scan=root / "scans" / "scan_000000.ply", protocol="tracked").plan()
 
 
 def test_held_out_cameras_do_not_vote(root, tmp_path):

@@ -141,7 +141,7 @@ def test_a_scan_is_registered_when_asked(tmp_path):
 
 def test_options_reach_the_inputs(tmp_path):
     command = Register(out=tmp_path, capture=FIXTURE, initial="none", frames="0:4:2", hold_out=("Cam001",), frame=2)
-    inputs = command.plan().inputs
+    inputs = command.inputs()
     assert (inputs.start, inputs.frames, inputs.hold_out, inputs.frame) == (False, (0, 2), ("Cam001",), 2)
 
 
