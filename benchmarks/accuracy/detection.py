@@ -241,7 +241,7 @@ def _point_errors(capture: Capture, body: BodyModel, frames: tuple[int, ...]) ->
             for group, errors in by_group.items()
         },
         "in_space": {group: _of_points(apart[:, groups == group]) for group in _GROUPS},
-        "triangulation_problems": in_space.problems,
+        "triangulation_problems": in_space.notes,
     }
 
 
@@ -261,7 +261,7 @@ def _registered(
         fit = register(body, case, RegisterConfig())
         spent = {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - cpu}
         own = exact.select(np.flatnonzero(np.isin(frames, fit.frames)))
-        rows[name] = asdict(pose_error(fit.params, own, body, covered)) | spent | {"problems": fit.problems}
+        rows[name] = asdict(pose_error(fit.params, own, body, covered)) | spent | {"problems": fit.notes}
         print(name, rows[name], flush=True)
     return rows
 

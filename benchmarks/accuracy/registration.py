@@ -78,7 +78,7 @@ class RegistrationBenchmark:
                 "cpu_seconds": spent,
                 "residuals": {key: float(np.nanmean(values)) for key, values in fit.residuals.items()},
             }
-            print(name, rows[name], *fit.problems, sep="\n  ", flush=True)
+            print(name, rows[name], *fit.notes, sep="\n  ", flush=True)
         rows |= self._refined(truth)
         if self.store:
             figures = {

@@ -97,7 +97,7 @@ def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, fl
         "worst_joint_mm": float(joints.max()),
         "facing_degrees": _facing_off(body, found.params, scan.params),
         "confidence": found.confidence,
-        "problems": list(found.problems),
+        "problems": list(found.notes),
         "cpu_seconds": seconds,
     }
     if labels:
