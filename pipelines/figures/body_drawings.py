@@ -28,20 +28,20 @@ def draw_keypoints(
     *,
     least: float = 0.3,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw points with a confidence of at least `least` as discs, the fainter the less sure they are."""
+    """Draw points with a confidence of at least `least` as discs, fainter for lower confidence."""
     height, width = picture.shape[:2]
     size = (_FINE * width, _FINE * height)
     whole = Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR).convert("RGBA")
     layer = Image.new("RGBA", size)
     draw = ImageDraw.Draw(layer)
-    for name, (x, y), sure in zip(names, _FINE * np.asarray(points), confidence, strict=True):
-        if sure < least:
+    for name, (x, y), certainty in zip(names, _FINE * np.asarray(points), confidence, strict=True):
+        if certainty < least:
             continue
         color = LEFT if "left_" in name else RIGHT if "right_" in name else MIDDLE
         share = _SMALL if name[-1].isdigit() or name.endswith("_tip") else _RADIUS
         radius = share * max(size)
         box = [x - radius, y - radius, x + radius, y + radius]
-        draw.ellipse(box, fill=(*color, round(80 + 175 * min(float(sure), 1.0))))
+        draw.ellipse(box, fill=(*color, round(80 + 175 * min(float(certainty), 1.0))))
     drawn = Image.alpha_composite(whole, layer).convert("RGB")
     return np.asarray(drawn.resize((width, height), Image.Resampling.BOX))
 

@@ -63,14 +63,16 @@ def _write_mp4(
     program = imageio_ffmpeg.get_ffmpeg_exe()
     with (
         atomic_path(path) as temporary,
-        tempfile.TemporaryFile() as said,
+        tempfile.TemporaryFile() as output,
         tempfile.NamedTemporaryFile(suffix=".wav") as heard,
     ):
         if sound is not None:
             heard.write(wave_bytes(sound))
             heard.flush()
         audio = None if sound is None else Path(heard.name)
-        encoder = subprocess.Popen(_encoding(program, temporary, fps, size, audio), stdin=subprocess.PIPE, stderr=said)
+        encoder = subprocess.Popen(
+            _encoding(program, temporary, fps, size, audio), stdin=subprocess.PIPE, stderr=output
+        )
         count = 0
         assert encoder.stdin is not None  # a pipe was asked for
         try:
@@ -78,7 +80,7 @@ def _write_mp4(
                 encoder.stdin.write(np.ascontiguousarray(frame).data)
                 count += 1
             encoder.stdin.close()
-        except BrokenPipeError:  # it ended: its status and words say why
+        except BrokenPipeError:  # the encoder ended; its status and output give the reason
             with suppress(BrokenPipeError):
                 encoder.stdin.close()  # of what it had not taken yet
         except BaseException:
@@ -86,8 +88,8 @@ def _write_mp4(
             raise
         finally:
             encoder.wait()
-        said.seek(0)
-        words = said.read().decode(errors="replace")
+        output.seek(0)
+        words = output.read().decode(errors="replace")
         # An encoder whose disk is full may end with 0: what counts is the film.
         if encoder.returncode or imageio_ffmpeg.count_frames_and_secs(str(temporary))[0] != count:
             raise _encoder_error(encoder.returncode, words)

@@ -63,10 +63,10 @@ def histogram_svg(histogram: Histogram) -> str:
         y = base - plot_height * tick / top
         out.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
         out.append(f'<text class="tick" x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:g} %</text>')
-    beyond = values > high
+    cut_off = values > high
     for k in np.flatnonzero(counts):
         height = plot_height * share[k] / top
-        last = k == _BINS - 1 and beyond.any()
+        last = k == _BINS - 1 and cut_off.any()
         label = f"{format_value(float(edges[k]))} to {'more' if last else format_value(float(edges[k + 1]))}{unit}"
         out.append(
             f'<rect class="{"bar beyond" if last else "bar"}" x="{x(edges[k]) + 0.5:.1f}" y="{base - height:.2f}" '
@@ -78,7 +78,7 @@ def histogram_svg(histogram: Histogram) -> str:
         out.append(f'<text class="tick" x="{x(tick):.1f}" y="{base + 17}" text-anchor="middle">{tick:g}</text>')
     out.append(
         f'<text class="tick" x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 6}" text-anchor="end">{escape(histogram.unit)}'
-        + (f" · {100 * beyond.mean():.2g} % lie beyond the axis" if beyond.any() else "")
+        + (f" · {100 * cut_off.mean():.2g} % exceed the axis" if cut_off.any() else "")
         + "</text>"
     )
     marks = ("p5", "p50", "p95") if low < 0 else ("p50", "p95", "p99")
@@ -178,7 +178,7 @@ def _range(histogram: Histogram, values: Num[np.ndarray, " N"]) -> tuple[float, 
     signed = values.min() < 0
     reach = histogram.upper
     if reach is None:
-        # A gate far beyond the data would squeeze the bars to nothing: it is left out of the axis then.
+        # A gate far outside of the data is left out of the axis, because it would squeeze the bars to nothing.
         reach = float(np.percentile(np.abs(values), 99.5))
         reach = max([reach, *(1.05 * abs(gate) for _, gate in histogram.gates if abs(gate) <= 3.0 * reach)])
     reach = reach if reach > 0 else 1.0

@@ -56,7 +56,7 @@ class CheckRow:
 
     @property
     def shown(self) -> str:
-        """The value with its unit."""
+        """Return the value as text with its unit."""
         return "not a number" if self.value is None else f"{format_value(self.value)} {self.unit}".strip()
 
 
@@ -125,12 +125,14 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """A distribution with its gates.
+    """Histogram of a distribution with its gates.
 
     Attributes:
-        values: of the distribution; values that are not finite are counted and named, not drawn.
+        title: title of the picture.
+        values: samples of the distribution; values that are not finite are counted and not drawn.
+        unit: unit of the values.
         gates: (label, value) drawn as dashed lines.
-        upper: end of the axis; the rest is counted in the last bar. Default: the 99.5th percentile, gates included.
+        upper: end of the axis; larger values are counted in the last bar. By default the 99.5th percentile, with gates.
     """
 
     title: str
@@ -145,8 +147,10 @@ class Curve:
     """Quantities over one axis, a line each.
 
     Attributes:
+        title: title of the picture.
         lines: name -> (x, y), x ascending; points that are not finite are left out.
-        x_label, unit: of the axes.
+        x_label: label of the x axis.
+        unit: unit of the y axis.
     """
 
     title: str
@@ -166,7 +170,7 @@ class KeyNumber:
 
 @dataclass(frozen=True)
 class Section:
-    """One stage or topic.
+    """Section of the report on one stage or topic.
 
     Attributes:
         text: paragraphs, plain text.
@@ -188,15 +192,16 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A whole report.
+    """Content of a whole report.
 
     Attributes:
-        subject: who or what the run is of. summary: one or two sentences.
+        subject: name of the run's person.
+        summary: one or two sentences.
         hero: pictures beside the title.
         checks: all checks of the run; the verdict counts them.
         seconds: wall-clock seconds by stage, in order.
         provenance: title -> {key: value}: configuration, versions, seeds, SHA-256 of the inputs.
-        kind: what of the project the report is on, in a word.
+        kind: kind of the report, in a word.
     """
 
     subject: str

@@ -1,4 +1,4 @@
-"""What of a scan lies under the pointer: rays, and the line that a drag of it leaves on the surface."""
+"""Find the surface under the pointer: intersections of rays, and the line that a drag draws on the surface."""
 
 from __future__ import annotations
 
@@ -9,21 +9,16 @@ from jaxtyping import Float, Float64
 
 from smplxpp.segment.corrected_faces import ScanSurface
 
-# Points of a line that jump by more than this share of the brush, or this many metres, are on another piece of surface.
-_JUMP_RADII, _LEAST_JUMP = 2.0, 0.03
-# Rays a radius of the brush, between two places of the pointer.
-_RAYS, _MOST_RAYS = 2.0, 64
-# Points of a line nearer to each other than this share of the brush say nothing more; longer lines are cut.
-_NEAR_RADII, _MOST_POINTS = 0.2, 2000
-
 
 @dataclass(frozen=True, eq=False)
 class Hit:
-    """Where a ray meets a scan.
+    """Intersection of a ray with a scan.
 
     Attributes:
-        face: number. point: metres. normal: the face's, turned to where the ray comes from.
-        distance: from the ray's origin, metres.
+        face: number of the face.
+        point: intersection, metres.
+        normal: normal of the face, on the side of the ray's origin.
+        distance: distance from the ray's origin, metres.
     """
 
     face: int
@@ -33,7 +28,7 @@ class Hit:
 
 
 def hits(surface: ScanSurface, origin: Float[np.ndarray, " 3"], direction: Float[np.ndarray, " 3"]) -> list[Hit]:
-    """All places where a ray meets the scan, nearest first."""
+    """Return all intersections of a ray with the scan, nearest first."""
     start = np.ascontiguousarray(origin, dtype=np.float64)
     along = np.asarray(direction, dtype=np.float64)
     along = np.ascontiguousarray(along / np.linalg.norm(along))
@@ -48,7 +43,7 @@ def hits(surface: ScanSurface, origin: Float[np.ndarray, " 3"], direction: Float
 
 
 def first_hit(surface: ScanSurface, origin: Float[np.ndarray, " 3"], direction: Float[np.ndarray, " 3"]) -> Hit | None:
-    """The nearest of them; None where the ray misses the scan."""
+    """Return the nearest intersection, or None if the ray misses the scan."""
     found = hits(surface, origin, direction)
     return found[0] if found else None
 
@@ -56,10 +51,10 @@ def first_hit(surface: ScanSurface, origin: Float[np.ndarray, " 3"], direction: 
 def middle_of_limb(
     surface: ScanSurface, origin: Float[np.ndarray, " 3"], direction: Float[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " 3"] | None:
-    """The middle between where a ray enters a limb and where it leaves it: about where its joint is.
+    """Return the middle between a ray's entry into a limb and its exit, which is about the joint's centre.
 
-    It leaves at the first face behind the first one that faces away from the ray's origin. None where it misses, and
-    where it finds no way out, as of a scan that is open at the back.
+    The exit is the first face behind the entry that faces away from the ray's origin. None if the ray misses or does
+    not exit, as in a scan that is open at the back.
     """
     found = hits(surface, origin, direction)
     along = np.asarray(direction, dtype=np.float64)
@@ -75,15 +70,19 @@ def line_under(
     places: Float[np.ndarray, "n 3"],
     radius: float,
 ) -> list[tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]]:
-    """Points and normals of the scan under a pointer that was dragged.
+    """Return points and normals of the scan under a dragged pointer.
 
     Args:
-        origin: of the camera. places: that the pointer went through, on any plane before it.
-        radius: of the brush, metres.
+        surface: the scan.
+        origin: centre of the camera.
+        places: positions of the pointer, on any plane before the camera.
+        radius: radius of the brush, metres.
 
     Returns:
-        A line for each piece of surface: where the pointer leaves the scan, or jumps to a limb behind, another begins.
+        A line for each piece of surface: a new one begins where the pointer leaves the scan or jumps to a limb behind.
     """
+    # A jump of more than two radii (at least 3 cm) is another piece of surface. Points within a fifth of the radius add
+    # nothing and are dropped; lines of 2,000 points are continued in a new one.
     lines: list[list[Hit]] = []
     last: Hit | None = None
     for place in _between(np.asarray(places, dtype=np.float64), radius):
@@ -92,22 +91,22 @@ def line_under(
             last = None
             continue
         step = np.inf if last is None else float(np.linalg.norm(hit.point - last.point))
-        if step > max(_JUMP_RADII * radius, _LEAST_JUMP):
+        if step > max(2.0 * radius, 0.03):
             lines.append([hit])
-        elif len(lines[-1]) >= _MOST_POINTS:
+        elif len(lines[-1]) >= 2000:
             lines.append([lines[-1][-1], hit])
-        elif np.linalg.norm(hit.point - lines[-1][-1].point) > _NEAR_RADII * radius:
+        elif np.linalg.norm(hit.point - lines[-1][-1].point) > 0.2 * radius:
             lines[-1].append(hit)
         last = hit
     return [(np.stack([hit.point for hit in line]), np.stack([hit.normal for hit in line])) for line in lines]
 
 
 def _between(places: Float64[np.ndarray, "n 3"], radius: float) -> Float64[np.ndarray, "m 3"]:
-    """Places as close to each other as the brush needs."""
+    """Return places at most half a radius apart, at most 64 between two positions of the pointer."""
     if len(places) == 1:
         return places
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    counts = np.clip(np.ceil(_RAYS * steps / radius), 1, _MOST_RAYS).astype(int)
+    counts = np.clip(np.ceil(2.0 * steps / radius), 1, 64).astype(int)
     parts = [
         places[k] + np.arange(count)[:, None] / count * (places[k + 1] - places[k]) for k, count in enumerate(counts)
     ]

@@ -36,11 +36,14 @@ _SHOWN = {"psnr_crop": "PSNR {:.1f} dB", "loss": "loss {:.4g}"}
 
 @dataclass(frozen=True)
 class TrainingNow:
-    """Where a training stands.
+    """Progress of a running training.
 
     Attributes:
-        stage: its name. words: step and figures. age: seconds since its log grew.
-        picture: the newest one, if there is any. state: its checkpoint, if there is one.
+        stage: name of the stage.
+        words: step and figures as text.
+        age: seconds since its log grew.
+        picture: newest preview, or None.
+        state: checkpoint, or None.
     """
 
     stage: str
@@ -50,16 +53,17 @@ class TrainingNow:
     state: Path | None
 
     def __str__(self) -> str:
-        """One line for the window."""
+        """Return one line of text for the window."""
         still = "" if self.age < _OLD else f", and nothing for {self.age / 60:.0f} minutes: it may have been stopped"
         return f"training `{self.stage}`: {self.words}{still}"
 
 
 def training_now(run: Path, *, clock: float | None = None) -> TrainingNow | None:
-    """Look at the last stage of a run that has state and was not finished; None: no training is under way.
+    """Return the progress of the last unfinished stage of a run that has state, or None.
 
     Args:
-        clock: seconds, as files' times are; None: now.
+        run: folder of the run.
+        clock: current time in seconds; None for now.
     """
     for name in reversed((REFINE_STAGE, *MODEL_STAGES)):
         folder = run / f"{name}{_WORK}"
@@ -106,16 +110,17 @@ log = logging.getLogger(__name__)
 _NEWEST_FIRST = (STUDENT, BAKED, GAUSSIANS)
 _FEWEST = 1e-6
 Surface = Callable[[int, BodyParams], Float[np.ndarray, "V 3"] | None]
-"""Frame and its parameters to vertices in the world, metres; None for a frame that was not followed."""
+"""Returns the vertices in the world, metres, of a frame and its parameters; None for a frame that was not tracked."""
 
 
 @dataclass(frozen=True)
 class SplatSource:
-    """The file that Gaussians come from; two that are equal have the same ones.
+    """Source of the Gaussians that are shown; equal sources have equal Gaussians.
 
     Attributes:
-        file: of a stage. state: checkpoint of a training whose attributes take the file's place; None: none.
-        changed: when both were written.
+        file: file of a stage.
+        state: checkpoint of a training whose attributes replace those of the file, or None.
+        changed: modification times of both.
     """
 
     file: Path
@@ -124,7 +129,7 @@ class SplatSource:
 
     @property
     def words(self) -> str:
-        """Which stage they are of."""
+        """Return the stages of the Gaussians as text."""
         of_file = self.file.parent.name
         if self.state is None:
             return of_file

@@ -25,12 +25,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class ShownMotion:
-    """What the viewer goes through.
+    """Frames that the viewer can show.
 
     Attributes:
-        params: T frames, without shape. numbers: of the capture's frames, or 0 to T - 1.
-        fps: frames a second. source: where they come from, in words.
-        photographed: the numbers are those of photographs.
+        params: T frames, without shape.
+        numbers: frame numbers of the capture, or 0 to T - 1.
+        fps: frames a second.
+        source: description of their origin.
+        photographed: whether photographs of these frames exist.
     """
 
     params: BodyParams

@@ -22,10 +22,11 @@ _GREY = (205, 205, 212)
 
 
 class RunScene:
-    """The scene of one server.
+    """Scene of one viser server.
 
     Args:
-        server: viser's. session: what is shown at first.
+        server: the server.
+        session: session that is shown first.
     """
 
     def __init__(self, server: Any, session: RunSession) -> None:
@@ -48,12 +49,12 @@ class RunScene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The nodes that are there and seen."""
+        """Return the names of the visible nodes."""
         return tuple(name for name, node in self._nodes.items() if node.visible)
 
     @property
     def eye(self) -> Float[np.ndarray, " 3"]:
-        """Where somebody looks from: the first window's camera, or the front."""
+        """Return the eye point: that of the first window's camera, or one in front of the person."""
         for client in self._server.get_clients().values():
             return np.array(client.camera.position)
         return self._front
@@ -73,7 +74,7 @@ class RunScene:
                 self._hide(_path(layer))
 
     def draw_splats(self, session: RunSession, *, shown: bool) -> None:
-        """Draw the Gaussians."""
+        """Draw the Gaussians of the session."""
         splats = session.splats(self.eye) if shown else None
         if splats is None:
             self._hide(SPLATS)
@@ -121,7 +122,7 @@ class RunScene:
 
     @property
     def photographs(self) -> int:
-        """How many photographs stand there."""
+        """Return the number of photographs in the scene."""
         return len(self._frusta)
 
     def step_back(self) -> None:

@@ -40,7 +40,7 @@ COLORINGS: tuple[Coloring, ...] = ("photograph", "labels", "weights", "one joint
 TURNED = SMPLX_JOINTS[:23]
 """Joints that can be turned by hand: the body's and the jaw."""
 _FOLLOWED = 1.0
-"""Seconds of the motion that clothes follow at once; after more they start anew."""
+"""Longest jump of the motion, in seconds, that loose clothes follow; after a longer one they restart."""
 _PLACES = {
     name: (block, 3 * k)
     for (block, count), first in zip(POSE_BLOCKS[:3], (0, 1, 22), strict=True)
@@ -77,16 +77,21 @@ class _Step:
 
 @dataclass(eq=False)
 class RunSession:
-    """What is shown of a run.
+    """State of a run in the viewer.
 
     Attributes:
-        run: its folder. template, motion: posed, and through which frames. capture: the photographs; None: none.
-        player: draws the Gaussians of `source`; None: the run has none yet. tracked: the surface that was followed.
-        now: the training that is under way.
-        relighting: another light than the capture's, which the Gaussians are shown in; None: there is none.
-        relit: whether they are.
-        simulated: loose clothes follow what is shown, frame after frame; else field and skinning say where they are.
-        at: row of the motion. turned: degrees about x, y and z by which joints are turned beyond the frame's pose.
+        run: folder of the run.
+        template: template that is posed.
+        motion: frames that can be shown.
+        capture: photographs, or None.
+        player: draws the Gaussians of `source`; None without Gaussians.
+        tracked: the tracked surface, or None.
+        now: progress of a running training, or None.
+        relighting: another light than the capture's, or None.
+        relit: whether the Gaussians are shown in it.
+        simulated: whether loose clothes are simulated along the shown frames; else field and skinning move them.
+        at: row of the motion.
+        turned: additional rotation of joints relative to the frame's pose, degrees about x, y and z.
         expression: added to the frame's coefficients.
     """
 
@@ -133,7 +138,7 @@ class RunSession:
         self.at = row % len(self.motion.numbers)
 
     def turn(self, joint: str, degrees: tuple[float, float, float]) -> None:
-        """Turn a joint beyond what the frame has."""
+        """Turn a joint relative to the frame's pose."""
         require_choice("joint", joint, TURNED)
         self.turned[joint] = degrees
 

@@ -17,10 +17,9 @@ from smplxpp.core.files.image_file import open_image
 
 log = logging.getLogger(__name__)
 LOOK_EVERY = 3.0
-"""Seconds between two looks at what a training has left."""
-_DEGREES = 120.0
-_EXPRESSIONS = 10
-_STRONGEST = 3.0
+"""Seconds between two checks for new files of a training."""
+# Ranges of the controls: degrees of a joint, number of expressions with a slider, and bound of a numbered coefficient.
+_DEGREES, _EXPRESSIONS, _STRONGEST = 120.0, 10, 3.0
 _NONE = "none"
 
 
@@ -34,10 +33,11 @@ def open_run_window(session: RunSession, *, host: str = "127.0.0.1", port: int =
 
 
 class RunWindow:
-    """One window on one session.
+    """Window of a viser server on one session.
 
     Args:
-        server: viser's.
+        server: the server.
+        session: the session.
     """
 
     def __init__(self, server: Any, session: RunSession) -> None:
@@ -54,7 +54,7 @@ class RunWindow:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """Return the address for a browser."""
         return address_of(self.server)
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class RunWindow:
         self._listen(reset)
 
     def _listen(self, reset: Any) -> None:
-        """Say what the controls do."""
+        """Connect the controls with their actions."""
         self._frame.on_update(lambda _: self._go())
         self._photographs.on_update(lambda _: self._photograph(step_back=True))
         self._play.on_update(lambda _: None if self._play.value else self._photograph())
@@ -210,7 +210,7 @@ class RunWindow:
 
     def _tell(self) -> None:
         now = self.session.now
-        self._training.content = "none is under way" if now is None else str(now)
+        self._training.content = "none is running" if now is None else str(now)
         if now is None or now.picture is None:
             self._preview.visible = False
             return

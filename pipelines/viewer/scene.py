@@ -10,25 +10,25 @@ from jaxtyping import Float, Float64, Int, Int64, UInt8
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from pipelines.figures.colors import heat_colors
-from pipelines.viewer.session import DoubtfulRegion, LabelSession, lies_within
+from pipelines.viewer.session import LabelSession, UncertainRegion, lies_within
 from smplxpp.core.labels import LABELS, display_colors
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
 from smplxpp.export.gltf_mesh import linear_rgba16
 
 MOST_SPLIT_FACES = 250_000
-"""Scans of more faces are drawn with colours of vertices: every face with corners of its own would take too long."""
+"""Scans with more faces are drawn with vertex colours, because separate corners for every face would take too long."""
 _LIFT = 0.0007
-"""Metres by which what is painted lies above the scan."""
+"""Distance of painted faces above the scan, metres, against flickering depth."""
 
 
 def label_colors(labels: Int[np.ndarray, " M"]) -> UInt8[np.ndarray, "M 3"]:
-    """Display colours of labels."""
+    """Return the display colours of labels."""
     return display_colors(labels)
 
 
 def confidence_colors(confidence: Float64[np.ndarray, " M"]) -> UInt8[np.ndarray, "M 3"]:
-    """Pale where labels are sure, dark red where they are not."""
+    """Return colours of confidence: pale where it is high, dark red where it is low."""
     return heat_colors(1.0 - confidence, cmap="error", limits=(0.0, 1.0))
 
 
@@ -95,10 +95,11 @@ _FIELD = np.radians(40.0)
 
 
 class ScanScene:
-    """The scene of one server.
+    """Scene of one viser server.
 
     Args:
-        server: viser's. session: what is shown at first.
+        server: the server.
+        session: session that is shown first.
     """
 
     def __init__(self, server: Any, session: LabelSession) -> None:
@@ -173,7 +174,7 @@ class ScanScene:
         dimensions = tuple(np.asarray(size).tolist())
         return gizmo, scene.add_box("/box/shape", dimensions=dimensions, color=color, opacity=0.35)
 
-    def look_at(self, region: DoubtfulRegion) -> None:
+    def look_at(self, region: UncertainRegion) -> None:
         """Turn all cameras to a region, from the front of it and half a metre away."""
         self.look_from(region.center, region.normal, max(0.5, 4.0 * float(np.sqrt(region.area))))
 
@@ -188,7 +189,7 @@ class ScanScene:
                 client.camera.look_at = tuple(np.asarray(target))
 
     def look_at_whole(self, side: float) -> None:
-        """Turn all cameras to the whole scan, from the front turned by so many degrees."""
+        """Turn all cameras to the whole scan, from the front rotated by `side` degrees."""
         angle = np.radians(side)
         self.look_from(self.center, np.array([np.sin(angle), 0.0, np.cos(angle)]), 1.6 * self._height)
 

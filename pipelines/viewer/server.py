@@ -30,19 +30,19 @@ def start_server(label: str, *, host: str, port: int) -> Any:
 
 
 def address_of(server: Any) -> str:
-    """Where a browser finds a server."""
+    """Return the address of a server for a browser."""
     host = server.get_host()
     return f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1') else host}:{server.get_port()}"
 
 
 def stop_server(server: Any) -> None:
-    """End a server, quietly."""
+    """Stop a server without its messages."""
     with redirect_stdout(StringIO()):
         server.stop()
 
 
 def one_at_a_time(method: Callable[..., None]) -> Callable[..., None]:
-    """Let callbacks of a window, which come from several threads, wait for each other, and show what they refuse.
+    """Serialise the callbacks of a window, which come from several threads, and show their errors.
 
     The window has a `lock` and a method `say`.
     """

@@ -39,27 +39,28 @@ CHOICE: tuple[str, ...] = (
     "pelvis",
     *(f"{side}_{part}" for part in _OF_SIDES for side in ("left", "right")),
 )
-"""In the order in which they help most: face and trunk say where the front is, limbs follow."""
+"""Landmarks by their usefulness: face and trunk determine the facing, limbs follow."""
 
 
 def lies_within(name: str) -> bool:
-    """Whether a landmark is a joint's centre, within the limb, and no point of the skin."""
+    """Return whether a landmark is a joint's centre within the limb and not a point of the skin."""
     return name in ("neck", "pelvis") or name.removeprefix("left_").removeprefix("right_") in _WITHIN
 
 
-DOUBTFUL = 0.6
-"""Confidence below which a face is doubtful."""
-_LEAST_AREA = 2e-4  # square metres
-_MOST = 40
+UNCERTAIN = 0.6
+"""Confidence below which a face is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
-class DoubtfulRegion:
-    """A patch of doubtful faces.
+class UncertainRegion:
+    """Connected patch of uncertain faces.
 
     Attributes:
-        label: that most of its area has. area: square metres. confidence: its mean.
-        center: of its area, metres. normal: its mean, outward, unit length.
+        label: label of most of its area.
+        area: square metres.
+        confidence: mean confidence.
+        center: centroid, metres.
+        normal: mean normal, outward, unit length.
     """
 
     label: int
@@ -69,29 +70,31 @@ class DoubtfulRegion:
     normal: Float64[np.ndarray, " 3"]
 
 
-def doubtful_regions(
+def uncertain_regions(
     surface: ScanSurface,
     labels: Int[np.ndarray, " M"],
     confidence: Float[np.ndarray, " M"],
     corrected: Bool[np.ndarray, " M"],
-) -> list[DoubtfulRegion]:
-    """Connected patches of faces with a confidence below 0.6 that no hand has set, of 2 square centimetres and more,
-    at most 40, by area times doubt."""
-    doubtful = (confidence < DOUBTFUL) & ~corrected
+) -> list[UncertainRegion]:
+    """Return connected patches of uncertain faces without manual labels, by area times (1 - confidence).
+
+    Patches have at least 2 square centimetres, and there are at most 40 of them.
+    """
+    uncertain = (confidence < UNCERTAIN) & ~corrected
     mesh, pairs = surface.mesh, surface.pairs
-    patch = component_labels(pairs[doubtful[pairs].all(axis=1)], mesh.face_count)
-    area = mesh.face_areas * doubtful
+    patch = component_labels(pairs[uncertain[pairs].all(axis=1)], mesh.face_count)
+    area = mesh.face_areas * uncertain
     of_patch = np.bincount(patch, area)
-    doubt = np.bincount(patch, area * (1.0 - confidence))
+    importance = np.bincount(patch, area * (1.0 - confidence))
     out = []
-    for k in np.argsort(-doubt, kind="stable")[:_MOST]:
-        if of_patch[k] < _LEAST_AREA:
+    for k in np.argsort(-importance, kind="stable")[:40]:
+        if of_patch[k] < 2e-4:
             continue
-        own = np.flatnonzero((patch == k) & doubtful)
+        own = np.flatnonzero((patch == k) & uncertain)
         weight = mesh.face_areas[own]
         center = weight @ mesh.face_centers[own] / weight.sum()
         out.append(
-            DoubtfulRegion(
+            UncertainRegion(
                 label=int(np.bincount(labels[own], weight).argmax()),
                 area=float(weight.sum()),
                 confidence=float(weight @ confidence[own] / weight.sum()),
@@ -124,25 +127,28 @@ class LabelledScan:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What undo returns to; nothing in it is ever changed.
+    """Immutable state for undo.
 
     Attributes:
-        items: corrections, oldest first. faces: of each. landmarks: by name.
-        said: what was done last, in words.
+        items: corrections, oldest first.
+        faces: faces of each correction.
+        landmarks: landmarks by name.
+        action: description of the last action.
     """
 
     items: tuple[Correction, ...] = ()
     faces: tuple[Int64[np.ndarray, " _"], ...] = ()
     landmarks: Mapping[str, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
-    said: str = ""
+    action: str = ""
 
 
 class LabelSession:
-    """Corrections of one scan.
+    """Corrections of labels and landmarks of one scan.
 
     Args:
-        scan: before any correction.
-        corrections, landmarks: those that there are already.
+        scan: scan before any correction.
+        corrections: existing corrections.
+        landmarks: existing landmarks.
     """
 
     def __init__(
@@ -162,17 +168,17 @@ class LabelSession:
 
     @property
     def corrections(self) -> Corrections:
-        """All of them."""
+        """Return all corrections of the session."""
         return Corrections(self._state.items)
 
     @property
     def landmarks(self) -> Mapping[str, Float64[np.ndarray, " 3"]]:
-        """By name, metres."""
+        """Return the landmarks by name, in metres."""
         return self._state.landmarks
 
     @property
     def changed(self) -> bool:
-        """Whether anything is not saved."""
+        """Return whether there are unsaved changes."""
         return self._state is not self._saved
 
     @property
@@ -181,14 +187,14 @@ class LabelSession:
         return self.scan.labels is not None
 
     def corrected(self) -> Bool[np.ndarray, " M"]:
-        """Faces that a correction sets."""
+        """Return the faces that some correction sets."""
         out = np.zeros(self.scan.mesh.face_count, dtype=bool)
         for faces in self._state.faces:
             out[faces] = True
         return out
 
     def labels(self) -> Int64[np.ndarray, " M"]:
-        """Of the faces, corrected.
+        """Return the labels of the faces after corrections.
 
         Raises:
             InputError: the run has none.
@@ -244,17 +250,17 @@ class LabelSession:
         placed = {**self._state.landmarks, name: np.array(point, dtype=np.float64)}
         self._now(_State(self._state.items, self._state.faces, placed, f"{name} placed"))
 
-    def take_away(self, name: str) -> None:
-        """Remove a landmark."""
+    def remove_landmark(self, name: str) -> None:
+        """Remove a landmark by its name."""
         placed = {other: point for other, point in self._state.landmarks.items() if other != name}
         self._now(_State(self._state.items, self._state.faces, placed, f"{name} removed"))
 
     def undo(self) -> str:
-        """Take back what was done last; returns it in words, "" where there is nothing left."""
+        """Undo the last action and return its description, "" if nothing is left."""
         if not self._before:
             return ""
-        said, self._state = self._state.said, self._before.pop()
-        return said
+        action, self._state = self._state.action, self._before.pop()
+        return action
 
     def save(self, run: Path) -> list[str]:
         """Write both files of a run whole; returns the names of those that were written."""
@@ -278,12 +284,12 @@ class LabelSession:
             )
         return self.scan.labels
 
-    def _add(self, items: Sequence[Correction], said: str) -> int:
+    def _add(self, items: Sequence[Correction], action: str) -> int:
         self._labels()
         faces = [faces_of(item, self.surface) for item in items]
         if items:
             state = self._state
-            self._now(_State((*state.items, *items), (*state.faces, *faces), state.landmarks, said))
+            self._now(_State((*state.items, *items), (*state.faces, *faces), state.landmarks, action))
         return len(np.unique(np.concatenate(faces))) if faces else 0
 
     def _now(self, state: _State) -> None:

@@ -15,7 +15,7 @@ from pipelines.viewer.picking import first_hit, line_under, middle_of_limb
 from pipelines.viewer.run_scan import label_again
 from pipelines.viewer.scene import MODES, ScanScene, legend
 from pipelines.viewer.server import address_of, one_at_a_time, start_server, stop_server
-from pipelines.viewer.session import CHOICE, DoubtfulRegion, LabelSession, doubtful_regions, lies_within
+from pipelines.viewer.session import CHOICE, LabelSession, UncertainRegion, lies_within, uncertain_regions
 from smplxpp.core.labels import LABEL_BY_NAME, LABELS, UPPER
 from smplxpp.segment.corrected_faces import stroked_faces
 
@@ -42,7 +42,7 @@ def open_window(session: LabelSession, run: Path, *, host: str = "127.0.0.1", po
 
 
 class LabelWindow:
-    """One window on one session.
+    """Window of a viser server on one session.
 
     Args:
         server: viser's. run: folder that `save` writes into.
@@ -53,7 +53,7 @@ class LabelWindow:
         self.scene = ScanScene(server, session)
         self._places: list[np.ndarray] = []
         self._box: tuple[Any, Any] | None = None
-        self._regions: list[DoubtfulRegion] = []
+        self._regions: list[UncertainRegion] = []
         self._at = -1
         self._build()
         self._listen_to_clicks()
@@ -61,11 +61,11 @@ class LabelWindow:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """Return the address for a browser."""
         return address_of(self.server)
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server of the window."""
         stop_server(self.server)
 
     def say(self, words: str) -> None:
@@ -98,7 +98,7 @@ class LabelWindow:
         with gui.add_folder("Corrections", expand_by_default=False):
             self._list = gui.add_dropdown("Entry", (_NONE,))
             remove = gui.add_button("Remove entry")
-        with gui.add_folder("Doubtful regions"):
+        with gui.add_folder("Uncertain regions"):
             self._doubt = gui.add_markdown("")
             steps = gui.add_button_group("Go to", ("previous", "next"))
         save = gui.add_button("Save", color="green")
@@ -236,13 +236,13 @@ class LabelWindow:
     @one_at_a_time
     def _remove_landmark(self) -> None:
         if self._mark.value in self.session.landmarks:
-            self.session.take_away(self._mark.value)
+            self.session.remove_landmark(self._mark.value)
             self._changed(f"{self._mark.value} removed")
 
     @one_at_a_time
     def _undo(self) -> None:
-        said = self.session.undo()
-        self._changed(f"undone: {said}" if said else "nothing to undo")
+        action = self.session.undo()
+        self._changed(f"undone: {action}" if action else "nothing to undo")
 
     @one_at_a_time
     def _remove(self) -> None:
@@ -274,7 +274,7 @@ class LabelWindow:
         if self._regions:
             self._at = (self._at + by) % len(self._regions) if self._at >= 0 else 0
             self.scene.look_at(self._regions[self._at])
-            self._show_doubts()
+            self._show_regions()
 
     # -- what is shown
 
@@ -291,23 +291,23 @@ class LabelWindow:
         self._changed(f"{faces} faces: {self._label.value}" if faces else "nothing there")
 
     def _changed(self, words: str) -> None:
-        """Show the session anew after a change."""
+        """Show the session again after a change."""
         session = self.session
         self._repaint()
         self._remark()
         if session.has_labels:
             labels, mesh = session.labels(), session.scan.mesh
             self._legend.content = legend(labels, mesh.face_areas)
-            self._regions = doubtful_regions(session.surface, labels, session.confidence(), session.corrected())
+            self._regions = uncertain_regions(session.surface, labels, session.confidence(), session.corrected())
         names = [f"{k + 1}: {LABELS[item.label].name}" for k, item in enumerate(session.corrections.items)]
         self._list.options = tuple(names[::-1]) or (_NONE,)
         self._at = min(self._at, len(self._regions) - 1)
-        self._show_doubts()
+        self._show_regions()
         unsaved = " (*not saved*)" if session.changed else ""
         placed = f"{len(session.landmarks)} landmarks"
         self.say(f"{words or 'ready'}  \n{len(session.corrections)} corrections, {placed}{unsaved}")
 
-    def _show_doubts(self) -> None:
+    def _show_regions(self) -> None:
         if not self.session.has_labels:
             self._doubt.content = "no labels yet: place landmarks, save, and give `smplxpp build` again"
         elif not self._regions:

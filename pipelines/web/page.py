@@ -68,8 +68,9 @@ class PageLight:
     """Another light that a page begins with.
 
     Attributes:
-        name: said on the page. relighting: the light, not turned, in the place of the capture's.
-        turn: degrees about +Y by which it is turned; the page changes it.
+        name: name on the page.
+        relighting: the light, not turned, in the place of the capture's.
+        turn: rotation of the light about +Y in degrees, which the page can change.
     """
 
     name: str
@@ -86,12 +87,13 @@ class PageLight:
 
 @dataclass(frozen=True, kw_only=True)
 class PageContent:
-    """What a page has beside its avatar.
+    """Content of a page beside its avatar.
 
     Attributes:
-        name: of the avatar, for the page's title. sound: a WAV file that the bundle's motion goes with.
-        light: that the avatar is shown in; None: the capture's.
-        lips: of `pipelines.web.page.lips_of`, by which live sound moves the mouth; None: it does not.
+        name: name of the avatar, for the page's title.
+        sound: WAV file that belongs to the bundle's motion, or None.
+        light: light of the avatar; None for the capture's.
+        lips: weights of `lips_of` with which live sound moves the mouth, or None.
     """
 
     name: str

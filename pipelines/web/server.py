@@ -89,7 +89,7 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """What to give a browser."""
+        """Return the address for a browser."""
         return f"http://{HOST}:{self.server_address[1]}/"
 
     @property

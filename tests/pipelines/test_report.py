@@ -245,7 +245,7 @@ def test_histogram_bars_are_the_distribution():
 def test_histograms_say_what_they_leave_out():
     values = np.array([0.1, 0.2, 0.3, 50.0, np.nan])
     svg = histogram_svg(Histogram("h", values, upper=1.0))
-    assert "25 % lie beyond the axis" in svg and 'class="bar beyond"' in svg
+    assert "25 % exceed the axis" in svg and 'class="bar beyond"' in svg
     assert histogram_statistics(values)["not_finite"] == 1
     assert histogram_statistics(values)["max"] == 50.0
     with pytest.raises(InputError, match="histogram"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.viewer.session import LabelledScan, LabelSession, doubtful_regions
+from pipelines.viewer.session import LabelledScan, LabelSession, uncertain_regions
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import concatenate_meshes
@@ -76,7 +76,7 @@ def test_landmarks_are_placed_moved_and_removed(session):
     session.place("nose", np.array([0.0, 1.0, 0.1]))
     session.place("nose", np.array([0.0, 1.1, 0.1]))
     session.place("left_knee", np.array([0.2, 0.5, 0.0]))
-    session.take_away("left_knee")
+    session.remove_landmark("left_knee")
     assert list(session.landmarks) == ["nose"] and session.landmarks["nose"][1] == 1.1
     assert session.undo() == "left_knee removed" and set(session.landmarks) == {"nose", "left_knee"}
     session.undo()
@@ -100,7 +100,7 @@ def test_saved_and_opened_again_it_is_the_same(session, scan, tmp_path):
     # What is taken back is taken back in the files too.
     again.remove(1)
     again.remove(0)
-    again.take_away("nose")
+    again.remove_landmark("nose")
     assert again.changed and len(again.save(tmp_path)) == 2
     assert len(Corrections.load(tmp_path / "labels_corrections.json")) == 0
     assert read_landmarks(tmp_path / "landmarks.json") == {}
@@ -127,10 +127,10 @@ def test_doubtful_regions_are_patches_by_doubt(scan):
     lone = int(np.flatnonzero((middle[:, 1] > 0.4) & (middle[:, 1] < 0.6))[0])
     confidence[lone] = 0.0
     none = np.zeros(mesh.face_count, dtype=bool)
-    first, second = doubtful_regions(surface, scan.labels, confidence, none)  # one face is too little
+    first, second = uncertain_regions(surface, scan.labels, confidence, none)  # one face is too little
     assert first.label == LOWER.id and second.label == SHOE.id
     assert first.area == pytest.approx(mesh.face_areas[high].sum()) and first.confidence == pytest.approx(0.5)
     np.testing.assert_allclose(second.center, [-0.2, 0.05, 0.0], atol=0.01)
-    (left,) = doubtful_regions(surface, scan.labels, confidence, high)
+    (left,) = uncertain_regions(surface, scan.labels, confidence, high)
     assert left.label == SHOE.id
-    assert doubtful_regions(surface, scan.labels, np.ones(mesh.face_count), none) == []
+    assert uncertain_regions(surface, scan.labels, np.ones(mesh.face_count), none) == []

@@ -196,7 +196,7 @@ def _distances(record: StageRecord) -> tuple[KeyNumber, ...]:
 
 
 def rewrite_report(run: Path) -> Path | None:
-    """Write the report of a finished run anew, from the run alone.
+    """Rewrite the report of a finished run from the run alone.
 
     Returns:
         The report, or None where the run does not say what it was built from.

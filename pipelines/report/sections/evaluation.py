@@ -27,7 +27,7 @@ def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:
     if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest:
         return None
     if "counts" not in manifest["numbers"]:
-        return None  # of a version that did not count its images: the next evaluation writes it anew
+        return None  # written by a version that did not count its images; the next evaluation replaces it
     measured = {name: digest for name, digest in manifest["inputs"].items() if name in MODEL_FILES.values()}
     if any(not (run / name).is_file() or sha256_file(run / name) != digest for name, digest in measured.items()):
         return None
@@ -160,8 +160,8 @@ def relight_section(record: StageRecord) -> Section:
     """All pictures, and the first two with a slider."""
     numbers = record.manifest["numbers"]
     pictures = [
-        Picture(said, read_bytes(path_inside(record.folder, file, subject="picture of a light"), subject="picture"))
-        for said, file in numbers["pictures"].items()
+        Picture(title, read_bytes(path_inside(record.folder, file, subject="picture of a light"), subject="picture"))
+        for title, file in numbers["pictures"].items()
     ]
     return Section(
         title="Avatar: another light",

@@ -106,7 +106,7 @@ def write_reconstruct_report(path: Path, run: Path, record: StageRecord) -> None
 def _surfaces(
     mesh: TriangleMesh, colors: np.ndarray | None, hull: TriangleMesh, confidence: np.ndarray, seen: np.ndarray
 ) -> list[Picture]:
-    """Hull and surface side by side, where they differ, and where nothing is sure."""
+    """Return pictures of hull and surface side by side, of their difference, and of the confidence."""
     cameras = body_cameras(mesh, views=("front", "back"), height=HEIGHT)
     shaded = []
     for camera in cameras:

@@ -54,7 +54,7 @@ def _sheet(
 _SOURCES = {
     "file": "labels given",
     "views": "votes of views, and where they are few what the body in the scan and its colours say",
-    "body": "what the body in the scan, its colours and its folds say, for nobody has labelled it",
+    "body": "labels estimated from the body in the scan, its colours and its folds",
 }
 
 

@@ -34,7 +34,7 @@ _TITLES = {
 
 
 def standing_trainings(run: Path, records: Iterable[StageRecord]) -> dict[str, StageRecord]:
-    """The trainings in a run by stage; without those of files that have been made anew since.
+    """Return the trainings of a run by stage, without those whose input files have changed since.
 
     Args:
         records: earlier stages that stand.
@@ -179,10 +179,10 @@ def _seconds(line: Mapping[str, Any]) -> float:
 
 
 _WHAT = (
-    "Cloth that swings cannot be read off a pose. Parts whose surface left skinning in the photographs, and with which "
-    "simulated the person's outline is nearer to the masks, are simulated in new motion: the drag of the air and the "
-    "depth to which the body holds them were fitted to the surface that the teacher followed through the training "
-    "frames, where that was followed well enough to say."
+    "The place of swinging cloth does not depend on the pose alone. Parts are simulated in new motion if their surface "
+    "left skinning in the photographs and the simulation brings the person's outline nearer to the masks. The drag of "
+    "the air and the depth of the pins were fitted to the surface that was tracked through the training frames, where "
+    "the tracking was good enough."
 )
 
 
