@@ -1,4 +1,4 @@
-"""A cache that counts bytes."""
+"""Least-recently-used cache of tensors, bounded in bytes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torch import Tensor
 
 
 class ByteCache:
-    """Tensors by key, the latest used kept up to a bound.
+    """Tensors by key; the least recently used ones are dropped when a bound is exceeded.
 
     Args:
-        max_bytes: of all that is kept.
+        max_bytes: bound of all tensors together.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -25,7 +25,7 @@ class ByteCache:
         return key in self._kept
 
     def get(self, key: Hashable, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        """Return what is kept under the key, or what `make` gives, without gradients."""
+        """Return the cached tensors of a key, or make and cache them, without gradients."""
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key]

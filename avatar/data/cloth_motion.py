@@ -1,4 +1,4 @@
-"""Simulated clothes along the frames of a capture: every run of frames in order, from a cold start before it."""
+"""Simulated clothes in the frames of a capture: each run of frames in order, from a cold start before it."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ from smplxpp.template.template import Template
 
 @dataclass(frozen=True, kw_only=True)
 class ClothMotionConfig:
-    """How clothes are simulated along a capture.
+    """Choices of the simulation of clothes along a capture.
 
     Attributes:
-        pre_roll: seconds before a run of frames from which on its motion is followed, after a cold start there.
-        smoothing: standard deviation of the Gaussian in time with which the motion that drives the clothes is smoothed,
-            seconds; trackers shake waistbands. The body that is drawn is not smoothed; the cloth hangs beside it where
-            the smoothed motion has brought it, so that it does not shake along.
+        pre_roll: seconds of motion before a run of frames that are simulated after a cold start.
+        smoothing: standard deviation of the temporal Gaussian filter of the motion that drives the clothes, seconds,
+            because the noise of trackers shakes waistbands. The rendered body is not filtered.
         mode: "simulate", or "skin": the clothes stay where skinning has them.
-        driver: how motions are followed.
+        driver: of the simulation.
     """
 
     pre_roll: float = 0.7
@@ -43,12 +42,15 @@ class ClothMotionConfig:
 
 
 class ClothMotions:
-    """Shapes of clothes in frames of a motion, simulated when the first of a run is asked for, then kept.
+    """Shapes of clothes in frames of a motion; a run of frames is simulated at its first request and cached.
 
     Args:
-        template: the person. garments: cut from it.
-        params: pose of a frame, None where nobody knows it.
-        frames: all frames of the motion, ascending. fps: of their numbers.
+        template: the person.
+        garments: cut from the template.
+        params: returns the parameters of a frame, None where there are none.
+        frames: all frames of the motion.
+        fps: frames a second of their numbers.
+        config: of the simulation; None: the defaults.
 
     Raises:
         InputError: no frames a second.
@@ -70,7 +72,7 @@ class ClothMotions:
         self._shapes: dict[int, ClothShape] = {}
 
     def simulate(self, run: Sequence[int]) -> None:
-        """Simulate frames that follow each other, with what comes before them as their pre-roll; none twice.
+        """Simulate consecutive frames, with the frames before them as pre-roll; simulated ones are skipped.
 
         Raises:
             InputError: a frame that is not among the motion's.
@@ -84,17 +86,19 @@ class ClothMotions:
         if self.config.mode == "skin":
             self._shapes |= dict.fromkeys(run, self._skinned())
             return
+        # Frames of pre-roll and run that have parameters, and the poses between them.
         first = run[0] - self.config.pre_roll * self._fps
         span = self._frames[(self._frames >= first) & (self._frames <= run[-1])].tolist()
         known = [frame for frame in span if self._params(frame) is not None]
-        ways = self._ways(known)
+        paths = self._paths(known)
+        # Step the driver through all of them, and keep the shapes of the run.
         driver = ClothDriver(self.template, self.garments, self.config.driver)
         last: int | None = None
         wanted = set(run)
         for frame in known:
             seconds = 1.0 if last is None else (frame - last) / self._fps
             pose_drawn = self._params(frame)
-            shape = driver.follow(ways[frame], seconds, pose_drawn if frame in wanted else None)
+            shape = driver.follow(paths[frame], seconds, pose_drawn if frame in wanted else None)
             last = frame
             if frame in wanted:
                 self._shapes[frame] = shape
@@ -107,26 +111,27 @@ class ClothMotions:
         return ClothShape(vertices, np.zeros((len(vertices), 3), np.float32), share)
 
     def shape(self, frame: int) -> ClothShape:
-        """Return what the clothes do in a frame that was simulated."""
+        """Return the shape of the clothes in a simulated frame."""
         return self._shapes[frame]
 
     def time(self, frame: int) -> float:
         """Return the seconds since the motion's first frame."""
         return float(frame - self._frames[0]) / self._fps
 
-    def _ways(self, frames: Sequence[int]) -> dict[int, list[BodyParams]]:
-        """The poses from each frame's predecessor to it, smoothed within stretches that no long gap parts.
+    def _paths(self, frames: Sequence[int]) -> dict[int, list[BodyParams]]:
+        """Return the poses from each frame's predecessor to it, filtered within stretches without long gaps.
 
-        Frames need not be even: what is missing within a stretch is filled by poses in between, so that smoothing
-        weighs by time. Slow frame rates get poses in between: places that go straight from pose to pose cut the
-        corners of limbs.
+        Missing frames within a stretch are interpolated, so that the filter is uniform in time. Low frame rates get
+        interpolated poses too, because vertices on straight lines from pose to pose would pass through limbs.
         """
         out: dict[int, list[BodyParams]] = {}
         apart = int(np.diff(self._frames).min()) if len(self._frames) > 1 else 1
+        # Cut at long gaps.
         cuts = np.flatnonzero(np.diff(frames) > max(apart, LONGEST_STEP * self._fps)) + 1
         for stretch in np.split(np.array(frames), cuts):
             found = [self._params(int(frame)) for frame in stretch]
             poses = BodyParams.concatenate([one for one in found if one is not None])
+            # Resample to an even spacing, filter in time, and add poses in between.
             even = int(np.gcd.reduce(np.diff(stretch))) if len(stretch) > 1 else apart
             at = (stretch - stretch[0]) // even
             if at[-1] + 1 > len(at):

@@ -1,4 +1,4 @@
-"""A single frame as a sequence to train on: the template stands still, its views are at hand."""
+"""A single frame as a training sequence: a fixed mesh and its views in memory."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 
 FRAME = 0
-"""The number of the only frame."""
+"""Number of the only frame."""
 
 
 class OneFrame:
     """A `FrameSequence` of one frame, whose mesh is given.
 
     Args:
-        template: of the person. vertices: of it in the frame, metres.
-        train, held_out: whole views of the frame, each with a name of its own; `held_out` are measured.
+        template: of the person.
+        vertices: of the template in the frame, metres.
+        train: whole training views of the frame, each with a unique name.
+        held_out: whole views for evaluations, each with a unique name.
         background: sRGB in [0, 1] behind the person.
         margin: pixels kept around the silhouette of a training view.
         device: of all tensors.
@@ -57,7 +59,7 @@ class OneFrame:
         self._measured = [view.name for view in held_out or train]
 
     def pose(self, frame: int) -> Pose:
-        """Return the pose, which leaves the given vertices where they are."""
+        """Return the pose, whose skinned mesh has the given vertices."""
         return self._pose
 
     def view(self, camera: str, frame: int) -> View:
@@ -77,7 +79,7 @@ class OneFrame:
         ]
 
     def expect(self, items: Sequence[Item]) -> None:
-        """Do nothing: the views are at hand."""
+        """Do nothing, because the views are in memory."""
 
     def measured_views(self, frames: int) -> Iterator[MeasuredView]:
         """Return all held-out views; the training views where none is held out."""
@@ -102,4 +104,4 @@ class OneFrame:
             raise InputError("views of the frame", expected="at least one training view", received="none")
         if len(set(names)) != len(names):
             twice = sorted({name for name in names if names.count(name) > 1})
-            raise InputError("views of the frame", expected="each with a name of its own", received=", ".join(twice))
+            raise InputError("views of the frame", expected="each with a unique name", received=", ".join(twice))

@@ -1,4 +1,4 @@
-"""A capture's frames as training sees them: poses of the template, cropped views, and the order they come in."""
+"""A capture as a training sequence: poses of the template, cropped views, and the order of frames and cameras."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from smplxpp.template.template import Template
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceConfig:
-    """How a capture is read for training.
+    """Choices of reading a capture for training.
 
     Attributes:
         margin: pixels kept around the silhouette of a training view.
@@ -48,7 +48,7 @@ class SequenceConfig:
 
 @dataclass(frozen=True)
 class Item:
-    """What one rendering of a step is made of: a frame, and the cameras that look at it."""
+    """A micro-batch of a step: a frame and some of its cameras."""
 
     frame: int
     cameras: tuple[str, ...]
@@ -59,10 +59,12 @@ class Item:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredView:
-    """A whole view that a training is measured on.
+    """A whole view on which a training is evaluated.
 
     Attributes:
-        kind: "novel_view" or "novel_pose". name: of the view among those that are measured.
+        kind: "novel_view" or "novel_pose".
+        name: of the view among those of an evaluation.
+        view: all its pixels.
         frame: of its image.
     """
 
@@ -73,11 +75,13 @@ class MeasuredView:
 
 
 class FrameSequence(Protocol):
-    """What photometric trainings learn from: numbered frames, their poses, and views of them.
+    """Data of photometric trainings: numbered frames, their poses, and views of them.
 
     Attributes:
-        rig: of the template. background: (3,) sRGB in [0, 1] behind the person.
-        train_cameras, train_frames: what is learned from.
+        rig: of the template.
+        background: (3,) sRGB in [0, 1] behind the person.
+        train_cameras: names of the training cameras.
+        train_frames: numbers of the training frames.
     """
 
     rig: Rig
@@ -92,19 +96,19 @@ class FrameSequence(Protocol):
         """Return a training view, cut to the silhouette."""
 
     def items(self, step: int, *, count: int, views: int, seed: int) -> list[Item]:
-        """Return the `count` items of a step with up to `views` cameras each, decided by seed and step alone."""
+        """Return the `count` items of a step with up to `views` cameras each; they depend on seed and step alone."""
 
     def expect(self, items: Sequence[Item]) -> None:
-        """Prepare for the views of items, which will be asked for soon."""
+        """Start to read the views of items that the next step needs."""
 
     def measured_views(self, frames: int) -> Iterable[MeasuredView]:
-        """Return the views that training is measured on, of at most `frames` frames of either kind."""
+        """Yield the views of an evaluation, of at most `frames` frames of either kind."""
 
     def camera(self, name: str) -> Camera:
         """Return a camera with all its pixels."""
 
     def person_center(self) -> Float[np.ndarray, " 3"]:
-        """Return the middle of the person in the first training frame, metres."""
+        """Return the centre of the person in the first training frame, metres."""
 
 
 class AvatarSequence:
@@ -113,9 +117,9 @@ class AvatarSequence:
     Args:
         capture: with cameras, images, masks and parameters.
         template: of the person.
-        config: how it is read.
+        config: of reading.
         device: of all tensors.
-        cloth: what is simulated along frames that training does not see; None: nothing is.
+        cloth: simulated clothes in frames that are not training frames; None: none.
 
     Raises:
         InputError: no training camera or frame, or a training frame without parameters.
@@ -141,12 +145,12 @@ class AvatarSequence:
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
 
     def with_cloth(self, cloth: ClothMotions) -> AvatarSequence:
-        """Return the same capture with clothes simulated; it shares the images."""
+        """Return the sequence with simulated clothes; both share the images."""
         return AvatarSequence(self.capture, self.rig.template, self.config, device=self.device, cloth=cloth)
 
     @cached_property
     def normal_maps(self) -> int:
-        """The number of training views that have a normal map, none where they are not read."""
+        """Number of training views with a normal map; 0 if normal maps are not read."""
         if not self.config.normals:
             return 0
         rows = np.isin(list(self.capture.cameras), self.train_cameras)
@@ -154,12 +158,12 @@ class AvatarSequence:
         return int((views & self.capture.presence("normal")).sum())
 
     def pose(self, frame: int) -> Pose:
-        """Return the pose of a frame; it has the frame's number if training sees the frame, else the null code.
+        """Return the pose of a frame; training frames keep their number and thereby their code.
 
-        Frames that training does not see have their clothes simulated, where there are some to simulate.
+        Other frames have simulated clothes, if the sequence has any.
 
         Raises:
-            InputError: no parameters of it.
+            InputError: a frame without parameters.
         """
         if frame not in self._poses:
             self._poses[frame] = self._read_pose(frame)
@@ -169,9 +173,9 @@ class AvatarSequence:
         return self._poses[frame]
 
     def as_new_pose(self, frame: int) -> Pose:
-        """Return the pose of a training frame as if it were new: without its code, its clothes simulated.
+        """Return the pose of a training frame marked as new: without its code, with simulated clothes.
 
-        All training frames are simulated when the first one is asked for, in order and from one cold start.
+        The first request simulates all training frames in order, from one cold start.
         """
         pose = self.pose(frame).as_new()
         if self.cloth is None:
@@ -201,7 +205,7 @@ class AvatarSequence:
                     if self.capture.file(camera, frame) is None:
                         continue
                     view = self.whole_view(camera, frame)
-                    if view.alpha.any():  # a view of nobody measures nothing
+                    if view.alpha.any():  # skip views without the person
                         yield MeasuredView(kind, f"{camera} {frame}", view, frame)
 
     def camera(self, name: str) -> Camera:
@@ -213,7 +217,7 @@ class AvatarSequence:
         return self.rig.skin(self.pose(self.train_frames[0])).mean(0).cpu().numpy()
 
     def expect(self, items: Sequence[Item]) -> None:
-        """Read the views of items in the background: they will be asked for soon."""
+        """Start to read the views of items in the background."""
         for item in items:
             for camera in item.cameras:
                 if (camera, item.frame) not in self._expected:
@@ -221,13 +225,16 @@ class AvatarSequence:
                     self._expected[camera, item.frame] = read
 
     def items(self, step: int, *, count: int, views: int, seed: int) -> list[Item]:
-        """Return the items of a step, decided by seed and step alone.
+        """Return the items of a step; they depend on seed and step alone.
 
-        Every frame comes once an epoch in a shuffled order; from epoch to epoch a frame goes through its cameras, in
-        a shuffled order too, so that every view is seen equally often.
+        Every frame comes once an epoch in a shuffled order. From epoch to epoch a frame passes through its cameras, in
+        a shuffled order too, so that every view comes equally often.
 
         Args:
-            count: items. views: cameras of each; all of a frame's where it has fewer.
+            step: number of the step.
+            count: number of items.
+            views: cameras of each item; all of a frame's where it has fewer.
+            seed: of the orders.
         """
         out = []
         for number in range(step * count, (step + 1) * count):
@@ -237,7 +244,7 @@ class AvatarSequence:
         return out
 
     def cameras(self, frame: int, visit: int, views: int, seed: int) -> tuple[str, ...]:
-        """Return training cameras for a visit of a frame: visit after visit every camera comes equally often."""
+        """Return training cameras for the n-th visit of a frame, so that every camera comes equally often."""
         names = [name for name in self.train_cameras if self.capture.file(name, frame) is not None]
         views = min(views, len(names))
         chosen = []
@@ -250,7 +257,7 @@ class AvatarSequence:
         """Return the body parameters of a frame.
 
         Raises:
-            InputError: none of it.
+            InputError: a frame without parameters.
         """
         params = self.capture.params(frame)
         if params is None:
@@ -272,7 +279,7 @@ class AvatarSequence:
         return self.rig.with_cloth(pose, self.cloth.shape(frame), time=self.cloth.time(frame))
 
     def _run_of(self, frame: int) -> list[int]:
-        """Return the frames about one that training does not see either and that have parameters."""
+        """Return the run of frames with parameters around a frame, bounded by training frames."""
         frames, seen = self.capture.frames, set(self.train_frames)
         at = first = last = frames.index(frame)
         while first > 0 and frames[first - 1] not in seen:

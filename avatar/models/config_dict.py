@@ -1,4 +1,4 @@
-"""Configurations of networks to and from the plain dictionaries that a checkpoint stores."""
+"""Configurations of networks as plain dictionaries in the headers of model files."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ def config_from_dict(cls: type[Config], stored: Mapping[str, Any]) -> Config:
             received=", ".join(sorted(map(str, stored))) or "none",
             remedy="the checkpoint was made by another version: train again, or use the version that made it",
         )
+    # Check the type and size of every value before the configuration is made.
     for name, default in defaults.items():
         value = stored[name]
-        # 1 stands for 1.0 in JSON written by hand; True never stands for 1.
+        # Integers are accepted for floats (JSON written by hand); bools are not accepted for numbers.
         accepted = (float, int) if type(default) is float else (type(default),)
         usable = type(value) in accepted and (not isinstance(value, int | float) or abs(value) <= LARGEST_NUMBER)
         if not usable:  # NaN is not

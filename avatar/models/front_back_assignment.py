@@ -1,4 +1,4 @@
-"""On which of the front and back maps a point of the canonical body is looked up."""
+"""Assignment of canonical points to the front or the back map."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from avatar.rig.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class FrontBackAssignment:
-    """The sides of P points.
+    """Sides of P points.
 
     Attributes:
-        front: whether the front is the side whose surface is the nearer one along z.
-        behind: metres by which the point lies below the surface that this side shows; 0 where it shows none.
+        front: whether the front map's surface is the nearer one along z.
+        behind: depth of the point below the surface on its side's map, metres; 0 where the map shows none.
     """
 
     front: Bool[Tensor, " P"]
@@ -30,18 +30,23 @@ class FrontBackAssignment:
 def assign_front_back(
     rig: Rig, frame: MapFrame, size: int, points: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
 ) -> FrontBackAssignment:
-    """Choose the side of every point by depth, not by the direction that a point faces.
+    """Choose the side of every point by its depth, not by its normal.
 
-    A fold of the front of a skirt has a far side, which faces backwards: on the back map at its place is the back of
-    the skirt, a hand's breadth away, which moves in another way. Where the maps show nothing, the normal decides.
+    The far side of a fold in front of a skirt faces backwards, but the back map at its place shows the back of the
+    skirt, ten centimetres away, which moves differently. Where the maps show nothing, the normal decides.
 
     Args:
-        frame, size: those of the maps. points: canonical, metres.
+        rig: of the template.
+        frame: of the maps.
+        size: side of the maps, pixels.
+        points: canonical, metres.
+        normals: of the points.
     """
     maps = front_back_maps(rig.vertices, rig.faces, frame, size=size)
     shown = maps.mask.to(points.dtype)
-    # Heights without the background: blended with it, they would be nowhere.
+    # Heights weighted by the mask, so that bilinear samples at its border can be divided by the mask's weight.
     table = torch.stack([maps.interpolate(rig.vertices)[..., 2] * shown, shown], dim=-1)[None]
+    # Distance along z from every point to the surface on each map.
     distances, belows = [], []
     for is_front in (True, False):
         side = torch.full((len(points),), is_front, device=points.device)

@@ -8,14 +8,14 @@ from torch import Tensor, nn
 from avatar.gaussians.binding import BoundGaussians
 
 LEARNED = ("normal_offset", "offset", "log_scales", "quats", "opacity_logits", "dc", "sh")
-"""Attributes that are learned; triangles and barycentric coordinates stay."""
+"""Learned attributes; triangles and barycentric coordinates stay fixed."""
 
 
 class LearnedGaussians(nn.Module):
-    """Parameters named as the attributes of `BoundGaussians`; the rest of them are buffers.
+    """Parameters named as the learned attributes of `BoundGaussians`; its other tensors are buffers.
 
     Args:
-        start: where the attributes begin.
+        start: initial attributes.
     """
 
     face_index: Tensor
@@ -41,7 +41,7 @@ class LearnedGaussians(nn.Module):
         return len(self.face_index)
 
     def forward(self) -> BoundGaussians:
-        """Return the Gaussians as they stand, with gradients to the attributes."""
+        """Return the current Gaussians, with gradients to the attributes."""
         named = {**dict(self.named_parameters()), **dict(self.named_buffers())}
         return BoundGaussians(**named, face_count=self.face_count, topology=self.topology)
 
@@ -52,6 +52,6 @@ class LearnedGaussians(nn.Module):
         return BoundGaussians(**copies, face_count=self.face_count, topology=self.topology)
 
     def normalise_quats(self) -> None:
-        """Give all quaternions length 1, so that residuals added to them have one scale."""
+        """Normalise all quaternions, so that residuals added to them have one scale."""
         with torch.no_grad():
             self.quats.div_(self.quats.norm(dim=-1, keepdim=True))

@@ -1,4 +1,4 @@
-"""Teacher and student as files: safetensors, their configuration in the header, nothing that is executed."""
+"""Files of teacher and student: safetensors with the configuration in the header; nothing is executed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from avatar.models.networks.pose_regression import PoseRegression
 from avatar.models.networks.teacher import Teacher, TeacherConfig
 from avatar.models.stored_model import StoredModel
 from avatar.models.student import Student, StudentConfig
-from avatar.models.teacher_avatar import TOLD, TeacherAvatar
+from avatar.models.teacher_avatar import TRACK_ERRORS, TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
@@ -30,7 +30,7 @@ from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.json_file import as_integer, shown
 
 SCHEMA = 2
-"""2: students may have a regression for new poses."""
+"""Version of the format; since 2 students may have a regression for new poses."""
 HEADER = "avatar"
 GAUSSIANS = "gaussians."
 KINDS = ("teacher", "student")
@@ -39,19 +39,21 @@ _REMEDY = "take the file as `smplxpp train` wrote it, or train again"
 
 
 def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bool = False) -> int:
-    """Write a trained avatar, whole or not at all.
+    """Write a trained avatar atomically.
 
     Args:
-        compact: floats in half precision and indices in 32 bits, as a player needs them.
+        path: of the file.
+        model: the teacher or student.
+        compact: floats in half precision and indices in 32 bits, as players need them.
 
     Returns:
-        Bytes of the file.
+        Size of the file, bytes.
     """
     about = {"schema": SCHEMA, "face_count": model.gaussians.face_count, "topology": model.gaussians.topology}
     if isinstance(model, TeacherAvatar):
         track = model.track
-        told = [name for name in TOLD if track is not None and getattr(track, name) is not None]
-        about |= {"kind": "teacher", "config": config_to_dict(model.config), "track_tells": told}
+        errors = [name for name in TRACK_ERRORS if track is not None and getattr(track, name) is not None]
+        about |= {"kind": "teacher", "config": config_to_dict(model.config), "track_tells": errors}
     else:
         config = model.config
         about |= {
@@ -70,10 +72,14 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
 
 
 def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
-    """Read what `save_avatar` wrote, on the rig's device.
+    """Read a file that `save_avatar` wrote, on the rig's device.
 
-    Everything is held against the tensors of the file before a network is made: what the header says cannot take more
-    memory than they do.
+    All sizes in the header are checked against the file's tensors before a network is made, so that a damaged header
+    cannot allocate more memory than they have.
+
+    Args:
+        path: of the file.
+        rig: of the template on which the avatar was trained.
 
     Raises:
         InputError: a missing, damaged or foreign file, one of a newer version, one of another template, numbers that
@@ -87,12 +93,14 @@ def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
             subject,
             expected="one of this template",
             received="Gaussians on other faces",
-            remedy="train again: the template was built anew since",
+            remedy="train again: the template was rebuilt since",
         )
+    # Tensors in single precision, checked; the Gaussians among them.
     tensors = {name: value.float() if value.is_floating_point() else value for name, value in file.tensors().items()}
     require_finite(tensors, subject=subject, remedy=_REMEDY)
     own = {name.removeprefix(GAUSSIANS): value for name, value in tensors.items() if name.startswith(GAUSSIANS)}
     gaussians = bound_from_tensors(own, file.about, subject=subject)
+    # Make the model from the header, then require exactly its tensors.
     stored = StoredModel(file.about, tensors, subject)
     try:
         make = _teacher if file.about["kind"] == "teacher" else _student
@@ -105,7 +113,7 @@ def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
     state: Mapping[str, Tensor] = model.state_dict()
     require_like(tensors, state, subject=subject, remedy=_REMEDY)
     unknown = sorted(set(tensors) - set(state))
-    if unknown:  # left out without a word they would leave another avatar
+    if unknown:  # ignoring them would load another avatar than the file's
         raise InputError(
             subject, expected="the tensors of the model alone", received=", ".join(unknown)[:200], remedy=_REMEDY
         )
@@ -130,18 +138,19 @@ def _check_version(about: Mapping[str, Any], subject: str) -> None:
 
 def _teacher(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> TeacherAvatar:
     config = stored.config("config", TeacherConfig)
-    assert config is not None  # what a teacher is never without
+    assert config is not None, "a teacher has a configuration"
     stored.require_networks({"networks": lambda: Teacher(config)})
     teacher = TeacherAvatar(config, rig, gaussians)
     if "track_controls" in stored.tensors:
         frames, controls = stored.track(rig.template.vertex_count)
         row = {frame: k for k, frame in enumerate(frames)}
-        told = stored.track_errors(*controls.shape[:2])
-        teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1]), **told))
+        errors = stored.track_errors(*controls.shape[:2])
+        teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1]), **errors))
     return teacher
 
 
 def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Student:
+    # Field and codes.
     field = stored.config("field", FieldConfig, optional=True)
     shapes_config = stored.config("blend_shapes", BlendShapeConfig, optional=True)
     frames = stored.frames()
@@ -149,13 +158,15 @@ def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Studen
         network = partial(FieldNetwork, field)
         stored.require_networks({"field.body": network, "field.cloth": network})
         stored.require("codes.codes", (len(frames), field.code_size))
+    # Blend shapes.
     shapes = None
     if shapes_config is not None:
         stored.require_networks({"blend_shapes": lambda: nn.ModuleDict(mapping_networks(shapes_config))})
         extra = stored.blended(shapes_config, len(gaussians))
         shapes = BlendShapes(shapes_config, len(gaussians), **extra)
+    # Control points, pose gate and regression.
     control_points = as_integer(stored.about.get("control_points"), subject="control_points", least=0)
-    still_body = stored.about.get("still_body", False)  # older files do not say: all of theirs moved
+    still_body = stored.about.get("still_body", False)  # older files: the body moves
     if not isinstance(still_body, bool):
         raise InputError("still_body", expected="true or false", received=shown(still_body), remedy=_REMEDY)
     config = StudentConfig(field, shapes_config, control_points, still_body)
@@ -165,7 +176,7 @@ def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Studen
         sizes = PoseRegression.shapes(*stored.directions("regression.basis"))
         regression = PoseRegression(**{k: stored.require(f"regression.{k}", size) for k, size in sizes.items()})
     student = Student(config, rig, gaussians, frames, blend_shapes=shapes, known_poses=known, regression=regression)
-    if stored.about.get("null_code_shown", True):  # older files do not say: their new poses stay as they were
+    if stored.about.get("null_code_shown", True):  # older files: the null code is zero
         show_null_code(student)
     return student
 

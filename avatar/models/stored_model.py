@@ -1,4 +1,4 @@
-"""What a model's file says of itself, held against its tensors before anything is made of it."""
+"""Header of a model file, checked against its tensors before a model is made."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ Config = TypeVar("Config", bound="DataclassInstance")
 
 @dataclass(frozen=True, eq=False)
 class StoredModel:
-    """A model as its file holds it.
+    """Header and tensors of a model file.
 
     Attributes:
-        about: what the header says.
+        about: the header's values.
         tensors: by name.
-        subject: of messages.
+        subject: of error messages.
     """
 
     about: Mapping[str, Any]
@@ -39,7 +39,7 @@ class StoredModel:
     subject: str
 
     def config(self, name: str, cls: type[Config], *, optional: bool = False) -> Config | None:
-        """Read a configuration of the header; None for null, where it is optional."""
+        """Read a configuration from the header; None for null where it is optional."""
         if name not in self.about:
             raise InputError(self.subject, expected=f"{name} in the metadata", received="none")
         value = self.about[name]
@@ -51,18 +51,18 @@ class StoredModel:
         return tuple(as_integer(value, subject="frame of a code", least=0, most=_LAST_FRAME) for value in values)
 
     def require(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
-        """Return a tensor of this shape and kind of numbers.
+        """Return a tensor, checked for shape and type.
 
         Raises:
-            InputError: none, or another.
+            InputError: a missing tensor, or one of another shape or type.
         """
         require_like(self.tensors, {name: torch.empty(shape, dtype=dtype, device="meta")}, subject=self.subject)
         return self.tensors[name]
 
     def require_networks(self, makers: Mapping[str, Callable[[], nn.Module]]) -> None:
-        """Raise `InputError` unless the tensors of networks of these names are there, in their shapes.
+        """Require the tensors of networks by name, in their shapes, else raise `InputError`.
 
-        They are made without memory: sizes of the header that the tensors do not have cost nothing.
+        The networks are made on the meta device, so that wrong sizes in the header allocate no memory.
         """
         for name, make in makers.items():
             with torch.device("meta"):
@@ -70,7 +70,7 @@ class StoredModel:
             require_like(self.tensors, {f"{name}.{key}": value for key, value in state.items()}, subject=self.subject)
 
     def track(self, most: int) -> tuple[list[int], Tensor]:
-        """Read the frames (T,) and controls (T, K, 3) of the surface that was followed; at most so many controls."""
+        """Read the frames (T,) and control points (T, K, 3) of the tracked surface, K at most `most`."""
         controls = self.tensors["track_controls"]
         if controls.ndim != 3 or controls.shape[2] != 3 or not 1 <= controls.shape[1] <= most:
             raise InputError(
@@ -83,10 +83,10 @@ class StoredModel:
         return frames, controls
 
     def track_errors(self, frames: int, count: int) -> dict[str, Tensor]:
-        """Read what the track of so many frames and controls tells of its errors, as its arguments, metres."""
+        """Read the errors of a track that the file has, "sigma" and "drift", metres, as arguments of `Track`."""
         shapes = {"sigma": (frames, count), "drift": (count,)}
-        told = as_list(self.about.get("track_tells", []), subject="track_tells")  # older files do not say: nothing
-        return {name: self.require(f"track_{name}", shape) for name, shape in shapes.items() if name in told}
+        present = as_list(self.about.get("track_tells", []), subject="track_tells")  # older files: none
+        return {name: self.require(f"track_{name}", shape) for name, shape in shapes.items() if name in present}
 
     def poses(self, name: str) -> Tensor:
         """Read poses (T, 63) of at least one frame, radians."""
@@ -97,14 +97,14 @@ class StoredModel:
         return self.require(name, (rows, THETA))
 
     def directions(self, name: str) -> tuple[int, int]:
-        """Read for how many points a regression's basis is, and of how many directions: no more than poses have."""
+        """Return the number of points and of directions of a regression's basis; directions are at most 63."""
         value = self.tensors[name]
         if value.ndim != 3 or not 1 <= value.shape[2] <= THETA:
             raise InputError(name, expected=f"shape (K, 3, r), r up to {THETA}", received=f"shape {tuple(value.shape)}")
         return value.shape[0], value.shape[2]
 
     def blended(self, config: BlendShapeConfig, count: int) -> dict[str, Tensor | None]:
-        """Return what blend shapes of so many Gaussians are made from beside their sizes, as their arguments."""
+        """Return the tensors from which blend shapes of `count` Gaussians are made, as arguments of `BlendShapes`."""
         active = self.tensors.get(f"{SHAPES}active")
         rows = len(active) if active is not None and active.ndim == 1 else count
         self.require(f"{SHAPES}active", (rows,), torch.int64)

@@ -1,4 +1,4 @@
-"""The student: Gaussians on a mesh that a small field moves, with blend shapes for what that leaves over."""
+"""The student: Gaussians on a mesh that a small field displaces, with blend shapes for the residual."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from smplxpp.core.validation import require_at_least
 
 @dataclass(frozen=True)
 class StudentConfig:
-    """What a student is made of. The defaults are the paper's.
+    """Architecture of a student. The defaults are the paper's.
 
     Attributes:
-        field: that of the mesh's motion; None: the mesh follows its joints alone.
-        blend_shapes: those of the Gaussians; None: they have none (as before the compensation).
-        control_points: vertices that the field is evaluated on, interpolated to the rest; 0: all vertices.
-        still_body: the field moves what is worn and the hair; the body's own surface follows its joints alone. Not
+        field: of the mesh's displacements; None: the mesh follows its joints alone.
+        blend_shapes: of the Gaussians; None, as before the compensation: none.
+        control_points: number of vertices on which the field is evaluated and from which it is interpolated; 0: all.
+        still_body: the field displaces clothes, shoes and hair alone; the body's own surface follows its joints. Not
             applied to a template that is a body alone.
     """
 
@@ -77,13 +77,14 @@ class Student(nn.Module):
     `du = U z` to their offsets and `dc = C z` to their colours.
 
     Args:
-        config: which of these there are.
-        rig: that of the template. gaussians: those on it.
-        frames: the frames that have a code.
-        blend_shapes: fitted to these Gaussians; None makes new ones where the configuration has them.
-        known_poses: theta of the training frames, radians: far from them the body's blend shapes fade; None: nowhere.
-        regression: of the field's points, what poses without a code show in the field's place; None: the field's
-            null code.
+        config: architecture.
+        rig: of the template.
+        gaussians: bound to the template.
+        frames: numbers of the frames that have a code.
+        blend_shapes: of these Gaussians; None makes new ones where the configuration has them.
+        known_poses: theta of the training frames, radians; far from them the body's blend shapes fade. None: they do
+            not fade.
+        regression: displacements of the field's points in poses without a code; None: the field with the null code.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class Student(nn.Module):
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The frames that have a code."""
+        """Numbers of the frames that have a code."""
         return () if self.codes is None else self.codes.frames
 
     def displacements(self, pose: Pose) -> Float[Tensor, "V 3"] | None:
@@ -138,12 +139,13 @@ class Student(nn.Module):
             return bound
         jaw = pose.jaw[None] if self.blend_shapes.config.jaw else None
         z = self.blend_shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)
+        # Body shapes fade in unseen poses and under simulated clothes; head shapes do not.
         head = self.blend_shapes.config.head_shapes
         of_head, of_body = z.clone(), self._known(pose) * z
         of_head[..., head:], of_body[..., :head] = 0.0, 0.0
         if pose.cloth is None:
             du, dc = self.blend_shapes(of_head + of_body)
-        else:  # what was learned from a followed surface says nothing of one that is simulated
+        else:  # body shapes were learned on the tracked surface and do not hold on simulated clothes
             still = (1.0 - pose.cloth.share[self.rig.faces[bound.face_index]].mean(dim=1))[None]
             du, dc = (
                 a + still * b for a, b in zip(self.blend_shapes(of_head), self.blend_shapes(of_body), strict=True)
@@ -151,7 +153,7 @@ class Student(nn.Module):
         return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
 
     def _known(self, pose: Pose) -> float | Tensor:
-        """Return how much a pose counts as one that training saw."""
+        """Return the weight of a pose as one of the training's, in [0, 1]; body shapes fade with it."""
         if pose.known is not None:
             return pose.known
         if self.pose_gate is None or pose.frame in self.frames:
@@ -165,7 +167,7 @@ class Student(nn.Module):
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.compensated(pose)
         world = world_from_frames(bound, frames)
-        # Directions count as constants: a colour must not pull its Gaussian to the side.
+        # Viewing directions are constants: a colour's gradient must not move its Gaussian.
         colors = view_colors(bound, frames, world.means.detach(), camera_centers)
         return PosedAvatar(vertices, world, colors, bound, displacements)
 
@@ -175,10 +177,11 @@ class Student(nn.Module):
         *,
         known_poses: Float[Tensor, "T 63"] | None = None,
     ) -> Student:
-        """Make the same student with other blend shapes; a configuration makes new ones, which start at zero.
+        """Return a copy of the student with other blend shapes; a configuration makes new ones that start at zero.
 
         Args:
-            known_poses: where the body's blend shapes act; None: where they did.
+            blend_shapes: the new ones, their configuration, or None for none.
+            known_poses: theta of the poses near which body shapes act; None: those of this student.
         """
         given = blend_shapes if isinstance(blend_shapes, BlendShapes) else None
         shapes_config = blend_shapes.config if isinstance(blend_shapes, BlendShapes) else blend_shapes

@@ -24,23 +24,20 @@ from avatar.rendering.mesh_maps import front_back_maps, vertex_normals
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Pose, Rig
 
-TOLD = ("sigma", "drift")
-"""What a track may tell of its errors."""
+TRACK_ERRORS = ("sigma", "drift")
+"""Optional attributes of a `Track` that are stored with a teacher."""
 HALF_EXTENT = 1.0
-"""Metres from the middle of the canonical maps to their border, and more for a body that does not fit."""
-
-STILL = 1e-3
-"""Metres: poses that differ less are not told apart more than that."""
+"""Least distance from the centre of the canonical maps to their border, metres: holds most bodies in the T-pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class TeacherMaps:
-    """What the networks are shown of a pose.
+    """Inputs of the networks in a pose.
 
     Attributes:
-        positions: posed coordinates without the root's motion, metres; or, `centred`, by how many
-            deviations they differ from the mean.
-        cosines: those between posed normals and the directions to C cameras, or None.
+        positions: posed coordinates relative to the root, metres; with `centred`, deviations from their mean in units
+            of the standard deviation.
+        cosines: between posed normals and the directions to C cameras; None: colours do not depend on the view.
     """
 
     positions: Float[Tensor, "1 2 S S 3"]
@@ -54,8 +51,9 @@ class TeacherAvatar(nn.Module):
     attributes, R the rotation of the triangle in the T-pose.
 
     Args:
-        config: that of the networks.
-        rig: that of the template. gaussians: those on it; their quaternions are brought to length 1.
+        config: of the networks.
+        rig: of the template.
+        gaussians: bound to the template; their quaternions are normalised.
     """
 
     canonical_from_local: Tensor
@@ -73,7 +71,8 @@ class TeacherAvatar(nn.Module):
 
         self.frame = map_frame(rig)
         canonical = triangle_frames(rig.vertices, rig.faces)
-        # Where the triangles have them, without the offsets, which are learned: one lookup for all of the training.
+        # Look the maps up at the Gaussians' places on their triangles. Offsets, which are learned, are left out, so
+        # that one lookup serves the whole training.
         face = gaussians.face_index.to(rig.device)
         points = on_triangles(canonical.corners[face], gaussians.barycentric.to(rig.device))
         sides = assign_front_back(rig, self.frame, config.out_size, points, canonical.rotations[face, :, 0])
@@ -88,18 +87,19 @@ class TeacherAvatar(nn.Module):
         self.to(rig.device)
 
     def remember(self, track: Track) -> None:
-        """Keep the surface that was followed through the training frames; it is saved with the teacher."""
+        """Keep the tracked surface of the training frames; it is saved with the teacher."""
         device = self.rig.device
-        told = {name: value.to(device) for name in TOLD if (value := getattr(track, name)) is not None}
-        self.track = track = replace(track, controls=track.controls.to(device), **told)
+        errors = {name: value.to(device) for name in TRACK_ERRORS if (value := getattr(track, name)) is not None}
+        self.track = track = replace(track, controls=track.controls.to(device), **errors)
         frames = sorted(track.row, key=lambda frame: track.row[frame])
         self.register_buffer("track_frames", torch.tensor(frames, device=self.rig.device))
         self.register_buffer("track_controls", track.controls)
-        for name in TOLD:
-            self.register_buffer(f"track_{name}", told.get(name))
+        for name in TRACK_ERRORS:
+            self.register_buffer(f"track_{name}", errors.get(name))
 
     def centre(self, poses: Iterable[Pose]) -> None:
-        """Learn the mean and deviation of the maps of poses, where the configuration asks for it."""
+        """Set mean and standard deviation of the position maps over poses, if the configuration is `centred`."""
+        least_deviation = 1e-3  # metres; smaller differences between poses are not amplified beyond this
         if not self.config.centred:
             return
         count = 0
@@ -111,30 +111,30 @@ class TeacherAvatar(nn.Module):
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0.0)[self.maps.mask].mean()
         self.mean_positions.copy_(mean)
-        self.deviation.copy_(variance.sqrt().clamp(min=STILL))
+        self.deviation.copy_(variance.sqrt().clamp(min=least_deviation))
 
     @contextmanager
     def _exact(self) -> Iterator[None]:
-        """Work without gradients and in full precision: half of it would round the world's positions to millimetres."""
+        """Disable gradients and autocast: half precision would round positions in the world to millimetres."""
         with torch.no_grad(), torch.autocast(self.rig.device.type, enabled=False):
             yield
 
     def _root_positions(self, pose: Pose) -> tuple[Tensor, Tensor]:
-        """Return the skinned vertices without the root's motion, and their maps (2, S, S, 3), metres."""
+        """Return the skinned vertices relative to the root, and their maps (2, S, S, 3), metres."""
         with self._exact():
             to_root = pose.root_from_world
             vertices = self.rig.skin(pose) @ to_root[:3, :3].T + to_root[:3, 3]
             return vertices, self.maps.interpolate(vertices)
 
     def position_input(self, pose: Pose) -> Float[Tensor, "1 2 S S 3"]:
-        """Return the maps of a pose as the networks are shown them; a constant for gradients."""
+        """Return the position maps of a pose as the networks' input, without gradients."""
         return self._shown(self._root_positions(pose)[1])
 
     def _shown(self, positions: Tensor) -> Tensor:
         return ((positions - self.mean_positions) / self.deviation if self.config.centred else positions)[None]
 
     def inputs(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> TeacherMaps:
-        """Return the maps of a pose and of cameras with these centres, metres; constants for gradients."""
+        """Return all inputs of the networks for a pose and camera centres, metres, without gradients."""
         with self._exact():
             to_root = pose.root_from_world
             vertices, positions = self._root_positions(pose)
@@ -152,16 +152,17 @@ class TeacherAvatar(nn.Module):
         return self.networks(maps.positions, self.semantics, maps.cosines)
 
     def displacement_maps(self, poses: Sequence[Pose]) -> Float[Tensor, "B 2 R R 3"]:
-        """Return dU in B poses, metres; the networks of other residuals do not run if they are apart."""
+        """Return dU in B poses, metres; separate networks of other residuals do not run."""
         inputs = torch.cat([self.position_input(pose) for pose in poses])
         return self.config.position_scale * self.networks.positions(inputs, self.semantics)
 
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
-        """Pose the teacher as cameras with these centres, metres, see it."""
+        """Pose the teacher for cameras with these centres, metres."""
         return self.posed(pose, camera_centers, self.residual_maps(pose, camera_centers))
 
     def posed(self, pose: Pose, camera_centers: Float[Tensor, "C 3"], maps: Residuals) -> PosedAvatar:
-        """Do what `forward` does, from residual maps at hand."""
+        """Pose the teacher with given residual maps, as `forward` does with its own."""
+        # Add the residuals at the Gaussians to their local attributes.
         residuals = maps.sampled(self.sampler)
         bound = self.gaussians()
         bound = replace(
@@ -171,12 +172,13 @@ class TeacherAvatar(nn.Module):
             log_scales=bound.log_scales + residuals.log_scales[0],
             quats=bound.quats + residuals.quats[0],
         )
+        # Skin the mesh without displacements, and carry the Gaussians on its triangles.
         vertices = self.rig.skin(pose)
         frames = triangle_frames(vertices, self.rig.faces)
         world = world_from_frames(bound, frames)
         means = world.means.detach()
         color = residuals.colour.expand(len(camera_centers), -1, -1)
-        # dc joins before the clamp, so each camera's residual is part of it.
+        # Colours of each camera; its residual is added to dc before the clamp.
         colors = [
             view_colors(replace(bound, dc=bound.dc + color[c]), frames, means, camera_centers[c : c + 1])
             for c in range(len(camera_centers))
@@ -185,8 +187,8 @@ class TeacherAvatar(nn.Module):
 
 
 def map_frame(rig: Rig) -> MapFrame:
-    """Return the square of the canonical maps: +- 1 m about the middle of the T-pose's box, more for a larger body."""
+    """Return the square of the canonical maps: 1 m to each side of the T-pose's centre, more for a larger body."""
+    margin = 0.05  # metres; Gaussians may stand a little off the surface
     vertices = rig.template.vertices
     reach = float((vertices.max(axis=0) - vertices.min(axis=0))[:2].max() / 2.0)
-    # A Gaussian may stand a little off the surface.
-    return MapFrame.of(vertices, half_extent=max(HALF_EXTENT, reach + 0.05))
+    return MapFrame.of(vertices, half_extent=max(HALF_EXTENT, reach + margin))

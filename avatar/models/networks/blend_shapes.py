@@ -1,4 +1,4 @@
-"""Blend shapes of the Gaussians: what the mesh's motion leaves over in position and colour."""
+"""Blend shapes of the Gaussians: residuals of position and colour beyond the mesh's displacement."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ class BlendShapeConfig:
     """Sizes of the blend shapes. The defaults are the paper's.
 
     Attributes:
-        head_shapes, body_shapes: n_h and n_b.
+        head_shapes: n_h, number of the head's shapes.
+        body_shapes: n_b, number of the body's shapes.
         expression_size: number of expression parameters that drive the head.
         jaw: the jaw's rotation (axis-angle) drives the head too.
         pose_size: length of theta, which drives the body.
-        width, hidden_layers: sizes of both mapping networks.
+        width: of the layers of both mapping networks.
+        hidden_layers: number of them.
         gated: head shapes act on the head alone and body shapes on the rest, by a weight for each Gaussian.
         parts: 1, every Gaussian has the same coefficients; more, every part of the Gaussians has its own.
     """
@@ -48,12 +50,12 @@ class BlendShapeConfig:
 
     @property
     def shapes(self) -> int:
-        """The number of all shapes, n = n_h + n_b."""
+        """Number of all shapes, n = n_h + n_b."""
         return self.head_shapes + self.body_shapes
 
     @property
     def head_inputs(self) -> int:
-        """The length of what drives the head."""
+        """Length of the head's drivers: expression and jaw."""
         return self.expression_size + 3 * self.jaw
 
 
@@ -180,7 +182,7 @@ class BlendShapes(nn.Module):
                 of_gaussian = of_gaussian * self._gate(self.head_weight)
             out = torch.einsum("mck,bmk->bmc", basis, of_gaussian)
         elif self.head_weight is not None:
-            # What head and body shapes come to apart, weighted after: one product that walks the basis once.
+            # Blend head and body shapes separately in one product, and weight the results.
             head = torch.arange(self.config.shapes, device=z.device) < self.config.head_shapes
             both = torch.where(torch.stack([head, ~head])[:, None], z[:, 0], 0.0)
             of_head, of_body = self._product(basis, both.flatten(0, 1)).unflatten(0, (2, B))
@@ -197,7 +199,7 @@ class BlendShapes(nn.Module):
         return (z @ basis.flatten(0, 1).T).unflatten(1, (-1, 3))
 
     def _gate(self, head_weight: Tensor) -> Tensor:
-        """Return what the active Gaussians' shapes are multiplied by, (M, n)."""
+        """Return the factors (M, n) on the active Gaussians' shapes: w for the head's, 1 - w for the body's."""
         w = head_weight[self.active][:, None]
         return torch.cat([w.expand(-1, self.config.head_shapes), (1 - w).expand(-1, self.config.body_shapes)], dim=1)
 
@@ -207,10 +209,10 @@ class BlendShapes(nn.Module):
         return STORED_BYTES * values + (4 * len(self.active) if len(self.active) < self.count else 0)
 
     def importance(self, coefficient_std: Float[Tensor, "P n"]) -> Float[Tensor, " N"]:
-        """Return each Gaussian's share in the motion and the colour changes of all, 0 where it has no blend shapes.
+        """Return each Gaussian's share of the variance of all in position and colour; 0 without blend shapes.
 
-        The energy of a Gaussian's residual is `sum_k (|U_k| sigma_k)^2`, in position and in colour; each is divided by
-        its sum over the Gaussians, so that metres and colours weigh the same.
+        The variance of a Gaussian's residual is `sum_k (|U_k| sigma_k)^2`, in position and in colour; each is divided
+        by its sum over the Gaussians, so that both have equal weight.
 
         Args:
             coefficient_std: standard deviations of the coefficients over the training frames.
@@ -232,7 +234,7 @@ class BlendShapes(nn.Module):
             keep: share of the N Gaussians that keep theirs, above 0 and at most 1.
 
         Raises:
-            InputError: such a share.
+            InputError: a share outside that range.
         """
         if not 0.0 < keep <= 1.0:
             raise InputError("share of blend shapes to keep", expected="above 0, at most 1", received=f"{keep:g}")

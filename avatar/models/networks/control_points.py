@@ -12,18 +12,15 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least
 from smplxpp.template.template import Template
 
-CLOTH_DENSITY = 4.0
-"""Control points of a vertex of the clothes, where one of the body has 1."""
-
 
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
-    """K control vertices of V, and how every vertex is interpolated from them.
+    """K control vertices of V, and the interpolation of every vertex from them.
 
     Attributes:
         vertices: index of each control vertex.
-        neighbours: index of control points, from 0 to K - 1.
-        weights: non-negative, rows sum to 1.
+        neighbours: control points of each vertex, from 0 to K - 1.
+        weights: of those control points, non-negative; rows sum to 1.
     """
 
     vertices: Int64[np.ndarray, " K"]
@@ -67,6 +64,7 @@ def choose_control_points(
         )
     require_at_least("neighbours of a vertex", neighbour_count, 1)
 
+    # Group by group: sample the control points, then tie the group's vertices to the nearest of them.
     chosen: list[np.ndarray] = []
     neighbours = np.zeros((len(vertices), neighbour_count), dtype=np.int64)
     weights = np.zeros((len(vertices), neighbour_count))
@@ -86,12 +84,15 @@ def choose_control_points(
 
 
 def template_control_points(template: Template, count: int) -> ControlPoints:
-    """Choose control points of a template, part by part; its clothes, which fold, have `CLOTH_DENSITY` times as many.
+    """Choose control points of a template, part by part, four times as densely on its clothes, which fold.
 
     Args:
-        count: number of control points; all vertices where there are no more.
+        template: the clothed body.
+        count: number of control points; at most all vertices.
     """
-    density = np.where(template.cloth_mask, CLOTH_DENSITY, 1.0)
+    cloth_density = 4.0  # relative to the body
+
+    density = np.where(template.cloth_mask, cloth_density, 1.0)
     count = min(count, template.vertex_count)
     return choose_control_points(template.vertices, template.vertex_part, count=count, importance=density)
 
@@ -99,7 +100,7 @@ def template_control_points(template: Template, count: int) -> ControlPoints:
 def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
     """Split `count` in proportion to `wishes`, exactly: from 1 to the size of each group.
 
-    The largest remainders are rounded up; what a full group cannot take goes to the others in the same proportion.
+    The largest remainders are rounded up; the excess of a full group goes to the others in the same proportion.
     """
     shares = np.ones(len(sizes), dtype=np.int64)
     while (left := count - shares.sum()) > 0:
@@ -114,11 +115,11 @@ def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
 
 
 def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of `count` points, each the farthest from those before it."""
+    """Return the indices of `count` points by farthest-point sampling."""
     picked = np.empty(count, dtype=np.int64)
     picked[0] = np.argmax(np.linalg.norm(points - points.mean(0), axis=1))
     distance = np.full(len(points), np.inf)
-    # Each choice depends on the one before: a loop over control points, not over vertices.
+    # Sequential, because each choice depends on the one before.
     for i in range(1, count):
         distance = np.minimum(distance, np.sum((points - points[picked[i - 1]]) ** 2, axis=1))
         picked[i] = np.argmax(distance)

@@ -26,9 +26,10 @@ class FieldConfig:
         frequencies: number of bands L of the positional encoding.
         pose_size: length of theta (21 body joints, axis-angle).
         code_size: length of a frame's code z_t.
-        width, hidden_layers: sizes of both MLPs; one more layer gives the displacement.
-        local_pose: a point sees the joints of theta within as many steps along the skeleton of one that carries it
-            (`seen_joints`), the others as zero; 0: all of them, as published.
+        width: of the layers of both MLPs.
+        hidden_layers: number of them; one more layer gives the displacement.
+        local_pose: number of steps along the skeleton from the joints that carry a point to the joints of theta that it
+            depends on (`seen_joints`); the others are zero. 0, as published: all of them.
     """
 
     frequencies: int = 6
@@ -47,7 +48,7 @@ class FieldConfig:
 
     @property
     def encoding_size(self) -> int:
-        """The length of a point's positional encoding."""
+        """Length of a point's positional encoding."""
         return 3 + 6 * self.frequencies
 
 
@@ -64,11 +65,11 @@ def positional_encoding(points: Float[Tensor, "*P 3"], frequencies: int) -> Floa
 
 
 class FieldNetwork(nn.Module):
-    """MLP on `phi(v) + theta + z`; the last layer starts at zero, the others as He et al. 2015 start rectified ones.
+    """MLP on the concatenation of phi(v), theta and z; hidden layers have He's initialisation, the last one is zero.
 
-    The first layer is linear in its parts: that of pose and code is computed once a frame (and once for every set of
-    joints that points see), not once a vertex. From PyTorch's own start, which halves what a layer says and adds
-    constants, points and frames were alike after five layers, and networks died within some hundred steps.
+    The first layer is linear in its parts. Its part of pose and code is computed once a frame (and once for every set
+    of joints), not once a vertex. PyTorch's default initialisation halves the signal in every layer and adds constants:
+    after five layers points and frames were alike, and units died within some hundred steps.
     """
 
     def __init__(self, config: FieldConfig) -> None:
@@ -80,7 +81,7 @@ class FieldNetwork(nn.Module):
         self.last = nn.Linear(config.width, 3)
         fan_in = config.encoding_size + config.pose_size + config.code_size
         for layer in (self.of_point, self.of_frame):
-            # As one layer of all inputs would start.
+            # The bound of a single layer of all inputs.
             nn.init.uniform_(layer.weight, -math.sqrt(6.0 / fan_in), math.sqrt(6.0 / fan_in))
         nn.init.zeros_(self.of_frame.bias)
         for layer in hidden:
@@ -90,7 +91,7 @@ class FieldNetwork(nn.Module):
         nn.init.zeros_(self.last.bias)
 
     def forward(self, encodings: Tensor, frames: Tensor, member: Tensor | None) -> Tensor:
-        """Take (V, E) encodings, (B, U, pose + code) and (V, U) one-hot, or None where U is 1, to (B, V, 3)."""
+        """Map (V, E) encodings, (B, U, pose + code) and a (V, U) one-hot, or None where U is 1, to (B, V, 3)."""
         of_frame = self.of_frame(frames)
         x = F.relu(self.of_point(encodings) + (of_frame if member is None else member @ of_frame))
         for layer in self.hidden:
@@ -109,8 +110,8 @@ class DeformationField(nn.Module):
         vertices: canonical vertices, metres.
         cloth_mask: m.
         control: control points of the same vertices, or None to evaluate the field on every vertex.
-        seen: the joints of theta, J = pose_size / 3, that each vertex sees, where the configuration asks for it.
-        still: vertices that are not displaced, whole groups of the control points; None: none are.
+        seen: the joints of theta, J = pose_size / 3, that each vertex depends on, if `local_pose` is set.
+        still: vertices that are not displaced, whole groups of the control points; None: none.
 
     Attributes:
         points: (K,) vertices that the networks are evaluated on.
@@ -161,6 +162,7 @@ class DeformationField(nn.Module):
                 expected=f"some of {len(vertices)}, not all",
                 received=f"{int(still.sum())} of {len(still)}",
             )
+        # Networks, and the points on which they are evaluated.
         self.config = config
         self.body = FieldNetwork(config)
         self.cloth = FieldNetwork(config)
@@ -169,11 +171,12 @@ class DeformationField(nn.Module):
         self.register_buffer("points", where, persistent=False)
         self.register_buffer("encodings", positional_encoding(vertices, config.frequencies), persistent=False)
         self.register_buffer("cloth_index", torch.nonzero(cloth_mask)[:, 0], persistent=False)
+        # Distinct sets of joints, and the set of each point.
         sets = member = None
         if seen is not None:
             sets, group = torch.unique(seen[where], dim=0, return_inverse=True)
             sets = sets.to(vertices.dtype).repeat_interleave(3, dim=1)
-            # A product with one-hot rows: its gradient is a product too, where a gather's is slow on a CPU.
+            # A matrix product with one-hot rows, because the gradient of a gather is slow on a CPU.
             member = F.one_hot(group, len(sets)).to(vertices.dtype)
         self.register_buffer("sets", sets, persistent=False)
         self.register_buffer("member", member, persistent=False)
@@ -186,7 +189,7 @@ class DeformationField(nn.Module):
         """Interpolate displacements of the points to all vertices."""
         if self.rows is None:
             return moved
-        # Poses side by side are one table.
+        # All poses in one table, side by side.
         spread = self.rows(moved.transpose(0, 1).flatten(1))
         return spread.unflatten(1, (len(moved), 3)).transpose(0, 1)
 
@@ -221,7 +224,7 @@ class DeformationField(nn.Module):
 def _evaluated(
     vertices: Float[Tensor, "V 3"], control: ControlPoints | None, still: Bool[Tensor, " V"] | None
 ) -> tuple[Tensor, SparseRows | None]:
-    """The vertices that the field is evaluated on, and how all are interpolated from them; None: they are all."""
+    """Return the vertices on which the field is evaluated, and the interpolation from them; None: all vertices."""
     every = torch.arange(len(vertices), device=vertices.device)
     if control is None:
         if still is None:
@@ -234,17 +237,17 @@ def _evaluated(
     if still is not None:
         moves = ~still[where]
         number = moves.cumsum(0) - 1
-        # A vertex that stays sums a row with weight 0, whichever.
+        # Still vertices have weight 0 on an arbitrary row.
         neighbours, weights = number[neighbours] * ~still[:, None], weights * ~still[:, None]
         where = where[moves]
     return where, SparseRows(neighbours, weights, len(where))
 
 
 class FrameCodes(nn.Module):
-    """Learnable codes z_t, one for every frame of a sequence, zero at first.
+    """Learnable codes z_t, one for every frame of a sequence, initially zero.
 
-    A pose without a frame is driven by the *null code*: the zero vector if training showed that to the field, in the
-    place of some of the codes (`show_null_code`); else z_0, the code of the first frame, which it has seen.
+    A pose without a frame has the *null code*: the zero vector if training used it in the place of some of the codes
+    (`show_null_code`); else z_0, the code of the first frame, which the field has seen.
 
     Args:
         frames: numbers of the frames, each once.
@@ -284,7 +287,7 @@ class FrameCodes(nn.Module):
 
 
 def show_null_code(model: nn.Module) -> None:
-    """Tell all frame codes within a model that training shows the zero vector to it as the null code."""
+    """Mark all frame codes of a model: training uses the zero vector as the null code."""
     for module in model.modules():
         if isinstance(module, FrameCodes):
             module.null_code_shown = True

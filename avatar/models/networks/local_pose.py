@@ -1,4 +1,4 @@
-"""Which joints of a pose a vertex sees."""
+"""Masks of the joints that influence a vertex, by steps along the skeleton."""
 
 from __future__ import annotations
 
@@ -8,23 +8,24 @@ from jaxtyping import Bool, Int64
 from smplxpp.template.template import Template
 
 MIN_SKIN_WEIGHT = 0.05
-"""Skin weight from which a joint carries a vertex."""
+"""Least skin weight with which a joint carries a vertex."""
 BODY_JOINTS = 21
-"""Joints in theta: 1 to 21 of the skeleton."""
+"""Number of joints in theta: joints 1 to 21 of the skeleton."""
 
 
 def seen_joints(template: Template, steps: int) -> Bool[np.ndarray, "V 21"]:
     """Mark, for each vertex, the joints of theta within `steps` of one that carries the vertex, along the skeleton.
 
-    A skirt that has seen few poses would learn the arms of those poses by heart. Saito et al., "SCANimate" (2021),
-    mask the pose by skin weights for the same reason.
+    With few training poses, a skirt would overfit to the arms of those poses. Saito et al., "SCANimate" (2021), mask
+    the pose by skin weights for the same reason.
     """
     return joint_steps(template) <= steps
 
 
 def joint_steps(template: Template) -> Int64[np.ndarray, "V 21"]:
-    """Count, for each vertex, the steps along the skeleton from each joint of theta to the nearest that carries it."""
+    """Count, for each vertex, the steps from each joint of theta to the nearest joint with skin weight on it."""
     parents = np.asarray(template.body.parents)
+    # Adjacency of the skeleton; then grow the set of carrying joints step by step (breadth-first search).
     near = np.eye(len(parents), dtype=bool)
     children = np.flatnonzero(parents >= 0)
     near[children, parents[children]] = near[parents[children], children] = True

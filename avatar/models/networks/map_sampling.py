@@ -1,4 +1,4 @@
-"""Gaussians looked up in the front and back maps of a body in its canonical pose."""
+"""Bilinear lookup of Gaussians in the front and back maps of a body in its canonical pose."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class MapSampler(nn.Module):
     several times faster than `grid_sample` on a CPU.
 
     Args:
-        frame: that of the maps.
+        frame: of the maps.
         size: side of the maps in pixels.
         points: canonical positions, metres.
-        front: True for those on the front map.
+        front: whether each point is on the front map.
 
     Raises:
         InputError: points that are not finite or outside the frame, or sides of another number.
@@ -37,14 +37,15 @@ class MapSampler(nn.Module):
                 received=f"shapes {tuple(points.shape)} and {tuple(front.shape)}",
             )
         pixels = frame.pixels_from_canonical(points.detach(), size)
-        beyond = float((pixels - 0.5 * size).abs().max()) * 2.0 / size if len(pixels) else 0.0
-        if not beyond <= 1.0:
+        excess = float((pixels - 0.5 * size).abs().max()) * 2.0 / size if len(pixels) else 0.0
+        if not excess <= 1.0:
             raise InputError(
                 "canonical Gaussians",
                 expected=f"within {frame.half_extent:g} m of the middle of the maps along x and y",
-                received=f"one {beyond * frame.half_extent:.3g} m away",
+                received=f"one {excess * frame.half_extent:.3g} m away",
                 remedy="check the units, or choose a larger half extent",
             )
+        # Bilinear weights of the four pixel centres around each point, as rows of a sparse matrix.
         self.size = size
         corner = (pixels - 0.5).floor().clamp(0, size - 2)
         right, down = (pixels - 0.5 - corner).clamp(0.0, 1.0).unbind(-1)

@@ -1,4 +1,4 @@
-"""How much a pose is one that training saw: what is learned from poses holds near those, and nowhere else."""
+"""Weight of a pose by its distance from the training poses, near which pose-driven shapes are valid."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor, nn
 class PoseGate(nn.Module):
     """`g(theta) = exp(-((d - d_0) / d_0)^2 / 2)` for d > d_0, else 1, with d the distance to the nearest known pose.
 
-    d_0 is the median distance of a known pose to its nearest other one: poses between two that follow each other count
-    as known.
+    d_0 is the median distance of a known pose to its nearest other one, so that poses between two consecutive frames
+    have weight 1.
 
     Args:
         poses: theta of the training frames, radians.
@@ -27,12 +27,12 @@ class PoseGate(nn.Module):
         apart.fill_diagonal_(float("inf"))
         nearest = apart.min(dim=1).values
         near = nearest[nearest.isfinite()]
-        # One pose, or copies of one: what is within two degrees of it in one joint is it.
-        scale = max(float(near.median()) if len(near) else 0.0, 0.035)
+        least_scale = 0.035  # radians, two degrees of one joint, for a single pose or copies of one
+        scale = max(float(near.median()) if len(near) else 0.0, least_scale)
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float32))
 
     def forward(self, pose: Float[Tensor, " 63"]) -> Float[Tensor, ""]:
-        """Return g of a pose, in [0, 1]."""
+        """Return the weight g of a pose, in [0, 1]."""
         distance = (self.poses - pose).norm(dim=1).min()
         over = ((distance - self.scale) / self.scale).clamp(min=0.0)
         return torch.exp(-0.5 * over.square())

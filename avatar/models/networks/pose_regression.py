@@ -1,4 +1,4 @@
-"""The surface of new poses: a regression, linear in the pose, of the surfaces that training found in its frames."""
+"""Displacements of new poses: a low-rank linear regression from the pose (`training.student.regress_poses` fits it)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ from avatar.rig.rig import THETA
 
 
 class PoseRegression(nn.Module):
-    """`dv(theta) = m + B A (clip(theta, low, high) - c)`: few directions of theta, linear as SMPL's pose correctives.
+    """`dv(theta) = m + B A (clip(theta, low, high) - c)`, linear in the pose as SMPL's pose correctives.
 
-    Beyond the angles that training saw a line leads anywhere: they are held at `low` and `high`.
+    Angles are clamped to a range about the training's, because a linear function does not extrapolate.
 
     Args:
-        level: m, metres along the canonical axes. basis: B, metres. rows: A, 1 / radian.
-        center: c, radians. low, high: radians.
+        level: m, mean displacement, metres along the canonical axes.
+        basis: B, metres.
+        rows: A, 1 / radian.
+        center: c, radians.
+        low: least angles, radians.
+        high: largest angles, radians.
     """
 
     level: Tensor
@@ -42,11 +46,11 @@ class PoseRegression(nn.Module):
 
     @staticmethod
     def shapes(points: int, directions: int) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the arguments."""
+        """Return the shapes of the arguments by name."""
         basis = {"level": (points, 3), "basis": (points, 3, directions), "rows": (directions, THETA)}
         return basis | dict.fromkeys(("center", "low", "high"), (THETA,))
 
     def forward(self, pose: Float[Tensor, "B 63"]) -> Float[Tensor, "B K 3"]:
-        """Return displacements of the points, metres."""
+        """Return displacements of the points in B poses, metres."""
         turned = torch.minimum(torch.maximum(pose, self.low), self.high) - self.center
         return self.level + (turned @ self.rows.T @ self.basis.flatten(0, 1).T).unflatten(1, (-1, 3))

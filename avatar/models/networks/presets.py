@@ -1,4 +1,4 @@
-"""Sizes of all networks under one name."""
+"""Presets of network sizes, by the name of the training preset."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from smplxpp.core.validation import require_choice
 
 @dataclass(frozen=True)
 class NetworkPreset:
-    """The teacher and the field of a preset."""
+    """Sizes of the teacher and of the field in a preset."""
 
     teacher: TeacherConfig
     field: FieldConfig
@@ -32,11 +32,11 @@ _TEACHERS = {
     "demo": replace(_LEAN, in_size=64, out_size=128, channel_base=1024, channel_max=32, style_size=16),
 }
 
-# Short trainings see few poses.
+# Short trainings have few poses: a vertex depends on nearby joints alone.
 _FIELDS = {name: FieldConfig(local_pose=3) for name in ("cpu", "demo")}
 
 NETWORK_PRESETS = {
-    # The field has the paper's sizes in all of them: it is small already.
+    # The field has the paper's sizes in all presets, because it is small.
     name: NetworkPreset(teacher, _FIELDS.get(name, FieldConfig()))
     for name, teacher in _TEACHERS.items()
 }

@@ -1,4 +1,4 @@
-"""Weighted sums of a few rows of a table: a sparse matrix with as many entries in every row."""
+"""Sparse matrix with equally many entries in every row: weighted sums of a few rows of a table."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ class SparseRows(nn.Module):
     """`out_i = sum_j w_ij table[r_ij]`, several times faster on a CPU than a gather, its gradient most of all.
 
     The transposed matrix is prepared too, so that the sums of the gradient have one order on any device. The buffers
-    are not saved: they follow from what the module is made of.
+    are not saved, because they follow from the arguments.
 
     Args:
-        rows: rows of the table. weights: those of the rows.
+        rows: r, indices of the table's rows.
+        weights: w, of those rows.
         count: number of the table's rows.
     """
 
@@ -42,6 +43,7 @@ class SparseRows(nn.Module):
         super().__init__()
         points, per_point = rows.shape
         flat, weights = rows.flatten(), weights.flatten()
+        # The transposed matrix: entries sorted by the table's row.
         order = torch.argsort(flat, stable=True)
         counts = torch.bincount(flat, minlength=count)
         offsets = torch.arange(0, per_point * points, per_point, device=rows.device)
@@ -58,7 +60,7 @@ class SparseRows(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def of(self, points: Int[Tensor, " N"]) -> tuple[Int[Tensor, "N k"], Float[Tensor, "N k"]]:
-        """Return the rows that some of the sums are made of, and their weights."""
+        """Return the table rows and weights of chosen sums."""
         rows, weights = (getattr(self, name).reshape(-1, self.per_point) for name in ("rows", "weights"))
         return rows[points], weights[points]
 

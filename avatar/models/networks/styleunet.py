@@ -29,9 +29,6 @@ from avatar.models.networks.stylegan2_layers import (
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_between
 
-STYLE_LR_MULTIPLIER = 0.01
-"""Learning-rate multiplier of the style's mapping network (Karras et al. 2019)."""
-
 
 @dataclass(frozen=True)
 class Head:
@@ -48,10 +45,13 @@ class StyleUNetConfig:
     Attributes:
         in_channels: channels of the input image (front and back together).
         heads: outputs; everything but the finest scale of the decoder is shared between them.
-        in_size, out_size: side of the input and output in pixels, powers of two.
+        in_size: side of the input in pixels, a power of two.
+        out_size: side of the output in pixels, a power of two.
         bottleneck: side of the coarsest feature map.
-        channel_base, channel_max: a feature map of side r has `min(channel_max, channel_base / r)` channels.
-        style_size, style_layers: length of the style and depth of its mapping network.
+        channel_base: a feature map of side r has `min(channel_max, channel_base / r)` channels.
+        channel_max: upper limit of the channels.
+        style_size: length of the style.
+        style_layers: depth of its mapping network.
         noise: add fixed noise of learnt strength in the decoder.
         zero_output: the output starts at exactly zero.
     """
@@ -108,7 +108,7 @@ class Encoder(nn.Module):
         self.filter = FirFilter()
 
     def forward(self, image: Float[Tensor, "B I S S"]) -> dict[int, Tensor]:
-        """Return the feature maps by their side."""
+        """Return the feature maps, by their side in pixels."""
         x = self.first(image)
         features = {x.shape[-1]: x}
         for from_image, block in zip(self.from_image, self.blocks, strict=True):
@@ -201,11 +201,13 @@ class Decoder(nn.Module):
         Returns:
             (B, channels, out_size, out_size) for each head, (V, ...) where it sees the view.
         """
+        # Coarse scales, shared by all heads: features, and the sum of their maps.
         maps: Tensor | None = None
         for step in self.coarse:
             x, part = step(skip(x), style)
             maps = part if maps is None else self.filter.enlarge(maps) + part
         assert maps is not None  # the output has at least eight times the bottleneck's side
+        # The finest scale of each head, with the features of the view.
         coarse_maps = maps.split([head.channels for head in self.heads], dim=1)
         outputs = []
         for head, step, coarse in zip(self.heads, self.fine, coarse_maps, strict=True):
@@ -244,9 +246,10 @@ class StyleUNet(nn.Module):
     def __init__(self, config: StyleUNetConfig) -> None:
         super().__init__()
         self.config = config
+        lr_multiplier = 0.01  # of the style's mapping network (Karras et al. 2019)
         self.register_buffer("style_seed", torch.ones(config.style_size), persistent=False)
         self.mapping = nn.ModuleList(
-            EqualizedLinear(config.style_size, config.style_size, lr_multiplier=STYLE_LR_MULTIPLIER)
+            EqualizedLinear(config.style_size, config.style_size, lr_multiplier=lr_multiplier)
             for _ in range(config.style_layers)
         )
         self.encoder = Encoder(config)
@@ -255,7 +258,7 @@ class StyleUNet(nn.Module):
         self.view_encoder = ViewEncoder(config) if any(head.sees_view for head in config.heads) else None
 
     def style(self) -> Float[Tensor, " Z"]:
-        """Return what modulates every convolution of the decoders."""
+        """Return the style, which modulates every convolution of the decoders."""
         w = self.style_seed
         for layer in self.mapping:
             w = F.leaky_relu(layer(w), SLOPE) * GAIN

@@ -14,9 +14,8 @@ from avatar.models.networks.styleunet import Head, StyleUNet, StyleUNetConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_between, require_choice, require_positive
 
-POSITION, COLOUR = 3, 3
-OTHER = 7
-"""Channels of opacity (1), tangential log scales (2) and quaternion (4)."""
+# Output channels: position, colour, and opacity (1) with tangential log scales (2) and quaternion (4).
+POSITION, COLOUR, OTHER = 3, 3, 1 + 2 + 4
 
 
 @dataclass(frozen=True)
@@ -33,10 +32,16 @@ class TeacherConfig:
             channels, sees the input at half that size and is enlarged to `out_size`; 0: the position is one of the
             others' outputs. Displacements are smoother than colours, and the smaller network learns them many times
             faster.
-        centred: show the networks by how much a pose's map differs from the mean of the training frames, in units of
-            the differences' standard deviation; False: the map itself, in metres.
-        in_size, out_size, bottleneck, channel_base, channel_max, style_size, style_layers, noise, zero_output: of each
-            StyleUNet, see `StyleUNetConfig`.
+        centred: standardise the position maps by mean and standard deviation of the training frames; False: metres.
+        in_size: side of the input, pixels. It and the following are of each StyleUNet, see `StyleUNetConfig`.
+        out_size: side of the output, pixels.
+        bottleneck: side of the coarsest feature map.
+        channel_base: channels times side of a feature map.
+        channel_max: upper limit of the channels.
+        style_size: length of the style.
+        style_layers: depth of its mapping network.
+        noise: add noise in the decoder.
+        zero_output: the output starts at zero.
 
     Raises:
         InputError: sizes that are no powers of two or do not fit each other, an unknown choice.
@@ -104,7 +109,7 @@ class TeacherConfig:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """What the teacher adds to the attributes: as maps (B, 2, R, R, ...) or Gaussian by Gaussian (B, N, ...).
+    """Residuals that the teacher adds to the attributes, as maps (B, 2, R, R, ...) or of Gaussians (B, N, ...).
 
     Attributes:
         shape: position in units of `position_scale`, opacity, log scales and quaternion, side by side.
@@ -119,26 +124,26 @@ class Residuals:
 
     @property
     def position(self) -> Float[Tensor, "*B 3"]:
-        """The displacements, metres along the axes of the canonical pose."""
+        """Displacements, metres along the axes of the canonical pose."""
         return self.position_scale * self.shape[..., :3]
 
     @property
     def opacity_logit(self) -> Float[Tensor, "*B"]:
-        """The opacities' residuals, added before the sigmoid."""
+        """Residuals of the opacities, added before the sigmoid."""
         return self.shape[..., 3]
 
     @property
     def log_scales(self) -> Float[Tensor, "*B 2"]:
-        """The scales' residuals, added to the logarithms of the tangential scales."""
+        """Residuals of the logarithms of the tangential scales."""
         return self.shape[..., 4:6]
 
     @property
     def quats(self) -> Float[Tensor, "*B 4"]:
-        """The rotations' residuals, wxyz, added before normalisation."""
+        """Residuals of the quaternions, wxyz, added before normalisation."""
         return self.shape[..., 6:]
 
     def sampled(self, sampler: MapSampler) -> Residuals:
-        """Look maps up at the Gaussians of `sampler`."""
+        """Sample residual maps at the Gaussians of `sampler`."""
         return Residuals(sampler(self.shape), sampler(self.colour), self.position_scale)
 
 
@@ -171,8 +176,8 @@ class Teacher(nn.Module):
         """Return the residual maps of B poses.
 
         Args:
-            positions: posed coordinates without the root's motion, metres, on the front and back map of
-                the canonical pose; 0 on the background.
+            positions: posed coordinates relative to the root, metres, on the front and back map of the canonical pose;
+                0 on the background.
             semantics: semantic colours on the same maps, one for all poses or one for each.
             view_cosines: cosine between the posed normal and the direction to the camera; V = B, or B = 1
                 and V views of one pose. None: no view is seen.
@@ -189,6 +194,7 @@ class Teacher(nn.Module):
         _require_shape("semantic maps", semantics, (B if len(semantics) != 1 else 1, 2, size, size, 3))
         if view_cosines is not None:
             _require_shape("view maps", view_cosines, (V if B == 1 else B, 2, size, size))
+        # One network with all heads, or a network of the position and others.
         image = self._image(positions, semantics)
         if "position" not in self.networks:
             shape, colour = self.networks["all"](image, view_cosines)
@@ -213,7 +219,7 @@ class Teacher(nn.Module):
         return self._position(image) if "position" in self.networks else self.networks["all"](image)[0][..., :POSITION]
 
     def _image(self, positions: Tensor, semantics: Tensor) -> Tensor:
-        """Make the input of the StyleUNets, (B, channels, S, S)."""
+        """Return the input of the StyleUNets, (B, channels, S, S)."""
         if self.config.semantics == "sum":
             image = positions + semantics
         else:

@@ -1,4 +1,4 @@
-"""Where a training stands, in one file: tensors of any names, an iteration, and what the training is of."""
+"""Checkpoints: tensors by name, the iteration, and a key of configuration and inputs, in one safetensors file."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Checkpoint:
     """A training after `iteration` steps.
 
     Attributes:
-        iteration: steps done.
-        seconds: time they took, all sessions together.
-        key: names the configuration and inputs; a training goes on only from a checkpoint of its own key.
+        iteration: number of finished steps.
+        seconds: their time over all sessions.
+        key: digest of configuration and inputs; a training continues only from a checkpoint of its own key.
         tensors: parameters and the optimiser's state by name.
     """
 
@@ -38,18 +38,18 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint as safetensors, whole or not at all: a kill or a full disk leaves the one before."""
+    """Write a checkpoint as safetensors, atomically: a kill or a full disk leaves the one before."""
     about = {"iteration": checkpoint.iteration, "seconds": checkpoint.seconds, "key": checkpoint.key}
     tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
     atomic_write_bytes(path, save(tensors, metadata={"training": json.dumps({"schema": SCHEMA, **about})}))
 
 
 def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
-    """Return the checkpoint in a file, bit for bit; None where there is none or it cannot be read, which is logged.
+    """Return the checkpoint in a file; None where there is none or it cannot be read, which is logged.
 
     Raises:
-        InputError: one of another training or of another version of the format. Hours may lie in it: only the user
-            can say that it may go.
+        InputError: one of another training or of another version of the format. It may hold hours of work, so that
+            only the user may delete it.
     """
     path = Path(path)
     if not path.exists():
@@ -69,12 +69,12 @@ def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
             f"checkpoint {path}",
             expected=f"version {SCHEMA} of the format",
             received=f"version {shown(schema)}",
-            remedy="go on with the smplxpp that wrote it; to start anew, delete it (--force does)",
+            remedy="continue with the smplxpp that wrote it; to start again, delete it (--force does)",
         )
     raise InputError(
         f"checkpoint {path}",
         expected="one of these options, inputs and code",
         received=f"one of others, at iteration {shown(file.about.get('iteration'))}",
-        remedy="give the options that it was made with, or take another run folder; to start anew, delete it "
+        remedy="give the options that it was made with, or take another run folder; to start again, delete it "
         "(--force does)",
     )

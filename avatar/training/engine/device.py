@@ -1,4 +1,4 @@
-"""Where a training computes, and what its random numbers follow from."""
+"""The device of a training, and a fixed seed of its random numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 def choose_device(name: str) -> str:
-    """Return "cpu" or "cuda" for "auto", "cpu" or "cuda"; auto takes CUDA where it is and gsplat, which draws there.
+    """Return "cpu" or "cuda" for "auto", "cpu" or "cuda"; auto takes CUDA where a GPU and gsplat are available.
 
     Raises:
         InputError: CUDA where there is none.
@@ -34,7 +34,7 @@ def choose_device(name: str) -> str:
 
 @contextmanager
 def fixed_seed(seed: int) -> Iterator[None]:
-    """Let random numbers of the CPU within the block follow from `seed`; those after it are as if it had not been."""
+    """Seed the CPU's random numbers within the block, and restore their state after it."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield

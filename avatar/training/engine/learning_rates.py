@@ -1,4 +1,4 @@
-"""Adam's steps of the Gaussians' attributes."""
+"""Learning rates of the Gaussians' attributes, and the size of a pixel at the person as their unit."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from smplxpp.core.validation import require_positive
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRates:
-    """Adam's step of every attribute at the start; all fall exponentially to `lr_final_factor` times that.
+    """Learning rate of every attribute at the start; all fall exponentially to `lr_final_factor` times that.
 
     Attributes:
-        normal_offset: pixels along the normal, which has the silhouettes to meet. A pixel is the median over the
-            training views of what one covers at the person, so that the rate fits any distance and image size.
+        normal_offset: pixels along the normal, which silhouettes determine. A pixel is the median over the training
+            views of its size at the person, so that the rate fits any distance and image size.
         offset: pixels in every direction; slow, so that texture stays where several views agree on it.
-        log_scales, quats, opacity_logits: of the parameters as they are stored.
-        dc: of colours in [0, 1]. sh: of the coefficients that depend on the view.
-        lr_final_factor: share left at the last step.
+        log_scales: of the logarithms of scales in the triangle's frame.
+        quats: of the quaternions' components.
+        opacity_logits: of the logits of opacities.
+        dc: of colours in [0, 1].
+        sh: of the harmonics' coefficients that depend on the view.
+        lr_final_factor: share of all rates left at the last step.
     """
 
     normal_offset: float = 0.1
@@ -42,10 +45,13 @@ class LearningRates:
 def attribute_groups(
     gaussians: LearnedGaussians, multiple: float, pixel: float, rates: LearningRates
 ) -> list[ParameterGroup]:
-    """Return groups of the Gaussians' attributes at `multiple` times `rates`; none for 0, which freezes them.
+    """Return parameter groups of the Gaussians' attributes at `multiple` times `rates`; none for 0, which freezes them.
 
     Args:
-        pixel: metres, the unit of the offsets' rates.
+        gaussians: whose attributes learn.
+        multiple: factor on all rates.
+        pixel: size of a pixel at the person, metres, the unit of the offsets' rates.
+        rates: of the attributes.
     """
     if not multiple:
         gaussians.requires_grad_(False)
@@ -65,7 +71,7 @@ def attribute_groups(
 
 
 def pixel_size(sequence: FrameSequence) -> float:
-    """Return the metres that a pixel covers at the person: median over the training cameras of `distance / f`."""
+    """Return the size of a pixel at the person, metres: the median of `distance / f` over the training cameras."""
     center = sequence.person_center()
     cameras = [sequence.camera(name) for name in sequence.train_cameras]
     return float(np.median([np.linalg.norm(c.position - center) / c.K[0, 0] for c in cameras]))

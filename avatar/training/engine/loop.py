@@ -1,4 +1,4 @@
-"""The loop that every training shares: metrics, evaluations, checkpoints, a limit of time."""
+"""The training loop: steps, metrics, evaluations, checkpoints and a time limit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TENSORBOARD_FOLDER = "tensorboard"
 
 
 class Task(Protocol):
-    """What is trained. A step depends on nothing but the state and its number: a resumed run is the same run.
+    """A training. Its steps depend on state and step number alone, so that a resumed run gives the same bits.
 
     Attributes:
         distributed: the processes that train together. All take every step; the first alone evaluates and saves.
@@ -38,23 +38,23 @@ class Task(Protocol):
         """Return figures of the state after `iteration` steps, as JSON values."""
 
     def state(self) -> Mapping[str, Tensor]:
-        """Return all that the next step depends on."""
+        """Return all tensors that the next step depends on, by name."""
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take what `state` gave."""
+        """Continue from tensors that `state` returned."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConfig:
-    """How long and how often.
+    """Number of steps and intervals of logs, evaluations and checkpoints.
 
     Attributes:
-        iterations: steps in all.
-        log_every, evaluate_every: steps between lines of metrics and between evaluations; both also come at the end,
-            and an evaluation at the start.
+        iterations: number of all steps.
+        log_every: steps between lines of metrics, which also come at the end.
+        evaluate_every: steps between evaluations, which also come at the start and at the end.
         checkpoint_seconds: a kill loses at most the steps of this time.
-        max_seconds: stop with a checkpoint when this session has worked as long.
-        keep_end: keep a checkpoint of the end too: what comes after this training may be killed as well.
+        max_seconds: stop with a checkpoint when this session's steps took this time.
+        keep_end: keep a checkpoint of the end too, for stages in which another training follows.
         tensorboard: log for TensorBoard too.
     """
 
@@ -69,13 +69,16 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the loop is.
+    """Progress of a training.
 
     Attributes:
-        iteration, iterations: steps done, steps in all.
-        seconds: spent in steps, all sessions together. session_seconds: of them, in this session.
+        iteration: number of finished steps.
+        iterations: number of all steps.
+        seconds: spent in steps, over all sessions.
         rate: steps a second of this session.
-        metrics: of the last logged step. evaluation: figures, when this call follows an evaluation.
+        metrics: of the last logged step.
+        evaluation: figures, when this call follows an evaluation.
+        session_seconds: spent in steps of this session.
     """
 
     iteration: int
@@ -95,18 +98,20 @@ class Progress:
 def run_training(
     task: Task, config: LoopConfig, folder: Path, *, key: str, report: Callable[[Progress], None] = lambda p: None
 ) -> Progress:
-    """Train, from the checkpoint in `folder` if there is one, else from the start.
+    """Train from the checkpoint in `folder` if there is one, else from the start.
 
-    `folder` gets `metrics.jsonl` and, until the last step, `state.safetensors`. Evaluations do not count as time spent.
-    Where several processes train, all start from the first one's state, its clock is everyone's, and it alone reads,
-    evaluates and writes.
+    `folder` gets `metrics.jsonl` and, until the last step, `state.safetensors`. The time of evaluations is not counted.
+    Of several processes all start from the first one's state and use its clock; it alone reads, evaluates and writes.
 
     Args:
-        key: of configuration and inputs; a checkpoint goes on under its own key alone.
+        task: the training.
+        config: number of steps and intervals.
+        folder: of metrics and checkpoint.
+        key: digest of configuration and inputs; a checkpoint of another key is refused.
         report: called by the first process after lines of metrics.
 
     Returns:
-        Where training ended: before the last step only when `max_seconds` was over.
+        The progress at the end: before the last step only when `max_seconds` was over.
 
     Raises:
         InputError: a checkpoint of another key or version, which stays as it is; memory or disk ran out, or the task
@@ -145,11 +150,13 @@ def run_training(
         save_checkpoint(state, Checkpoint(done, spent_before + spent, key, task.state()))
 
     with explain_resource_errors(folder), ExitStack() as stack:
+        # Start from the checkpoint, or evaluate the initial state.
         done, spent_before = _begin(task, state, metrics, key)
         first, spent, unsaved = done, 0.0, 0.0
         processes.run_on_rank0(open_events)
         if not done:
             processes.run_on_rank0(evaluate)
+        # Steps, with logs, evaluations and checkpoints at their intervals.
         while done < config.iterations and spent < config.max_seconds:
             begin = time.perf_counter()
             values = task.step(done)
@@ -164,23 +171,24 @@ def run_training(
             if unsaved >= config.checkpoint_seconds and not last:
                 processes.run_on_rank0(save)
                 unsaved = 0.0
+        # A checkpoint of an unfinished training, and of the end on request.
         if done < config.iterations or (config.keep_end and done > first):
             processes.run_on_rank0(save)
         return progress()
 
 
 def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float]:
-    """Bring every process to the checkpoint, or to where the first one stands; steps done and seconds they took."""
+    """Restore every process to the checkpoint or the first one's state; return finished steps and their seconds."""
 
     def start() -> Checkpoint:
         state.parent.mkdir(parents=True, exist_ok=True)
         for left in (*state.parent.glob(f".{state.stem}.*"), *state.parent.glob(f".{metrics.stem}.*")):
-            left.unlink()  # half a file of a session that was killed while it wrote
+            left.unlink()  # a partial file of a session that was killed while it wrote
         checkpoint = load_checkpoint(state, key=key)
         if checkpoint is not None and checkpoint.iteration:
             truncate_metrics(metrics, checkpoint.iteration)
             return checkpoint
-        metrics.unlink(missing_ok=True)  # before the first step the start is measured again
+        metrics.unlink(missing_ok=True)  # a training without steps evaluates its start again
         return checkpoint or Checkpoint(
             0, 0.0, key, {name: value.detach().cpu() for name, value in task.state().items()}
         )

@@ -1,4 +1,4 @@
-"""The mean of what is learned over the last steps of a training (Polyak and Juditsky 1992; Izmailov et al. 2018)."""
+"""Mean of the parameters over the last steps of a training (Polyak and Juditsky 1992; Izmailov et al. 2018)."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from torch import Tensor
 from avatar.gaussians.tensor_file import require_finite, require_like
 
 EVERY = 10
-"""Steps from one that counts to the next: neighbours differ little, and a mean of every one costs time."""
+"""Steps between two that enter the mean: neighbours differ little, and a mean of every step would cost time."""
 _PREFIX = "mean."
 
 
 class MeanOfSteps:
-    """Mean of parameters over the last `share` of the steps, which stand in their place when the last is done.
+    """Running mean of parameters over the last `share` of the steps; it replaces them after the last one.
 
-    Adam takes steps of the same length however small a gradient is: what hardly shows in one image wanders about its
-    place until rates are down, and stays wherever it then happens to be. Its mean is in the middle.
+    Adam's steps have the same length however small a gradient is. Weakly observed parameters therefore wander until the
+    rates are small, and end at a random point. Their mean is near the centre.
 
     Args:
-        learned: parameters by key, which steps change in place. iterations: T, all steps.
+        learned: parameters by key, which steps change in place.
+        iterations: T, number of all steps.
         share: in [0, 1]; 0: no mean.
     """
 
@@ -32,7 +33,7 @@ class MeanOfSteps:
 
     @torch.no_grad()
     def after(self, iteration: int) -> None:
-        """Count the parameters in after a step, counted from 0; after the last one they become the mean."""
+        """Update the mean after a step, counted from 0; after the last one copy it into the parameters."""
         since = iteration - self.first
         if since >= 0 and since % EVERY == 0:
             if not since:
@@ -44,14 +45,14 @@ class MeanOfSteps:
                 self.learned[key].copy_(mean)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the mean so far by key; nothing before the first step that counts."""
+        """Return the current mean by key; empty before the first step that enters it."""
         return {_PREFIX + key: mean for key, mean in self.mean.items()}
 
     def restore(self, tensors: Mapping[str, Tensor], *, remedy: str) -> None:
-        """Take what `state` gave, among other tensors.
+        """Continue from a `state`, among other tensors.
 
         Raises:
-            InputError: tensors that are missing, of another shape or type, or not finite; nothing was taken.
+            InputError: tensors that are missing, of another shape or type, or not finite; nothing has changed.
         """
         if not any(key.startswith(_PREFIX) for key in tensors):
             self.mean = {}

@@ -1,4 +1,4 @@
-"""What a training logs: metrics.jsonl, one JSON object a line, and the same numbers as TensorBoard's events."""
+"""Logs of a training: metrics.jsonl, one JSON object a line, and the same numbers for TensorBoard."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from smplxpp.core.files.json_file import as_integer, as_object, as_text, jsonabl
 from smplxpp.core.files.paths import read_bytes
 
 log = logging.getLogger(__name__)
-# A million steps have some hundred megabytes.
-_MOST_BYTES = 1 << 30
+_MOST_BYTES = 1 << 30  # 1 GiB; the lines of a million steps have some hundred megabytes
 
 
 def append_metrics(path: str | Path, entry: Mapping[str, Any]) -> None:
-    """Add a line; numbers that are not finite become null."""
+    """Append a line to a log; numbers that are not finite become null."""
     with open(path, "a", encoding="utf-8") as file:
         file.write(json.dumps(jsonable(entry)) + "\n")
 
 
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
-    """Return all entries: objects with a kind and an iteration. A last line that a kill cut short is left out.
+    """Return all entries of a log: objects with a kind and an iteration.
 
-    Lines that are something else are left out too, and a file that is no log, with a warning in the log.
+    A last line that a kill cut short is skipped. Other lines that are no entries, and a file that is no log, are
+    skipped with a warning.
     """
     if not Path(path).exists():
         return []
@@ -46,13 +46,13 @@ def read_metrics(path: str | Path) -> list[dict[str, Any]]:
 
 
 def truncate_metrics(path: str | Path, iteration: int) -> None:
-    """Drop the entries after `iteration`: those steps are done again from the checkpoint."""
+    """Drop the entries after `iteration`, whose steps are repeated from the checkpoint."""
     kept = [entry for entry in read_metrics(path) if entry["iteration"] <= iteration]
     atomic_write_text(path, "".join(json.dumps(entry) + "\n" for entry in kept))
 
 
 def _entry(line: bytes) -> dict[str, Any] | None:
-    """A line's entry; None for anything else."""
+    """Return the entry in a line; None for anything else."""
     try:
         entry = as_object(parse_json(line, subject="line"), subject="line")
         as_text(entry.get("kind"), subject="kind")
@@ -67,7 +67,7 @@ class TensorboardLog:
 
     Args:
         folder: for TensorBoard's files.
-        redone: first iteration whose entries come (again); TensorBoard hides what it has from there on.
+        redone: first iteration whose entries are repeated; TensorBoard hides its older ones from there on.
 
     Raises:
         MissingExtraError: tensorboard is not installed.
@@ -81,19 +81,19 @@ class TensorboardLog:
         self._writer = SummaryWriter(str(folder), purge_step=redone)
 
     def add(self, entry: Mapping[str, Any]) -> None:
-        """Add an entry with `kind`, `iteration` and numbers; all else in it is left out."""
+        """Add the numbers of an entry with `kind` and `iteration`; other values are ignored."""
         for tag, value in _numbers(entry["kind"], entry):
             if tag != f"{entry['kind']}/iteration":
                 self._writer.add_scalar(tag, value, entry["iteration"])
         self._writer.flush()
 
     def close(self) -> None:
-        """Take no more entries."""
+        """Close the writer; no entries can be added after that."""
         self._writer.close()
 
 
 def _numbers(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """Give the numbers in nested mappings with their paths."""
+    """Yield the numbers in nested mappings with their paths."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _numbers(f"{path}/{name}", value)

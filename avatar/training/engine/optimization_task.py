@@ -1,4 +1,4 @@
-"""What every training by gradients shares: micro-batches, schedules, Adam, a stop at the first NaN, exact state."""
+"""Base of all trainings: Adam on micro-batches, schedules, a stop at the first NaN, exact resumption."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
 
 Batch = TypeVar("Batch")
-_START_ANEW = "delete the file of its state, or give --force, to start anew"
+_START_AGAIN = "delete the file of its state, or give --force, to start again"
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 class DivergedError(InputError):
-    """Training met a number that is not finite. Parameters and the last checkpoint are as before the step."""
+    """A loss or gradient is not finite. Parameters and the last checkpoint are as before the step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,13 +32,14 @@ class OptimiserConfig:
 
     Attributes:
         iterations: T.
-        schedule: share of a group's rate at step t, counted from 0. With f the group's `lr_final_factor`:
+        schedule: factor on a group's rate at step t, counted from 0. With f the group's `lr_final_factor`:
             cosine `f + (1 - f) (1 + cos(pi t / T)) / 2` (Loshchilov and Hutter 2017), exponential `f^(t / T)`,
             constant 1.
         warmup: steps over which the rates also rise linearly from `1 / warmup` to 1; 0 for none.
-        betas, eps: Adam's.
-        max_grad_norm: largest norm of all gradients together; longer ones are scaled down to it.
-        averaged: share of the steps, to the last, over which what is learned is averaged in the end (`MeanOfSteps`).
+        betas: decay rates of Adam's moments.
+        eps: of Adam.
+        max_grad_norm: largest norm of all gradients together; larger ones are scaled down to it.
+        averaged: share of the last steps over which the parameters are averaged at the end (`MeanOfSteps`).
         amp: networks in bfloat16 on CUDA, where the task says so with `OptimizationTask.autocast`. bfloat16 has
             float32's range, so that no gradient needs scaling. Without effect on the CPU.
     """
@@ -161,10 +162,11 @@ class OptimizationTask(ABC, Generic[Batch]):
             InputError: fewer items than processes.
         """
         items = self.micro_batches(iteration)
-        for group, told in zip(self.optimiser.param_groups, self.groups, strict=True):
-            group["lr"] = told.lr * self.lr_factor(iteration, told)
+        for group, own in zip(self.optimiser.param_groups, self.groups, strict=True):
+            group["lr"] = own.lr * self.lr_factor(iteration, own)
+        # Gradients of the micro-batches, shared among the processes and summed over them.
         self.optimiser.zero_grad(set_to_none=True)
-        outcomes = self.distributed.share_out(items, lambda own: self._backward(own, len(items)))
+        outcomes = self.distributed.share_out(items, lambda item: self._backward(item, len(items)))
         finite = []
         for item, figures in zip(items, outcomes, strict=True):
             if figures is None:
@@ -172,6 +174,7 @@ class OptimizationTask(ABC, Generic[Batch]):
             finite.append(figures)
         parameters = list(self.learned.values())
         self.distributed.sum_gradients(parameters)
+        # Adam's step, and the mean of the last steps.
         if self.optimiser_config.max_grad_norm < math.inf:
             torch.nn.utils.clip_grad_norm_(parameters, self.optimiser_config.max_grad_norm)
         self.optimiser.step()
@@ -179,7 +182,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         return {**_means(finite), "items": [self.name_of(item) for item in items]}
 
     def state(self) -> Mapping[str, Tensor]:
-        """Return parameters by `group.name`, Adam's moments of each that has been moved, and the mean so far."""
+        """Return parameters by `group.name`, Adam's moments of each that has taken a step, and the current mean."""
         tensors = {**self.learned, **self.mean.state()}
         for key, value in self.learned.items():
             for moment, content in self.optimiser.state.get(value, {}).items():
@@ -187,19 +190,20 @@ class OptimizationTask(ABC, Generic[Batch]):
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take what `state` gave, bit for bit.
+        """Continue from a `state`, bit for bit.
 
         Raises:
-            InputError: tensors that are missing, of another shape or type, or not finite; nothing was taken.
+            InputError: tensors that are missing, of another shape or type, or not finite; nothing has changed.
         """
+        # Check all tensors before any is copied.
         wanted = dict(self.learned)
         for key, value in self.learned.items():
             if any(f"adam.{moment}.{key}" in tensors for moment in MOMENTS):
                 shapes = {"step": torch.empty(()), "exp_avg": value, "exp_avg_sq": value}
                 wanted |= {f"adam.{moment}.{key}": shapes[moment] for moment in MOMENTS}
-        require_like(tensors, wanted, subject="checkpoint", remedy=_START_ANEW)
-        require_finite({name: tensors[name] for name in wanted}, subject="checkpoint", remedy=_START_ANEW)
-        self.mean.restore(tensors, remedy=_START_ANEW)
+        require_like(tensors, wanted, subject="checkpoint", remedy=_START_AGAIN)
+        require_finite({name: tensors[name] for name in wanted}, subject="checkpoint", remedy=_START_AGAIN)
+        self.mean.restore(tensors, remedy=_START_AGAIN)
         with torch.no_grad():
             for key, value in self.learned.items():
                 value.copy_(tensors[key])
@@ -209,7 +213,7 @@ class OptimizationTask(ABC, Generic[Batch]):
                 }
 
     def _backward(self, item: Batch, count: int) -> Mapping[str, float] | None:
-        """Add a micro-batch's share to the gradients; None if it is not finite."""
+        """Backpropagate a micro-batch's share of the loss; return its figures, None if anything is not finite."""
         loss, figures = self.loss(item)
         (loss / count).backward()
         gradients = (value.grad for value in self.learned.values() if value.grad is not None)
@@ -217,14 +221,14 @@ class OptimizationTask(ABC, Generic[Batch]):
 
 
 def _laid_out(content: Tensor, parameter: Tensor) -> Tensor:
-    """A copy on the parameter's device that lies in memory as the parameter does: fused Adam walks both together."""
+    """Return a copy with the parameter's device and memory layout, because fused Adam walks both together."""
     if content.shape != parameter.shape:  # the number of steps
         return content.to(parameter.device, copy=True)
     return torch.empty_like(parameter).copy_(content)
 
 
 def _finite(values: Iterable[Tensor]) -> bool:
-    """A sum is NaN or infinite when any of its terms is."""
+    """Return whether all values are finite: a sum is NaN or infinite when any of its terms is."""
     return bool(torch.isfinite(torch.stack([value.detach().sum() for value in values]).sum()))
 
 
@@ -233,7 +237,7 @@ def _diverged(iteration: int, item: str) -> DivergedError:
         f"training step {iteration}, {item}",
         expected="a finite loss and finite gradients",
         received="NaN or infinity",
-        remedy="look at its images, masks, parameters and cameras; lower the learning rates",
+        remedy="check its images, masks, parameters and cameras; lower the learning rates",
     )
 
 

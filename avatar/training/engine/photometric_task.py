@@ -1,4 +1,4 @@
-"""What all trainings on photographs share: views of frames, the loss on them, figures of held-out views."""
+"""Base of all trainings on photographs: views of frames, the reconstruction loss, figures of held-out views."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from smplxpp.core.validation import require_at_least
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
 Surface = Callable[[View, int], View]
-"""Gives a view of a frame normals that the capture has not."""
+"""Returns a view of a frame with normals that the capture does not have."""
 
 
 @dataclass(frozen=True, eq=False)
 class TaskContext:
-    """What a task has beside data, model and configuration; perceptual distance and surface alone change its steps.
+    """Services of a task beside data, model and configuration; perceptual distance and surface change its steps.
 
     Attributes:
         perceptual: for the perceptual term; None leaves it out.
@@ -51,7 +51,7 @@ class TaskContext:
 
 
 ALONE = TaskContext()
-"""One process, no perceptual term, nothing shown."""
+"""The context of one process without a perceptual term and previews."""
 
 
 class TrainableAvatar(AvatarModel, Protocol):
@@ -62,25 +62,32 @@ class TrainableAvatar(AvatarModel, Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PhotometricConfig:
-    """What every stage chooses.
+    """Choices of every training on photographs.
 
     Attributes:
-        iterations: steps. poses_per_step: the batch. views: cameras that look at each pose.
-        lr: Adam's step of the networks at the start. lr_final_factor: share of it left at the end.
-        schedule: how every step falls, see `OptimiserConfig`.
-        attributes: multiple of `rates` for the Gaussians' own attributes; 0 leaves them as they are.
-        rates: of those attributes.
+        iterations: number of steps.
+        poses_per_step: batch size, in poses.
+        views: cameras of each pose.
+        lr: learning rate of the networks at the start.
+        lr_final_factor: share of it left at the end.
+        schedule: of all learning rates, see `OptimiserConfig`.
+        attributes: multiple of `rates` for the Gaussians' own attributes; 0 freezes them.
+        rates: learning rates of those attributes.
         weights: of the losses.
-        surface_normals: whether normals of followed clothes stand for maps where a capture has none; without, the loss
-            has no normal term there.
-        perceptual_every: steps between those with the perceptual term, which then counts as many times.
-        coarse: share of the steps, from the start, that see images of half the size: a displacement of many pixels is
-            found there first.
+        surface_normals: use normals of tracked clothes where a capture has no normal maps; otherwise the loss has no
+            normal term there.
+        perceptual_every: steps between two with the perceptual term, whose weight is multiplied by this number.
+        coarse: share of the steps, from the start, on images of half the size, where displacements of many pixels are
+            found.
         eps2d: see `rasterize`.
-        scale_penalty, offset_penalty: weights of GaussianAvatars' penalties, where the attributes learn.
-        averaged: share of the steps, to the last, whose mean is what is learned, see `OptimiserConfig`.
-        betas: Adam's. amp: networks in bfloat16 on CUDA. max_grad_norm: largest norm of the gradient.
-        evaluations: how often held-out views are measured, evenly. evaluated: how many frames of either kind then.
+        scale_penalty: weight of GaussianAvatars' penalty of large scales, where the attributes learn.
+        offset_penalty: weight of GaussianAvatars' penalty of large offsets, where the attributes learn.
+        averaged: share of the last steps whose mean parameters are the result, see `OptimiserConfig`.
+        betas: of Adam.
+        amp: run networks in bfloat16 on CUDA.
+        max_grad_norm: largest norm of the gradient.
+        evaluations: number of evaluations on held-out views, evenly spaced.
+        evaluated: number of frames of either kind in an evaluation.
         seed: of the order of frames and views and of all noise.
     """
 
@@ -125,7 +132,7 @@ class PhotometricConfig:
             require_at_least(f"training: {name}", getattr(self, name), least)
 
     def optimiser(self) -> OptimiserConfig:
-        """Return the optimiser of these steps."""
+        """Return the configuration of Adam for these steps."""
         return OptimiserConfig(
             iterations=self.iterations,
             schedule=self.schedule,
@@ -138,7 +145,7 @@ class PhotometricConfig:
 
     @property
     def evaluate_every(self) -> int:
-        """Steps between evaluations."""
+        """Number of steps between evaluations."""
         return max(1, self.iterations // self.evaluations)
 
 
@@ -146,10 +153,10 @@ class PhotometricTask(OptimizationTask[Item]):
     """A training whose micro-batches are frames with some of their cameras.
 
     Args:
-        sequence: what is trained on.
-        model: what is trained.
-        groups: its learned parameters; the attributes of `gaussians` join them where the configuration moves them.
-        gaussians: the model's.
+        sequence: frames and views.
+        model: the avatar in training.
+        config: of steps, losses and rates.
+        groups: learned parameters; the Gaussians' attributes are added where the configuration trains them.
         context: perceptual distance, processes, previews.
     """
 
@@ -171,7 +178,7 @@ class PhotometricTask(OptimizationTask[Item]):
         hold_unseen(sequence, model.gaussians, getattr(model, "blend_shapes", None))
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
-        """Return the step's frames and cameras; those of the next are read meanwhile."""
+        """Return the step's frames and cameras, and start to read those of the next step in the background."""
         self.iteration = iteration
         now, soon = (
             self.sequence.items(k, count=self.config.poses_per_step, views=self.config.views, seed=self.config.seed)
@@ -185,7 +192,7 @@ class PhotometricTask(OptimizationTask[Item]):
         """Return the mean loss over the item's views, and its terms."""
 
     def views(self, item: Item) -> list[View]:
-        """Return the item's photographs, at half their size in the coarse part of the training, with all normals."""
+        """Return the item's photographs with all normals; at half their size in the coarse part of the training."""
         views = [self.sequence.view(camera, item.frame) for camera in item.cameras]
         coarse = self.iteration < self.config.coarse * self.config.iterations
         views = [view.halved() for view in views] if coarse else views
@@ -204,8 +211,12 @@ class PhotometricTask(OptimizationTask[Item]):
         """Return the mean reconstruction loss of a pose over views, its terms, and the renderings.
 
         Args:
-            targets: in the place of the photographs. extra: more values of the Gaussians to draw.
+            posed: the avatar in the pose of the views.
+            views: of one frame.
+            targets: of each view, in place of the photographs.
+            extra: more values of the Gaussians to render.
         """
+        # The perceptual term comes every n-th step with n times its weight.
         weights = self.config.weights
         turn = self.iteration % self.config.perceptual_every == 0
         if self.config.perceptual_every > 1:
@@ -214,6 +225,7 @@ class PhotometricTask(OptimizationTask[Item]):
         total = posed.vertices.new_zeros(())
         terms: list[dict[str, float]] = []
         renderings: list[Rendering] = []
+        # Mean over the views.
         for index, view in enumerate(views):
             target = targets[index] if targets else photograph(view, self.sequence.background)
             normals = bool(weights.normal) and target.normals is not None
@@ -227,12 +239,13 @@ class PhotometricTask(OptimizationTask[Item]):
             terms.append(figures)
             renderings.append(rendering)
         total = total + self._attribute_penalties()
+        # Each term's mean over the views that have it.
         names = {name: None for figures in terms for name in figures}
         means = {name: float(np.mean([f[name] for f in terms if name in f])) for name in names}
         return total, means, renderings
 
     def _attribute_penalties(self) -> Float[Tensor, ""] | float:
-        """Return what large Gaussians, and such far from their triangles, cost; nothing where they stay as they are."""
+        """Return the penalties of large scales and of large offsets; 0 if attributes are frozen."""
         if not self.config.attributes:
             return 0.0
         bound = self.model.gaussians()
@@ -241,7 +254,7 @@ class PhotometricTask(OptimizationTask[Item]):
         )
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Return mean figures of the measured views by kind, those of "novel_view" as "mean" too."""
+        """Return mean figures of the measured views by kind; "mean" repeats those of "novel_view"."""
         quality, images = self.measure_views()
         self.preview(images)
         means = {kind: mean_quality(views) for kind, views in quality.items()}
@@ -265,14 +278,14 @@ class PhotometricTask(OptimizationTask[Item]):
         return quality, eight_bit(seen.image).numpy()
 
     def head_box_of(self, view: View) -> Box | None:
-        """Return the box of the head in a measured view, to measure it apart; None leaves it out."""
+        """Return the box of the head in a measured view, for figures of its own; None: no figures."""
         return None
 
     def generator(self, *key: int) -> np.random.Generator:
-        """Return noise that the seed, the step and a key decide."""
+        """Return a random generator that depends on the seed, the step and a key alone."""
         return np.random.default_rng((self.config.seed, 2, self.iteration, *key))
 
 
 def photograph(view: View, background: Tensor) -> Target:
-    """Return the view's own pixels as what a rendering should look like."""
+    """Return the view's own pixels as the target of a rendering."""
     return Target(view.composited(background), view.opacity(), view.normals)

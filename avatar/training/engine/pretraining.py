@@ -1,4 +1,4 @@
-"""Trainings without rendering: networks that learn known displacements, many poses a step, at little cost."""
+"""Pretraining without rendering: networks learn known displacements, many poses a step."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ import numpy as np
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from smplxpp.core.validation import require_at_least
 
-KNOWN_BYTES = 1 << 30
-"""Of inputs and known displacements that are kept."""
+CACHE_BYTES = 1 << 30
+"""Bound of the cache of inputs and known displacements, bytes: 1 GiB."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig:
-    """Choices of a training without rendering.
+    """Choices of a pretraining.
 
     Attributes:
-        iterations: steps of Adam. batch: poses a step.
-        lr, lr_final_factor, warmup, betas: of Adam, see `OptimiserConfig`.
+        iterations: steps of Adam.
+        batch: poses a step.
+        lr: learning rate at the start.
+        lr_final_factor: share of it left at the end.
+        warmup: steps over which it rises linearly, see `OptimiserConfig`.
+        betas: of Adam.
     """
 
     iterations: int
@@ -37,32 +41,32 @@ class PretrainConfig:
 
     @property
     def evaluate_every(self) -> int:
-        """Steps between evaluations: nothing is measured on the way."""
+        """Steps between evaluations; there are none before the end."""
         return self.iterations
 
     def optimiser(self) -> OptimiserConfig:
-        """Return the optimiser of these steps."""
+        """Return the configuration of Adam for these steps."""
         return OptimiserConfig(iterations=self.iterations, warmup=self.warmup, betas=self.betas)
 
     def shortened(self, share: float) -> PretrainConfig:
-        """Return the same with `share` of the steps."""
+        """Return the configuration with `share` of the steps."""
         return replace(self, iterations=max(1, round(share * self.iterations)))
 
 
 class PretrainTask(OptimizationTask[tuple[int, ...]]):
-    """A training that takes one batch a step, in an order that changes from epoch to epoch."""
+    """A pretraining with one batch a step, in a new random order each epoch."""
 
     def __init__(self, groups: Sequence[ParameterGroup], config: PretrainConfig, count: int, seed: int) -> None:
         super().__init__(groups, config.optimiser())
         self.batch, self.count, self.seed = min(config.batch, count), count, seed
 
     def micro_batches(self, iteration: int) -> Sequence[tuple[int, ...]]:
-        """Return the numbers of a step's poses: each at most once an epoch, what batches leave over in another one."""
+        """Return the numbers of a step's poses, each at most once an epoch; a remainder waits for the next one."""
         per_epoch = self.count // self.batch
         epoch, place = divmod(iteration, per_epoch)
         order = np.random.default_rng((self.seed, 3, epoch)).permutation(self.count)
         return [tuple(order[place * self.batch : (place + 1) * self.batch].tolist())]
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
-        """Return nothing: no view is rendered."""
+        """Return no figures, because no view is rendered."""
         return {"mean": {}}

@@ -1,4 +1,4 @@
-"""Several processes, one training: who takes which micro-batch, and how their gradients become one."""
+"""Data-parallel training: micro-batches shared among processes, and gradients summed over them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from smplxpp.core.errors import InputError
 
 S = TypeVar("S")
 T = TypeVar("T")
-PATIENCE = timedelta(hours=4)
-"""How long processes wait for each other: evaluations of the first one are within it."""
+TIMEOUT = timedelta(hours=4)
+"""Timeout of messages between processes; it must exceed the evaluations of the first one."""
 
 
 @dataclass(frozen=True)
 class Distributed:
     """One of the processes that train together; by default the only one, for which every method is trivial.
 
-    All processes call each method at the same time, with arguments that differ only where said.
+    All processes call each method at the same time, with equal arguments except where documented.
 
     Attributes:
         rank: of this process, from 0. Process 0 alone evaluates and writes.
@@ -39,13 +39,13 @@ class Distributed:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that evaluates and writes."""
+        """Whether this is process 0, which evaluates and writes."""
         return self.rank == 0
 
     def share_out(self, items: Sequence[S], work: Callable[[S], T | None]) -> list[T | None]:
-        """Return `work(item)` of every item, on every process; item k is done by process `k mod world_size`.
+        """Return `work(item)` of every item, on every process; process `k mod world_size` works on item k.
 
-        A process leaves its other items out after one for which `work` gives None; theirs are None as well.
+        A process stops after an item for which `work` returns None; its later items are None as well.
 
         Raises:
             InputError: fewer items than processes.
@@ -57,6 +57,7 @@ class Distributed:
                 received=str(len(items)),
                 remedy="start fewer processes, or take larger batches",
             )
+        # Own items, then everybody's results in the items' order.
         results: list[T | None] = [None] * len(items)
         for k in range(self.rank, len(items), self.world_size):
             results[k] = work(items[k])
@@ -69,9 +70,9 @@ class Distributed:
         return [parts[k % self.world_size][k] for k in range(len(items))]
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """Make every gradient the sum over the processes, bit for bit the same on each, with one message.
+        """Replace every gradient by the sum over the processes, bit-identical on each, with one message.
 
-        A parameter without a gradient on some processes has the others' sum; without one on all it keeps none.
+        Processes without a gradient of a parameter add nothing; a parameter without a gradient on all keeps none.
         """
         if self.world_size == 1:
             return
@@ -87,7 +88,7 @@ class Distributed:
                 parameter.grad.copy_(summed.view(parameter.shape))
 
     def run_on_rank0(self, work: Callable[[], T]) -> T:
-        """Return what `work` gives on the first process, on all; the others wait. Its error is raised on all."""
+        """Run `work` on the first process and return its result on all; its error is raised on all."""
         if self.world_size == 1:
             return work()
         box: list[Any] = [None, None]
@@ -108,7 +109,7 @@ class Distributed:
 
 @contextmanager
 def join_processes(device: str = "cpu") -> Iterator[Distributed]:
-    """Give the processes that `torchrun` started, joined for the block; this one alone where it did not.
+    """Join the processes that `torchrun` started for the block; without torchrun yield this one alone.
 
     Args:
         device: "cpu" (messages by gloo) or "cuda" (NCCL; each process takes the GPU of its LOCAL_RANK).
@@ -131,7 +132,7 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
         torch.cuda.set_device(local)
         device = f"cuda:{local}"
     dist.init_process_group(
-        "nccl" if device.startswith("cuda") else "gloo", rank=rank, world_size=size, timeout=PATIENCE
+        "nccl" if device.startswith("cuda") else "gloo", rank=rank, world_size=size, timeout=TIMEOUT
     )
     try:
         yield Distributed(rank, size, device)
@@ -140,7 +141,7 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
 
 
 def _number(name: str) -> int:
-    """Return a number of torchrun's environment."""
+    """Read a number of torchrun's environment variables."""
     text = os.environ.get(name, "")
     if not text.isdigit():
         raise InputError(

@@ -1,4 +1,4 @@
-"""The machine's memory and disk: what a training holds of them, and what to do when they run out."""
+"""Memory and disk of the machine: their use by a training, and errors that explain when they run out."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ import torch
 from smplxpp.core.errors import InputError
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "not enough memory")
-"""In the words of CUDA's libraries and of the CPU allocators, which have no exception of their own."""
+"""Texts in messages of CUDA's libraries and of CPU allocators, which have no exception class of their own."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-# glibc's malloc.h: options that say from how many bytes on freed memory goes back to the system, and what never does.
+# Options of glibc's malloc.h: sizes in bytes from which freed memory returns to the system, and one that none reaches.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _NEVER = -1, -3, 1 << 30
 
 
 def peak_memory(device: str = "cpu") -> dict[str, int]:
-    """Return the most bytes that this process has held: of the machine's memory, and of the GPU's where it uses one."""
+    """Return the peak memory of this process, bytes: of the machine, and of the GPU where it uses one."""
     unit = 1 if sys.platform == "darwin" else 1024
     host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
     if not device.startswith("cuda"):
@@ -31,10 +31,11 @@ def peak_memory(device: str = "cpu") -> dict[str, int]:
 
 
 def keep_freed_memory() -> bool:
-    """Have the allocator keep for the next step what this one freed; whether it can (glibc alone knows how).
+    """Have the allocator keep freed memory for the next step; return whether it can (only glibc's does).
 
-    Steps of a training ask for the same tens of megabytes over and over. Given back to the system each time, they come
-    again as thousands of empty pages: a tenth of a step of the compensation on two cores. Holds for the whole process.
+    Steps of a training allocate the same tens of megabytes repeatedly. If they return to the system each time, they
+    come back as thousands of empty pages, which costs a tenth of a step of the compensation on two cores. The setting
+    holds for the whole process.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -62,7 +63,7 @@ def explain_resource_errors(folder: Path) -> Iterator[None]:
             "memory",
             expected="room for a step of the training",
             received=words.splitlines()[0] if words else type(error).__name__,
-            remedy="end other programs and give the same command, which goes on from the last checkpoint; or take a "
+            remedy="end other programs and give the same command, which continues from the last checkpoint; or take a "
             "smaller preset, smaller images (--scale) or fewer Gaussians",
         ) from error
     except OSError as error:
@@ -72,5 +73,5 @@ def explain_resource_errors(folder: Path) -> Iterator[None]:
             f"disk of {folder}",
             expected="room for checkpoints and results",
             received=error.strerror or str(error),
-            remedy="free some space and give the same command, which goes on from the last checkpoint",
+            remedy="free some space and give the same command, which continues from the last checkpoint",
         ) from error

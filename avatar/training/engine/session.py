@@ -1,4 +1,4 @@
-"""Where and how a training runs."""
+"""Session: folder, time limit, processes and reports of a training."""
 
 from __future__ import annotations
 
@@ -15,22 +15,24 @@ from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.processes import Distributed
 
 TRACK, PRETRAIN = "track", "pretrain"
-"""Folders of what comes before a training."""
+"""Folders of the tracking and of the pretraining, which precede a training."""
 BACK = "back"
-"""Folder, in that of the tracking, of the way back."""
+"""Folder of the backward pass, inside that of the tracking."""
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Where and how a training runs; of all this the perceptual distance alone changes what comes out of its steps.
+    """Folder, time limit, processes and reports of a training; only the perceptual distance changes its steps.
 
     Attributes:
-        folder: for metrics and the checkpoint. key: names configuration and inputs.
-        perceptual: for the perceptual term, None leaves it out.
+        folder: for metrics and the checkpoint.
+        key: digest of configuration and inputs; a checkpoint of another key is refused.
+        perceptual: distance of the perceptual term; None leaves the term out.
         distributed: the processes that train together.
-        max_seconds: stop with a checkpoint after as much work.
+        max_seconds: stop with a checkpoint after this time.
         tensorboard: log for TensorBoard too.
-        report: called after logged steps and evaluations. preview: with rendered images at evaluations.
+        report: called after logged steps and evaluations.
+        preview: called at evaluations with rendered images.
     """
 
     folder: Path
@@ -44,7 +46,7 @@ class Session:
 
     @property
     def context(self) -> TaskContext:
-        """What a `PhotometricTask` takes of it."""
+        """The parts of the session that a `PhotometricTask` uses."""
         return TaskContext(self.perceptual, self.distributed, self.preview)
 
     def run(
@@ -54,7 +56,7 @@ class Session:
         *,
         keep_end: bool = False,
     ) -> Progress:
-        """Train what `make` gives."""
+        """Run the training of the task that `make` returns, from its checkpoint if there is one."""
         loop = LoopConfig(
             iterations=config.iterations,
             evaluate_every=config.evaluate_every,
@@ -67,14 +69,14 @@ class Session:
     def run_alone(
         self, make: Callable[[], OptimizationTask[Any]], config: PhotometricConfig | PretrainConfig
     ) -> Progress:
-        """Train what `make` gives on the first process; the others wait. A checkpoint of the end is kept."""
+        """Run a training on the first process while the others wait; a checkpoint of its end is kept."""
         processes = self.distributed or Distributed()
         return processes.run_on_rank0(lambda: self.run(make, config, keep_end=True))
 
     def within(self, name: str) -> Session:
-        """Return the same in a folder of its own, without previews."""
+        """Return the session in a folder inside this one, without previews."""
         return replace(self, folder=self.folder / name, preview=lambda images: None)
 
     def after(self, progress: Progress) -> Session:
-        """Return the session with what is left of the time after a training that came first."""
+        """Return the session with the time that an earlier training left."""
         return replace(self, max_seconds=max(self.max_seconds - progress.session_seconds, 0.0))

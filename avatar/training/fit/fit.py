@@ -34,8 +34,10 @@ class FitScene:
     """What a fit is made on.
 
     Attributes:
-        template: the clothed body. vertices: of it in the frame's pose, metres.
-        train, held_out: whole views, each with a name of its own; `held_out` are measured.
+        template: the clothed body.
+        vertices: of the template in the frame's pose, metres.
+        train: whole training views, each with a unique name.
+        held_out: whole views for evaluations, each with a unique name.
         background: sRGB in [0, 1] behind the person.
     """
 

@@ -1,4 +1,4 @@
-"""Gaussians to start from, coloured as the photographs: what the photographs show where each Gaussian lies."""
+"""Initial Gaussians: sampled on the template and coloured from the photographs that show them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,7 @@ from smplxpp.raster import rasterize_mesh
 from smplxpp.template.mouth import inside_of_mouth
 
 DEPTH_TOLERANCE = 0.015
-"""Metres that a point may lie behind the surface and still count as seen."""
-MOUTH_TOLERANCE = 0.002
-"""The same for the inside of the mouth: teeth lie a centimetre behind lips, and are none."""
-MIN_COSINE = 0.2
-"""Surfaces seen at a flatter angle than this give no colour: their pixels belong to the silhouette."""
-MIN_OPACITY = 0.99
+"""Metres that a visible point may lie behind the z-buffer."""
 
 
 def initial_gaussians(
@@ -38,12 +33,17 @@ def initial_gaussians(
     *,
     detail: float = 0.0,
 ) -> BoundGaussians:
-    """Sample Gaussians on a template and colour them from whole views of it at `vertices`, metres.
+    """Sample Gaussians on a template and colour them from whole views of it.
 
     Args:
-        detail: how much denser they lie where the views change quickly, see `density_of_detail`.
+        rig: of the template.
+        vertices: of the template in the views' frame, metres.
+        views: whole photographs of the frame.
+        sampling: number and distribution of the Gaussians, and the seed.
+        detail: additional density where the photographs change quickly, see `density_of_detail`; 0: none.
     """
     start = sample_on_mesh(rig.template, sampling)
+    # A first sample measures the gradient magnitude of the photographs; the second one follows it.
     if detail:
         rates, seen = _shown(rig, vertices, start, [changes(view) for view in views])
         density = density_of_detail(rig.template, start.face_index.numpy(), rates.cpu().numpy(), seen, detail)
@@ -54,7 +54,8 @@ def initial_gaussians(
 def _shown(
     rig: Rig, vertices: Float[np.ndarray, "V 3"], gaussians: BoundGaussians, views: Sequence[View]
 ) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
-    """Colours of Gaussians on a template at `vertices` as views show them, and which of them any view shows."""
+    """Return the colours of Gaussians on a template at `vertices` in the views, and whether any view shows each."""
+    mouth_tolerance = 0.002  # metres behind the z-buffer: teeth are a centimetre behind the lips
     gaussians = gaussians.to(device=rig.device)
     placed = world_from_frames(gaussians, triangle_frames(rig.pose_from_vertices(vertices).rest, rig.faces))
     return colors_from_views(
@@ -63,7 +64,7 @@ def _shown(
         gaussians.dc,
         mesh=rig.template.mesh.with_vertices(vertices),
         views=views,
-        tolerance=np.where(_in_mouth(rig, gaussians), MOUTH_TOLERANCE, DEPTH_TOLERANCE),
+        tolerance=np.where(_in_mouth(rig, gaussians), mouth_tolerance, DEPTH_TOLERANCE),
     )
 
 
@@ -81,22 +82,27 @@ def colors_from_views(
     views: Sequence[View],
     tolerance: Float[np.ndarray, " N"] | None = None,
 ) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
-    """Return the mean colour of points over the views that see them, weighted by the pixels a square metre has there.
+    """Return the mean colour of points over the views that show them, weighted by pixels a square metre of surface.
 
     `c = sum_v w_v I_v(p) / sum_v w_v`, `w_v = cos^2 (f / distance)^2` where the z-buffer of the mesh shows the point,
     no silhouette edge is within a pixel, and the mask is opaque; 0 elsewhere.
 
     Args:
-        points, normals: in the world, metres; unit normals.
-        fallback: colours of the points that no view sees.
-        mesh: what hides points from cameras.
-        tolerance: metres that each may lie behind the surface and still count as seen; None: `DEPTH_TOLERANCE`.
+        points: in the world, metres.
+        normals: unit normals at the points.
+        fallback: colours of the points that no view shows.
+        mesh: occluder.
+        views: whole photographs.
+        tolerance: metres that each visible point may lie behind the z-buffer; None: `DEPTH_TOLERANCE`.
 
     Returns:
-        Colours, and which points some view saw.
+        Colours, and whether any view shows each point.
     """
+    min_cosine = 0.2  # surfaces at flatter angles project into pixels of the silhouette
+    min_opacity = 0.99
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
     for view in views:
+        # Project the points, and rasterise the occluder.
         camera = view.camera
         x, y, depth = camera.screen_from_world(points).T[:3]
         front = rasterize_mesh(mesh, camera).depth
@@ -108,11 +114,13 @@ def colors_from_views(
         away = camera.position - points
         distance = np.linalg.norm(away, axis=1)
         cosine = (away * normals).sum(1) / distance
+        # A point is visible if it is near the z-buffer, not seen at a flat angle, and inside the mask.
         opacity = view.opacity().cpu().numpy()
         seen = (
-            inside & (cosine > MIN_COSINE) & np.isfinite(farthest[row, column]) & (opacity[row, column] > MIN_OPACITY)
+            inside & (cosine > min_cosine) & np.isfinite(farthest[row, column]) & (opacity[row, column] > min_opacity)
         )
         seen &= depth <= nearest[row, column] + (DEPTH_TOLERANCE if tolerance is None else tolerance)
+        # Sample the image bilinearly at the visible points, and add with weight cos^2 (f / distance)^2.
         index = np.flatnonzero(seen)
         image = view.foreground.cpu().numpy() / 255.0
         at = np.stack([y[index] - 0.5, x[index] - 0.5])

@@ -1,4 +1,4 @@
-"""Where photographs change quickly: more Gaussians belong there."""
+"""Density of Gaussians from the gradient magnitude of the photographs."""
 
 from __future__ import annotations
 
@@ -13,18 +13,15 @@ from scipy.spatial import cKDTree
 from avatar.data.views import View
 from smplxpp.template.template import Template
 
-NEIGHBOURS = 16
-"""Places whose changes are averaged."""
-
 
 def changes(view: View) -> View:
-    """Return a view whose colours are how fast the photograph's change, a pixel, off the silhouette's edge.
+    """Return a view whose colours are the photograph's gradient magnitudes, a pixel, inside the eroded mask.
 
-    `sqrt((dI/dx)^2 + (dI/dy)^2)` of each colour by Sobel's filter. Pixels that the filter would compare with the
-    background are no longer the person's.
+    `sqrt((dI/dx)^2 + (dI/dy)^2)` of each colour by the Sobel filter. The mask is eroded by the pixels that the filter
+    would compare with the background.
     """
     image = view.foreground.cpu().numpy().astype(np.float64)
-    # Each colour alone: the filter smooths across all axes but its own. It gives 8 for a slope of 1.
+    # Each colour on its own, because the filter smooths along all other axes. Its response to a slope of 1 is 8.
     rate = np.stack([np.hypot(sobel(one, 0), sobel(one, 1)) / 8.0 for one in np.moveaxis(image, 2, 0)], axis=2)
     alpha = minimum_filter(view.alpha.cpu().numpy(), 3)
     return replace(
@@ -42,19 +39,21 @@ def density_of_detail(
     seen: Bool[np.ndarray, " N"],
     detail: float,
 ) -> Float64[np.ndarray, " F"]:
-    """Return how densely each face is to be covered: `1 + detail g / G`.
+    """Return the relative density of Gaussians on each face, `1 + detail g / G`.
 
-    g is the root mean square of the changes at the places nearest to the face that some view saw, of the same part, G
-    that of all places that some view saw. A
-    Gaussian draws a patch of about one colour: over a surface that changes by g a metre, `1 / rho` a Gaussian, its mean
-    squared error goes with `g^2 / rho`, whose sum over a given number of Gaussians is least where rho goes with g. The
-    1 keeps what looks plain in one frame and one light from going bare.
+    g is the RMS gradient at the 16 visible places of the same part that are nearest to the face, G the RMS over all
+    visible places. A Gaussian draws a patch of about one colour. On a surface with gradient g a metre, and 1 / rho
+    square metres a Gaussian, its mean squared error is proportional to `g^2 / rho`; the sum over a fixed number of
+    Gaussians is least for rho proportional to g. The constant 1 keeps surfaces covered that are plain in this frame.
 
     Args:
-        face_index: faces where the photographs were looked at. rates: how fast their colours change there.
+        template: the clothed body.
+        face_index: faces of the N places where the gradients were measured.
+        rates: gradient magnitude of each colour there.
         seen: whether any photograph shows the place.
-        detail: 0 covers all faces alike.
+        detail: 0 covers all faces with equal density.
     """
+    neighbours = 16
     weight = np.ones(len(template.faces))
     square = np.square(rates).sum(1)
     usual = np.sqrt(square[seen].mean()) if seen.any() else 0.0
@@ -66,6 +65,6 @@ def density_of_detail(
         known = seen & (of_face[face_index] == one)
         known = known if known.any() else seen
         places = cKDTree(centers[face_index[known]])
-        _, nearest = places.query(centers[of_face == one], k=[*range(1, min(NEIGHBOURS, places.n) + 1)])
+        _, nearest = places.query(centers[of_face == one], k=[*range(1, min(neighbours, places.n) + 1)])
         weight[of_face == one] += detail * np.sqrt(square[known][nearest].mean(1)) / usual
     return weight

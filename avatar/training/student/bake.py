@@ -1,4 +1,4 @@
-"""The bake: what the teacher does in maps becomes motion of the student's mesh."""
+"""The bake: the student's field, frame codes and attributes learn from the teacher's maps and images."""
 
 from __future__ import annotations
 
@@ -39,19 +39,21 @@ class BakeConfig(PhotometricConfig):
     """Choices of the bake: `L_bak = L_rec + a L_non + b L_sem`.
 
     Attributes:
-        iterations: 30k in the paper. attributes: the paper refines them.
-        pretrain: `L_non` alone before the iterations, without rendering; None in the paper.
-        images: what renderings are compared with: the "teacher"'s, or "photographs".
-        nonrigid: a, of `DisplacementLoss`. semantic: b, of the L1 between semantic maps.
-        semantic_map: what shows the student's labels: its "mesh", as in the paper, whose gradients reach the field
-            alone; or its "gaussians", which are drawn with the image.
-        tau: radians a metre, of the semantic labels.
-        code_lr_factor: Adam's step of the frame codes, as a multiple of `lr`.
-        null_share: of the poses that are shown as new ones: with the null code, so that it means something, or with
+        iterations: 30k in the paper.
+        attributes: multiple of the attributes' rates; the paper refines them.
+        images: targets of the renderings: the "teacher"'s, or "photographs".
+        pretrain: pretraining of the field without rendering; None, as in the paper: none.
+        regression: replace the field in new poses by a ridge regression from the pose to the surfaces of the training
+            frames (`regress_poses`), fitted to the pretrained field first and to the trained one at the end.
+        nonrigid: a, weight of `DisplacementLoss`.
+        semantic: b, weight of the L1 distance of semantic maps.
+        semantic_map: what is drawn with the student's labels: its "mesh", as in the paper, whose gradients reach the
+            field alone; or its "gaussians", which are drawn with the image.
+        tau: of the semantic labels, radians a metre.
+        code_lr_factor: learning rate of the frame codes, as a multiple of `lr`.
+        null_share: share of the poses that are shown as new ones: with the null code, which is trained by this, or with
             the regression.
-        regression: new poses have a regression from the pose to the surfaces of the training frames in the field's
-            place (`regress_poses`), made of the pretrained field first and of the trained one in the end.
-        pose_noise: radians, standard deviation on the theta that the field sees; skinning has the true pose.
+        pose_noise: standard deviation of the noise on the field's theta, radians; skinning has the true pose.
     """
 
     iterations: int = 30_000
@@ -77,10 +79,13 @@ class BakeConfig(PhotometricConfig):
 
 
 class BakeTask(PhotometricTask):
-    """Field, frame codes and local attributes learn from the teacher; without one, from the photographs alone.
+    """Trains field, frame codes and attributes on the teacher; without one, on the photographs alone.
 
     Args:
-        student: with a field, or without one, when only its attributes learn.
+        sequence: of the training frames.
+        student: with a field; without one only its attributes learn.
+        config: of the bake.
+        context: perceptual distance, processes, previews.
         teacher: frozen; None: `L_rec` alone, on photographs.
     """
 
@@ -124,24 +129,28 @@ class BakeTask(PhotometricTask):
             )
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Return the loss of one frame and its terms."""
-        pose = self._seen(self.sequence.pose(item.frame), item.frame)
+        """Return `L_rec + nonrigid L_non + semantic L_sem` of one frame and its terms."""
+        pose = self._shown(self.sequence.pose(item.frame), item.frame)
         views = self.views(item)
         posed = self.student(pose, camera_centers_of(views))
+        # Without a teacher: the photometric loss on photographs alone.
         if self.targets is None:
             total, terms, _ = self.compared(posed, views)
             return total, {"loss": float(total.detach()), **terms}
+        # L_rec on the teacher's images or on photographs.
         semantic, imitates = bool(self.config.semantic), self.config.images == "teacher"
         shown = self.targets.of_views(item.frame, views) if semantic or imitates else []
         targets = [one.target for one in shown] if imitates else None
         total, terms, renderings = self.compared(
             posed, views, targets, extra=None if self.of_mesh or not semantic else self.labels
         )
+        # L_sem: L1 distance of the semantic maps.
         if semantic:
             drawn = self._mesh_labels(posed, views) if self.of_mesh else map(_labels, renderings)
             differences = [(own - one.labels).abs().mean() for own, one in zip(drawn, shown, strict=True)]
             terms["semantic"] = float(torch.stack(differences).mean().detach())
             total = total + self.config.semantic * torch.stack(differences).mean()
+        # L_non: distance of the mesh's displacement from the teacher's maps.
         if self.config.nonrigid and posed.displacements is not None:
             nonrigid = self.displacement_loss(posed.displacements, self.targets.displacements(item.frame))
             terms["nonrigid"] = float(nonrigid.detach())
@@ -149,13 +158,13 @@ class BakeTask(PhotometricTask):
         return total, {"loss": float(total.detach()), **terms}
 
     def _mesh_labels(self, posed: PosedAvatar, views: Sequence[View]) -> Iterator[Tensor]:
-        """Return the labels of the student's mesh in each view, with gradients to its vertices."""
+        """Yield the semantic map of the student's mesh in each view, with gradients to its vertices."""
         for view in views:
             maps = mesh_maps(posed.vertices, self.sequence.rig.faces, view.camera)
             yield maps.interpolate(self.labels)
 
-    def _seen(self, pose: Pose, frame: int) -> Pose:
-        """Return the pose as the field is shown it."""
+    def _shown(self, pose: Pose, frame: int) -> Pose:
+        """Return the pose that the field sees: a share of them as new ones, with noise on theta."""
         noise = self.generator(frame)
         if self.config.null_share and noise.random() < self.config.null_share:
             pose = self.sequence.as_new_pose(frame)
@@ -166,7 +175,7 @@ class BakeTask(PhotometricTask):
 
 
 def _labels(rendering: Rendering) -> Float[Tensor, "H W 3"]:
-    """Return the semantic map that was drawn with an image."""
+    """Return the semantic map that was rendered with an image."""
     assert rendering.extra is not None
     return rendering.extra
 
@@ -180,10 +189,23 @@ def bake(
     *,
     teacher: TeacherAvatar | None,
 ) -> tuple[Student, Progress]:
-    """Train a student's field, codes and attributes on what a teacher shows, or on photographs without one."""
+    """Train a student's field, codes and attributes on a teacher, or on photographs without one.
+
+    Args:
+        sequence: of the training frames.
+        gaussians: from which the student starts, bound to the template.
+        student: its architecture.
+        config: of the bake.
+        session: of the training; a stopped one continues from its checkpoint.
+        teacher: frozen; None: photographs alone.
+
+    Returns:
+        The student and the progress of the last training that ran.
+    """
     together = session.distributed or Distributed()
     with fixed_seed(config.seed):
         made = Student(student, sequence.rig, gaussians, sequence.train_frames)
+    # Pretrain the field without rendering, and fit the regression to it.
     if config.pretrain is not None and teacher is not None and made.field is not None:
         pretrain = config.pretrain
         progress = session.within(PRETRAIN).run_alone(
@@ -204,9 +226,10 @@ def bake(
         if config.regression:
             made.regression = together.run_on_rank0(lambda: regress_poses(made, sequence))
         elif config.null_share:
-            show_null_code(made)  # on the processes that only waited for the pretraining, too
-    followed = teacher.track if config.surface_normals and teacher is not None else None
-    context = with_surface_normals(session.context, sequence, followed)
+            show_null_code(made)  # also on the processes that waited for the pretraining
+    # Train on images, then fit the regression to the trained field.
+    tracked = teacher.track if config.surface_normals and teacher is not None else None
+    context = with_surface_normals(session.context, sequence, tracked)
     progress = session.run(lambda: BakeTask(sequence, made, config, context, teacher=teacher), config)
     if config.regression and made.field is not None:
         made.regression = together.run_on_rank0(lambda: regress_poses(made, sequence))

@@ -1,4 +1,4 @@
-"""The compensation: blend shapes of the Gaussians learn what the baked mesh leaves over; the field stays."""
+"""The compensation: blend shapes of the Gaussians learn the residual of the baked mesh; the field is frozen."""
 
 from __future__ import annotations
 
@@ -35,11 +35,15 @@ class CompensateConfig(PhotometricConfig):
     """Choices of the compensation.
 
     Attributes:
-        iterations: 100k, and poses_per_step: 4, in the paper.
-        lr: of the mapping networks. position_lr: of U, pixels. color_lr: of C, colours in [0, 1].
-        null_share: of the poses that are shown as new ones.
-        init_from_track: the blend shapes start from what the field left over of the surface that the teacher
-            followed, see `init_blend_shapes`; False: from zero, as in the paper.
+        iterations: 100k in the paper.
+        poses_per_step: 4 in the paper.
+        lr: learning rate of the mapping networks.
+        position_lr: learning rate of U, pixels.
+        color_lr: learning rate of C, colours in [0, 1].
+        null_share: share of the poses that are shown as new ones.
+        init_from_track: initialise the blend shapes by the residual between the teacher's tracked surface and the field
+            (`init_blend_shapes`); False: zero, as in the paper.
+        coherence: weight of the differences between neighbours' changes of U (`Coherence`); 0, as in the paper: none.
     """
 
     iterations: int = 100_000
@@ -57,12 +61,18 @@ class CompensateConfig(PhotometricConfig):
 
 
 class CompensateTask(PhotometricTask):
-    """U, C and the mapping networks H and B learn from photographs by `L_rec`; field and codes are frozen.
+    """Trains U, C and the mapping networks H and B on photographs by `L_rec`; field and codes are frozen.
 
-    With `coherence`, U is held to what it is when the task is made, up to ways that neighbours share.
+    With `coherence`, neighbours' changes of U since the start of the task are held together.
 
     Args:
+        sequence: of the training frames.
         student: with blend shapes.
+        config: of the compensation.
+        context: perceptual distance, processes, previews.
+
+    Raises:
+        InputError: a student without blend shapes.
     """
 
     config: CompensateConfig
@@ -93,8 +103,9 @@ class CompensateTask(PhotometricTask):
             self.coherence = Coherence(student.rig, student.gaussians().select(shapes.active), shapes.U)
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Return the loss of one frame and its terms."""
+        """Return `L_rec` and the weighted coherence of one frame, and the terms."""
         views = self.views(item)
+        # A share of the poses is shown as new ones.
         pose = self.sequence.pose(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
             pose = self.sequence.as_new_pose(item.frame)
@@ -116,18 +127,26 @@ def compensate(
     *,
     teacher: TeacherAvatar | None = None,
 ) -> tuple[Student, Progress]:
-    """Give a baked student blend shapes and train them.
+    """Add blend shapes to a baked student and train them.
 
     Args:
-        teacher: of the bake; the surface that it remembers, if any, seeds the blend shapes where `config` says so, and
+        sequence: of the training frames.
+        student: from the bake.
+        shapes: architecture of the blend shapes.
+        config: of the compensation.
+        session: of the training; a stopped one continues from its checkpoint.
+        teacher: of the bake. Its tracked surface, if any, initialises the blend shapes where `config` requests it, and
             gives normals where the capture has no maps.
+
+    Returns:
+        The student and the progress of its training.
     """
     with fixed_seed(config.seed):
         known = torch.stack([sequence.pose(frame).body_pose for frame in sequence.train_frames])
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
-    followed = teacher.track if config.surface_normals and teacher is not None else None
-    context = with_surface_normals(session.context, sequence, followed)
+    tracked = teacher.track if config.surface_normals and teacher is not None else None
+    context = with_surface_normals(session.context, sequence, tracked)
     progress = session.run(lambda: CompensateTask(sequence, made, config, context), config)
     return made.eval(), progress

@@ -1,4 +1,4 @@
-"""What the teacher says of the training frames: renderings, labels and maps, kept while they fit in memory."""
+"""The teacher's renderings, labels and maps of the training frames as targets of the student, cached in memory."""
 
 from __future__ import annotations
 
@@ -20,16 +20,14 @@ from avatar.rendering.avatar_view import render_view
 from avatar.rendering.mesh_maps import MeshMapsTensor, front_back_maps
 from avatar.rig.posed import PosedAvatar
 
-SEEN = 0.5
-"""Opacity from which a blended normal counts."""
-
 
 @dataclass(frozen=True, eq=False)
 class DistillationTarget:
-    """What the student is to imitate in one view.
+    """Targets of the student in one view.
 
     Attributes:
-        target: the teacher's image, opacity and, if asked for, normals. labels: its semantic map.
+        target: the teacher's image, opacity and, if requested, normals.
+        labels: its semantic map.
     """
 
     target: Target
@@ -37,13 +35,15 @@ class DistillationTarget:
 
 
 class DistillationTargets:
-    """The frozen teacher, asked for targets; the latest used are kept, in half precision.
+    """Computes targets with the frozen teacher and caches the latest used ones in half precision.
 
     Args:
-        teacher: its weights are not changed. sequence: of the frames.
+        teacher: its weights are not changed.
+        sequence: of the frames.
         eps2d: see `rasterize`.
-        tau: of the semantic labels. normals: whether targets have them.
-        max_bytes: of what is kept.
+        tau: of the semantic labels, radians a metre.
+        normals: whether targets have normals.
+        max_bytes: bound of the cache.
     """
 
     def __init__(
@@ -59,29 +59,29 @@ class DistillationTargets:
         self.teacher, self.sequence = teacher.requires_grad_(False), sequence
         self.eps2d, self.normals = eps2d, normals
         self.labels = semantic_labels(sequence.rig, teacher.gaussians(), tau=tau)
-        self._kept = ByteCache(max_bytes)
+        self._cache = ByteCache(max_bytes)
 
     def displacements(self, frame: int) -> Float[Tensor, "2 R R 3"]:
-        """Return the teacher's position maps dU of a frame, metres; the surface itself where it was followed."""
+        """Return the teacher's position maps dU of a frame, metres; with a track, maps of the tracked surface."""
 
         def make() -> tuple[Tensor, ...]:
             if self.teacher.track is not None:
                 return (self._maps.interpolate(self.teacher.track.displacements(frame)).half(),)
             return (self.teacher.displacement_maps([self.sequence.pose(frame)])[0].half(),)
 
-        return self._kept.get(("maps", frame), make)[0].float()
+        return self._cache.get(("maps", frame), make)[0].float()
 
     @cached_property
     def _maps(self) -> MeshMapsTensor:
-        """Maps of the T-pose, as large as the teacher's."""
+        """Maps of the T-pose, of the size of the teacher's."""
         rig, teacher = self.sequence.rig, self.teacher
         return front_back_maps(rig.vertices, rig.faces, teacher.frame, size=teacher.config.out_size)
 
     def of_views(self, frame: int, views: Sequence[View]) -> list[DistillationTarget]:
-        """Return what the teacher shows in views of a frame."""
+        """Return the targets of a frame's views, rendered where the cache has none."""
         keys = [(frame, view.name, view.camera.width, view.camera.height) for view in views]
-        # Taken before others are put in, which may push them out.
-        found = {k: self._kept.get(key, tuple) for k, key in enumerate(keys) if key in self._kept}
+        # Read the cached ones first: new ones may evict them.
+        found = {k: self._cache.get(key, tuple) for k, key in enumerate(keys) if key in self._cache}
         missing = [k for k in range(len(keys)) if k not in found]
         if missing:
             with torch.no_grad():
@@ -89,7 +89,7 @@ class DistillationTargets:
                 posed = self.teacher(self.sequence.pose(frame), camera_centers)
                 for index, k in enumerate(missing):
                     draw = partial(self._draw, posed, index, views[k])
-                    found[k] = self._kept.get(keys[k], draw)
+                    found[k] = self._cache.get(keys[k], draw)
         return [_target(found[k]) for k in range(len(keys))]
 
     def _draw(self, posed: PosedAvatar, index: int, view: View) -> tuple[Tensor, ...]:
@@ -99,7 +99,7 @@ class DistillationTargets:
         assert seen.extra is not None
         tensors = [seen.image, seen.alpha, seen.extra]
         if seen.normals is not None:
-            tensors.append(seen.normals * (seen.alpha > SEEN)[..., None])
+            tensors.append(seen.normals * (seen.alpha > 0.5)[..., None])
         return tuple(tensor.half() for tensor in tensors)
 
 

@@ -1,4 +1,4 @@
-"""Blend shapes that start from what the field left over of a surface that was followed."""
+"""Initialise blend shapes by PCA: the residual between the tracked surface and the field's."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from avatar.models.tracked_surface import Track
 from smplxpp.core.spread import spread_inside
 
 FRAMES = 256
-"""At most as many, spread over the training's, are looked at."""
-STEPS, RATE, POSE_NOISE, WEIGHT_DECAY = 600, 3e-3, 0.03, 1e-3
-"""Of the regression from poses to coefficients: Adam's steps and rate, radians, share of the weights."""
+"""Largest number of training frames, evenly spread, which bounds the memory of the residuals."""
 
 
 def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) -> None:
-    """Set U's columns of the body and the network that drives them; C and the head's columns stay.
+    """Set U's columns of the body and the network B that drives them; C and the head's columns stay.
 
-    With `r_t = R^T (dv_track - dv_field)` at the Gaussians in frame t, `U z_t` are the first principal components of
-    r, coefficients of unit deviation, and `B(theta_t)` is fitted to them by least squares. Poses are blurred a little,
-    so that B stays smooth between the few that there are.
+    With the residuals `r_t = R^T (dv_track - dv_field)` at the Gaussians in frame t, `U z_t` are the first principal
+    components of r, with coefficients z of unit deviation. `B(theta_t)` is fitted to z_t by least squares on poses with
+    a little noise, so that B is smooth between them.
+
+    Args:
+        student: with blend shapes.
+        sequence: of the training frames.
+        track: the tracked surface.
     """
     shapes, rig = student.blend_shapes, sequence.rig
     assert shapes is not None, "a student with blend shapes"
@@ -34,6 +37,7 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
     residuals, poses = [], []
     with torch.no_grad():
         for frame in spread_inside(sequence.train_frames, FRAMES):
+            # Displacement that the field leaves over, in the triangles' frames of the T-pose.
             pose = sequence.pose(frame)
             left = track.displacements(frame)
             moved = student.displacements(pose)
@@ -48,7 +52,7 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
 
 
 def _components(shapes: BlendShapes, residuals: Float[Tensor, "T M 3"]) -> Float[Tensor, "T parts n_b"]:
-    """Set U from residuals in metres; return the coefficients."""
+    """Set U to the principal components of residuals in metres, part by part, and return their coefficients."""
     head, body, frames = shapes.config.head_shapes, shapes.config.body_shapes, len(residuals)
     count = min(body, frames)
     out = residuals.new_zeros(frames, shapes.config.parts, body)
@@ -57,10 +61,10 @@ def _components(shapes: BlendShapes, residuals: Float[Tensor, "T M 3"]) -> Float
         rows = slice(None) if of_part is None else torch.nonzero(of_part == part)[:, 0]
         own = residuals[:, rows]
         if shapes.head_weight is not None:
-            # Columns of the body do nothing where the head's act.
+            # The body's columns have no effect where the head's have all of it.
             own = own * (1.0 - shapes.head_weight[shapes.active][rows, None])
         own = own.flatten(1).double()
-        # T is small beside 3 M: the eigenvectors of the frames' products are the coefficients.
+        # T is small beside 3 M, so that the Gram matrix of the frames is decomposed: its eigenvectors are coefficients.
         _, vectors = torch.linalg.eigh(own @ own.T)
         vectors = vectors[:, -count:].flip(1) * frames**0.5
         basis = own.T @ vectors / frames
@@ -70,16 +74,17 @@ def _components(shapes: BlendShapes, residuals: Float[Tensor, "T M 3"]) -> Float
 
 
 def _fit(shapes: BlendShapes, pose: Float[Tensor, "T 63"], targets: Float[Tensor, "T parts n_b"]) -> None:
-    """Bring B(theta) to the coefficients."""
+    """Fit B(theta) to the coefficients by AdamW on poses with noise."""
+    steps, rate, pose_noise, weight_decay = 600, 3e-3, 0.03, 1e-3  # noise in radians; no rendering, so that it is quick
     network = shapes.body
-    # Coefficients count as much as the motion that they stand for.
+    # The weight of a coefficient's error is the norm of its blend shape.
     size = shapes.U.detach()[..., shapes.config.head_shapes :].square().sum((0, 1)).sqrt()
     weight = size / size.max().clamp(min=1e-12)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=weight_decay)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     noise = torch.Generator().manual_seed(0)
-    for _ in range(STEPS):
-        blurred = pose + POSE_NOISE * torch.randn(pose.shape, generator=noise).to(pose)
+    for _ in range(steps):
+        blurred = pose + pose_noise * torch.randn(pose.shape, generator=noise).to(pose)
         found = network(blurred).unflatten(1, targets.shape[1:])
         loss = ((found - targets) * weight).square().mean()
         optimiser.zero_grad()

@@ -1,4 +1,4 @@
-"""Networks that learn known displacements before anything is rendered: many poses a step, at little cost."""
+"""Pretraining of the student's field on known displacements, without rendering."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rendering.mesh_maps import vertex_normals
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.pretraining import KNOWN_BYTES, PretrainConfig, PretrainTask
-
-HIDDEN = 0.01
-"""Metres behind the maps' surface from which a point is not the one that they show."""
+from avatar.training.engine.pretraining import CACHE_BYTES, PretrainConfig, PretrainTask
 
 
 class PretrainFieldTask(PretrainTask):
-    """`L_non` where the field is evaluated: its displacements against the teacher's at the same points.
+    """Fits the field to known displacements at its points: the weighted mean of `|dv - known|`, in units of the maps.
 
-    Those of a training frame are the surface that was followed, where there is one, else the teacher's maps.
+    The known displacements of a training frame are those of the tracked surface, weighted by the track's confidence, or
+    without a track those of the teacher's maps.
 
     Args:
-        student: with a field. teacher: whose maps are learned.
-        code_lr_factor: rate of the frame codes, as a multiple of the field's.
-        null_share: of the poses that are shown with the null code.
+        sequence: of the training frames.
+        student: with a field.
+        teacher: its track or its maps are the known displacements.
+        config: of the steps.
+        seed: of the order of poses and of the draws.
+        code_lr_factor: learning rate of the frame codes, as a multiple of the field's.
+        null_share: share of the poses that are shown with the null code.
     """
 
     def __init__(
@@ -59,21 +61,22 @@ class PretrainFieldTask(PretrainTask):
         if null_share:
             show_null_code(student)
         self._lookup = _MapLookup(teacher, field.points)
-        self._known = ByteCache(KNOWN_BYTES)
+        self._known = ByteCache(CACHE_BYTES)
         self.iteration = 0
 
     def micro_batches(self, iteration: int) -> Sequence[tuple[int, ...]]:
-        """Return the numbers of the poses of a step."""
+        """Return the numbers of the poses in a step, counted in the training frames."""
         self.iteration = iteration
         return super().micro_batches(iteration)
 
     def name_of(self, item: tuple[int, ...]) -> str:
-        """Return the poses of a batch."""
+        """Return the name of a batch for messages: its frames."""
         return "poses " + " ".join(str(self.sequence.train_frames[k]) for k in item)
 
     def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
-        """Return the loss of a batch of poses."""
+        """Return the weighted mean distance of a batch of poses, in units of the maps."""
         frames = self.sequence.train_frames
+        # A share of the poses is shown with the null code.
         draws = np.random.default_rng((self.seed, 4, self.iteration)).random(len(item))
         shown = [frames[k] if draw >= self.null_share else None for k, draw in zip(item, draws, strict=True)]
         pose, known, weight = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
@@ -82,7 +85,7 @@ class PretrainFieldTask(PretrainTask):
         return loss, {"loss": float(loss.detach())}
 
     def _of(self, number: int) -> tuple[Tensor, ...]:
-        """Return theta (63,), displacements (K, 3) metres at the field's points, and how much each counts (K,)."""
+        """Return theta (63,), known displacements (K, 3) at the field's points, metres, and their weights (K,)."""
 
         def make() -> tuple[Tensor, ...]:
             frame, track = self.sequence.train_frames[number], self.teacher.track
@@ -97,9 +100,10 @@ class PretrainFieldTask(PretrainTask):
 
 
 class _MapLookup:
-    """The teacher's displacements at vertices of the template.
+    """Looks up the teacher's displacement maps at vertices of the template.
 
-    Clothes under other clothes take what is shown in front of them: layers move together. Skin that is not shown stays.
+    Clothes under other clothes take the displacement shown in front of them, because layers move together. Skin that is
+    hidden by more than a centimetre of them gets none.
     """
 
     def __init__(self, teacher: TeacherAvatar, points: Tensor) -> None:
@@ -107,8 +111,9 @@ class _MapLookup:
         vertices, normals = rig.vertices[points], vertex_normals(rig.vertices, rig.faces)[points]
         sides = assign_front_back(rig, teacher.frame, size, vertices, normals)
         self.sampler = MapSampler(teacher.frame, size, vertices, sides.front)
-        self.stays = (sides.behind > HIDDEN) & ~rig.cloth_mask[points]
+        hidden = 0.01  # metres behind the surface of the maps
+        self.stays = (sides.behind > hidden) & ~rig.cloth_mask[points]
 
     def __call__(self, maps: Float[Tensor, "B 2 R R 3"]) -> Float[Tensor, "B K 3"]:
-        """Return the displacements of maps at the points, metres."""
+        """Return the displacements of maps at the points, metres, 0 on hidden skin."""
         return self.sampler(maps).masked_fill(self.stays[:, None], 0.0)

@@ -1,4 +1,4 @@
-"""A trained student made small: blend shapes of the Gaussians that need them, within a number of bytes."""
+"""Prune a trained student to a number of bytes: only the most active Gaussians keep their blend shapes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,13 @@ from avatar.models.networks.blend_shapes import STORED_BYTES
 from avatar.models.student import Student
 from smplxpp.core.errors import InputError
 
-HEADER_BYTES = 16_384
-"""More than the names and shapes of a model file take."""
-
 
 def coefficient_std(student: Student, sequence: AvatarSequence) -> Float[Tensor, "parts n"]:
     """Return the standard deviations of the blend shapes' coefficients over the training frames.
 
     Args:
         student: with blend shapes.
+        sequence: of the training frames.
     """
     shapes = student.blend_shapes
     assert shapes is not None, "a student with blend shapes"
@@ -35,18 +33,24 @@ def coefficient_std(student: Student, sequence: AvatarSequence) -> Float[Tensor,
 
 
 def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> tuple[Student, float]:
-    """Return the student with as many Gaussians' blend shapes as a compact file of `max_bytes` has room for.
+    """Return the student with as many Gaussians' blend shapes as fit into a compact file of `max_bytes`.
 
-    Those that move and colour most over the training frames keep theirs (`BlendShapes.pruned`).
+    Gaussians whose position and colour vary most over the training frames keep theirs (`BlendShapes.pruned`).
+
+    Args:
+        student: with blend shapes.
+        sequence: of the training frames.
+        max_bytes: of the compact file.
 
     Returns:
-        The smaller student, and the share of the Gaussians that keep their blend shapes; itself and 1 if all fit.
+        The pruned student and the share of Gaussians that keep their blend shapes; the student itself and 1 if all fit.
 
     Raises:
         InputError: the Gaussians and networks alone are larger.
     """
     shapes = student.blend_shapes
     assert shapes is not None, "a student with blend shapes"
+    # Bytes of everything but the blend shapes, and of one Gaussian's blend shapes.
     count, stored = shapes.count, student.state_dict()
     one = 2 * 3 * shapes.config.shapes * STORED_BYTES + 4  # U, C and the Gaussian's index in `active`
     tensors = {
@@ -54,7 +58,8 @@ def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> t
         for name, value in stored.items()
         if name not in ("blend_shapes.U", "blend_shapes.C", "blend_shapes.active")
     }
-    rest = HEADER_BYTES + sum(value.numel() * _compact_size(value) for value in tensors.values())
+    header_bytes = 16_384  # more than names and shapes of a model file take
+    rest = header_bytes + sum(value.numel() * _compact_size(value) for value in tensors.values())
     keep = min(1.0, (max_bytes - rest) / (one * count))
     if keep * count < 1:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The teacher's training: residual maps that make the Gaussians of every frame look like its photographs."""
+"""Training of the teacher: residual maps that fit the Gaussians of every frame to its photographs."""
 
 from __future__ import annotations
 
@@ -32,11 +32,12 @@ class FitTeacherConfig(PhotometricConfig):
 
     Attributes:
         iterations: 600k in the paper.
-        pretrain: before them, without rendering: to zero residuals (5k steps in Animatable Gaussians), or with `track`
-            to the displacements that were found. None: the networks start as they are.
-        track: follow the surface first; None: the paper's way.
-        view_jitter: standard deviation of the noise on the directions that colour sees, as a share of the distance.
-        displacement: weight of `mean |dU|^2` over the Gaussians, in units of the map.
+        pretrain: pretraining without rendering, to zero residuals (5k steps in Animatable Gaussians), or with `track`
+            to the tracked displacements. None: none.
+        view_jitter: standard deviation of the noise on camera centres for the colour network, as a share of their
+            distance.
+        displacement: weight of `mean |dU|^2` over the Gaussians, in units of the maps.
+        track: of the surface tracking that comes first; None, as in the paper: none.
     """
 
     iterations: int = 600_000
@@ -46,14 +47,14 @@ class FitTeacherConfig(PhotometricConfig):
     track: TrackConfig | None = None
 
     def starting_at(self, frame: int | None) -> FitTeacherConfig:
-        """Return the configuration with its tracking started in a frame, None for the tracking's own choice."""
+        """Return the configuration with a reference frame for its tracking; None: the tracking's own choice."""
         if self.track is None:
             return self
         return replace(self, track=replace(self.track, reference=frame, seed=self.seed))
 
 
 class TeacherTask(PhotometricTask):
-    """`L_rec` of the teacher's renderings goes down."""
+    """Trains the teacher's networks by `L_rec` on photographs."""
 
     config: FitTeacherConfig
 
@@ -71,7 +72,7 @@ class TeacherTask(PhotometricTask):
         self.teacher = teacher
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
-        """Return the loss of one frame, whose networks run once for all its cameras."""
+        """Return the loss of one frame; the networks run once for all its cameras."""
         views = self.views(item)
         pose, camera_centers = self.sequence.pose(item.frame), camera_centers_of(views)
         maps = self._maps(item, camera_centers)
@@ -83,6 +84,7 @@ class TeacherTask(PhotometricTask):
         return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
 
     def _maps(self, item: Item, camera_centers: Tensor) -> Residuals:
+        """Return the residual maps of a frame, with noise on the camera centres of the colour network."""
         pose = self.sequence.pose(item.frame)
         noise = self.generator(item.frame).normal(size=camera_centers.shape) * self.config.view_jitter
         center = pose.root_from_world.inverse()[:3, 3]
@@ -99,10 +101,6 @@ def _millimetres(posed: PosedAvatar, teacher: TeacherAvatar) -> float:
         return 1e3 * float((posed.bound.offset - teacher.gaussians.offset).norm(dim=-1).mean())
 
 
-CENTRED_ON = 256
-"""Frames, spread over the training's, that centred inputs are measured on."""
-
-
 def fit_teacher(
     sequence: AvatarSequence,
     gaussians: BoundGaussians,
@@ -110,10 +108,23 @@ def fit_teacher(
     config: FitTeacherConfig,
     session: Session,
 ) -> tuple[TeacherAvatar, Progress]:
-    """Train a teacher on Gaussians of the template, after following the surface where the configuration says so."""
+    """Train a teacher on Gaussians of the template, after tracking the surface where the configuration requests it.
+
+    Args:
+        sequence: of the training frames.
+        gaussians: from the fit, bound to the template.
+        networks: architecture of the teacher.
+        config: of tracking, pretraining and training.
+        session: of the training; a stopped one continues from its checkpoints.
+
+    Returns:
+        The teacher and the progress of the last training that ran.
+    """
+    centred_on = 256  # frames of which mean and deviation of the input maps are taken
     with fixed_seed(config.seed):
         teacher = TeacherAvatar(networks, sequence.rig, gaussians)
-    teacher.centre(sequence.pose(frame) for frame in spread_inside(sequence.train_frames, CENTRED_ON))
+    teacher.centre(sequence.pose(frame) for frame in spread_inside(sequence.train_frames, centred_on))
+    # Track the surface.
     track = None
     if config.track is not None:
         track, progress = follow_surface(sequence, gaussians, config.track, session.within(TRACK))
@@ -121,7 +132,7 @@ def fit_teacher(
             return teacher.eval(), progress
         teacher.remember(track)
         session = session.after(progress)
-    # Networks whose output is zero know zero residuals already.
+    # Pretrain on the track. Networks whose output starts at zero need no pretraining to zero residuals.
     if config.pretrain is not None and (track is not None or not networks.zero_output):
         pretrain = config.pretrain
         progress = session.within(PRETRAIN).run_alone(
@@ -130,6 +141,7 @@ def fit_teacher(
         if not progress.finished:
             return teacher.eval(), progress
         session = session.after(progress)
+    # Train on photographs.
     context = with_surface_normals(session.context, sequence, track if config.surface_normals else None)
     progress = session.run(lambda: TeacherTask(sequence, teacher, config, context), config)
     return teacher.eval(), progress

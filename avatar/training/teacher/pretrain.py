@@ -1,4 +1,4 @@
-"""The teacher's networks learn the surface that was followed, or zero residuals, before anything is rendered."""
+"""Pretraining of the teacher's networks on the tracked surface, or on zero residuals, without rendering."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from avatar.models.networks.teacher import Residuals
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.pretraining import KNOWN_BYTES, PretrainConfig, PretrainTask
+from avatar.training.engine.pretraining import CACHE_BYTES, PretrainConfig, PretrainTask
 
 
 class PretrainTeacherTask(PretrainTask):
-    """Displacements that are known, `mean |dU - known|` where the Gaussians look the maps up; or all residuals zero.
+    """Fits the networks to known displacements: `mean |dU - known|` where the Gaussians look the maps up.
 
-    The mean is weighted by the track's confidence.
+    The mean is weighted by the track's confidence, in units of the maps. Without a track all residuals are fitted to 0.
 
     Args:
+        sequence: of the training frames.
         teacher: whose networks learn.
-        track: the displacements that are known, of a teacher whose other residuals start at zero; None: every residual
-            is to be zero.
+        config: of the steps.
+        seed: of the order of frames.
+        track: the known displacements; the teacher's other residuals start at zero. None: zero residuals.
     """
 
     def __init__(
@@ -37,20 +39,22 @@ class PretrainTeacherTask(PretrainTask):
         )
         super().__init__([networks], config, len(sequence.train_frames), seed)
         self.sequence, self.teacher, self.track = sequence, teacher, track
-        self._known = ByteCache(KNOWN_BYTES)
+        self._known = ByteCache(CACHE_BYTES)
 
     def name_of(self, item: tuple[int, ...]) -> str:
-        """Return the frames of a batch."""
+        """Return the name of a batch for messages: its frames."""
         return "frames " + " ".join(str(self.sequence.train_frames[k]) for k in item)
 
     def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
-        """Return the loss of a batch of frames."""
+        """Return the loss of a batch of frames, in units of the maps."""
         frames = [self.sequence.train_frames[k] for k in item]
+        # Without a track: the mean size of all residuals.
         if self.track is None:
             maps = [self._all_residuals(frame) for frame in frames]
             sizes = [m.shape.float().abs().mean() + m.colour.float().abs().mean() for m in maps]
             loss = sum(sizes[1:], sizes[0]) / len(maps)
             return loss, {"loss": float(loss.detach())}
+        # With a track: weighted L1 distance at the Gaussians.
         inputs, known, weights = zip(*(self._of(frame, self.track) for frame in frames), strict=True)
         with self.autocast():
             found = self.teacher.networks.positions(torch.cat(inputs), self.teacher.semantics)
@@ -60,8 +64,9 @@ class PretrainTeacherTask(PretrainTask):
         return loss, {"loss": float(loss.detach())}
 
     def _of(self, frame: int, track: Track) -> tuple[Tensor, ...]:
-        """Return the input map, the Gaussians' known displacements, (N, 3) metres along the axes of the T-pose, and how
-        much each counts (N,).
+        """Return the input map of a frame, the Gaussians' known displacements (N, 3) and their weights (N,).
+
+        Displacements are in metres along the axes of the T-pose.
         """
 
         def make() -> tuple[Tensor, ...]:
@@ -74,6 +79,7 @@ class PretrainTeacherTask(PretrainTask):
         return self._known.get(frame, make)
 
     def _all_residuals(self, frame: int) -> Residuals:
+        """Return all residual maps of a frame, seen by one of its cameras."""
         cameras = self.sequence.cameras(frame, 0, 1, self.seed)
         positions = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
         camera_centers = torch.tensor(positions, dtype=torch.float32, device=self.sequence.device)

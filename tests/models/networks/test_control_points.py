@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avatar.models.networks.control_points import CLOTH_DENSITY, choose_control_points, template_control_points
+from avatar.models.networks.control_points import choose_control_points, template_control_points
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import template
 
@@ -97,7 +97,7 @@ def test_a_templates_clothes_have_more():
     it = template()
     control = template_control_points(it, 90)
     cloth = int(it.cloth_mask[control.vertices].sum())
-    wishes = CLOTH_DENSITY * it.cloth_mask.sum(), (~it.cloth_mask).sum()
+    wishes = 4.0 * it.cloth_mask.sum(), (~it.cloth_mask).sum()
     assert len(control.vertices) == 90 and abs(cloth - 90 * wishes[0] / sum(wishes)) <= 2
     assert (it.vertex_part[control.vertices[control.neighbours]] == it.vertex_part[:, None]).all()
 

@@ -130,7 +130,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_views_name(tmp_path):
 def test_scenes_that_cannot_be_fitted_are_refused():
     with pytest.raises(InputError, match="at least one training view"):
         scene(train=[])
-    with pytest.raises(InputError, match="name of its own"):
+    with pytest.raises(InputError, match="unique name"):
         FitTask(scene(held_out=[view(TRAIN[0])]), CONFIG)
     with pytest.raises(InputError, match="posed vertices"):
         scene(vertices=doll().template.vertices[:-1])

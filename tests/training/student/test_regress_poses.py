@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
 
-from avatar.training.student.regress_poses import BEYOND, FADES, fit_pose_regression
+from avatar.training.student.regress_poses import DEFAULT, fit_pose_regression
 
 JOINTS, POINTS = 21, 40
 NEAR = 3
@@ -42,7 +42,7 @@ PARTS = np.zeros(POINTS, dtype=np.int64)
 def test_what_is_linear_in_near_joints_is_found_from_few_poses():
     poses, new = _poses(40, 1), _poses(20, 2)
     regression, chosen = fit_pose_regression(poses, _moved(poses), PLACES, _steps(), PARTS)
-    assert chosen[0].fade < 1.0 and chosen[0].error < 0.05 * chosen[0].of_mean
+    assert chosen[0].fade < 1.0 and chosen[0].error < 0.05 * chosen[0].mean_error
     off, whole = (np.linalg.norm(x, axis=2).mean() for x in (_said(regression, new) - _moved(new), _moved(new)))
     assert off < 0.03 * whole
     # The other joints say nothing, and few directions are left of 63.
@@ -56,7 +56,7 @@ def test_where_poses_tell_nothing_the_mean_stands():
     poses, rng = _poses(40, 1), np.random.default_rng(5)
     noise = 0.01 * rng.normal(size=(40, POINTS, 3))
     regression, chosen = fit_pose_regression(poses, noise, PLACES, _steps(), PARTS)
-    assert chosen[0].error < 1.05 * chosen[0].of_mean
+    assert chosen[0].error < 1.05 * chosen[0].mean_error
     said = _said(regression, _poses(20, 2))
     assert np.abs(said - noise.mean(0)).max() < 0.01 and np.square(said - noise.mean(0)).mean() < 0.1 * 0.01**2
 
@@ -67,8 +67,8 @@ def test_parts_are_chosen_apart():
     parts = np.repeat([3, 7], POINTS // 2)
     noisy = np.where((parts == 7)[:, None], 0.01 * np.random.default_rng(5).normal(size=surfaces.shape), surfaces)
     _, chosen = fit_pose_regression(poses, noisy, PLACES, _steps(), parts)
-    assert set(chosen) == {3, 7} and chosen[3].amount < 0.01 * chosen[7].amount
-    assert all(one.fade in FADES for one in chosen.values())
+    assert set(chosen) == {3, 7} and chosen[3].ridge < 0.01 * chosen[7].ridge
+    assert all(one.fade in DEFAULT.fades for one in chosen.values())
 
 
 def test_the_order_of_points_does_not_matter():
@@ -90,8 +90,8 @@ def test_angles_are_held_a_quarter_of_their_range_beyond_training():
     poses = _poses(30, 1)
     regression, _ = fit_pose_regression(poses, _moved(poses), PLACES, _steps(), PARTS)
     reach = np.ptp(poses, axis=0)
-    np.testing.assert_allclose(regression.low.numpy(), poses.min(0) - BEYOND * reach, atol=1e-6)
-    np.testing.assert_allclose(regression.high.numpy(), poses.max(0) + BEYOND * reach, atol=1e-6)
+    np.testing.assert_allclose(regression.low.numpy(), poses.min(0) - DEFAULT.margin * reach, atol=1e-6)
+    np.testing.assert_allclose(regression.high.numpy(), poses.max(0) + DEFAULT.margin * reach, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -130,4 +130,4 @@ def test_what_sways_slowly_of_its_own_is_not_taken_for_the_poses(seed):
     regression, chosen = fit_pose_regression(poses[learned], surfaces[learned], PLACES, _steps(), PARTS)
     off = np.square(_said(regression, poses[asked]) - surfaces[asked]).mean()
     of_mean = np.square(surfaces[learned].mean(0) - surfaces[asked]).mean()
-    assert chosen[0].error > 0.8 * chosen[0].of_mean and off < 1.15 * of_mean
+    assert chosen[0].error > 0.8 * chosen[0].mean_error and off < 1.15 * of_mean
