@@ -23,7 +23,8 @@ class View:
 
     Attributes:
         camera: of these pixels.
-        foreground: sRGB times opacity. alpha: opacity of the person.
+        foreground: sRGB times opacity.
+        alpha: opacity of the person.
         normals: world normals in half precision, 0 on the background; None where the capture has none.
     """
 

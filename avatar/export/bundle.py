@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from avatar.export.bundle_numbers import Tensors, blended, halves, rounded, signed, unsigned
 from avatar.models.networks.blend_shapes import BlendShapes
-from avatar.models.networks.local_pose import BODY_JOINTS
+from avatar.models.networks.pose_dependence import BODY_JOINTS
 from avatar.models.student import Student
 from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, motion_tensors, save_bundle
 from smplxpp.cloth.garment import Garment

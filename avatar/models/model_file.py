@@ -15,10 +15,10 @@ from torch import Tensor, nn
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.bound_file import bound_from_tensors
 from avatar.gaussians.tensor_file import open_tensor_file, require_finite, require_like
-from avatar.models.config_dict import config_to_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes, mapping_networks
+from avatar.models.networks.config_dict import config_to_dict
 from avatar.models.networks.deformation_field import FieldConfig, FieldNetwork, show_null_code
-from avatar.models.networks.pose_regression import PoseRegression
+from avatar.models.networks.pose_dependence import PoseRegression
 from avatar.models.networks.teacher import Teacher, TeacherConfig
 from avatar.models.stored_model import StoredModel
 from avatar.models.student import Student, StudentConfig

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from avatar.gaussians.tensor_file import require_like
-from avatar.models.config_dict import config_from_dict
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.config_dict import config_from_dict
 from avatar.rig.rig import THETA
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_object

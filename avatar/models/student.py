@@ -21,9 +21,7 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.networks.control_points import choose_control_points, template_control_points
 from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes
-from avatar.models.networks.local_pose import seen_joints
-from avatar.models.networks.pose_gate import PoseGate
-from avatar.models.networks.pose_regression import PoseRegression
+from avatar.models.networks.pose_dependence import PoseGate, PoseRegression, seen_joints
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Pose, Rig
 from smplxpp.cloth.garment import Garment

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from avatar.reconstruct.hash_grid import HashGrid
 from avatar.reconstruct.neural_surface import NeuralSurface
-from avatar.reconstruct.rays import Rays, rays_of
-from avatar.reconstruct.volume import opacities, weights_of
+from avatar.reconstruct.rays import Rays, opacities, rays_of, weights_of
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
@@ -31,7 +30,8 @@ class SurfaceConfig:
     """How a neural surface is fitted; lengths in metres.
 
     Attributes:
-        iterations: steps. rays, samples: of a step, and of a ray.
+        iterations: steps.
+        rays, samples: of a step, and of a ray.
         before, behind: of the hull's surface, between which a ray is sampled.
         levels, finest, log2_entries: of the hash grid.
         rate: of Adam.
@@ -70,7 +70,8 @@ class SurfaceFit:
     """A fitted surface.
 
     Attributes:
-        mesh: closed. model: on its device.
+        mesh: closed.
+        model: on its device.
         losses: of every iteration.
     """
 
@@ -90,7 +91,8 @@ def fit_surface(
     """Fit a signed distance, a residual over the hull's, to photographs, and take its surface.
 
     Args:
-        views: of one moment, whose masks agree. hull: closed, around the person.
+        views: of one moment, whose masks agree.
+        hull: closed, around the person.
         device: a CUDA device; "cpu" takes hours at the default size.
 
     Raises:

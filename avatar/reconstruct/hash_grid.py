@@ -17,8 +17,10 @@ class HashGrid(nn.Module):
     A level whose corners fit its table has one entry a corner; others share entries by a hash.
 
     Args:
-        levels: how many. coarsest, finest: cells along a side of the unit cube.
-        log2_entries: of each table. features: of an entry.
+        levels: how many.
+        coarsest, finest: cells along a side of the unit cube.
+        log2_entries: of each table.
+        features: of an entry.
 
     Raises:
         InputError: no level, or sizes that do not grow.

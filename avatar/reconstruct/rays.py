@@ -1,4 +1,4 @@
-"""Rays through pixels that the hull covers, with the depth at which they enter it."""
+"""Rays through pixels that the hull covers, and unbiased volume rendering of a signed distance along them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class Rays:
     Attributes:
         origin, direction: in the world, directions of unit length.
         enter: metres to the hull.
-        color: of the pixel, sRGB in [0, 1]. opacity: of the person.
+        color: of the pixel, sRGB in [0, 1].
+        opacity: of the person.
     """
 
     origin: Float[Tensor, "N 3"]
@@ -64,3 +65,16 @@ def rays_of(views: Sequence[PhotoView], hull: TriangleMesh, device: torch.device
         name: torch.from_numpy(np.concatenate(values).astype(np.float32)).to(device) for name, values in parts.items()
     }
     return Rays(**tensors)
+
+
+def opacities(distance: Float[Tensor, "R S"], sharpness: Float[Tensor, ""]) -> Float[Tensor, "R T"]:
+    """Opacity of each interval between samples: how much of the logistic of the distance falls across it."""
+    at = torch.sigmoid(distance * sharpness)
+    return ((at[:, :-1] - at[:, 1:]) / at[:, :-1].clamp(min=1e-6)).clamp(0, 1)
+
+
+def weights_of(opacity: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """How much each interval adds to the pixel: its opacity times what those before it let through."""
+    through = torch.cumprod(1 - opacity + 1e-7, dim=1)
+    before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], dim=1)
+    return opacity * before

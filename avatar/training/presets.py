@@ -35,7 +35,8 @@ class TrainingPreset:
         networks: sizes of the teacher and the field.
         fit: the fit, which makes the Gaussians.
         teacher, bake, compensate: the three trainings.
-        blend_shapes: of the student. control_points, still_body: see `StudentConfig`.
+        blend_shapes: of the student.
+        control_points, still_body: see `StudentConfig`.
     """
 
     networks: NetworkPreset

@@ -45,7 +45,8 @@ class TrainConfig:
         loose_parts: names of parts to simulate, in the place of those that the training finds.
         perceptual: metric of the perceptual term: "lpips", "st-lpips", "none", or "auto" for the installed one where
             the preset has the term.
-        hold_out: cameras to keep from training; empty: those that the capture's splits hold out.
+        hold_out: cameras to keep from training;
+        empty: those that the capture's splits hold out.
         seed: seed of all random draws.
         device: "auto", "cpu" or "cuda".
         force: train again what stands.

@@ -100,7 +100,8 @@ def hold_out_cameras(capture: Capture, names: Sequence[str]) -> Capture:
 
     Args:
         capture: with cameras and images.
-        names: cameras to hold out; empty: those of the splits.
+        names: cameras to hold out;
+        empty: those of the splits.
 
     Raises:
         InputError: an unknown camera, no images, or no camera left to train on.

@@ -23,10 +23,9 @@ from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Rig
 from avatar.training.checks import check_training, note_missing_normals
-from avatar.training.engine.device import choose_device
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resources import explain_resource_errors, keep_freed_memory
+from avatar.training.engine.resources import choose_device, explain_resource_errors, keep_freed_memory
 from avatar.training.engine.session import Session
 from avatar.training.fit.fit import fit_gaussians, fit_scene
 from avatar.training.loose_clothes import find_garments, with_simulated

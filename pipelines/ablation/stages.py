@@ -17,7 +17,7 @@ from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
 from avatar.gaussians.tensor_file import open_tensor_file, require_finite, require_like
 from avatar.models.model_file import save_avatar
 from avatar.models.networks.deformation_field import show_null_code
-from avatar.training.engine.device import fixed_seed
+from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.student.prune import coefficient_std, pruned_to
 from pipelines.runs.stage import StageOutput

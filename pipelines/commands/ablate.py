@@ -75,7 +75,7 @@ class Ablate:
         require_avatar("training avatars")
         from avatar.evaluation.evaluate import EvaluationConfig
         from avatar.evaluation.protocol import ProtocolConfig
-        from avatar.training.engine.device import choose_device
+        from avatar.training.engine.resources import choose_device
         from pipelines.ablation.ablate import AblationRun, ablate
         from pipelines.ablation.rows import ablation_rows
         from pipelines.runs.folders import keep_out_of_capture

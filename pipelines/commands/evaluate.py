@@ -89,7 +89,7 @@ class Evaluate:
         from avatar.evaluation.protocol import ProtocolConfig
         from avatar.evaluation.report import EvalReport
         from avatar.evaluation.summary import evaluation_tables
-        from avatar.training.engine.device import choose_device
+        from avatar.training.engine.resources import choose_device
         from pipelines.report.sections.build import rewrite_report
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.evaluate import evaluate

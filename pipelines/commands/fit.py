@@ -72,8 +72,8 @@ class Fit:
     def run(self) -> dict:
         """Fit, write the report, print the figures."""
         require_avatar("fitting Gaussians")
-        from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import Distributed
+        from avatar.training.engine.resources import choose_device
         from avatar.training.refinement.config import RefineConfig
         from pipelines.report.sections.build import rewrite_report
         from pipelines.runs.folders import keep_out_of_capture

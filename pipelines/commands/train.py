@@ -115,8 +115,8 @@ class Train:
         require_avatar("training an avatar")
         if int(os.environ.get("RANK") or 0):
             logging.disable(logging.WARNING)  # the first process says it
-        from avatar.training.engine.device import choose_device
         from avatar.training.engine.processes import join_processes
+        from avatar.training.engine.resources import choose_device
         from avatar.training.recipe import with_batch
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.models import TrainOptions

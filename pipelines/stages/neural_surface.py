@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from avatar.reconstruct import SurfaceConfig, fit_surface
-from avatar.training.engine.device import choose_device
+from avatar.training.engine.resources import choose_device
 from pipelines.stages.reconstruct import Method
 from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback
 from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, adopt_surface, reconstruct

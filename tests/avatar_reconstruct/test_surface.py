@@ -7,8 +7,7 @@ import torch
 from avatar.reconstruct import NeuralSurface, SurfaceConfig, fit_surface
 from avatar.reconstruct.fit_surface import hull_grid
 from avatar.reconstruct.hash_grid import HashGrid
-from avatar.reconstruct.rays import rays_of
-from avatar.reconstruct.volume import opacities, weights_of
+from avatar.reconstruct.rays import opacities, rays_of, weights_of
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.reconstruct.hull import solid_status, zero_surface

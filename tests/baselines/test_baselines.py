@@ -19,7 +19,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
-from avatar.training.engine.device import fixed_seed
+from avatar.training.engine.resources import fixed_seed
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import SKIN
 from tests.dolls.swaying import TORSO, open_moving, params, template

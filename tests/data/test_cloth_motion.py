@@ -81,7 +81,7 @@ def test_frames_that_nobody_knows_the_pose_of_are_passed_over():
 
 def test_a_long_gap_is_said_and_the_rest_goes_on():
     made = motions(lambda frame: None if 10 < frame < 40 else pose(frame), pre_roll=1.0)
-    with pytest.warns(GeometryWarning, match="simulated clothes: .*start anew"):
+    with pytest.warns(GeometryWarning, match="simulated clothes: .*restart"):
         made.simulate([50])
     assert np.isfinite(made.shape(50).displacements).all()
 

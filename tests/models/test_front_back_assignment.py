@@ -10,8 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from avatar.models.front_back_assignment import FrontBackAssignment, assign_front_back
-from avatar.models.teacher_avatar import map_frame
+from avatar.models.teacher_avatar import FrontBackAssignment, assign_front_back, map_frame
 from avatar.rendering.map_frame import MapFrame
 from avatar.rendering.mesh_maps import vertex_normals
 from avatar.rig.rig import Rig

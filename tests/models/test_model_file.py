@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from avatar.models import model_file
 from avatar.models.model_file import HEADER, SCHEMA, load_avatar, save_avatar
 from avatar.models.networks.blend_shapes import BlendShapeConfig
-from avatar.models.networks.pose_regression import PoseRegression
+from avatar.models.networks.pose_dependence import PoseRegression
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track

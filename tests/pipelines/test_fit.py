@@ -13,7 +13,7 @@ from PIL import Image
 
 from avatar.formats.ply import read_splat_ply
 from avatar.gaussians.bound_file import load_bound
-from avatar.training.engine.device import choose_device
+from avatar.training.engine.resources import choose_device
 from pipelines.cli import main
 from pipelines.commands import inspect, options
 from pipelines.commands.inspect import summarise_run
@@ -234,7 +234,7 @@ def test_cameras_that_the_splits_leave_out_are_not_trained_on(tmp_path, capture,
 def test_the_gpu_is_taken_where_gsplat_is(monkeypatch, caplog):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for found, device in ((None, "cpu"), (object(), "cuda")):
-        module = sys.modules["avatar.training.engine.device"]
+        module = sys.modules["avatar.training.engine.resources"]
         monkeypatch.setattr(module, "find_spec", lambda name, found=found: found)
         assert choose_device("auto") == device and choose_device("cuda") == "cuda"
     assert "gsplat is not installed" in caplog.text

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor, nn
 
-from avatar.models.networks.limits import MOST_LAYERS
+from avatar.models.networks.config_dict import MOST_LAYERS
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_between
 

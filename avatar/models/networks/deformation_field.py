@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from avatar.models.networks.config_dict import MOST_LAYERS
 from avatar.models.networks.control_points import ControlPoints
-from avatar.models.networks.limits import MOST_LAYERS
 from avatar.models.networks.sparse_rows import SparseRows
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_between

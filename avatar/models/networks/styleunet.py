@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.models.networks.limits import LARGEST_SIDE, MOST_LAYERS
+from avatar.models.networks.config_dict import LARGEST_SIDE, MOST_LAYERS
 from avatar.models.networks.stylegan2_layers import (
     GAIN,
     SLOPE,

@@ -79,7 +79,8 @@ class ParameterGroup:
     Attributes:
         name: with the tensor's own, `name.own`, its key in checkpoints. Groups may share a name, not a key.
         parameters: leaves that require a gradient, all of one device.
-        lr: Adam's step at the start. lr_final_factor: share of it left at the end; the schedule says how it gets there.
+        lr: Adam's step at the start.
+        lr_final_factor: share of it left at the end; the schedule says how it gets there.
     """
 
     name: str

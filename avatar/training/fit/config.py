@@ -17,7 +17,8 @@ class FitConfig:
     """Choices of a fit.
 
     Attributes:
-        sampling: number of Gaussians and where they start. detail: how much denser they lie where the photographs
+        sampling: number of Gaussians and where they start.
+        detail: how much denser they lie where the photographs
             change quickly, see `density_of_detail`; 0, as in the paper, one density.
         iterations: steps; each renders one view.
         rates: learning rates.

@@ -23,7 +23,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
 from avatar.training.engine.photometric_task import ALONE, PhotometricTask, TaskContext
 from avatar.training.fit.config import FitConfig
-from avatar.training.fit.initial_colors import initial_gaussians
+from avatar.training.fit.initial_gaussians import initial_gaussians
 from avatar.training.scene import TrainScene
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
@@ -78,7 +78,8 @@ class FitResult:
     """What a fit gives.
 
     Attributes:
-        gaussians: on the CPU. splats: the same in the world, in the frame's pose.
+        gaussians: on the CPU.
+        splats: the same in the world, in the frame's pose.
         progress: where the loop ended; not `finished` when its time was over.
         quality: of held-out and training views by camera.
         images: (H, W, 3) uint8 rendered, by camera, and `heads` the box of the head in each.

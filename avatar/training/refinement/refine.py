@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from avatar.data.sequence import AvatarSequence
 from avatar.data.views import View, read_view
 from avatar.gaussians.binding import BoundGaussians
-from avatar.training.fit.initial_colors import initial_gaussians
+from avatar.training.fit.initial_gaussians import initial_gaussians
 from avatar.training.refinement.align import Alignment, PassReport, Scene
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.nuisance import CameraCorrections

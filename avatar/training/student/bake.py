@@ -20,12 +20,12 @@ from avatar.rendering.avatar_view import Rendering
 from avatar.rendering.mesh_maps import mesh_maps
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Pose
-from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.processes import Distributed
+from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import PRETRAIN, Session
 from avatar.training.student.distillation import DistillationTargets
 from avatar.training.student.pretrain import PretrainFieldTask

@@ -13,7 +13,6 @@ from avatar.losses.coherence import Coherence
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
-from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
@@ -23,6 +22,7 @@ from avatar.training.engine.photometric_task import (
     PhotometricTask,
     TaskContext,
 )
+from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.student.init_blend_shapes import init_blend_shapes
 from avatar.training.tracking.surface_normals import with_surface_normals

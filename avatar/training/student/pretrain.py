@@ -11,11 +11,10 @@ from torch import Tensor
 
 from avatar.data.byte_cache import ByteCache
 from avatar.data.sequence import AvatarSequence
-from avatar.models.front_back_assignment import assign_front_back
 from avatar.models.networks.deformation_field import show_null_code
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.student import Student
-from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.teacher_avatar import TeacherAvatar, assign_front_back
 from avatar.rendering.mesh_maps import vertex_normals
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.pretraining import CACHE_BYTES, PretrainConfig, PretrainTask

@@ -16,8 +16,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from avatar.data.sequence import AvatarSequence
-from avatar.models.networks.local_pose import joint_steps
-from avatar.models.networks.pose_regression import PoseRegression
+from avatar.models.networks.pose_dependence import PoseRegression, joint_steps
 from avatar.models.student import Student
 from smplxpp.core.labels import LABELS
 from smplxpp.core.spread import spread_inside

@@ -13,11 +13,11 @@ from avatar.gaussians.binding import BoundGaussians
 from avatar.models.networks.teacher import Residuals, TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.posed import PosedAvatar
-from avatar.training.engine.device import fixed_seed
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.teacher.pretrain import PretrainTeacherTask
 from avatar.training.tracking.config import TrackConfig

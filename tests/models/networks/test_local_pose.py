@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from avatar.models.networks.local_pose import MIN_SKIN_WEIGHT, seen_joints
+from avatar.models.networks.pose_dependence import MIN_SKIN_WEIGHT, seen_joints
 from tests.dolls.dancing import template
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.models.networks.pose_regression import PoseRegression
+from avatar.models.networks.pose_dependence import PoseRegression
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ def test_one_of_another_training_is_refused_and_stays(tmp_path):
 def test_one_of_a_newer_version_is_refused_by_its_number(tmp_path):
     path = tmp_path / "state"
     path.write_bytes(save({"later": torch.zeros(1)}, metadata={"training": json.dumps({"schema": 4, "steps": "many"})}))
-    with pytest.raises(InputError, match=r"expected version 1 of the format, received version 4\. Go on with"):
+    with pytest.raises(InputError, match=r"expected version 1 of the format, received version 4\. Continue with"):
         load_checkpoint(path, key="this")
 
 

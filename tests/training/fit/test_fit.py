@@ -12,10 +12,10 @@ from avatar.data.views import View
 from avatar.export.posed import posed_splats
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.metrics.view_quality import head_box
-from avatar.training.engine.device import choose_device
 from avatar.training.engine.learning_rates import LearningRates
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.optimization_task import DivergedError
+from avatar.training.engine.resources import choose_device
 from avatar.training.fit.config import FitConfig
 from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
 from smplxpp.core.camera import Camera

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from avatar.data.views import View
-from avatar.training.fit.initial_colors import colors_from_views
+from avatar.training.fit.initial_gaussians import colors_from_views
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from tests.dolls.doll import paint
 from tests.dolls.standing import STRIPES, TRAIN, doll

@@ -13,8 +13,7 @@ from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.rig.rig import Rig
-from avatar.training.fit.initial_colors import initial_gaussians
-from avatar.training.fit.picture_detail import changes, density_of_detail
+from avatar.training.fit.initial_gaussians import changes, density_of_detail, initial_gaussians
 from smplxpp.core.camera import Camera
 from tests.dolls.standing import TRAIN, doll
 

@@ -57,7 +57,7 @@ def test_nothing_is_kept_without_memory_and_targets_are_the_same(frames):
     views = [frames.view("Ring0", 0)]
     key = (0, "Ring0", views[0].camera.width, views[0].camera.height)
     torch.testing.assert_close(own.of_views(0, views)[0].labels, without.of_views(0, views)[0].labels)
-    assert key in own._kept and key not in without._kept
+    assert key in own._cache and key not in without._cache
 
 
 def test_without_normals_a_target_has_none(frames):
@@ -69,8 +69,8 @@ def test_a_target_that_another_pushes_out_is_still_given(frames):
     whole = source(frames)
     views = [frames.view(name, 0) for name in ("Ring0", "Ring1")]
     first, second = whole.of_views(0, views)
-    size = sum(t.numel() * t.element_size() for t in whole._kept.get((0, "Ring0", *sizes(views[0])), tuple))
-    other = sum(t.numel() * t.element_size() for t in whole._kept.get((0, "Ring1", *sizes(views[1])), tuple))
+    size = sum(t.numel() * t.element_size() for t in whole._cache.get((0, "Ring0", *sizes(views[0])), tuple))
+    other = sum(t.numel() * t.element_size() for t in whole._cache.get((0, "Ring1", *sizes(views[1])), tuple))
     small = source(frames, max_bytes=size + other - 1)
     small.of_views(0, views[:1])  # the one that the next call finds, and loses
     for found, expected in zip(small.of_views(0, views), (first, second), strict=True):

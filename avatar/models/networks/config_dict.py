@@ -1,4 +1,4 @@
-"""Configurations of networks as plain dictionaries in the headers of model files."""
+"""Configurations of networks as plain dictionaries in the headers of model files, and limits of their sizes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from avatar.models.networks.limits import LARGEST_NUMBER
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+
 
 Config = TypeVar("Config", bound="DataclassInstance")
 
@@ -52,3 +52,11 @@ def config_from_dict(cls: type[Config], stored: Mapping[str, Any]) -> Config:
                 received=shown(value),
             )
     return cls(**{name: type(default)(stored[name]) for name, default in defaults.items()})
+
+
+MOST_LAYERS = 64
+"""Layers of a network, bands of an encoding, steps along a skeleton: ten times what is useful."""
+LARGEST_SIDE = 8192
+"""Side of a map, pixels; eight times the paper's."""
+LARGEST_NUMBER = 1 << 20
+"""Width of a layer, or any other number in a configuration."""
