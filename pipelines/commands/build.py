@@ -11,17 +11,15 @@ import tyro
 
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
-from pipelines.runs.folders import keep_out_of_capture, take_file
+from pipelines.runs.folders import keep_out_of_capture
 from pipelines.runs.layout import BUILD_STAGES, CORRECTIONS_FILE, LANDMARKS_FILE, REGISTER_STAGE, reconstructed_scan
 from pipelines.runs.stage import read_manifest
-from pipelines.stages.build_config import load_reconstruct, load_register, stages_of
+from pipelines.stages.build_config import load_reconstruct, load_register
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.inputs import BuildPlan, BuildRequest, plan_build
 from smplxpp.clean.remesh import require_remesher
 from smplxpp.core.files.json_file import read_json
 from smplxpp.detect import load_detector
-from smplxpp.register import read_landmarks
-from smplxpp.segment import Corrections
 
 StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
 
@@ -110,32 +108,30 @@ class Build:
     def run(self) -> dict:
         """Build, write metrics.json and the report, print the summary."""
         from pipelines.commands.inspect import Inspect
-        from pipelines.report.sections.build import report_stands, write_build_report
+        from pipelines.report.sections.build import update_build_report
         from pipelines.stages.build import build
 
         keep_out_of_capture(self.out, self.capture)
         plan = self.plan()
         self._check_tools()
-        take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
-        take_file(self.out, CORRECTIONS_FILE, self.corrections, read=Corrections.load)
+        # The bar counts the steps that this build has between its first and its last stage, and the report.
         bounds = BUILD_STAGES.index(self.from_stage), BUILD_STAGES.index(self.until_stage)
-        count = sum(name in stages_of(plan.inputs) for name in BUILD_STAGES[bounds[0] : bounds[1] + 1])
+        names = [stage.partition("_")[2] for stage in BUILD_STAGES[bounds[0] : bounds[1] + 1]]
+        count = sum(name in plan.inputs.steps for name in names)
         whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report
         with stage_progress(count + whole, enabled=not self.json) as step:
-            records = build(
+            build(
                 self.out,
                 plan.inputs,
                 plan.config,
                 registration=plan.registration,
                 reconstruction=plan.reconstruction,
+                by_hand={LANDMARKS_FILE: self.landmarks, CORRECTIONS_FILE: self.corrections},
                 first=self.from_stage,
                 last=self.until_stage,
                 progress=step,
+                report=None if self.no_report else update_build_report,
             )
-            if whole and not report_stands(self.out, records):
-                step("report", False)
-                write_build_report(self.out, plan.inputs, plan.config, records)
-                step("report", True)
         if not self.json:
             Inspect(run_folder=self.out).run()
         metrics = read_json(self.out / "metrics.json", subject="metrics")

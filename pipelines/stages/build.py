@@ -13,7 +13,7 @@ from typing import Any
 
 from pipelines.runs import layout
 from pipelines.runs.code import sha256_file
-from pipelines.runs.folders import own_run_folder
+from pipelines.runs.folders import own_run_folder, take_file
 from pipelines.runs.layout import BUILD_STAGES, RECONSTRUCT_STAGE, REGISTER_STAGE
 from pipelines.runs.stage import Stage, StageRecord, require_stage, run_stage
 from pipelines.stages import template_stages
@@ -28,10 +28,19 @@ from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.validation import require_choice
 from smplxpp.detect import load_detector
+from smplxpp.register import read_landmarks
+from smplxpp.segment import Corrections
 
 METRICS_SCHEMA = 1
 Progress = Callable[[str, bool], None]
 """Called with a stage's name before (False) and after (True) it."""
+Report = Callable[[Path, BuildInputs, BuildConfig, dict[str, StageRecord]], object]
+"""Writes the page of a run from its inputs, choices and the records of its stages."""
+_READERS: dict[str, Callable[[Path], object]] = {
+    layout.LANDMARKS_FILE: read_landmarks,
+    layout.CORRECTIONS_FILE: Corrections.load,
+}
+"""Readers of the files that a user places in a run; they refuse a wrong file before anything is replaced."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +145,11 @@ def build(
     *,
     registration: RegisterInputs | None = None,
     reconstruction: ReconstructInputs | None = None,
+    by_hand: Mapping[str, Path | None] | None = None,
     first: str = BUILD_STAGES[0],
     last: str = BUILD_STAGES[-1],
     progress: Progress = lambda name, done: None,
+    report: Report | None = None,
 ) -> dict[str, StageRecord]:
     """Build a template in the folder `run`.
 
@@ -151,9 +162,11 @@ def build(
         config: choices.
         registration: what the body is registered to, where the inputs register.
         reconstruction: what the scan is made of, where the inputs reconstruct.
+        by_hand: the user's files of landmarks and corrections by their names in a run, which replace those there.
         first: stage to begin with.
         last: stage to end with.
         progress: called with a stage's name before (False) and after (True) it.
+        report: writes the page of the run when all stages stand; it lies above this room, so that it is handed in.
 
     Returns:
         The record of every stage up to `last`.
@@ -161,6 +174,9 @@ def build(
     Raises:
         InputError: unusable input; every finished stage is kept.
     """
+    # What a user made by hand lies in the run whatever becomes of the build.
+    for name, source in (by_hand or {}).items():
+        take_file(run, name, source, read=_READERS[name])
     for name in (first, last):
         require_choice("stage", name, BUILD_STAGES)
     if BUILD_STAGES.index(first) > BUILD_STAGES.index(last):
@@ -178,6 +194,10 @@ def build(
             makers[REGISTER_STAGE] = partial(register_capture, run, registration)
         records = _run_stages(BuildContext(run, inputs, config), makers, first, last, progress)
         write_metrics(run, inputs, records)
+    if report is not None and last == BUILD_STAGES[-1]:
+        progress("report", False)
+        report(run, inputs, config, records)
+        progress("report", True)
     return records
 
 

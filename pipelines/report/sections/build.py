@@ -72,6 +72,12 @@ def report_stands(run: Path, records: dict[str, StageRecord]) -> bool:
     return report.is_file() and report.stat().st_mtime_ns > max(made)
 
 
+def update_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> None:
+    """Write `run/report.html`, unless it was written after every stage."""
+    if not report_stands(run, records):
+        write_build_report(run, inputs, config, records)
+
+
 def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, records: dict[str, StageRecord]) -> Path:
     """Write `run/report.html` from a finished run, with what was fitted, trained and measured on it."""
     with values_of(records[ASSEMBLE_STAGE]):

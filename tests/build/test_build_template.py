@@ -1,0 +1,146 @@
+"""`smplxpp.build_template` and `smplxpp build` are two doors to one build: the digits are the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipelines.commands.build import Build
+from pipelines.runs.artefacts import load_parts, load_weights
+from pipelines.runs.layout import METRICS_FILE, TEMPLATE
+from pipelines.stages.build import build
+from smplxpp.body import load_params
+from smplxpp.build import BuildConfig, build_template
+from smplxpp.build.config import STEPS
+from smplxpp.capture import open_capture
+from smplxpp.clean import simplify
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import read_json
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
+from smplxpp.template.template import Template
+
+PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
+SCAN, PARAMS = PERSON / "scans" / "scan_000000.ply", PERSON / "params" / "params.npz"
+FEW = {"hair": 400, "shoe": 400, "upper": 1500, "lower": 1500, "outer": 400}
+pytestmark = pytest.mark.filterwarnings("ignore::smplxpp.core.errors.GeometryWarning")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, Path]:
+    """A coarse copy of the fixture's scan in memory, and in a file without colours."""
+    scan = read_mesh(SCAN).mesh
+    mesh = simplify(scan, 8000).mesh
+    path = tmp_path_factory.mktemp("small") / "scan.npz"
+    np.savez(path, vertices=mesh.vertices, faces=mesh.faces)
+    return mesh, path
+
+
+@pytest.fixture(scope="module")
+def by_command(small: tuple[TriangleMesh, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("command") / "run"
+    command = Build(out=run, scan=small[1], params=PARAMS, budgets=FEW, samples=2000, label_source="body")
+    plan = command.plan()
+    build(run, plan.inputs, plan.config)
+    return run
+
+
+@pytest.fixture(scope="module")
+def built(small: tuple[TriangleMesh, Path]):
+    """The same by the library, from a file, with the progress that it reports."""
+    seen: list[tuple[str, bool]] = []
+    config = BuildConfig(budgets=FEW, samples=2000, label_source="body")
+    result = build_template(small[1], params=PARAMS, config=config, on_stage=lambda *step: seen.append(step))
+    return result, seen
+
+
+def same(one: Template, other: Template, folder: Path) -> None:
+    """Two templates are the same files, bit for bit."""
+    one.save(folder / "one.npz")
+    other.save(folder / "other.npz")
+    assert (folder / "one.npz").read_bytes() == (folder / "other.npz").read_bytes()
+
+
+def test_both_doors_give_the_same_template(by_command, built, tmp_path):
+    result, _ = built
+    result.template.save(tmp_path / "template.npz")
+    assert (tmp_path / "template.npz").read_bytes() == (by_command / TEMPLATE).read_bytes()
+    parts = load_parts(by_command)
+    weights = load_weights(by_command, parts)
+    assert list(result.parts) == list(parts)
+    for name, part in result.parts.items():
+        assert np.array_equal(part.posed.mesh.vertices, parts[name].mesh.vertices)
+        assert np.array_equal(part.weights.joint_weights, weights[name].joint_weights)
+
+
+def test_both_doors_report_the_same_checks(by_command, built):
+    result, seen = built
+    metrics = read_json(by_command / METRICS_FILE)
+    theirs = [(check["name"], check["value"], check["status"]) for check in metrics["checks"]]
+    assert [(check.name, check.value, check.status) for check in result.report.checks] == theirs
+    assert [check.name for check in result.report.failed] == [name for name, _, status in theirs if status == "fail"]
+    names = [name for name in STEPS if name not in ("reconstruct", "locate", "register")]
+    assert seen == [(name, done) for name in names for done in (False, True)]
+    assert list(result.report.numbers) == names and result.capture is None
+    assert len(str(result.report).splitlines()) == len(theirs)
+
+
+def test_a_mesh_in_memory_is_the_same_scan(small, built, tmp_path):
+    mesh, _ = small
+    config = BuildConfig(budgets=FEW, samples=2000, label_source="body")
+    given = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    params = load_params(PARAMS)
+    same(build_template(given, params=params, config=config).template, built[0].template, tmp_path)
+
+
+def test_labels_in_memory_are_used(small):
+    mesh, _ = small
+    labels = np.where(mesh.face_centers[:, 1] < 0.5, 5, 0)
+    config = BuildConfig(budgets=FEW, samples=2000)
+    result = build_template(mesh, params=PARAMS, labels=labels, config=config)
+    assert result.template.part_names == ("body", "lower") or len(result.template.part_names) == 2
+    assert result.report.numbers["segment"]["labels_from"] == "file"
+    with pytest.raises(InputError, match="labels of the scan"):
+        build_template(mesh, params=PARAMS, labels=labels[:-1], config=config)
+
+
+def test_the_capture_comes_back_with_the_parameters_that_were_used(small, tmp_path):
+    root = tmp_path / "capture"
+    (root / "scans").mkdir(parents=True)
+    for name in ("cameras.json", "rgbs", "masks", "params"):
+        (root / name).symlink_to(PERSON / name)
+    write_ply(root / "scans" / "scan_000000.ply", small[0])
+    given = load_params(PERSON / "params" / "params_noisy.npz")
+    config = BuildConfig(budgets=FEW, samples=2000, label_source="body")
+    result = build_template(capture=open_capture(root), params=given, config=config)
+    found = result.capture.params(3)
+    assert np.array_equal(found.body_pose[0], given.body_pose[3])
+    assert not np.array_equal(found.body_pose, open_capture(root).params(3).body_pose)
+
+
+def test_what_is_asked_for_has_to_be_one_thing():
+    with pytest.raises(InputError, match="received neither"):
+        build_template()
+    with pytest.raises(InputError, match="received both"):
+        build_template(SCAN, capture=PERSON)
+    with pytest.raises(InputError, match="option budgets"):
+        BuildConfig(budgets={"cape": 100})
+
+
+@pytest.mark.slow
+def test_the_embedded_person_is_the_same_through_both_doors(tmp_path):
+    """As `make demo` builds it: tracked parameters, registered to keypoints, masks and label maps."""
+    budgets = {"upper": 8000, "lower": 8000}
+    plan = Build(out=tmp_path / "run", capture=PERSON, protocol="tracked", budgets=budgets).plan()
+    build(tmp_path / "run", plan.inputs, plan.config, registration=plan.registration)
+    config = BuildConfig(protocol="tracked", budgets=BuildConfig().budgets | budgets)
+    result = build_template(capture=PERSON, config=config)
+    result.template.save(tmp_path / "template.npz")
+    assert (tmp_path / "template.npz").read_bytes() == (tmp_path / "run" / TEMPLATE).read_bytes()
+    registered = open_capture(PERSON, params=tmp_path / "run" / "05_register" / "params.npz", protocol="tracked")
+    for frame in registered.frames:
+        one, other = registered.params(frame), result.capture.params(frame)
+        assert all(np.array_equal(a, b) for a, b in zip(one.as_dict().values(), other.as_dict().values(), strict=True))
