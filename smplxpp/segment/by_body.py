@@ -94,7 +94,7 @@ class ByBodyConfig:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Intermediate results of `label_by_body`.
+    """Intermediate results of `label_by_body`, step by step.
 
     Attributes:
         chart: places of the faces on the body.

@@ -185,7 +185,7 @@ class Blend:
 
     @staticmethod
     def of(pairs: Int64[np.ndarray, "P 2"], alike: Float64[np.ndarray, " P"], count: int, *, steps: int) -> Blend:
-        """Build the averaging matrix.
+        """Build the averaging matrix of a mesh's faces.
 
         Args:
             pairs: faces that share an edge.

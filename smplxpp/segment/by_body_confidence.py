@@ -13,14 +13,6 @@ from smplxpp.segment.by_body_colors import SkinModel
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import ARM_START, RUNS, STEP, Outfit, in_arm, in_column
 
-_NEAR = 2  # rings by which a hem may lie beside its ring
-# Precision of two rules on the procedural people of the benchmark `labels_by_body`: an `upper` without a coat is no
-# jacket, cape or waistcoat; one garment over trunk and legs is `upper` (a truth may call a dress lower, or two garments
-# of one
-# cloth look like one).
-_NO_JACKET, _ONE_PIECE = 0.93, 0.55
-_CLOSE_CALL = 6.0  # nats between two outlines, below which a note mentions the border
-_LOW, _MUCH = 0.6, 0.15  # confidence of an uncertain face; share of a label's area that is worth a note
 BODY_ELSEWHERE = 0.05
 """Distance, in metres, between body and bare skin from which the body is not the scan's."""
 _BORDERS = {
@@ -51,11 +43,14 @@ def confidence_bound(
     ring = np.clip(np.floor((chart.reach[arm] - ARM_START) / STEP).astype(np.int64), 0, len(sleeve) - 1)
     own = labels[arm]
     most[arm] = np.where(own == UPPER.id, sleeve[ring], np.where(own == SKIN.id, bare[ring], 1.0))
+    # Precision of two rules on the procedural people of the benchmark `labels_by_body`. One garment over trunk and legs
+    # is `upper`, although a truth may call a dress lower, or two garments of one cloth look like one; an `upper`
+    # without a coat is no jacket, cape or waistcoat.
     upper = labels == UPPER.id
     if outfit.one_piece:
-        most[upper & np.isin(chart.region, (TRUNK, LEG))] *= _ONE_PIECE
+        most[upper & np.isin(chart.region, (TRUNK, LEG))] *= 0.55
     if not layers.coat.any():
-        most[upper] *= _NO_JACKET
+        most[upper] *= 0.93
     return most
 
 
@@ -68,8 +63,8 @@ def _labels_of_outline(outfit: Outfit) -> np.ndarray:
 
 
 def _around(shares: np.ndarray) -> np.ndarray:
-    """Return the maximum over the rings around each ring."""
-    return np.asarray(maximum_filter1d(shares, 2 * _NEAR + 1, axis=0, mode="nearest"))
+    """Return the maximum over five rings around each ring, because a hem may lie up to two rings beside its own."""
+    return np.asarray(maximum_filter1d(shares, 5, axis=0, mode="nearest"))
 
 
 def notes_on_labels(
@@ -95,15 +90,16 @@ def notes_on_labels(
         out.append(f"the body lies {1e3 * misfit:.0f} mm from the scan's face and hands: no label can be trusted")
     elif misfit > 0.012:
         out.append(f"the body misses face and hands by {1e3 * misfit:.0f} mm: clothes are recognised by colour alone")
-    # The outline: borders for which another place costs nearly as little.
-    close = [_BORDERS[name] for name, margin in outfit.margins.items() if margin < _CLOSE_CALL]
+    # The outline: borders for which another place costs less than 6 nats more.
+    close = [_BORDERS[name] for name, margin in outfit.margins.items() if margin < 6.0]
     out.extend(f"it is a close call {words}" for words in dict.fromkeys(close))
     if outfit.one_piece:
         out.append("no seam at the waist: taken as one garment (dress, jumpsuit), labelled upper")
+    # Labels of which more than 15 % of the area has a confidence below 0.6.
     area = mesh.face_areas
     for label in LABELS:
         own = labels == label.id
         total = area[own].sum()
-        if total > 0 and (low := area[own & (confidence < _LOW)].sum()) > _MUCH * total:
+        if total > 0 and (low := area[own & (confidence < 0.6)].sum()) > 0.15 * total:
             out.append(f"{low / total:.0%} of the faces labelled {label.name} are uncertain")
     return tuple(out)

@@ -36,7 +36,7 @@ RUNS = (SHOE, SKIN, LOWER, SKIN, UPPER)
 
 @dataclass(frozen=True)
 class OutfitConfig:
-    """Costs of `find_outfit`, in nats.
+    """Costs of an outline in `find_outfit`, in nats.
 
     Attributes:
         samples: number of independent samples of colour in a ring.

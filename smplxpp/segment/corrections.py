@@ -1,4 +1,4 @@
-"""Labels corrected by hand: what a hand has said of which surface, its file, and labels with it applied."""
+"""Correct labels by hand: faces, brush strokes and boxes with a label, their file, and their application to a scan."""
 
 from __future__ import annotations
 
@@ -24,23 +24,18 @@ from smplxpp.segment.corrected_faces import ScanSurface, nearest_faces, stroked_
 from smplxpp.segment.segment import SegmentedScan
 
 FORMAT_VERSION = 1
-LEAST_RADIUS, MOST_RADIUS = 0.001, 0.5
-"""Metres, of a stroke."""
-LONGEST_STEP = 0.25
-"""Metres between two points of a stroke: what lies farther apart is not one stroke on a surface."""
-_MOST_CORRECTIONS, _MOST_POINTS, _MOST_FACES = 20_000, 10_000, 5_000_000
-_MOST_METRES = 1e3
-_MARK = {"faces", "stroke", "box"}
+_KINDS = {"faces", "stroke", "box"}
 
 
 @dataclass(frozen=True, eq=False)
 class FaceCorrection:
-    """Faces of a scan.
+    """A label for faces of a scan, by their indices.
 
     Attributes:
-        label: id. faces: their numbers in the scan.
-        triangles: where they lie, metres: how they are found again in another triangulation; None: not at all.
-        scan: digest of the scan that they are numbers of; None: of whichever scan there is.
+        label: label id.
+        faces: indices of the faces in the scan.
+        triangles: corners of the faces, metres, by which they are found in another triangulation; None: only by index.
+        scan: digest of the scan that the indices belong to; None: indices hold for any scan.
     """
 
     label: int
@@ -50,18 +45,21 @@ class FaceCorrection:
 
     @staticmethod
     def of(mesh: TriangleMesh, label: int, faces: Integer[np.ndarray, " n"]) -> FaceCorrection:
-        """Faces of this mesh, with all that finds them again."""
+        """Build a correction of this mesh's faces with their corners and the mesh's digest."""
         faces = np.asarray(faces, dtype=np.int64)
         return FaceCorrection(label, faces, mesh.triangles[faces], scan_digest(mesh))
 
 
 @dataclass(frozen=True, eq=False)
 class StrokeCorrection:
-    """A stroke of a brush: the surface within a distance of a line on it, measured along the surface.
+    """A label for a brush stroke: the surface within a geodesic distance of a polyline.
 
     Attributes:
-        label: id. points: of the line, metres, at most 25 cm apart. radius: metres.
-        normals: of the surface under the points, which tell its front from its back; None: of the nearest faces.
+        label: label id.
+        points: vertices of the polyline, metres, at most 25 cm apart.
+        radius: of the brush, metres.
+        normals: normals of the surface under the points, which tell its front from its back; None: those of the nearest
+            faces.
     """
 
     label: int
@@ -72,10 +70,12 @@ class StrokeCorrection:
 
 @dataclass(frozen=True, eq=False)
 class BoxCorrection:
-    """Everything in a box, on all sides: faces whose centres lie in it.
+    """A label for all faces whose centres lie in an oriented box.
 
     Attributes:
-        label: id. center: metres. size: lengths of its edges, metres.
+        label: label id.
+        center: centre of the box, metres.
+        size: lengths of its edges, metres.
         rotation: world from the box's own axes.
     """
 
@@ -89,7 +89,7 @@ Correction = FaceCorrection | StrokeCorrection | BoxCorrection
 
 
 def scan_digest(mesh: TriangleMesh) -> str:
-    """SHA-256 of a scan's vertices and faces: whether numbers of faces still mean the same."""
+    """Return the SHA-256 of a scan's vertices and faces, which tells whether indices of faces still hold."""
     whole = hashlib.sha256(np.ascontiguousarray(mesh.vertices, dtype=np.float64).tobytes())
     whole.update(np.ascontiguousarray(mesh.faces, dtype=np.int64).tobytes())
     return whole.hexdigest()
@@ -97,9 +97,9 @@ def scan_digest(mesh: TriangleMesh) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """Corrections in the order in which they were made: a later one covers an earlier one.
+    """Corrections in the order in which they were made; a later one overrides an earlier one.
 
-    They are applied to finished labels, after the graph cut, and hold as they are painted: nothing smooths them away.
+    They are applied to finished labels, after the graph cut, so that nothing smooths them away.
 
     Example:
         >>> corrections = Corrections.load("runs/me/labels_corrections.json")
@@ -112,28 +112,29 @@ class Corrections:
         return len(self.items)
 
     def with_added(self, correction: Correction) -> Corrections:
-        """One more at the end."""
+        """Return these corrections with one more at the end."""
         return Corrections((*self.items, correction))
 
     @staticmethod
     def load(path: str | Path) -> Corrections:
-        """Read `labels_corrections.json` (docs/corrections.md).
+        """Read corrections from `labels_corrections.json` (docs/corrections.md).
 
         Raises:
-            InputError: no such file, another version, unknown labels, numbers out of range; the entry is named.
+            InputError: no such file, another version, unknown labels, numbers out of range; it names the entry.
         """
+        most = 20_000  # far more than a session of painting; bounds the time that a damaged file costs
         subject = f"corrections {path}"
         content = as_object(read_json(path, subject="corrections"), subject=subject)
         version = as_integer(content.get("version", FORMAT_VERSION), subject=f"{subject}: version")
         if version != FORMAT_VERSION:
             raise InputError(f"{subject}: version", expected=f"{FORMAT_VERSION}", received=f"{version}")
         rows = as_list(content.get("corrections"), subject=f"{subject}: corrections")
-        if len(rows) > _MOST_CORRECTIONS:
-            raise InputError(subject, expected=f"at most {_MOST_CORRECTIONS} corrections", received=f"{len(rows)}")
+        if len(rows) > most:
+            raise InputError(subject, expected=f"at most {most} corrections", received=f"{len(rows)}")
         return Corrections(tuple(_read(row, f"{subject}: correction {k + 1}") for k, row in enumerate(rows)))
 
     def save(self, path: str | Path) -> None:
-        """Write what `load` reads, a line a correction, to a tenth of a millimetre, whole or not at all."""
+        """Write the file that `load` reads: one line for each correction, rounded to 0.1 mm, written atomically."""
         rows = ",\n  ".join(json.dumps(_written(item), separators=(",", ":")) for item in self.items)
         inner = f"[\n  {rows}\n ]" if rows else "[]"
         atomic_write_text(path, f'{{\n "version": {FORMAT_VERSION},\n "corrections": {inner}\n}}\n')
@@ -141,14 +142,18 @@ class Corrections:
     def face_labels(
         self, mesh: TriangleMesh, labels: Integer[np.ndarray, " M"], *, surface: ScanSurface | None = None
     ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
-        """The labels of a scan's faces with all corrections applied, and the number of the correction that set each,
-        -1 where none did.
+        """Return a scan's labels with all corrections applied, and the index of the correction that set each face.
 
         Args:
-            surface: of the mesh, where there is one already.
+            mesh: the scan.
+            labels: labels of its faces before the corrections.
+            surface: search structures of the mesh, if they exist already.
+
+        Returns:
+            Labels of the faces, and for each face the index of its correction, -1 without one.
 
         Raises:
-            InputError: numbers of faces of another scan, without the places of these.
+            InputError: indices of faces of another scan without the faces' corners.
         """
         surface, out = surface or ScanSurface(mesh), np.array(labels, dtype=np.int64)
         by = np.full(mesh.face_count, -1, dtype=np.int64)
@@ -158,7 +163,7 @@ class Corrections:
         return out, by
 
     def apply(self, mesh: TriangleMesh, segmented: SegmentedScan) -> SegmentedScan:
-        """Labels with the corrections: what a hand has set has confidence 1, is seen, and is marked as `corrected`."""
+        """Apply the corrections to labels; corrected faces have confidence 1, are seen, and are marked `corrected`."""
         labels, by = self.face_labels(mesh, segmented.face_labels)
         corrected = by >= 0
         return replace(
@@ -171,13 +176,13 @@ class Corrections:
 
 
 def faces_of(item: Correction, surface: ScanSurface, *, subject: str = "correction") -> Int64[np.ndarray, " n"]:
-    """The faces of a scan that a correction means.
+    """Return the faces of a scan that a correction covers.
 
     Warns:
-        GeometryWarning: it means none, or the scan has changed since and its faces are found again by their places.
+        GeometryWarning: it covers none, or the scan has changed since and its faces were found by their corners.
 
     Raises:
-        InputError: numbers of faces of another scan, without the places of these.
+        InputError: indices of faces of another scan without the faces' corners.
     """
     if isinstance(item, StrokeCorrection):
         faces = stroked_faces(surface, item.points, item.radius, normals=item.normals)
@@ -185,13 +190,14 @@ def faces_of(item: Correction, surface: ScanSurface, *, subject: str = "correcti
         inside = np.abs((surface.centers - item.center) @ item.rotation) <= 0.5 * item.size
         faces = np.flatnonzero(inside.all(axis=1))
     else:
-        faces = _numbered_faces(item, surface, subject)
+        faces = _indexed_faces(item, surface, subject)
     if not len(faces):
         warnings.warn(f"{subject}: nothing of the scan is there; it changes nothing", GeometryWarning, stacklevel=2)
     return faces
 
 
-def _numbered_faces(item: FaceCorrection, surface: ScanSurface, subject: str) -> Int64[np.ndarray, " n"]:
+def _indexed_faces(item: FaceCorrection, surface: ScanSurface, subject: str) -> Int64[np.ndarray, " n"]:
+    # Indices hold for the scan of the correction; on another one the faces are found by their corners.
     count = surface.mesh.face_count
     if item.scan is None or item.scan == surface.digest(scan_digest):
         if len(item.faces) and item.faces.max() >= count:
@@ -207,7 +213,7 @@ def _numbered_faces(item: FaceCorrection, surface: ScanSurface, subject: str) ->
             subject,
             expected="faces of this scan, or their `triangles`",
             received="numbers of faces of another scan",
-            remedy="correct it anew with `smplxpp label RUN`, or remove the entry",
+            remedy="correct it again with `smplxpp label RUN`, or remove the entry",
         )
     faces, share = nearest_faces(surface, item.triangles)
     warnings.warn(
@@ -226,22 +232,24 @@ def _read(row: Any, subject: str) -> Correction:
     values = as_object(row, subject=subject)
     name = as_text(values.get("label"), subject=f"{subject}: label")
     require_choice(f"{subject}: label", name, list(LABEL_BY_NAME))
-    label, marks = LABEL_BY_NAME[name].id, sorted(_MARK & set(values))
-    if len(marks) != 1:
-        raise InputError(subject, expected=f"one of {', '.join(sorted(_MARK))}", received=", ".join(marks) or "none")
-    if marks == ["faces"]:
+    label, kinds = LABEL_BY_NAME[name].id, sorted(_KINDS & set(values))
+    if len(kinds) != 1:
+        raise InputError(subject, expected=f"one of {', '.join(sorted(_KINDS))}", received=", ".join(kinds) or "none")
+    if kinds == ["faces"]:
         return _read_faces(values, label, subject)
-    if marks == ["box"]:
+    if kinds == ["box"]:
         return _read_box(as_object(values["box"], subject=f"{subject}: box"), label, f"{subject}: box")
+    # A stroke: points more than 25 cm apart are not one stroke on a surface; a radius is 1 mm to 50 cm.
     points = _points(values["stroke"], f"{subject}: stroke")
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    if (steps > LONGEST_STEP).any():
+    longest = 0.25
+    if (steps > longest).any():
         raise InputError(
             f"{subject}: stroke",
-            expected=f"points at most {LONGEST_STEP:g} m apart, along the surface",
+            expected=f"points at most {longest:g} m apart, along the surface",
             received=f"{steps.max():.3g} m",
         )
-    radius = as_number(values.get("radius"), subject=f"{subject}: radius", least=LEAST_RADIUS, most=MOST_RADIUS)
+    radius = as_number(values.get("radius"), subject=f"{subject}: radius", least=0.001, most=0.5)
     normals = None
     if values.get("normals") is not None:
         normals = as_numbers(values["normals"], points.shape, subject=f"{subject}: normals")
@@ -250,8 +258,9 @@ def _read(row: Any, subject: str) -> Correction:
 
 def _read_faces(values: Mapping[str, Any], label: int, subject: str) -> FaceCorrection:
     listed = as_list(values["faces"], subject=f"{subject}: faces")
-    if not 0 < len(listed) <= _MOST_FACES:
-        raise InputError(f"{subject}: faces", expected=f"1 to {_MOST_FACES}", received=f"{len(listed)}")
+    most = 5_000_000  # faces of the largest scans
+    if not 0 < len(listed) <= most:
+        raise InputError(f"{subject}: faces", expected=f"1 to {most}", received=f"{len(listed)}")
     numbers = as_numbers(listed, (None,), subject=f"{subject}: faces")
     if (numbers < 0).any() or (numbers > 2**31).any() or (numbers != np.floor(numbers)).any():
         raise InputError(f"{subject}: faces", expected="whole numbers from 0", received="others")
@@ -283,15 +292,17 @@ def _read_box(values: Mapping[str, Any], label: int, subject: str) -> BoxCorrect
 
 def _points(value: Any, subject: str) -> Float64[np.ndarray, "n 3"]:
     listed = as_list(value, subject=subject)
-    if not 0 < len(listed) <= _MOST_POINTS:
-        raise InputError(subject, expected=f"1 to {_MOST_POINTS} points", received=f"{len(listed)}")
+    most = 10_000
+    if not 0 < len(listed) <= most:
+        raise InputError(subject, expected=f"1 to {most} points", received=f"{len(listed)}")
     points = as_numbers(listed, (None, 3), subject=subject)
     _require_near(points, subject)
     return points
 
 
 def _require_near(values: Float[np.ndarray, "*n"], subject: str) -> None:
-    if np.abs(values).max(initial=0.0) > _MOST_METRES:
+    # A coordinate above 1 km is in millimetres, or damaged.
+    if np.abs(values).max(initial=0.0) > 1e3:
         raise InputError(subject, expected="metres, as the run's scan has them", received=f"{np.abs(values).max():.3g}")
 
 

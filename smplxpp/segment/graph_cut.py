@@ -1,4 +1,4 @@
-"""Labels that minimise a Potts energy on a graph, by alpha-expansion with exact reductions.
+"""Minimise a Potts energy on a graph by alpha-expansion with exact reductions.
 
 E(L) = sum_i U[i, L_i] + sum_(p,q) w_pq [L_p != L_q]        (Boykov, Veksler and Zabih 2001)
 """
@@ -14,16 +14,18 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from smplxpp.core.errors import InputError
 
-# Costs become integers at this scale, so that flows are exact and results the same everywhere.
 COST_SCALE = 1000
+"""Integer units of one unit of cost. Costs are integers, so that flows are exact and results equal on all machines."""
 
 
 @dataclass(frozen=True, eq=False)
 class PottsProblem:
-    """Costs in integers.
+    """A Potts energy with integer costs.
 
     Attributes:
-        unary: (n, L) int64. pairs: (E, 2) nodes, each pair once. weights: (E,) int64, none negative.
+        unary: (n, L) int64 cost of each label at each node.
+        pairs: (E, 2) neighbouring nodes, each pair once.
+        weights: (E,) int64 cost of two different labels at a pair, none negative.
     """
 
     unary: Int64[np.ndarray, "n L"]
@@ -34,7 +36,7 @@ class PottsProblem:
     def from_costs(
         unary: Num[np.ndarray, "n L"], pairs: Integer[np.ndarray, "E 2"], weights: Num[np.ndarray, " E"]
     ) -> PottsProblem:
-        """Round real costs to 1/1000.
+        """Round real costs to thousandths and build the problem.
 
         Raises:
             InputError: NaN, negative weights, or costs too large for the solver's 32-bit capacities.
@@ -52,7 +54,7 @@ class PottsProblem:
         )
 
     def energy(self, labels: Integer[np.ndarray, " n"]) -> int:
-        """E(L) in thousandths."""
+        """Return the energy E(L) of a labelling, in thousandths."""
         p, q = self.pairs.T
         return int(self.unary[np.arange(len(labels)), labels].sum() + self.weights[labels[p] != labels[q]].sum())
 
@@ -60,12 +62,16 @@ class PottsProblem:
 def minimize_potts(
     problem: PottsProblem, *, labels: Integer[np.ndarray, " n"] | None = None, reduce: bool = True
 ) -> tuple[Int64[np.ndarray, " n"], int]:
-    """Alpha-expansion to convergence: no single label can grow to a lower energy.
+    """Minimise the energy by alpha-expansion, until no single label can grow to a lower energy.
 
-    Starts from `labels`, else from the cheapest label of each node. `reduce` leaves out of each cut the nodes that
-    provably keep their label (`_may_switch`); the energy of every expansion is the same without.
+    Args:
+        problem: the energy.
+        labels: labels to start from; None starts from the cheapest label of each node.
+        reduce: leave nodes that provably keep their label (`_may_switch`) out of each cut; the energy of every
+            expansion is the same without.
 
-    Returns (n,) labels and the energy in thousandths.
+    Returns:
+        (n,) labels and their energy in thousandths.
     """
     count, label_count = problem.unary.shape
     current = problem.unary.argmin(axis=1) if labels is None else np.array(labels, dtype=np.int64)
@@ -85,11 +91,12 @@ def minimize_potts(
 def expand(
     problem: PottsProblem, labels: Integer[np.ndarray, " n"], alpha: int, *, reduce: bool = True
 ) -> Int64[np.ndarray, " n"]:
-    """The labelling of least energy among those where each node keeps its label or takes `alpha`.
+    """Return the labelling of least energy among those where each node keeps its label or takes `alpha`.
 
     With x = 1 for "takes alpha", an edge costs A, B, C, 0 for (x_p, x_q) = 00, 01, 10, 11. All costs doubled, that is
     (B + C - A) [x_p != x_q] + (C - B - A) x_p + (B - C - A) x_q + constant: a cut with symmetric capacities.
     """
+    # Costs of the binary problem.
     p, q = problem.pairs.T
     a = problem.weights * (labels[p] != labels[q])
     b = problem.weights * (labels[p] != alpha)
@@ -110,12 +117,13 @@ def expand(
 
 
 def _may_switch(cost: np.ndarray, p: np.ndarray, q: np.ndarray, capacity: np.ndarray) -> np.ndarray:
-    """A set of nodes outside which none takes alpha in some minimal cut.
+    """Return a set of nodes outside which none takes alpha in some minimal cut.
 
     It starts as the nodes that gain by switching alone (cost < 0) and takes in, until nothing changes, every node i
     with cost_i < sum of the capacities to nodes inside. Then for any set S of nodes outside, switching S back to its
     labels changes the cut by at most -sum_S cost + capacity(S, inside) <= 0, so S need not switch.
     """
+    # Adjacency in compressed rows, then a breadth-first growth of the set.
     n = len(cost)
     rows = np.concatenate([p, q])
     order = np.argsort(rows, kind="stable")
@@ -137,7 +145,7 @@ def _may_switch(cost: np.ndarray, p: np.ndarray, q: np.ndarray, capacity: np.nda
 
 
 def _cut(cost: np.ndarray, p: np.ndarray, q: np.ndarray, capacity: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Indices of the nodes that take alpha: what the source cannot reach is empty of profit, so they lie with it."""
+    """Return the indices of the nodes that take alpha: those on the source's side of the minimum cut."""
     nodes = np.flatnonzero(active)
     place = np.full(len(cost), -1)
     place[nodes] = np.arange(len(nodes))
@@ -146,6 +154,7 @@ def _cut(cost: np.ndarray, p: np.ndarray, q: np.ndarray, capacity: np.ndarray, a
     for here, there in ((p, q), (q, p)):
         leaving = active[here] & ~active[there]
         own += np.bincount(here[leaving], capacity[leaving], minlength=len(cost)).astype(np.int64)
+    # The flow network: the source feeds nodes that gain by switching, nodes that lose drain into the sink.
     inner = active[p] & active[q]
     i, j, c = place[p[inner]], place[q[inner]], capacity[inner]
     own = own[nodes]
@@ -156,6 +165,7 @@ def _cut(cost: np.ndarray, p: np.ndarray, q: np.ndarray, capacity: np.ndarray, a
     cols = np.concatenate([j, i, gain, np.full(len(loss), sink)])
     caps = np.concatenate([c, c, -own[gain], own[loss]]).astype(np.int32)
     graph = csr_matrix((caps, (rows, cols)), shape=(n + 2, n + 2))
+    # After the maximum flow, the nodes that the residual graph reaches from the source are on its side of the cut.
     residual = graph - maximum_flow(graph, source, sink).flow
     residual.data = np.maximum(residual.data, 0)
     residual.eliminate_zeros()

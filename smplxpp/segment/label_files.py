@@ -1,4 +1,4 @@
-"""Label files: per-vertex or per-face ids of a scan, and label maps of views."""
+"""Read label files: ids of a scan's vertices or faces, and label maps of views."""
 
 from __future__ import annotations
 
@@ -40,18 +40,25 @@ def read_labels(
     color_tolerance: float = 24.0,
     source_faces: Int64[np.ndarray, " M"] | None = None,
 ) -> Int64[np.ndarray, " n"]:
-    """Labels of a scan's vertices (N,) or faces (M,), in our ids; which of the two, the length tells.
+    """Read labels of a scan's vertices (N,) or faces (M,), in our ids; the length tells which of the two they are.
 
-    Of a scan file with polygons, `source_faces` (`RawMesh.source_faces`) names the polygon of each triangle: labels may
-    then count the file's polygons, and each triangle takes its polygon's.
+    Formats are `.npz` and `.pkl` (a key such as `label`, `labels`, `scan_labels`, `face_labels`), `.npy`, and mesh
+    files: a PLY property of such a name, or else vertex colours, taken as the display colours of
+    `smplxpp.core.labels`.
 
-    Reads `.npz` and `.pkl` (a key such as `label`, `labels`, `scan_labels`, `face_labels`), `.npy`, and mesh files:
-    a PLY property of such a name, or else vertex colours, taken as the display colours of `smplxpp.core.labels`
-    (nearest colour within `color_tolerance` in 8-bit RGB; farther ones are unlabelled, -1, and no label set applies).
+    Args:
+        path: the file.
+        vertex_count: number of vertices of the scan.
+        face_count: number of triangles of the scan.
+        label_set: numbering of the labels in the file; display colours need none.
+        color_tolerance: distance in 8-bit RGB to the nearest display colour, above which a vertex is unlabelled (-1).
+        source_faces: polygon of each triangle (`RawMesh.source_faces`), for a scan file with polygons. Labels may then
+            be one for each polygon; each triangle takes its polygon's.
 
     Raises:
         InputError: no labels in the file, a length that is neither count, or that is both, or unknown ids.
     """
+    # Read the array by the suffix of the file; whatever is no array file is a mesh.
     path = regular_file(path, subject="label file")
     suffix = path.suffix.lower()
     if suffix == ".npy":
@@ -67,6 +74,7 @@ def read_labels(
         return _read_from_mesh(path, vertex_count, face_count, label_set, color_tolerance)
     if values.ndim == 2 and 1 in values.shape:
         values = values.ravel()
+    # The length tells vertices, faces and polygons apart.
     polygons = None if source_faces is None else int(source_faces.max()) + 1
     of = check_element_count(
         values, vertex_count=vertex_count, face_count=face_count, polygon_count=polygons, subject=f"label file {path}"
@@ -91,11 +99,12 @@ def check_element_count(
     subject: str,
     polygon_count: int | None = None,
 ) -> str:
-    """What `values` has one entry of: "vertex", "face" (a triangle), or "polygon" of a file that has any.
+    """Return which element `values` has one entry for: "vertex", "face" (a triangle), or "polygon" of the scan's file.
 
     Raises:
-        InputError: another length or shape, or one that two of them have so that it cannot tell.
+        InputError: another length or shape, or one that two kinds of elements have.
     """
+    # Compare the length with each count; exactly one must agree.
     length = len(values) if values.ndim == 1 else -1
     counts = {"vertex": vertex_count, "face": face_count}
     if polygon_count not in (None, face_count):
@@ -121,7 +130,11 @@ def check_element_count(
 
 
 def _why_not(length: int, vertex_count: int) -> str:
-    """Our reading neither merges nor splits: other counts come from the tool that wrote the labels."""
+    """Return the remedy for a wrong length.
+
+    The project's readers neither merge nor split vertices, so that other counts come from the tool that wrote the
+    labels.
+    """
     if length < 0:
         return "give one list of labels"
     did = (
@@ -154,7 +167,7 @@ def _as_array(values: Any, path: Path) -> np.ndarray:
 
 
 def holds_labels(path: str | Path) -> bool:
-    """Whether a mesh file says what its surface is: a property with a name of labels, or the table's display colours.
+    """Return whether a mesh file holds labels: a property with a name of labels, or display colours of labels.
 
     Raises:
         InputError: it is no mesh file.
@@ -166,13 +179,14 @@ def holds_labels(path: str | Path) -> bool:
 
 
 def _of_the_table(labels: np.ndarray) -> bool:
-    """Whether colours are display colours of labels: most of them are in the table."""
+    """Return whether colours are display colours of labels, which holds if at least half of them are in the table."""
     return bool((labels == BACKGROUND).mean() <= 0.5)
 
 
 def _read_from_mesh(
     path: Path, vertex_count: int, face_count: int, label_set: str | Path | LabelSet, color_tolerance: float
 ) -> np.ndarray:
+    # The file must have the scan's vertices and faces in their order. Properties are preferred to colours.
     file = read_raw_mesh(path, clouds=True)
     if (len(file.vertices), len(file.faces)) != (vertex_count, face_count):
         raise InputError(
@@ -203,7 +217,7 @@ def _read_from_mesh(
 
 
 def labels_from_colors(colors: Num[np.ndarray, "N 3"], *, tolerance: float = 24.0) -> Int64[np.ndarray, " N"]:
-    """The label ids of display colours; -1 farther than `tolerance` from every colour of the table."""
+    """Return the label ids of display colours; -1 farther than `tolerance` from every colour of the table."""
     table = cKDTree(np.array([label.display_rgb for label in LABELS], dtype=np.float64))
     distance, nearest = table.query(np.asarray(colors, dtype=np.float64), distance_upper_bound=tolerance + 1e-9)
     ids = np.array([label.id for label in LABELS] + [BACKGROUND])
@@ -211,7 +225,7 @@ def labels_from_colors(colors: Num[np.ndarray, "N 3"], *, tolerance: float = 24.
 
 
 def read_label_map(path: str | Path, *, label_set: str | Path | LabelSet) -> Int64[np.ndarray, "H W"]:
-    """A view's label map, (H, W) in our ids: an index PNG (palette or grey) or an integer `.npy`.
+    """Read a view's label map, (H, W) in our ids, from an index PNG (palette or grey) or an integer `.npy`.
 
     Raises:
         InputError: missing file, a colour image, or unknown ids.

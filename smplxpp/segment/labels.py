@@ -1,6 +1,6 @@
-"""Label sets of other data sets and parsers, mapped onto ours.
+"""Map label sets of other data sets and parsers onto ours.
 
-Where their classes are finer or other than ours:
+Some of their classes are finer than ours, or differ from them:
 
 | theirs | ours | why |
 |---|---|---|
@@ -11,7 +11,7 @@ Where their classes are finer or other than ours:
 | coat | outer | |
 | dress, jumpsuit | upper | one garment from the shoulders; it stays whole |
 | pants, skirt, belt | lower | |
-| bag | background | not worn: no votes, the surface takes its neighbours' label |
+| bag | background | not worn; it does not vote, the surface takes its neighbours' label |
 | undefined background, ignored (255) | background | |
 """
 
@@ -28,16 +28,15 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.labels import BACKGROUND, LABEL_BY_NAME, LABELS
 
-_IGNORED = 255
 _OURS = {name: label.id for name, label in LABEL_BY_NAME.items()} | {"background": BACKGROUND}
 
 
 @dataclass(frozen=True)
 class LabelSet:
-    """A numbering of semantic classes.
+    """The numbering of semantic classes in one data set or parser.
 
     Attributes:
-        name: for options and messages.
+        name: name in options and messages.
         classes: (their id, their name, our name) of every class.
     """
 
@@ -46,7 +45,7 @@ class LabelSet:
 
     @property
     def ours(self) -> dict[int, int]:
-        """Their id -> our id."""
+        """Return the mapping from their ids to ours."""
         return {number: _OURS[ours] for number, _, ours in self.classes}
 
 
@@ -55,8 +54,8 @@ def _numbered(name: str, *classes: tuple[str, str]) -> LabelSet:
 
 
 def _parser(name: str, *classes: tuple[str, str]) -> LabelSet:
-    """A parser's classes from 0; its maps mark pixels to be ignored by 255, which do not vote."""
-    return LabelSet(name, (*_numbered(name, *classes).classes, (_IGNORED, "ignored", "background")))
+    """Return a parser's label set: classes from 0, and 255 for pixels to be ignored, which do not vote."""
+    return LabelSet(name, (*_numbered(name, *classes).classes, (255, "ignored", "background")))
 
 
 _LIP = (
@@ -154,7 +153,7 @@ LABEL_SETS: dict[str, LabelSet] = {
 
 
 def find_label_set(name: str | Path | LabelSet) -> LabelSet:
-    """A label set by name, or from a JSON file `{"<their id>": "<our name>", ...}`.
+    """Return a label set by its name, or from a JSON file `{"<their id>": "<our name>", ...}`.
 
     Our names: skin, hair, shoe, upper, lower, outer, background.
 
@@ -185,10 +184,11 @@ def find_label_set(name: str | Path | LabelSet) -> LabelSet:
 def map_labels(
     ids: Num[np.ndarray, "*N"], label_set: str | Path | LabelSet | Mapping[int, int]
 ) -> Int64[np.ndarray, "*N"]:
-    """Ids of a label set, of any shape -> ours, int64 (background -1).
+    """Map ids of a label set, in an array of any shape, to ours (int64, background -1).
 
     Args:
-        ids: integers (floats that hold integers pass). label_set: see `find_label_set`; or their id -> our id.
+        ids: integers; floats that hold integers are accepted.
+        label_set: see `find_label_set`; or a mapping from their ids to ours.
 
     Raises:
         InputError: ids that the set does not have.

@@ -1,4 +1,4 @@
-"""What keeps labels together along a surface: costs of a change across edges, islands given to what is around."""
+"""Smooth labels along a surface: pairwise costs of label changes across edges, and removal of small patches."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from smplxpp.core.labels import LABELS, SKIN
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels
 
-# Steps of lightness and of the two axes of colour that weigh the same: light and noise change lightness most.
 COLOR_STEP = np.array([0.055, 0.022, 0.022])
+"""Scale of OKLab differences (L, a, b). Light and noise change lightness most, so that it weighs least."""
 
 
 @dataclass(frozen=True)
 class SmoothingConfig:
-    """Costs of label changes, and which patches are too small.
+    """Costs of label changes, and bounds below which a patch is too small.
 
     Attributes:
-        smoothness: factor of the pairwise cost. floor: its least value at any edge.
-        eta_convex, eta_concave: how much a fold lowers the cost of a label change there.
-        fold: cosine deficit that counts as a fold.
-        least_contrast: what is left of the cost across the strongest edges of colour, where colours are given.
-        speck_area: patches below this fraction of the surface's area take their surroundings' label.
-        island_area: patches of anything worn do so below this fraction: a label map that is wrong beside a border
-            leaves a bit of skirt on the fingers, and nothing worn is that small (57 of 19,000 square centimetres).
-        doubtful_area, doubtful: so does a patch of any label below this fraction whose mean confidence is lower.
+        smoothness: factor of the pairwise cost.
+        floor: lower bound of the pairwise cost at any edge.
+        eta_convex: how much a convex fold lowers the cost of a label change.
+        eta_concave: the same for a concave fold.
+        fold: scale of 1 - cos(dihedral angle) in the pairwise cost.
+        least_contrast: factor of the cost across the strongest edges of colour, if colours are given.
+        speck_area: area fraction of the surface below which a patch of skin is relabelled.
+        island_area: the same for patches of garments, hair and shoes. Parsers leave such fragments near label borders
+            (a bit of skirt on the fingers); nothing worn is smaller than 57 of 19,000 square centimetres.
+        uncertain_area: the same for patches of any label with a mean confidence below `uncertain`.
+        uncertain: mean confidence below which a patch is uncertain.
     """
 
     smoothness: float = 1.2
@@ -40,14 +43,15 @@ class SmoothingConfig:
     least_contrast: float = 0.1
     speck_area: float = 1e-4
     island_area: float = 3e-3
-    doubtful_area: float = 5e-3
-    doubtful: float = 0.7
+    uncertain_area: float = 5e-3
+    uncertain: float = 0.7
 
 
 def face_colors(mesh: TriangleMesh, colors: Num[np.ndarray, "N C"]) -> Float64[np.ndarray, "M 3"]:
-    """The mean OKLab colour of each face's corners.
+    """Return the mean OKLab colour of each face's corners.
 
     Args:
+        mesh: the mesh.
         colors: sRGB of the vertices, bytes or 0..1, with or without opacity.
 
     Raises:
@@ -70,7 +74,7 @@ def face_colors(mesh: TriangleMesh, colors: Num[np.ndarray, "N C"]) -> Float64[n
 
 
 def likeness(lab: Float64[np.ndarray, "M 3"], pairs: Int64[np.ndarray, "P 2"]) -> Float64[np.ndarray, " P"]:
-    """1 where two faces have one colour, down to 0 where they differ far more than neighbours do on average.
+    """Return the similarity of neighbours' colours: 1 for equal colours, near 0 for far more than the mean difference.
 
     `exp(-d^2 / (2 mean d^2))` (Rother et al., GrabCut, 2004), d the difference in steps of `COLOR_STEP`.
     """
@@ -87,11 +91,16 @@ def edge_weights(
     *,
     lab: Float64[np.ndarray, "M 3"] | None = None,
 ) -> Float64[np.ndarray, " P"]:
-    """The cost of a label change across each edge: low in folds, above all in concave ones, and across edges of colour.
+    """Return the cost of a label change across each edge; it is low at folds and across edges of colour.
 
     Args:
-        pairs, ends: faces and vertices of the edges (`face_adjacency`). lab: colours of the faces (`face_colors`).
+        mesh: the mesh.
+        pairs: the two faces of each edge (`face_adjacency`).
+        ends: the two vertices of each edge.
+        config: weights.
+        lab: colours of the faces (`face_colors`).
     """
+    # w = smoothness (length / mean) exp(-eta (1 - cos dihedral) / fold) + floor, times the contrast of colours.
     length = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
     normal = mesh.face_normals
     n0, n1 = normal[pairs[:, 0]], normal[pairs[:, 1]]
@@ -115,21 +124,23 @@ def absorb_islands(
     ends: Int64[np.ndarray, "P 2"],
     config: SmoothingConfig,
 ) -> Int64[np.ndarray, " M"]:
-    """Give patches that are too small for their label the one that they share the longest border with.
+    """Relabel patches that are too small to the label with which they share the longest border.
 
-    Only patches that are large enough hand on their label; a small one that touches none of them stays.
+    Only patches that are large enough pass on their label; a small patch that touches none of them keeps its own.
     """
+    # Patches are connected faces of one label; the least area depends on the label and the mean confidence.
     same = labels[pairs[:, 0]] == labels[pairs[:, 1]]
     patch = component_labels(pairs[same], len(labels))
     area = np.bincount(patch, mesh.face_areas)
     label_of_patch = np.empty(len(area), dtype=np.int64)
     label_of_patch[patch] = labels
-    doubtful = np.bincount(patch, mesh.face_areas * confidence) < config.doubtful * area
+    uncertain = np.bincount(patch, mesh.face_areas * confidence) < config.uncertain * area
     least = np.where(label_of_patch == SKIN.id, config.speck_area, config.island_area)
-    least = np.where(doubtful, np.maximum(least, config.doubtful_area), least)
+    least = np.where(uncertain, np.maximum(least, config.uncertain_area), least)
     small = area < least * area.sum()
     if not small.any():
         return labels
+    # Lengths of the borders between each small patch and the labels of large patches around it.
     crossing = pairs[~same]
     length = np.linalg.norm(np.diff(mesh.vertices[ends[~same]], axis=1)[:, 0], axis=1)
     here = np.concatenate([patch[crossing[:, 0]], patch[crossing[:, 1]]])

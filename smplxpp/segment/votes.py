@@ -1,4 +1,4 @@
-"""Votes of label maps on the faces that each view sees."""
+"""Vote on the labels of a scan's faces by the label maps of views, and leave out maps that contradict the others."""
 
 from __future__ import annotations
 
@@ -16,23 +16,18 @@ from smplxpp.core.labels import BACKGROUND, LABELS
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import MeshMaps, rasterize_mesh
 
-# A pixel counts fully this far inside the silhouette, and at least by the second number.
-_SILHOUETTE_PX = 4.0
-_LEAST_WEIGHT = 0.1
-# Pixels of depth by which a face smaller than a pixel may lie behind what that pixel shows.
-_SLOPE_PX = 2.0
-
 
 def vote_on_faces(
     mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]
 ) -> Float64[np.ndarray, "M L"]:
     """Sum `cos(view, normal) clip(d / 4, 0.1, 1)` over the views' pixels that show a face, for each label.
 
-    d is the pixel's distance to the silhouette of the labelled foreground, in pixels. Background pixels do not vote;
-    faces that look away from the camera get nothing (the far side of an open sheet). A face that is seen but owns no
-    pixel, as it is smaller than one, has the vote of the pixel that its centre falls into, times its share of it.
+    d is the pixel's distance to the silhouette of the labelled foreground, in pixels, because parsers err there.
+    Background pixels do not vote; faces that look away from the camera get nothing (the far side of an open sheet). A
+    visible face smaller than a pixel may own none; it gets the vote of the pixel at its centre, times its share of it.
 
     Args:
+        mesh: the scan.
         views: (camera, label map) pairs; a map is (H, W) in our ids, background -1, of its camera's size.
 
     Raises:
@@ -46,7 +41,7 @@ def vote_on_faces(
 
 
 def votes_of_view(mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray, "_ _"]) -> Float64[np.ndarray, "M L"]:
-    """What one view says; see `vote_on_faces`.
+    """Return the votes of one view, as defined in `vote_on_faces`.
 
     Raises:
         InputError: sizes that do not agree, or unknown ids.
@@ -66,6 +61,7 @@ def votes_of_view(mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray
             received=f"{labels.min()} to {labels.max()}",
             remedy="map them with map_labels first",
         )
+    # Pixels of visible faces, and the pixels of faces that are smaller than a pixel.
     maps = rasterize_mesh(mesh, camera)
     foreground = labels != BACKGROUND
     row, col = np.nonzero(maps.mask & foreground)
@@ -73,17 +69,18 @@ def votes_of_view(mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray
     small, small_row, small_col, small_share = _smaller_than_a_pixel(mesh, camera, maps, foreground)
     hit, share = np.concatenate([hit, small]), np.concatenate([share, small_share])
     row, col = np.concatenate([row, small_row]), np.concatenate([col, small_col])
-    # A border of background: the edge of the image cuts the person off like a silhouette.
+    # Distance to the silhouette. The image is padded with background, because its edge cuts the person off like a
+    # silhouette.
     inside = distance_transform_edt(np.pad(foreground, 1))[1:-1, 1:-1][row, col]
     cosine = -np.einsum("ij,ij->i", _rays(camera, row, col), mesh.face_normals[hit])
-    weight = share * np.maximum(cosine, 0.0) * np.clip(inside / _SILHOUETTE_PX, _LEAST_WEIGHT, 1.0)
+    weight = share * np.maximum(cosine, 0.0) * np.clip(inside / 4.0, 0.1, 1.0)
     votes = np.bincount(hit * len(LABELS) + labels[row, col], weight, minlength=mesh.face_count * len(LABELS))
-    # Of no pixels at all it counts integers.
+    # `bincount` of no pixels returns integers.
     return votes.astype(np.float64).reshape(mesh.face_count, len(LABELS))
 
 
 def require_votes(some: bool) -> None:
-    """Refuse views that have no vote on any face.
+    """Refuse views that do not vote on any face.
 
     Raises:
         InputError: there is none.
@@ -100,7 +97,8 @@ def require_votes(some: bool) -> None:
 def _smaller_than_a_pixel(
     mesh: TriangleMesh, camera: Camera, maps: MeshMaps, foreground: Bool[np.ndarray, "H W"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Visible faces that own no pixel: their numbers, row and column of their centres, and their share of a pixel."""
+    """Return the visible faces that own no pixel: indices, rows and columns of their centres, and shares of a pixel."""
+    # Faces without a pixel whose centres lie within the image.
     owns = np.zeros(mesh.face_count, dtype=bool)
     owns[maps.face_id[maps.mask]] = True
     face = np.flatnonzero(~owns)
@@ -111,15 +109,15 @@ def _smaller_than_a_pixel(
     row, col = y[inside].astype(np.int64), x[inside].astype(np.int64)
     focal = np.sqrt(abs(np.linalg.det(camera.K[:2, :2])))
     pixel = np.full(len(face), 1.0 / focal) if camera.orthographic else depth / focal
-    # In front of all that the pixel shows, but for the pixel's own slope.
-    seen = foreground[row, col] & (depth < maps.depth[row, col] + _SLOPE_PX * pixel)
+    # A face is visible if it lies at most two pixel sizes behind the surface that the pixel shows, which may slope.
+    seen = foreground[row, col] & (depth < maps.depth[row, col] + 2.0 * pixel)
     face, row, col = face[seen], row[seen], col[seen]
     share = mesh.face_areas[face] / pixel[seen] ** 2
     return face, row, col, np.minimum(share, 1.0)
 
 
 def _rays(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.ndarray:
-    """The unit viewing directions (P, 3) in the world through pixel centres."""
+    """Return the unit viewing directions (P, 3) in the world through pixel centres."""
     if camera.orthographic:
         return np.broadcast_to(camera.forward, (len(row), 3))
     pixel = np.stack([col + 0.5, row + 0.5, np.ones(len(row))], axis=1)
@@ -127,19 +125,13 @@ def _rays(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.ndarray:
     return ray / np.linalg.norm(ray, axis=1, keepdims=True)
 
 
-# A label map is a candidate for exclusion if the other views agree with less than half of its votes, and is excluded if
-# they agree with 75 % of theirs without it. At most one view in three, because with more the majority is unknown.
-_DOUBTED, _AGREED = 0.5, 0.75
-_ONE_OF = 3
-
-
 @dataclass(frozen=True, eq=False)
 class AgreedVotes:
-    """Votes of the views that agree.
+    """Votes of the views that agree with each other.
 
     Attributes:
-        votes: as of `vote_on_faces`, of the views that are kept.
-        left_out: the others by name, each with the share of its votes that the rest agreed with.
+        votes: votes of the views that are kept, as `vote_on_faces` returns them.
+        left_out: the other views by name, each with the share of its votes that the rest agreed with.
     """
 
     votes: Float64[np.ndarray, "M L"]
@@ -147,25 +139,27 @@ class AgreedVotes:
 
 
 def vote_in_agreement(mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]) -> AgreedVotes:
-    """Votes as of `vote_on_faces`, without maps that the other views contradict.
+    """Sum votes as `vote_on_faces` does, without the label maps that the other views contradict.
 
-    A view agrees on a face where it calls it what the sum of all others does. Of the views that agree on less than half
-    of what others see too, the one goes whose absence makes the rest agree most, if they then agree on 75 %; and so
-    on, while at most a third of the views is gone. Two views that contradict each other are both kept.
+    A view agrees on a face if its label wins the sum of all other views. A view is a candidate for exclusion if it
+    agrees on less than half of its votes on faces that others see. The candidate whose absence makes the rest agree
+    most is excluded, if the rest then agrees on 75 %. This repeats until no candidate is left or a third of the views
+    is gone; with more, the majority would be unknown. Two views that contradict each other are both kept.
 
     Raises:
         InputError: as `vote_on_faces` does.
     """
-    # Sparse: a view sees a part of the faces, and a studio has a hundred views.
+    # Sparse matrices, because a view sees a part of the faces, and a studio has a hundred views.
     each = [csr_matrix(votes_of_view(mesh, camera, labels)) for camera, labels in views]
     require_votes(any(votes.nnz for votes in each))
     kept = [k for k, votes in enumerate(each) if votes.nnz]
     left_out: dict[str, float] = {}
-    for _ in range(len(kept) // _ONE_OF):
+    for _ in range(len(kept) // 3):
+        # Exclude the candidate whose absence leaves the best agreement.
         shared, agreed = _shares([each[k] for k in kept])
-        doubted = [i for i in range(len(kept)) if shared[i] > 0 and agreed[i] < _DOUBTED * shared[i]]
-        rests = {i: _mean_agreement([each[k] for k in kept if k != kept[i]]) for i in doubted}
-        if not rests or max(rests.values()) < _AGREED:
+        candidates = [i for i in range(len(kept)) if shared[i] > 0 and agreed[i] < 0.5 * shared[i]]
+        rests = {i: _mean_agreement([each[k] for k in kept if k != kept[i]]) for i in candidates}
+        if not rests or max(rests.values()) < 0.75:
             break
         worst = max(rests, key=lambda i: rests[i])
         left_out[views[kept[worst]][0].name or f"view {kept[worst]}"] = float(agreed[worst] / shared[worst])
@@ -175,13 +169,13 @@ def vote_in_agreement(mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[
 
 
 def _shares(each: Sequence[csr_matrix]) -> tuple[np.ndarray, np.ndarray]:
-    """Votes of every view on faces that another sees, and those of them that the others' sum agrees with."""
+    """Return each view's sum of votes on faces that others see, and the part of it that agrees with the others' sum."""
     total = np.asarray(sum(each).todense())
     shared, agreed = np.zeros(len(each)), np.zeros(len(each))
     for k, votes in enumerate(each):
         face = np.flatnonzero(np.diff(votes.indptr))
         own = votes[face].toarray()
-        # Sums of floats leave crumbs of what was taken away.
+        # Subtracting from a floating-point sum leaves rounding errors, which are no votes.
         others = np.where(total[face] - own > 1e-9 * total[face], total[face] - own, 0.0)
         seen = others.any(axis=1)
         shared[k] = own[seen].sum()
@@ -190,6 +184,6 @@ def _shares(each: Sequence[csr_matrix]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mean_agreement(each: Sequence[csr_matrix]) -> float:
-    """Share of all views' votes that the others agree with; 0 where no face is seen twice."""
+    """Return the share of all views' votes that the others agree with; 0 if no face is seen twice."""
     shared, agreed = _shares(each)
     return float(agreed.sum() / shared.sum()) if shared.any() else 0.0
