@@ -7,7 +7,7 @@
 `photographs`: the training cameras' photographs with their masks' boxes; errors against the true body's landmarks as a
 camera and a triangulation see them, and the body that `smplxpp.register` fits to these keypoints, with masks and
 without, from nothing else. `scans`: landmarks of bare scans drawn all around (`smplxpp.build.scan_keypoints`), of
-every capture and procedural person, as they are, after `benchmarks.people.VARIANTS`, without colours. `masks`: of
+every capture and procedural person, as they are, after `pipelines.synth.people.VARIANTS`, without colours. `masks`: of
 MediaPipe, and of empty plates: the captures are on black, so their people are put before made rooms, with noise, a
 shadow on the floor and another exposure than the plate's. The truth is looked at in measuring alone.
 """
@@ -26,13 +26,13 @@ import tyro
 from jaxtyping import Bool, Float64, UInt8
 
 from benchmarks.accuracy.registration import bare_and_under
-from benchmarks.people import captured, captured_names, people, variant
-from benchmarks.people.person_scan import PersonScan
+from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
 from pipelines.captures.detect_keypoints import detect_keypoints, problems_of
 from pipelines.commands.capture import selected_frames
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.stages.build_config import RegisterInputs
+from pipelines.synth.people import PersonScan, people, variant
 from smplxpp.body import BodyModel, load_body
 from smplxpp.build.observe import observe
 from smplxpp.build.scan_keypoints import ScanViews, facing, keypoints_of_scan

@@ -2,7 +2,7 @@
 
     SMPLXPP_PEOPLE=DIR python -m benchmarks labels_by_body [--count 36] [--seed 0] [--only NAME]
 
-The cast of `benchmarks.people`, the fixture, and the captures where they are. Accuracy is of the seen faces, by area
+The cast of `synth.people`, the fixture, and the captures where they are. Accuracy is of the seen faces, by area
 and by number. The body is
   a fit   every joint turned by 1.5 to 3 degrees about each axis, betas off by 0.3 to 0.5 (stature kept), placed rigidly
           as a fit would place it and then moved by 8 to 15 mm: 13 to 45 mm of mean vertex error; two draws a person
@@ -20,9 +20,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.people import CAST, PersonScan, captured, captured_names, person
+from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
 from pipelines.synth.noise import smooth_noise
+from pipelines.synth.people import CAST, PersonScan, person
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.labels import LABELS

@@ -16,8 +16,9 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from benchmarks.people import CAST, PersonScan, captured, captured_names, person
+from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
+from pipelines.synth.people import CAST, PersonScan, person
 from pipelines.viewer.session import lies_within
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.params import BodyParams

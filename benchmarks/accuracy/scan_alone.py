@@ -2,7 +2,7 @@
 
     python -m benchmarks scan_alone [--people 12] [--who NAME ...] [--seed 0] [--variants "as it is" "3 mm noise"]
 
-Scans are the fixture's, the captures' that are there, and procedural people (`benchmarks.people`); each is read as a
+Scans are the fixture's, the captures' that are there, and procedural people (`synth.people`); each is read as a
 file without parameters, labels, units and axis would be, and gone through as `smplxpp build --scan` does. The truth is
 looked at in measuring alone. Wrong facing: the pelvis' front more than 90 degrees off. Labels are those of
 `label_by_body`, on faces that the scanner saw.
@@ -18,8 +18,9 @@ from functools import partial
 import numpy as np
 import tyro
 
-from benchmarks.people import VARIANTS, PersonScan, captured, captured_names, people, person, variant
+from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
+from pipelines.synth.people import VARIANTS, PersonScan, people, person, variant
 from smplxpp.body import BodyModel, load_body
 from smplxpp.build.locate import certain_labels
 from smplxpp.clean import convert_points, find_scan_frame
@@ -39,13 +40,13 @@ class ScanAlone:
     people: int = 12
     """Number of procedural people; 0: none."""
     who: tuple[str, ...] = ()
-    """These of them by name (`benchmarks.people.cast`), in place of the first ones."""
+    """These of them by name (`pipelines.synth.people.cast`), in place of the first ones."""
     seed: int = 0
     """Seed of the procedural people."""
     captured: bool = True
     """The fixture's scan and those of captures, too."""
     variants: tuple[str, ...] = ("as it is",)
-    """Changes of the scans: names of `benchmarks.people.VARIANTS`, or "all"."""
+    """Changes of the scans: names of `pipelines.synth.people.VARIANTS`, or "all"."""
     labels: bool = True
     """Label the scans with the body that was found, too."""
     store: bool = True

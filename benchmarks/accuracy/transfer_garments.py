@@ -4,7 +4,7 @@
 
 26 garments are made by procedure on the open body, on persons of three shapes, in the T-pose and, with a scan's noise
 and simplified, in an A-pose and with the arms as low as they come before a hand touches the cloth
-(`benchmarks.garments`). Their weights are painted by rules in the garments' own coordinates, none of which is a method
+(`synth.garments`). Their weights are painted by rules in the garments' own coordinates, none of which is a method
 compared here; what lies on the skin keeps the weights of the skin that it was grown from. Weights are transferred from
 the posed body, the garment is unposed with them and driven to the stress poses; errors are distances in mm to the same
 garment driven by its authored weights, the mean of all its scans. A ratio is that of the mean errors, ours to the
@@ -22,16 +22,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.accuracy.driving import Method, nearest_point, nearest_vertex
-from benchmarks.garments.trial import Trial
-from benchmarks.garments.wardrobe import SHAPES, cases
 from benchmarks.support.results import store_results
+from pipelines.synth.garments.wardrobe import SHAPES, Case, cases
 from smplxpp.body import BodyModel, load_body
+from smplxpp.body.named_poses import stress_poses
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 
 _TIE_MM = 0.2
@@ -55,8 +57,48 @@ VARIANTS = {
     "turned 0": replace(_DEFAULT, turned=0.0),
     "turned 0.06": replace(_DEFAULT, turned=0.06),
 }
+_ANY_DETERMINANT = UnposeConfig(warn_below=-np.inf, fail_below=-np.inf)  # baselines may fold a vertex: measure it
+
 Scores = dict[str, dict[str, float]]
 Rows = dict[str, list[dict[str, float]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A case, and what its authored weights make of it.
+
+    Attributes:
+        case: the garment as scanned.
+        reference: transforms of the joints in the scan's pose.
+        driven: those of the stress poses.
+        expected: (P, N, 3) metres, the garment in the stress poses by its authored weights.
+    """
+
+    case: Case
+    reference: Float[np.ndarray, "J 4 4"]
+    driven: Float[np.ndarray, "P J 4 4"]
+    expected: Float[np.ndarray, "P N 3"]
+
+    @staticmethod
+    def of(body: BodyModel, case: Case) -> Trial:
+        """Drive the garment by its authored weights."""
+        reference = body.forward(case.params).posed_from_rest[0]
+        driven = body.forward(stress_poses(replace(case.params, transl=np.zeros((1, 3))))).posed_from_rest
+        return Trial(case, reference, driven, _drive(case.mesh.vertices, case.weights, reference, driven))
+
+    def judge(self, dense: Float[np.ndarray, "N J"]) -> dict[str, float]:
+        """Mean total variation of the weights; mean, p95 and p99 in mm of all driven positions."""
+        error = 1e3 * np.linalg.norm(
+            _drive(self.case.mesh.vertices, dense, self.reference, self.driven) - self.expected, axis=2
+        )
+        p95, p99 = np.percentile(error, [95, 99])
+        variation = 0.5 * np.abs(dense - self.case.weights).sum(axis=1).mean()
+        return {"tv": float(variation), "mean": float(error.mean()), "p95": float(p95), "p99": float(p99)}
+
+
+def _drive(vertices: np.ndarray, dense: np.ndarray, reference: np.ndarray, driven: np.ndarray) -> np.ndarray:
+    rest = unpose(vertices, dense, reference, config=_ANY_DETERMINANT).vertices
+    return np.stack([skin(rest, dense, transforms) for transforms in driven])
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarr
 
 def scan_checks(reference: TriangleMesh, scan: SimulatedScan) -> dict[str, float]:
     """Measure the scan against the layers that it shows."""
-    shown = np.einsum("pk,pkx->px", scan.barycentric, reference.triangles[scan.face])
+    shown = scan.shown_on(reference)
     distance = row_lengths(scan.mesh.vertices - shown) * _MM
     inside = SignedDistanceField(scan.mesh, solid=True).query(shown[distance < 5]).distance
     counts = scan.mesh.edges_with_counts[1]

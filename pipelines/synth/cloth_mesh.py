@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
+from smplxpp.body import BodyModel
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
 from smplxpp.core.signed_distance import SignedDistanceField
 
@@ -30,6 +31,11 @@ class ClothMesh:
     def with_vertices(self, vertices: Float[np.ndarray, "N 3"]) -> ClothMesh:
         """Return the same faces and weights at other places."""
         return replace(self, vertices=vertices)
+
+
+def outer_faces(body: BodyModel) -> Bool[np.ndarray, " M"]:
+    """Return which faces of the body are outer skin, neither eyes nor mouth."""
+    return (body.part_labels == body.part_label_names.index("body"))[body.faces].all(axis=1)
 
 
 def submesh(cloth: ClothMesh, face_mask: Bool[np.ndarray, " M"]) -> ClothMesh:

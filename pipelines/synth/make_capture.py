@@ -257,7 +257,7 @@ def _scan_attributes(
 ) -> tuple[UInt8[np.ndarray, " N"], UInt8[np.ndarray, " N"], UInt8[np.ndarray, "N 3"]]:
     """Return part, label and colour of each scan vertex: those of the point of the layers that it shows."""
     corners = person.tpose.faces[scan.face]
-    rest = np.einsum("pk,pkx->px", scan.barycentric, person.tpose.vertices[corners])
+    rest = scan.shown_on(person.tpose)
     nearest = corners[np.arange(len(corners)), np.argmax(scan.barycentric, axis=1)]
     shown, label = person.face_part[scan.face], person.vertex_label[nearest]
     colors = person.colors(rest, shown, label)

@@ -60,6 +60,10 @@ class SimulatedScan:
     face: Int[np.ndarray, " N"]
     barycentric: Float[np.ndarray, "N 3"]
 
+    def shown_on(self, layers: TriangleMesh) -> Float[np.ndarray, "N 3"]:
+        """Return the points that the vertices show on the layers, whatever pose the layers are in."""
+        return np.einsum("pk,pkx->px", self.barycentric, layers.triangles[self.face])
+
 
 def simulate_scan(layers: TriangleMesh, sheets: list[Bool[np.ndarray, " M"]], config: ScanConfig) -> SimulatedScan:
     """Scan `layers`, standing on the plane of its lowest vertex.

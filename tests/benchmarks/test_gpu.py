@@ -10,8 +10,7 @@ import torch
 
 import benchmarks.gpu.__main__ as gpu
 from benchmarks.gpu.__main__ import GpuBenchmark, run_part
-from benchmarks.gpu.parts import PARTS, Job
-from benchmarks.gpu.views import enlarge
+from benchmarks.gpu.parts import PARTS, Job, enlarge
 from smplxpp.capture import open_capture
 from tests.dolls.dancing import write_dance, write_dance_run
 

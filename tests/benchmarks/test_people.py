@@ -8,13 +8,12 @@ import igl
 import numpy as np
 import pytest
 
-from benchmarks.people import CAST, VARIANTS, access, captured, captured_names, people, person, variant
-from benchmarks.people.__main__ import body_outside
-from benchmarks.people.builds import BUILDS, betas_of, fitting_mannequin
-from benchmarks.people.making import make_person
-from benchmarks.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
-from benchmarks.people.stances import STANCES, Posing
-from benchmarks.people.tailor import all_cuts
+from benchmarks.support.people import body_outside, captured, captured_names
+from pipelines.synth.garments.wardrobe import all_garments
+from pipelines.synth.people import CAST, VARIANTS, access, people, person, variant
+from pipelines.synth.people.bodies import BUILDS, STANCES, Posing, betas_of, fitting_mannequin
+from pipelines.synth.people.making import make_person
+from pipelines.synth.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
 from pipelines.synth.scan_simulation import ScanConfig
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
@@ -123,11 +122,11 @@ def test_what_nobody_has_is_refused(scan):
 
 def test_the_cast_is_made_of_what_there_is(body):
     mannequin, _ = fitting_mannequin(body, betas_of(body, "mean", np.random.default_rng(0)))
-    cuts = all_cuts(mannequin)
+    garments = all_garments(mannequin)
     for name, member in CAST.items():
         assert member.build in BUILDS and member.stance in STANCES and member.tone in SKIN_TONES, name
         for wear in member.wears:
-            dyes = HAIR_COLORS if cuts[wear.cut].label == "hair" else DYES
+            dyes = HAIR_COLORS if garments[wear.garment].label == "hair" else DYES
             assert wear.dye.color in dyes and wear.dye.second in DYES and wear.dye.pattern in PATTERNS, name
 
 

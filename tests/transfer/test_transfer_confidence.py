@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.garments.fitted import fitted_garments
-from benchmarks.garments.hair import hairstyles
-from benchmarks.garments.loose import loose_garments
-from benchmarks.garments.mannequin import Mannequin, shares
-from benchmarks.garments.trial import Trial
-from benchmarks.garments.wardrobe import betas_of, scan
+from benchmarks.accuracy.transfer_garments import Trial
+from pipelines.synth.garments.fitted import fitted_garments
+from pipelines.synth.garments.hair import hairstyles
+from pipelines.synth.garments.loose import loose_garments
+from pipelines.synth.garments.mannequin import Mannequin, shares
+from pipelines.synth.garments.wardrobe import scan, shape_betas
 from smplxpp.body import load_body
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.correspond import closest_points
@@ -84,7 +84,7 @@ def test_cloth_beside_a_hand_does_not_follow_it(mannequin, wardrobe, name):
 def test_the_back_of_a_hand_is_no_match_for_the_cloth_before_its_palm():
     """On a heavy person the back of the hand lay within the reach of a confident match and faced as the dress does."""
     body = load_body()
-    heavy = Mannequin.of(body, betas_of(body, "heavy and tall"))
+    heavy = Mannequin.of(body, shape_betas(body, "heavy and tall"))
     dress = next(garment for garment in loose_garments(heavy) if garment.name == "dress")
     case = scan(heavy, dress, "heavy and tall", "hands", seed=17)
     beside = error(heavy, case, TransferConfig.for_label("upper"))

@@ -1,4 +1,4 @@
-"""How the garments are cut: layers grown from the skin, and sheets laid out by their own coordinates."""
+"""Build garment meshes: layers grown from the skin, and sheets laid out in coordinates of their own."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from benchmarks.garments.mannequin import Mannequin
 from pipelines.synth.cloth_mesh import ClothMesh, clip, push_out, smooth, submesh
+from pipelines.synth.garments.mannequin import Mannequin
 from pipelines.synth.noise import ramp
 from smplxpp.core.topology import face_components
 
 Level = Callable[[np.ndarray], np.ndarray]
+"""Maps points (N, 3) to a level (N,) that is positive where the garment is, in metres from its hem."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,47 +23,52 @@ class Garment:
     """A garment in the T-pose.
 
     Attributes:
-        name, label: of the garment, and the label that a segmentation would give it.
-        make: makes its mesh and authored weights. rule: what gives these weights, in words.
-        loose: whether it hangs free of the skin, so that no point of the body says what it follows.
-        beside_hands: whether the arms may hang beside it (it follows none).
+        name: name of the garment.
+        label: the label that a segmentation would give it.
+        make: returns its mesh with authored weights.
+        rule: description of the rule that gives the weights.
+        loose: whether it hangs free of the skin, so that the nearest skin does not tell which joints it follows.
+        beside_hands: whether arms may hang beside it, as it follows neither arm.
     """
 
     name: str
     label: str
     make: Callable[[], ClothMesh]
-    rule: str
+    rule: str = "the weights of the skin that each vertex was grown from"
     loose: bool = False
     beside_hands: bool = False
 
     @cached_property
     def cloth(self) -> ClothMesh:
-        """Its mesh and authored weights, made when they are asked for."""
+        """The mesh with its authored weights, built at the first access."""
         return self.make()
 
 
 def layer(
     mannequin: Mannequin, level: Level, *, ease: float | Callable[[np.ndarray], np.ndarray], fairing: int = 4
 ) -> ClothMesh:
-    """The skin where `level` (of the points) is positive, faired and lifted by `ease` metres along the normals.
+    """Return the skin where `level` is positive, smoothed and lifted by `ease` metres along the normals.
 
     A vertex keeps the weights of the skin that it was grown from.
     """
+    # Cut the skin along the garment's hems.
     whole = mannequin.skin
     cloth = clip(whole, level(whole.vertices))
     lift = ease(cloth.vertices) if callable(ease) else np.full(len(cloth.vertices), ease)
+    # Smooth away the skin's relief, then lift the surface along normals that are as smooth.
     mesh = cloth.mesh
     vertices = smooth(mesh, cloth.vertices, steps=fairing)
     normals = smooth(mesh, mesh.with_vertices(vertices).vertex_normals, steps=fairing)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     vertices = vertices + lift[:, None] * normals
     lifted = cloth.with_vertices(push_out(mesh.with_vertices(vertices), whole.mesh, clearance=0.003, solid=True))
+    # Drop crumbs that the cut leaves, below 5 % of the faces.
     component = face_components(lifted.faces)
     return submesh(lifted, np.bincount(component)[component] > 0.05 * len(component))
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool) -> Int[np.ndarray, "M 3"]:
-    """Faces of a sheet of rows x columns points, the columns closed to a ring or not.
+    """Return the faces of a sheet of rows x columns points, the columns closed to a ring or not.
 
     Seen from the front side rows go down and columns to the left: outward for rows downwards and azimuths that grow.
     """
@@ -83,14 +89,23 @@ def hang(
     stand_off: float = 0.008,
     pleats: tuple[int, float] = (0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (R * C, 3) and faces of cloth that hangs about the trunk from the first height down.
+    """Return points (R * C, 3) and faces of cloth that hangs about the trunk from the first height down.
 
-    It keeps to the outline, never goes inwards below it, and widens by `flare` metres a metre under the hips' widest
-    place. `pleats`: their number around, and their depth in metres a metre below the waist.
+    It follows the outline at a distance of `stand_off` metres.
+
+    Args:
+        mannequin: the person.
+        heights: of the rows, metres, descending.
+        azimuths: of the columns, radians.
+        closed: whether the last column joins the first.
+        flare: metres of radius gained a metre of height, below the widest place of the hips.
+        stand_off: metres between outline and cloth.
+        pleats: their number around, and their depth in metres a metre below the hips.
     """
     hips = mannequin.joints["left_hip"][1]
     outline = mannequin.outline(heights[:, None], azimuths[None, :]) + stand_off
     radius = outline.copy()
+    # Below the hips cloth hangs: its radius never shrinks downwards.
     for row in range(1, len(heights)):
         free = heights[row] < hips + 0.06
         grow = flare * (heights[row - 1] - heights[row]) if free else 0.0
@@ -105,14 +120,14 @@ def hang(
 
 
 def around(count: int = 100) -> np.ndarray:
-    """Azimuths of a closed ring."""
+    """Return `count` azimuths of a closed ring, radians."""
     return 2 * np.pi * np.arange(count) / count
 
 
 def skirt_weights(
     mannequin: Mannequin, points: Float[np.ndarray, "N 3"], *, legs: float, shins: float
 ) -> Float[np.ndarray, "N J"]:
-    """How a skirt is painted, in its own coordinates.
+    """Return the skinning weights of a skirt from its own coordinates.
 
     Down to the hips' joints it follows the trunk at the same height and azimuth. From there to 22 cm below them the
     thighs take over a share that grows smoothly to `legs`; the pelvis keeps the rest. Left and right share it by how
@@ -122,10 +137,12 @@ def skirt_weights(
     joints, body = mannequin.joints, mannequin.body
     hip, knee = joints["left_hip"][1], joints["left_knee"][1]
     x, y, _ = points.T
+    # The share of the left leg, by the place across the ring.
     half = 0.8 * np.maximum(np.hypot(x, points[:, 2] - mannequin.axis[1]), 0.05)
     left = ramp(x / half, -1.0, 1.0)
     leg = legs * ramp(y, hip, hip - 0.22)
     shin = shins * ramp(y, knee + 0.05, knee - 0.25)
+    # Pelvis, thighs and shins below the hips; the trunk's weights above them.
     rows = mannequin.rigid("pelvis", len(points)) * (1 - leg)[:, None]
     for side, share in (("left", left), ("right", 1 - left)):
         rows[:, body.joint_names.index(f"{side}_hip")] += leg * share * (1 - shin)
@@ -135,7 +152,7 @@ def skirt_weights(
 
 
 def joined(*pieces: ClothMesh) -> ClothMesh:
-    """Pieces as one garment of several components."""
+    """Return pieces as one garment of several components."""
     offsets = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
     return ClothMesh(
         np.concatenate([piece.vertices for piece in pieces]),
@@ -145,7 +162,7 @@ def joined(*pieces: ClothMesh) -> ClothMesh:
 
 
 def tube_along(curve: Float[np.ndarray, "R 3"], radii: Float[np.ndarray, " R"], *, sides: int = 24) -> tuple:
-    """Points and faces of a tube about a curve, its normals outward, its ends open."""
+    """Return points and faces of a tube about a curve, normals outward, ends open."""
     tangent = np.gradient(curve, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     first = np.cross(tangent, [0.31, 0.12, 0.94])
@@ -158,6 +175,6 @@ def tube_along(curve: Float[np.ndarray, "R 3"], radii: Float[np.ndarray, " R"], 
 
 
 def facing_out(cloth: ClothMesh, inner: Float[np.ndarray, "N 3"]) -> ClothMesh:
-    """The sheet wound so that its normals lead away from the inner points of its vertices."""
+    """Return the sheet wound so that its normals point away from the inner point of each vertex."""
     outward = np.einsum("ij,ij->i", cloth.mesh.vertex_normals, cloth.vertices - inner).mean()
     return cloth if outward > 0 else ClothMesh(cloth.vertices, cloth.faces[:, ::-1], cloth.weights)

@@ -1,4 +1,4 @@
-"""Garments that hang: sheets laid out by height and azimuth, painted by rules in those coordinates."""
+"""Hanging garments: sheets laid out by height and azimuth, with weights by rules in those coordinates."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
-from benchmarks.garments.mannequin import Mannequin
 from pipelines.synth.cloth_mesh import ClothMesh, push_out
+from pipelines.synth.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
+from pipelines.synth.garments.mannequin import Mannequin
 
 _SKIRT = (
     "trunk at the same height and azimuth down to the hips; from there to 22 cm below the thighs grow to {legs}, the "
@@ -18,11 +18,10 @@ _SKIRT = (
 _COAT = "body and sleeves as grown from the skin; panels as a skirt's with legs 0.7, shins 0.3"
 _CAPE = "trunk at the same height and azimuth down to the hips, below that pelvis with up to 0.4 of the thighs"
 _SLEEVES = "body as grown from the skin; sleeves: the arm's skin at the same place along the arm, however far they hang"
-_CELL = 0.014
 
 
 def loose_garments(mannequin: Mannequin) -> list[Garment]:
-    """Skirts, dresses, coat, cape and wide sleeves."""
+    """Return skirts, dresses, a coat, a cape and wide sleeves."""
     j = mannequin.joints
     waist, hip, knee, ankle = j["spine1"][1] + 0.04, j["left_hip"][1], j["left_knee"][1], j["left_ankle"][1]
     chest = j["spine3"][1] + 0.085
@@ -48,18 +47,17 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
 def _hung(
     mannequin: Mannequin, top: float, hem: float, *, legs: float, shins: float, gap: float = 0.0, **cut
 ) -> ClothMesh:
-    """A skirt from `top` down to `hem`, open by `gap` radians to each side of the front."""
-    heights = np.linspace(top, hem, int((top - hem) / _CELL) + 2)
+    """Return a skirt from `top` down to `hem`, open by `gap` radians to each side of the front."""
+    heights = np.linspace(top, hem, int((top - hem) / 0.014) + 2)  # rows 14 mm apart
     azimuths = around(100) if not gap else np.linspace(np.pi / 2 + gap, 2.5 * np.pi - gap, 100)
     points, faces = hang(mannequin, heights, azimuths, closed=not gap, **cut)
-    cloth = ClothMesh(points, faces, np.zeros((len(points), mannequin.body.joint_count)))
-    cloth = facing_out(cloth, np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + mannequin.axis[1]]))
+    cloth = facing_out(mannequin.unweighted(points, faces), mannequin.inner_points(points))
     cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.004, solid=True))
     return ClothMesh(cloth.vertices, cloth.faces, skirt_weights(mannequin, points, legs=legs, shins=shins))
 
 
 def _coat(mannequin: Mannequin) -> ClothMesh:
-    """A long coat, open in front: body and sleeves to the hips, and panels from there down."""
+    """Return a long coat, open in front: body and sleeves to the hips, and panels from there down."""
     j = mannequin.joints
     hip, knee = j["left_hip"][1], j["left_knee"][1]
 
@@ -76,25 +74,25 @@ def _coat(mannequin: Mannequin) -> ClothMesh:
 
 
 def _cape(mannequin: Mannequin) -> ClothMesh:
-    """A cape about the back, from the shoulders to the knees."""
+    """Return a cape about the back, from the shoulders to the knees."""
     j = mannequin.joints
     top, hem = j["neck"][1] - 0.05, j["left_knee"][1] + 0.05
     heights = np.linspace(top, hem, 60)
     azimuths = np.linspace(np.pi + 0.12, 2 * np.pi - 0.12, 70)
+    # A cape falls from the shoulders outwards, in folds that deepen downwards.
     reach = 0.125 + 0.16 * ((top - heights) / (top - hem)) ** 0.7
     outline = mannequin.outline(heights[:, None], azimuths[None, :]) * np.clip(-np.sin(azimuths), 0.75, 1.0) + 0.01
     radius = np.maximum(outline, reach[:, None] * (1 + 0.05 * np.sin(9 * azimuths) * (reach[:, None] / 0.2)))
     points = mannequin.at(heights[:, None], azimuths[None, :], np.maximum.accumulate(radius, axis=0)).reshape(-1, 3)
     faces = grid_faces(len(heights), len(azimuths), closed=False)
-    cloth = ClothMesh(points, faces, np.zeros((len(points), mannequin.body.joint_count)))
-    cloth = facing_out(cloth, np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + mannequin.axis[1]]))
+    cloth = facing_out(mannequin.unweighted(points, faces), mannequin.inner_points(points))
     cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.006, solid=True))
     weights = skirt_weights(mannequin, points, legs=0.4, shins=0.0)
     return ClothMesh(cloth.vertices, cloth.faces, weights)
 
 
 def _kimono(mannequin: Mannequin) -> ClothMesh:
-    """A robe's upper part with sleeves that hang wide below the arms."""
+    """Return a robe's upper part with sleeves that hang wide below the arms."""
     j = mannequin.joints
     hip, shoulder, wrist = j["left_hip"][1], j["left_shoulder"], j["left_wrist"]
 
@@ -106,6 +104,7 @@ def _kimono(mannequin: Mannequin) -> ClothMesh:
         )
 
     pieces = [layer(mannequin, level, ease=0.014, fairing=8)]
+    # Sleeves are tubes along the arms, wider downwards than upwards.
     along = np.linspace(shoulder[0] + 0.10, wrist[0] - 0.03, 40)
     angle = around(48)
     hangs = 0.07 + 0.19 * ((along - along[0]) / (along[-1] - along[0])) ** 0.8

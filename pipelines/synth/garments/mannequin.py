@@ -1,4 +1,4 @@
-"""The open body in the T-pose as a tailor sees it: joints by name, its outline at each height, weights by place."""
+"""The open body in the T-pose as a tailor's form: joints by name, outlines by height, skinning weights by place."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from pipelines.synth.cloth_mesh import ClothMesh
+from pipelines.synth.cloth_mesh import ClothMesh, outer_faces
 from smplxpp.body import BodyModel
 from smplxpp.core.params import BodyParams
 
-_STEP = 0.02
-_DIRECTIONS = 72
-_AZIMUTH = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-_ARM = ("shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
-_HEAD = ("head", "jaw", "eye")
+# Parts of joint names, without the side.
+HAND_JOINTS = ("elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
+ARM_JOINTS = ("shoulder", *HAND_JOINTS)
+_HEAD_JOINTS = ("head", "jaw", "eye")
+
+# Outlines are sampled at heights this far apart (metres) and in this many directions around the trunk: finer than the
+# garments' own meshes, so that cloth laid on an outline shows no steps.
+_STEP, _DIRECTIONS = 0.02, 72
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +27,12 @@ class Mannequin:
     """A person in the T-pose. Azimuths are radians from +x (the person's left) towards +z (the front).
 
     Attributes:
-        body: its model. params: the T-pose of the person.
-        skin: the outer skin with its weights. joints: places of the joints by name.
+        body: the body model.
+        params: the T-pose of the person.
+        skin: the outer skin with its skinning weights.
+        joints: joint positions (3,) by name, metres.
         outlines: radius of the convex outline of trunk and legs, heights x azimuths, about the trunk's axis.
-        low: height of the first outline.
+        low: height of the first outline, metres.
     """
 
     body: BodyModel
@@ -39,27 +44,27 @@ class Mannequin:
 
     @staticmethod
     def of(body: BodyModel, betas: Float[np.ndarray, " B"]) -> Mannequin:
-        """Make the mannequin of shape coefficients."""
+        """Return the mannequin of shape coefficients."""
         params = BodyParams.rest(betas=betas, expressions=body.num_expressions)
         posed = body.forward(params)
-        skin, used = body.mesh(posed.vertices[0]).submesh((body.part_labels == 0)[body.faces].all(axis=1))
+        skin, used = body.mesh(posed.vertices[0]).submesh(outer_faces(body))
         cloth = ClothMesh(skin.vertices, skin.faces, body.weights[used])
         return Mannequin.cut_on(body, params, cloth, dict(zip(body.joint_names, posed.joints[0], strict=True)))
 
     @staticmethod
     def cut_on(body: BodyModel, params: BodyParams, skin: ClothMesh, joints: dict[str, np.ndarray]) -> Mannequin:
-        """Make the mannequin of a skin and its joints, of any size."""
-        torso = shares(body, skin.weights, (*_ARM, *_HEAD)) < 0.5
+        """Return the mannequin of a skin and its joints, of any size."""
+        torso = shares(body, skin.weights, (*ARM_JOINTS, *_HEAD_JOINTS)) < 0.5
         low, outlines = _outlines(skin.vertices[torso], joints["pelvis"][2])
         return Mannequin(body, params, skin, joints, outlines, low)
 
     @property
     def axis(self) -> np.ndarray:
-        """Where the trunk's axis stands: x and z."""
+        """Position (2,) of the trunk's vertical axis: x and z, metres."""
         return np.array([0.0, self.joints["pelvis"][2]])
 
     def outline(self, height: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-        """Distance from the axis to the outline of trunk and legs; the arrays broadcast."""
+        """Return the distance from the axis to the outline of trunk and legs, bilinear; the arrays broadcast."""
         row = np.clip((height - self.low) / _STEP, 0, len(self.outlines) - 1.001)
         column = np.mod(azimuth, 2 * np.pi) / (2 * np.pi) * _DIRECTIONS
         r, c = np.broadcast_arrays(row, column)
@@ -69,20 +74,29 @@ class Mannequin:
         return (1 - u) * ((1 - v) * o[i, j] + v * o[i, k]) + u * ((1 - v) * o[i + 1, j] + v * o[i + 1, k])
 
     def at(self, height: np.ndarray, azimuth: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Points by cylinder coordinates about the trunk's axis."""
+        """Return points (..., 3) of cylinder coordinates about the trunk's axis; the arrays broadcast."""
         h, a, r = np.broadcast_arrays(height, azimuth, radius)
         return np.stack([self.axis[0] + r * np.cos(a), h, self.axis[1] + r * np.sin(a)], axis=-1)
 
+    def inner_points(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+        """Return the point of the trunk's axis at the height of each point."""
+        return np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + self.axis[1]])
+
+    def unweighted(self, points: Float[np.ndarray, "N 3"], faces: np.ndarray) -> ClothMesh:
+        """Return a mesh with zero weights, to be painted once its vertices are in place."""
+        return ClothMesh(points, faces, np.zeros((len(points), self.body.joint_count)))
+
     def rigid(self, name: str, count: int) -> np.ndarray:
-        """Rows that follow one joint."""
+        """Return (count, J) weights that follow one joint."""
         rows = np.zeros((count, self.body.joint_count))
         rows[:, self.body.joint_names.index(name)] = 1.0
         return rows
 
     def trunk_weights(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N J"]:
-        """Weights of the trunk's skin at the same height and azimuth, the mean over some centimetres.
+        """Return the weights of the trunk's skin at the same height and azimuth, averaged over a few centimetres.
 
-        Trunk is what follows pelvis, spine, collars and hips; how far a point stands off does not matter.
+        The trunk is the skin that follows pelvis, spine, collars, hips and neck. How far a point stands off the skin
+        does not matter.
         """
         names = ("pelvis", "spine", "collar", "hip", "neck")
         kept = shares(self.body, self.skin.weights, names) > 0.9
@@ -91,41 +105,42 @@ class Mannequin:
         return _mean_of_nearest(self._unrolled(self.skin.vertices[kept]), own, self._unrolled(points))
 
     def arm_weights(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N J"]:
-        """Weights of the arm's skin at the same place along the arm, the mean around it; hands count as the wrist."""
+        """Return the mean weights around the arm at the same place along it; hands count as the wrist."""
         weights = self.skin.weights.copy()
         for side in ("left", "right"):
             fingers = [i for i, n in enumerate(self.body.joint_names) if n.startswith(side) and n[-1].isdigit()]
             fingers = [i for i in fingers if "spine" not in self.body.joint_names[i]]
             weights[:, self.body.joint_names.index(f"{side}_wrist")] += weights[:, fingers].sum(axis=1)
             weights[:, fingers] = 0.0
-        kept = shares(self.body, self.skin.weights, _ARM) > 0.5
+        kept = shares(self.body, self.skin.weights, ARM_JOINTS) > 0.5
         place = self.skin.vertices[kept][:, :1]
         return _mean_of_nearest(place, weights[kept], points[:, :1])
 
     def below(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N J"]:
-        """Weights of the skin straight below: what a thing that lies on the shoulders lies on."""
-        up = (self.skin.mesh.vertex_normals[:, 1] > 0.2) & (shares(self.body, self.skin.weights, _HEAD) < 0.5)
+        """Return the weights of the skin straight below points that rest on the shoulders."""
+        up = (self.skin.mesh.vertex_normals[:, 1] > 0.2) & (shares(self.body, self.skin.weights, _HEAD_JOINTS) < 0.5)
         up &= self.skin.vertices[:, 1] > self.joints["spine3"][1]
         return _mean_of_nearest(self.skin.vertices[up][:, [0, 2]], self.skin.weights[up], points[:, [0, 2]])
 
     def _unrolled(self, points: np.ndarray) -> np.ndarray:
-        """Height, and the azimuth as a place on a circle of a trunk's radius."""
+        """Return height, and the azimuth as a point of a circle with about the trunk's radius (13 cm)."""
         flat = points[:, [0, 2]] - self.axis
         flat = 0.13 * flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
         return np.column_stack([points[:, 1], flat])
 
 
 def named(body: BodyModel, words: tuple[str, ...]) -> np.ndarray:
-    """The joints (J,) whose names hold one of the words."""
+    """Return which joints (J,) have one of the words in their names."""
     return np.array([any(word in name for word in words) for name in body.joint_names])
 
 
 def shares(body: BodyModel, weights: np.ndarray, words: tuple[str, ...]) -> np.ndarray:
-    """How much of each row belongs to the joints whose names hold one of the words."""
+    """Return the weight (N,) that belongs to the joints whose names hold one of the words."""
     return weights[:, named(body, words)].sum(axis=1)
 
 
 def _mean_of_nearest(places: np.ndarray, weights: np.ndarray, queries: np.ndarray, count: int = 24) -> np.ndarray:
+    """Return the mean weights of the nearest places under a Gaussian kernel as wide as their mean distance."""
     distance, index = cKDTree(places).query(queries, k=count)
     kernel = np.exp(-0.5 * (distance / np.maximum(distance.mean(axis=1, keepdims=True), 0.01)) ** 2)
     out = np.einsum("nk,nkj->nj", kernel, weights[index])
@@ -133,16 +148,18 @@ def _mean_of_nearest(places: np.ndarray, weights: np.ndarray, queries: np.ndarra
 
 
 def _outlines(points: np.ndarray, depth: float) -> tuple[float, np.ndarray]:
-    """The convex outlines of slices, every 2 cm, as radii by azimuth."""
+    """Return the lowest height, and the convex outlines of slices from there up as radii by azimuth."""
     heights = np.arange(points[:, 1].min(), points[:, 1].max(), _STEP)
-    axes = np.stack([np.cos(_AZIMUTH), np.sin(_AZIMUTH)])
-    cosine = np.cos(_AZIMUTH[:, None] - _AZIMUTH)
+    azimuth = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    axes = np.stack([np.cos(azimuth), np.sin(azimuth)])
+    cosine = np.cos(azimuth[:, None] - azimuth)
     rows: list[np.ndarray] = []
     for height in heights:
         near = points[np.abs(points[:, 1] - height) < 0.75 * _STEP]
         if len(near) < 3:
             rows.append(rows[-1])
             continue
+        # The support function of the slice; a ray leaves the hull at the nearest of its tangents.
         support = ((near[:, [0, 2]] - [0.0, depth]) @ axes).max(axis=0)
         rays = np.where(cosine > 0.05, support / np.maximum(cosine, 0.05), np.inf)
         rows.append(np.maximum(rays.min(axis=1), 0.02))

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
-from benchmarks.garments.cut import Garment, facing_out, grid_faces, joined, layer, tube_along
-from benchmarks.garments.mannequin import Mannequin
 from pipelines.synth.cloth_mesh import ClothMesh, push_out, smooth
+from pipelines.synth.garments.cut import Garment, facing_out, grid_faces, joined, layer, tube_along
+from pipelines.synth.garments.mannequin import Mannequin
 from pipelines.synth.noise import ramp
-
-_BACK, _OPEN = 1.5 * np.pi, 0.95  # azimuth of the back; how far the curtain's edges stay from the front
 
 
 def hairstyles(mannequin: Mannequin) -> list[Garment]:
-    """A bob on the shoulders, long hair down the back, hair over chest and arms, and a braid over the chest."""
+    """Return a bob on the shoulders, long hair down the back, hair over chest and arms, and a braid over the chest."""
     j = mannequin.joints
     head = "the head down to the chin; from there it passes smoothly to "
 
@@ -45,8 +45,44 @@ def hairstyles(mannequin: Mannequin) -> list[Garment]:
     ]
 
 
+def tied_and_short_hair(mannequin: Mannequin) -> list[Garment]:
+    """Return three caps of short hair, a bun and a ponytail."""
+    rigid, j = "the head", mannequin.joints
+
+    def ball(centre: tuple[float, float, float], radius: float) -> ClothMesh:
+        t = np.linspace(0.02, np.pi - 0.02, 24)
+        curve = np.asarray(centre) + radius * np.column_stack([0 * t, np.cos(t), 0 * t])
+        points, faces = tube_along(curve, radius * np.sin(t), sides=32)
+        cloth = ClothMesh(points, faces, mannequin.rigid("head", len(points)))
+        return facing_out(cloth, np.repeat(0 * curve + curve.mean(axis=0), 32, axis=0))
+
+    def bun() -> ClothMesh:
+        return joined(skull_cap(mannequin, ease=0.012), ball((0.0, j["head"][1] + 0.13, j["head"][2] - 0.105), 0.045))
+
+    def tail() -> ClothMesh:
+        t = np.linspace(0, 1, 50)
+        back = j["head"][2] - 0.1
+        curve = np.column_stack(
+            [0 * t, j["head"][1] + 0.09 - 0.36 * t, back - 0.05 * np.sin(np.pi * np.minimum(1.4 * t, 1.0)) - 0.02]
+        )
+        points, faces = tube_along(curve, 0.012 + 0.024 * np.sin(np.pi * (0.08 + 0.88 * t)))
+        # From the chin to 30 cm below it the trunk takes over 0.9 of the weight.
+        chin = j["jaw"][1] - 0.045
+        head = (1 - 0.9 * ramp(points[:, 1], chin, chin - 0.3))[:, None]
+        weights = head * mannequin.rigid("head", len(points)) + (1 - head) * mannequin.trunk_weights(points)
+        cloth = facing_out(ClothMesh(points, faces, weights), np.repeat(curve, 24, axis=0))
+        return joined(skull_cap(mannequin, ease=0.011), cloth)
+
+    caps = {"cropped hair": 0.006, "short hair": 0.014, "full short hair": 0.026}
+    return [
+        *(Garment(name, "hair", partial(skull_cap, mannequin, ease=ease), rigid) for name, ease in caps.items()),
+        Garment("bun", "hair", bun, rigid),
+        Garment("ponytail", "hair", tail, "the head down to the chin; from there it passes to 0.9 of the trunk"),
+    ]
+
+
 def skull_cap(mannequin: Mannequin, *, ease: float = 0.017) -> ClothMesh:
-    """The hair on the skull, `ease` metres thick, rigid to the head."""
+    """Return the hair on the skull, `ease` metres thick, rigid to the head."""
     j = mannequin.joints
 
     def level(p: np.ndarray) -> np.ndarray:
@@ -57,11 +93,11 @@ def skull_cap(mannequin: Mannequin, *, ease: float = 0.017) -> ClothMesh:
     return ClothMesh(cloth.vertices, cloth.faces, mannequin.rigid("head", len(cloth.vertices)))
 
 
-def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float = np.pi - _OPEN) -> ClothMesh:
-    """A sheet about the back of the head, `half` radians to each side, that hangs and is pushed off the skin."""
+def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float = np.pi - 0.95) -> ClothMesh:
+    """Return a sheet about the back of the head, `half` radians to each side, that hangs and is pushed off the skin."""
     j = mannequin.joints
     top = j["head"][1] + 0.055
-    heights, azimuths = np.linspace(top, bottom, 60), np.linspace(_BACK - half, _BACK + half, 70)
+    heights, azimuths = np.linspace(top, bottom, 60), np.linspace(1.5 * np.pi - half, 1.5 * np.pi + half, 70)
     down = ((top - heights) / (top - bottom))[:, None]
     radius = np.broadcast_to(0.096 + spread * down**2, (60, 70))
     centre = j["head"][2] + 0.005
@@ -71,7 +107,7 @@ def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float 
         ),
         axis=-1,
     ).reshape(-1, 3)
-    cloth = ClothMesh(points, grid_faces(60, 70, closed=False), np.zeros((len(points), mannequin.body.joint_count)))
+    cloth = mannequin.unweighted(points, grid_faces(60, 70, closed=False))
     inside = np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + centre])
     cloth = facing_out(cloth, inside)
     pushed = push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.009, solid=True, reach=0.12)
@@ -82,7 +118,7 @@ def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float 
 
 
 def _handed_over(mannequin: Mannequin, cloth: ClothMesh, below: np.ndarray, *, keeps: float, over: float) -> ClothMesh:
-    """Head down to the chin, `below` from `over` metres under it, which still keeps a share with the head."""
+    """Weight hair to the head down to the chin, to `below` from `over` metres under it but for the head's share."""
     chin = mannequin.joints["jaw"][1] - 0.045
     head = (keeps + (1 - keeps) * ramp(cloth.vertices[:, 1], chin - over, chin))[:, None]
     weights = head * mannequin.rigid("head", len(cloth.vertices)) + (1 - head) * below
@@ -100,7 +136,7 @@ def _hanging(mannequin: Mannequin, curtain: ClothMesh, *, keeps: float) -> Cloth
 
 
 def _braid(mannequin: Mannequin) -> ClothMesh:
-    """A braid from behind the left ear over the shoulder down the chest."""
+    """Return a braid from behind the left ear over the shoulder down the chest."""
     j = mannequin.joints
     t = np.linspace(0, 1, 70)
     knots = np.array(
@@ -112,12 +148,12 @@ def _braid(mannequin: Mannequin) -> ClothMesh:
             [0.090, j["spine2"][1] + 0.02, mannequin.axis[1] + 0.15],
         ]
     )
+    # A polyline through the knots, smoothed into a curve.
     curve = np.column_stack([np.interp(t, np.linspace(0, 1, 5), knots[:, k]) for k in range(3)])
     for _ in range(30):
         curve[1:-1] = 0.5 * curve[1:-1] + 0.25 * (curve[:-2] + curve[2:])
     points, faces = tube_along(curve, 0.02 + 0.003 * np.sin(40 * t) - 0.008 * t)
-    cloth = ClothMesh(points, faces, np.zeros((len(points), mannequin.body.joint_count)))
-    cloth = facing_out(cloth, np.repeat(curve, 24, axis=0))
+    cloth = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 24, axis=0))
     cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.003, solid=True, reach=0.08))
     middle = np.repeat(curve, 24, axis=0)
     line = ClothMesh(middle, cloth.faces, cloth.weights)

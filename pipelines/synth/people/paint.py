@@ -1,11 +1,11 @@
-"""Colours: skin of several tones, dyed and patterned cloth, hair, and the light and grain of a coloured scan."""
+"""Paint procedural people: skin tones, dyed and patterned cloth, hair, and the light and grain of a coloured scan."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from pipelines.synth import textures
 from pipelines.synth.noise import smooth_noise
@@ -14,8 +14,7 @@ from pipelines.synth.person_file import face_landmarks
 from pipelines.synth.soft_light import LightConfig, bounced, vertex_light
 from smplxpp.core.mesh import TriangleMesh
 
-Color = tuple[int, int, int]
-SKIN_TONES: dict[str, Color] = {
+SKIN_TONES: dict[str, textures.Color] = {
     "pale": (240, 208, 192),
     "light": (222, 176, 150),
     "olive": (198, 152, 116),
@@ -23,7 +22,7 @@ SKIN_TONES: dict[str, Color] = {
     "brown": (128, 84, 58),
     "dark": (82, 54, 42),
 }
-HAIR_COLORS: dict[str, Color] = {
+HAIR_COLORS: dict[str, textures.Color] = {
     "black": (34, 28, 26),
     "brown": (74, 46, 28),
     "blond": (196, 158, 96),
@@ -31,7 +30,7 @@ HAIR_COLORS: dict[str, Color] = {
     "grey": (150, 148, 146),
     "white": (222, 218, 212),
 }
-DYES: dict[str, Color] = {
+DYES: dict[str, textures.Color] = {
     "white": (236, 234, 228),
     "black": (36, 36, 40),
     "grey": (128, 130, 134),
@@ -52,13 +51,17 @@ DYES: dict[str, Color] = {
     "orange": (218, 116, 44),
 }
 PATTERNS = ("plain", "stripes", "pinstripes", "check", "dots", "blotches", "print")
-_LIGHT = LightConfig(directions=40, resolution=256)
-_GRAIN = 2.5  # of 255, in each channel, and as much in common
 
 
 @dataclass(frozen=True)
 class Dye:
-    """How a layer is coloured: a name of `DYES` (of `HAIR_COLORS` for hair), a pattern and its second colour."""
+    """Colours of a layer.
+
+    Attributes:
+        color: name in `DYES`, or in `HAIR_COLORS` for hair.
+        pattern: one of `PATTERNS`.
+        second: name in `DYES` of the pattern's second colour.
+    """
 
     color: str
     pattern: str = "plain"
@@ -68,13 +71,22 @@ class Dye:
 def skin_paint(
     points: Float[np.ndarray, "P 3"],
     eyes: Float[np.ndarray, "2 3"],
-    eyeball: np.ndarray,
+    eyeball: Bool[np.ndarray, " P"],
     *,
     tone: str,
     betas: Float[np.ndarray, " B"],
     seed: int,
 ) -> Float[np.ndarray, "P 3"]:
-    """Skin and face of points on the T-pose; `eyeball`: which of them lie on one, `eyes`: their centres."""
+    """Return colours of skin and face at points on the T-pose.
+
+    Args:
+        points: metres.
+        eyes: centres of the eyeballs.
+        eyeball: which points lie on an eyeball.
+        tone: name in `SKIN_TONES`.
+        betas: shape coefficients, which place the face's landmarks.
+        seed: seed of the skin's mottling.
+    """
     colors = textures.skin_colors(points, face_marks(face_landmarks(betas)), seed=seed)
     colors *= np.asarray(SKIN_TONES[tone]) / np.asarray(textures.SKIN, dtype=float)
     nearer = np.argmin(np.linalg.norm(points[eyeball][:, None] - eyes, axis=2), axis=1)
@@ -83,14 +95,15 @@ def skin_paint(
 
 
 def hair_paint(points: Float[np.ndarray, "P 3"], color: str, *, seed: int) -> Float[np.ndarray, "P 3"]:
-    """Strands along the fall, lighter and darker."""
+    """Return colours of hair: strands along its fall, lighter and darker."""
     locks = smooth_noise(points, scale=(0.008, 0.3, 0.008), seed=seed)
     strands = smooth_noise(points, scale=(0.002, 0.12, 0.002), seed=seed + 1)
     return np.asarray(HAIR_COLORS[color]) * (1.0 + 0.16 * locks + 0.12 * strands)[:, None]
 
 
 def cloth_paint(points: Float[np.ndarray, "P 3"], dye: Dye, *, seed: int) -> Float[np.ndarray, "P 3"]:
-    """A dyed cloth by the place on the T-pose."""
+    """Return colours of dyed cloth at points on the T-pose, 0 to 255."""
+    # Lengths along the garment (along the arms on sleeves) and around the trunk, metres.
     x, y, z = points.T
     rng = np.random.default_rng(seed)
     along = np.where((np.abs(x) > 0.24) & (y > 0.4), np.abs(x), y)
@@ -109,6 +122,7 @@ def cloth_paint(points: Float[np.ndarray, "P 3"], dye: Dye, *, seed: int) -> Flo
         share = 1.0 * ((np.hypot(x, y - 0.44) < 0.085) & (z > 0.03))
     else:
         share = np.zeros(len(points))
+    # Worn patches and the grain of the weave; denim is worn most.
     patches = smooth_noise(points, scale=(0.06, 0.06, 0.06), seed=seed + 1)
     weave = smooth_noise(points, scale=(0.004, 0.008, 0.004), seed=seed + 2)
     wear = 0.10 if dye.color == "denim" else 0.035
@@ -118,16 +132,13 @@ def cloth_paint(points: Float[np.ndarray, "P 3"], dye: Dye, *, seed: int) -> Flo
 def photographed(
     mesh: TriangleMesh, albedo: Float[np.ndarray, "N 3"], *, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "N 3"]:
-    """sRGB colours a vertex as a scanner bakes them: soft light from above and one side, and grain."""
+    """Return sRGB vertex colours as a scanner bakes them: soft light from above and one side, and grain."""
+    # Gamma 2.2; ambient light with the shadows that the person casts on herself, and one side brighter.
     linear = (np.clip(albedo, 0, 255) / 255.0) ** 2.2
-    light = np.clip(vertex_light(mesh, _LIGHT)[0], 0.04, None)
+    light = np.clip(vertex_light(mesh, LightConfig(directions=40, resolution=256))[0], 0.04, None)
     side = rng.normal(size=3) * [1.0, 0.3, 1.0]
     light = light * (1.0 + 0.22 * mesh.vertex_normals @ (side / np.linalg.norm(side)))
     colors = 255.0 * np.clip(bounced(light, linear), 0, 1) ** (1 / 2.2)
-    colors += _GRAIN * (rng.normal(size=colors.shape) + rng.normal(size=(len(colors), 1)))
+    # Sensor noise of 2.5 levels in each channel, and as much that all three share.
+    colors += 2.5 * (rng.normal(size=colors.shape) + rng.normal(size=(len(colors), 1)))
     return np.clip(colors, 0, 255).round().astype(np.uint8)
-
-
-def seeds(count: int, rng: np.random.Generator) -> Int[np.ndarray, " K"]:
-    """Seeds for the layers' patterns."""
-    return rng.integers(0, 2**31, size=count)

@@ -1,4 +1,8 @@
-"""Poses by name. Those that bring a hand near something are a way: how far it is gone is found when clothes are on."""
+"""Body shapes and poses of procedural people by name.
+
+Poses that bring a hand near something run from a start to an end. How far along the hand stops is found once the
+clothes are on.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +13,56 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from pipelines.synth.cloth_mesh import ClothMesh
+from pipelines.synth.garments.mannequin import Mannequin
 from smplxpp.body import BodyModel
 from smplxpp.core.params import BodyParams
 
-_JITTER = 2.5  # degrees, of every joint of trunk and limbs
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 Turns = dict[str, np.ndarray]
+
+# Leading shape coefficients of the open body: 0 is short (+) or tall (-), 1 and 2 man (-) or woman (+), 4 and 5 weight.
+BUILDS: dict[str, tuple[float, ...]] = {
+    "mean": (0.0,),
+    "woman": (0.35, 1.4, 0.9, 0.6),
+    "man": (-0.2, -1.4, -1.0, 0.3),
+    "tall man": (-0.75, -1.2, -1.3, -0.6),
+    "tall woman": (-0.3, 1.3, 1.0, -0.5, -0.6),
+    "small woman": (0.95, 1.2, 1.1, 0.2),
+    "tiny woman": (1.3, 0.9, 0.6, 0.0, -0.5),
+    "child-sized": (2.1, -0.4, 0.3, -0.5, -0.8, -0.6),
+    "thin woman": (0.1, 1.0, 1.0, -0.8, -1.7, -1.5),
+    "thin man": (-0.3, -1.2, -0.9, -0.8, -1.7, -1.4),
+    "heavy woman": (0.3, 1.0, 1.2, 1.0, 2.0, 2.2),
+    "heavy man": (-0.3, -1.3, -1.0, 1.2, 2.2, 1.9),
+    "broad man": (-0.45, -1.9, -1.8, 1.1, 0.9, 0.2),
+    "short heavy man": (0.7, -1.2, -0.8, 0.6, 1.9, 1.6),
+}
+
+
+def betas_of(body: BodyModel, build: str, rng: np.random.Generator) -> Float[np.ndarray, " B"]:
+    """Return shape coefficients of one of `BUILDS`, with random deviations that make it an individual."""
+    betas = rng.normal(size=body.num_betas) * np.where(np.arange(body.num_betas) < 6, 0.12, 0.6)
+    leading = BUILDS[build]
+    betas[: len(leading)] += leading
+    return betas
+
+
+def fitting_mannequin(body: BodyModel, betas: Float[np.ndarray, " B"]) -> tuple[Mannequin, float]:
+    """Return the person scaled to the height that garments are cut for, and the factor from there to her own size."""
+    own = Mannequin.of(body, betas)
+    scale = float(np.ptp(own.skin.vertices[:, 1])) / 1.76  # metres: the height that the lengths of garments fit
+    skin = ClothMesh(own.skin.vertices / scale, own.skin.faces, own.skin.weights)
+    joints = {name: joint / scale for name, joint in own.joints.items()}
+    return Mannequin.cut_on(body, own.params, skin, joints), scale
 
 
 @dataclass(frozen=True)
 class Stance:
-    """A pose, or a way from one to another.
+    """A pose, or a path from one to another.
 
     Attributes:
-        at: rotations (3, 3) of joints by name at a share of the way, 0 to 1.
+        at: returns rotations (3, 3) of joints by name at a share of the path, 0 to 1.
         touching: arms ("left", "right") that stop before they touch; the share is the largest that allows it.
     """
 
@@ -31,17 +71,22 @@ class Stance:
 
 
 def _turn(*, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """About x, then y, then z, all fixed axes; degrees."""
+    """Return the rotation about the fixed axes x, then y, then z; degrees."""
     return Rotation.from_euler("xyz", [x, y, z], degrees=True).as_matrix()
 
 
 def _arm(
     side: str, lower: float, *, forward: float = 0.0, twist: float = 0.0, elbow: float = 10.0, fore: float = 0.0
 ) -> Turns:
-    """An arm lowered from the T-pose, then swung forward about the shoulders' axis; degrees.
+    """Return the rotations of an arm lowered from the T-pose, then swung forward about the shoulders' axis; degrees.
 
     Args:
-        twist: of the upper arm about itself, palm turning back. elbow: its bend. fore: bend sideways, inwards.
+        side: "left" or "right".
+        lower: angle by which it is lowered.
+        forward: swing to the front.
+        twist: rotation of the upper arm about itself, palm turning back.
+        elbow: bend of the elbow.
+        fore: bend of the elbow sideways, inwards.
     """
     swing = _turn(x=-forward) @ _turn(z=-0.88 * lower) @ _turn(x=twist)
     turns = {f"{side}_collar": _turn(z=-0.12 * lower), f"{side}_shoulder": swing}
@@ -151,12 +196,14 @@ STANCES: dict[str, Stance] = {
 
 @dataclass(frozen=True, eq=False)
 class Posing:
-    """A stance as one person takes it: what her body makes of a share of the way.
+    """A stance as one person takes it, as a function of the share of its path.
 
     Attributes:
-        body: its model. stance: where to.
-        betas: her shape. facing: degrees about the vertical that she is turned by, to her left.
-        jitter: (J, 3) rotation vectors added at every joint, radians.
+        body: the body model.
+        stance: the stance.
+        betas: her shape coefficients.
+        facing: degrees about the vertical by which she is turned to her left.
+        jitter: rotation vectors added at every joint, radians.
     """
 
     body: BodyModel
@@ -169,9 +216,9 @@ class Posing:
     def of(
         body: BodyModel, stance: str, betas: Float[np.ndarray, " B"], *, facing: float, rng: np.random.Generator
     ) -> Posing:
-        """Take one of `STANCES`, with joints and fingers a little different for everybody."""
+        """Return one of `STANCES` with small random deviations of joints and fingers."""
         names = body.joint_names
-        jitter = np.radians(_JITTER) * rng.normal(size=(len(names), 3))
+        jitter = np.radians(2.5) * rng.normal(size=(len(names), 3))
         jitter[names.index("jaw") :] = 0.0
         jitter[names.index("pelvis")] *= 0.5
         curl = np.radians(rng.uniform(4.0, 22.0))
@@ -181,7 +228,7 @@ class Posing:
         return Posing(body, STANCES[stance], betas, facing, jitter)
 
     def params(self, share: float) -> BodyParams:
-        """Parameters at a share of the way, standing where the model puts it."""
+        """Return the parameters at a share of the path, without translation."""
         turns = self.stance.at(share)
         pose = np.zeros((1, len(self.body.joint_names), 3))
         for k, name in enumerate(self.body.joint_names):

@@ -1,19 +1,23 @@
-"""Who there is: each person's build, stance, clothes from the inside out, skin and colours."""
+"""The cast of procedural people: build, stance, clothes from the inside out, skin tone and colours of each."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from benchmarks.people.paint import Dye
-
-_FOLDS = 1.5  # millimetres
+from pipelines.synth.people.paint import Dye
 
 
 @dataclass(frozen=True)
 class Wear:
-    """Attributes: the name of a cut (`benchmarks.people.tailor.all_cuts`), how it is dyed, folds in metres."""
+    """A layer of clothes.
 
-    cut: str
+    Attributes:
+        garment: name among `garments.wardrobe.all_garments`.
+        dye: its colours.
+        folds: height of its folds, metres.
+    """
+
+    garment: str
     dye: Dye
     folds: float
 
@@ -23,8 +27,11 @@ class Member:
     """One person of the cast.
 
     Attributes:
-        build, stance: of `BUILDS`, `STANCES`. wears: layers from the inside out, hair among them.
-        tone: of `SKIN_TONES`. facing: degrees that she is turned by about the vertical, to her left.
+        build: name in `BUILDS`.
+        stance: name in `STANCES`.
+        wears: layers from the inside out, hair among them.
+        tone: name in `SKIN_TONES`.
+        facing: degrees about the vertical by which she is turned to her left.
         colored: whether the scan has colours.
     """
 
@@ -41,10 +48,10 @@ def _member(build: str, stance: str, wears: str, tone: str, facing: float = 0.0,
 
 
 def _wear(text: str) -> Wear:
-    """Read "cut: colour [pattern [second colour]] [@folds in millimetres]"."""
+    """Read "garment: colour [pattern [second colour]] [@folds in millimetres, else 1.5]"."""
     text, _, folds = text.partition(" @")
-    cut, _, dye = text.partition(": ")
-    return Wear(cut, Dye(*dye.split()), 1e-3 * float(folds or _FOLDS))
+    garment, _, dye = text.partition(": ")
+    return Wear(garment, Dye(*dye.split()), 1e-3 * float(folds or 1.5))
 
 
 CAST: dict[str, Member] = {

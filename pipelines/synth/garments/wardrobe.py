@@ -1,4 +1,4 @@
-"""All garments on one person, and each as a scan shows it: in some pose, noisy, simplified."""
+"""Every garment by name, and each as a scan shows it on a person: posed, noisy, simplified."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import igl
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.garments.cut import Garment
-from benchmarks.garments.fitted import fitted_garments
-from benchmarks.garments.hair import hairstyles
-from benchmarks.garments.loose import loose_garments
-from benchmarks.garments.mannequin import Mannequin, shares
+from pipelines.synth.garments.cut import Garment
+from pipelines.synth.garments.fitted import bottoms, fitted_garments, tops
+from pipelines.synth.garments.hair import hairstyles, tied_and_short_hair
+from pipelines.synth.garments.loose import loose_garments
+from pipelines.synth.garments.mannequin import HAND_JOINTS, Mannequin, shares
 from pipelines.synth.noise import smooth_noise
 from smplxpp.body import BodyModel
 from smplxpp.clean.simplify import simplify
@@ -23,11 +23,6 @@ from smplxpp.skinning import skin
 
 SHAPES = ("mean", "heavy and tall", "slight")
 POSES = ("T", "A", "hands")
-_A_POSE = 50.0  # degrees that the arms are lowered
-_STEEPEST, _STEP = 82.0, 4.0
-_GAP = 0.004  # between hands and cloth
-_KEPT = 0.6  # of the faces
-_HANDS = ("elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +30,14 @@ class Case:
     """A garment on a person in a pose.
 
     Attributes:
-        garment: in the T-pose. shape, pose: names.
-        mesh: as scanned. weights: (N, J) authored. rest_vertices: (N, 3) in the T-pose.
-        source: the posed body. params: of the pose; its identity is the person's.
+        garment: the garment in the T-pose.
+        shape: one of `SHAPES`.
+        pose: one of `POSES`.
+        mesh: the garment as scanned.
+        weights: authored skinning weights of the scan's vertices.
+        rest_vertices: the same vertices in the T-pose, metres.
+        source: the posed body.
+        params: parameters of the posed body.
     """
 
     garment: Garment
@@ -50,8 +50,8 @@ class Case:
     params: BodyParams
 
 
-def betas_of(body: BodyModel, shape: str) -> np.ndarray:
-    """Coefficients of one of `SHAPES`."""
+def shape_betas(body: BodyModel, shape: str) -> np.ndarray:
+    """Return the shape coefficients of one of `SHAPES`."""
     betas = np.zeros(body.num_betas)
     if shape != "mean":
         rng = np.random.default_rng(SHAPES.index(shape))
@@ -61,13 +61,19 @@ def betas_of(body: BodyModel, shape: str) -> np.ndarray:
 
 
 def garments_of(mannequin: Mannequin) -> list[Garment]:
-    """Every garment of the bench."""
+    """Return the garments of the transfer benchmark in their fixed order, which seeds their scans' noise."""
     return [*fitted_garments(mannequin), *loose_garments(mannequin), *hairstyles(mannequin)]
 
 
+def all_garments(mannequin: Mannequin) -> dict[str, Garment]:
+    """Return every garment and hairstyle by name, with those that only procedural people wear."""
+    more = (*tops(mannequin), *bottoms(mannequin), *tied_and_short_hair(mannequin))
+    return {garment.name: garment for garment in (*garments_of(mannequin), *more)}
+
+
 def cases(body: BodyModel, shape: str, *, poses: tuple[str, ...] = POSES) -> Iterator[Case]:
-    """Every garment on a person of one shape in every pose; "hands" for those that arms may hang beside."""
-    mannequin = Mannequin.of(body, betas_of(body, shape))
+    """Yield every garment on a person of one shape in every pose; "hands" for those that arms may hang beside."""
+    mannequin = Mannequin.of(body, shape_betas(body, shape))
     for k, garment in enumerate(garments_of(mannequin)):
         for pose in poses:
             if pose != "hands" or garment.beside_hands:
@@ -75,19 +81,20 @@ def cases(body: BodyModel, shape: str, *, poses: tuple[str, ...] = POSES) -> Ite
 
 
 def scan(mannequin: Mannequin, garment: Garment, shape: str, pose: str, *, seed: int) -> Case:
-    """One garment as scanned in a pose of `POSES`; in the T-pose as it was made."""
+    """Return one garment as scanned in a pose of `POSES`; in the T-pose as it was made."""
     cloth = garment.cloth
     if pose == "T":
         source = mannequin.body.mesh(mannequin.body.forward(mannequin.params).vertices[0])
         return Case(garment, shape, pose, cloth.mesh, cloth.weights, cloth.vertices, source, mannequin.params)
-    params = lowered(mannequin, _A_POSE) if pose == "A" else _hands_beside(mannequin, garment)
+    params = lowered(mannequin, 50.0) if pose == "A" else _hands_beside(mannequin, garment)
     posed = mannequin.body.forward(params)
     mesh = cloth.mesh.with_vertices(skin(cloth.vertices, cloth.weights, posed.posed_from_rest[0]))
+    # A scan adds folds of 1.2 mm and grain of 0.4 mm along the normals, and keeps 60 % of the faces.
     folds = smooth_noise(mesh.vertices, scale=(0.02, 0.05, 0.02), seed=seed)
     grain = np.random.default_rng(seed).normal(size=mesh.vertex_count)
     scanned = mesh.with_vertices(mesh.vertices + (0.0012 * folds + 0.0004 * grain)[:, None] * mesh.vertex_normals)
-    kept = simplify(scanned, int(_KEPT * scanned.face_count))
-    # A simplified vertex stands for a vertex of the scan: it takes that one's place, so that the truth is exact there.
+    kept = simplify(scanned, int(0.6 * scanned.face_count))
+    # Each vertex is moved back to the scan's vertex that it stands for, so that its true weights are exact.
     index = kept.source_vertex
     return Case(
         garment,
@@ -102,7 +109,7 @@ def scan(mannequin: Mannequin, garment: Garment, shape: str, pose: str, *, seed:
 
 
 def lowered(mannequin: Mannequin, degrees: float) -> BodyParams:
-    """The person with lowered arms, elbows a little bent and feet a step apart, face and hands at rest."""
+    """Return a pose with arms lowered by `degrees`, elbows a little bent and feet a step apart."""
     pose = np.zeros((1, 55, 3))
     names = mannequin.body.joint_names
     for side, sign in (("left", -1.0), ("right", 1.0)):
@@ -115,15 +122,15 @@ def lowered(mannequin: Mannequin, degrees: float) -> BodyParams:
 
 
 def _hands_beside(mannequin: Mannequin, garment: Garment) -> BodyParams:
-    """The person with the arms as low as they come before forearm or hand touch the cloth."""
-    arm = shares(mannequin.body, mannequin.body.weights, _HANDS) > 0.9
+    """Return a pose with the arms as low as possible with 4 mm between cloth and forearms or hands."""
+    arm = shares(mannequin.body, mannequin.body.weights, HAND_JOINTS) > 0.9
     chosen = lowered(mannequin, 0.0)
-    for degrees in np.arange(_STEP, _STEEPEST + 1e-9, _STEP):
+    for degrees in np.arange(4.0, 82.0 + 1e-9, 4.0):
         params = lowered(mannequin, float(degrees))
         posed = mannequin.body.forward(params)
         points = skin(garment.cloth.vertices, garment.cloth.weights, posed.posed_from_rest[0])
         squared = igl.point_mesh_squared_distance(posed.vertices[0][arm], points, garment.cloth.faces)[0]
-        if squared.min() < _GAP**2:
+        if squared.min() < 0.004**2:
             break
         chosen = params
     return chosen

@@ -1,1 +1,0 @@
-"""Garments made by procedure on the open body, each with weights that a stated rule gives it."""

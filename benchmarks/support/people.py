@@ -1,0 +1,140 @@
+"""Scans of people with known truth: the fixture's and those of captures; and a contact sheet of procedural people.
+
+python -m benchmarks.support.people --out sheet.png [--cache FOLDER] [--count 12] [--seed 0] [--variant "3 mm noise"]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import igl
+import numpy as np
+import tyro
+from jaxtyping import Bool
+
+from benchmarks.support.results import ROOT
+from pipelines.figures.sheets import caption, contact_sheet, encode_png, row
+from pipelines.synth.garments.mannequin import shares
+from pipelines.synth.people import PersonScan, people, variant
+from pipelines.synth.people.bodies import FINGERS
+from pipelines.synth.people.person_scan import face_majority
+from smplxpp.body import load_body, load_params
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.labels import LABELS, display_colors
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.mesh_files.mesh_io import read_mesh
+from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.raster import render_shaded
+from smplxpp.raster.viewpoints import body_cameras
+from smplxpp.segment import read_labels
+
+_CAPTURES = ROOT.parent / "shared" / "captures"
+FOLDERS = {
+    "fixture": ROOT / "data" / "fixtures" / "person",
+    "woman_casual": _CAPTURES / "woman_casual",
+    "man_casual": _CAPTURES / "man_casual",
+}
+
+
+def captured_names() -> tuple[str, ...]:
+    """Return the names of `FOLDERS` whose scans are on this machine."""
+    return tuple(name for name, folder in FOLDERS.items() if (folder / "scans" / "scan_000000.ply").is_file())
+
+
+def captured(name: str) -> PersonScan:
+    """Return frame 0 of one of `captured_names()`, with its exact parameters and true labels.
+
+    Raises:
+        InputError: an unknown capture, or one that is not on this machine.
+    """
+    if name not in captured_names():
+        raise InputError("capture with a known truth", expected=f"one of {captured_names()}", received=name)
+    folder, body = FOLDERS[name], load_body()
+    read = read_mesh(folder / "scans" / "scan_000000.ply")
+    labels = read_labels(
+        folder / "scans" / "scan_000000_labels.npz",
+        vertex_count=read.mesh.vertex_count,
+        face_count=read.mesh.face_count,
+        label_set="capture",
+    )
+    return PersonScan.of(
+        body,
+        load_params(folder / "params" / "params.npz", body=body).frame(0),
+        name=name,
+        mesh=read.mesh,
+        colors=read.vertex_colors,
+        face_labels=face_majority(labels, read.mesh.faces),
+        seen=_seen(folder, read.mesh),
+    )
+
+
+def _seen(folder: Path, scan: TriangleMesh) -> Bool[np.ndarray, " M"]:
+    """Return which faces lie within 4 mm of the true surface, as for procedural people."""
+    with np.load(folder / "geometry" / "topology.npz") as topology:
+        faces = topology["faces"][~topology["face_hidden"]]
+    with np.load(folder / "geometry" / "frame_000000.npz") as frame:
+        vertices = frame["verts"].astype(np.float64)
+    squared = igl.point_mesh_squared_distance(scan.vertices, vertices, faces.astype(np.int64))[0]
+    return (squared < 0.004**2)[scan.faces].all(axis=1)
+
+
+@dataclass(frozen=True)
+class PeopleSheet:
+    """Make the people and a contact sheet of them."""
+
+    out: Path
+    """The PNG."""
+    cache: Path | None = None
+    """A folder of people made before."""
+    count: int | None = None
+    """Number of people; by default the whole cast."""
+    seed: int = 0
+    """0: as the cast describes them; another one: others of the same kinds."""
+    variant: str = "as it is"
+    """Change of the scans: one of `pipelines.synth.people.VARIANTS`."""
+    height: int = 420
+    """Height of a person's pictures, pixels."""
+
+    def run(self) -> None:
+        """Make the people, print a line for each and write the sheet."""
+        cells = []
+        for scan in people(count=self.count, seed=self.seed, cache=self.cache):
+            shown = variant(scan, self.variant).as_read()
+            print(describe(shown), flush=True)
+            cells.append(self._cell(shown))
+        atomic_write_bytes(self.out, encode_png(contact_sheet(cells, columns=4)))
+
+    def _cell(self, scan: PersonScan) -> np.ndarray:
+        front, side = body_cameras(scan.mesh, views=("front", "side"), height=self.height)
+        pictures = [render_shaded(scan.mesh, camera, vertex_colors=scan.colors) for camera in (front, side)]
+        labels = display_colors(np.where(scan.seen, scan.face_labels, -1))
+        pictures.append(render_shaded(scan.mesh, front, face_colors=labels))
+        return caption(row(pictures, gap=2), scan.name, size=14)
+
+
+def describe(scan: PersonScan) -> str:
+    """Return size, share of each label in the area, and how far the body is outside the scan."""
+    areas = np.bincount(scan.face_labels, scan.mesh.face_areas, minlength=len(LABELS)) / scan.mesh.face_areas.sum()
+    shares = " ".join(f"{label.name} {100 * share:.0f} %" for label, share in zip(LABELS, areas, strict=True) if share)
+    out = 1e3 * body_outside(scan)
+    return (
+        f"{scan.name}: {np.ptp(scan.mesh.vertices[:, 1]):.2f} m, {scan.mesh.face_count} faces, "
+        f"{100 * scan.seen.mean():.0f} % seen; {shares}; body out of the scan by more than 3 mm: "
+        f"{100 * (out > 3).mean():.2f} % of the vertices, p99 {np.percentile(out, 99):.1f} mm"
+    )
+
+
+def body_outside(scan: PersonScan) -> np.ndarray:
+    """Return how far the body's skin lies outside the scan, metres a vertex, negative within it.
+
+    Fingers are left out, because a scan rounds off their tips.
+    """
+    body = load_body()
+    kept = (body.part_labels == body.part_label_names.index("body")) & (shares(body, body.weights, FINGERS) < 0.5)
+    return SignedDistanceField(scan.mesh, solid=True).query(scan.body_vertices[kept]).distance
+
+
+if __name__ == "__main__":
+    tyro.cli(PeopleSheet, prog="python -m benchmarks.support.people").run()

@@ -1,0 +1,1 @@
+"""Procedural garments and hair on the open body, with skinning weights that follow from stated rules."""
