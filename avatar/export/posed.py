@@ -11,7 +11,7 @@ from torch import Tensor
 from avatar.formats.splats import Splats
 from avatar.gaussians.binding import THICKNESS, BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.spherical_harmonics import C0, rotate_sh
+from smplxpp.core.spherical_harmonics import C0, rotate_sh
 
 
 def posed_splats(bound: BoundGaussians, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Splats:

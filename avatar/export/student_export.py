@@ -22,9 +22,9 @@ from smplxpp.core.params import DEFAULT_FPS, BodyParams
 
 _WRITERS = {
     ".ply": "avatar.formats.ply:write_splat_ply",
-    ".spz": "avatar.formats.spz:write_splat_spz",
-    ".sog": "avatar.formats.sog:write_splat_sog",
-    ".glb": "avatar.formats.splat_gltf:write_splat_glb",
+    ".spz": "avatar.formats.packed_splats:write_splat_spz",
+    ".sog": "avatar.formats.packed_splats:write_splat_sog",
+    ".glb": "avatar.formats.splat_scenes:write_splat_glb",
 }
 _MOVING = (".usdc", ".usda", ".usd")
 SUFFIXES = (SUFFIX, *_WRITERS, *_MOVING, ".onnx")
@@ -80,7 +80,7 @@ def export_student(
         splats = splats_along(player, motion, range(frames), cloth=mode)
         if suffix in _MOVING:
             fps = (motion.fps or DEFAULT_FPS) if frames > 1 else None
-            import_module("avatar.formats.splat_usd").write_splat_usd(path, frames=splats, fps=fps)
+            import_module("avatar.formats.splat_scenes").write_splat_usd(path, frames=splats, fps=fps)
         else:
             module, function = _WRITERS[suffix].split(":")
             getattr(import_module(module), function)(path, splats=next(splats))

@@ -1,4 +1,4 @@
-"""Graphs of ONNX, written as calls on names."""
+"""Build ONNX graphs by calls on the names of values."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import numpy as np
 from smplxpp.core.errors import MissingExtraError
 
 OPSET = 17
+"""Version of the ONNX operators."""
 
 
 class Graph:
-    """Collects nodes and constants; a value is the name that a call returned.
+    """A graph under construction: nodes and constants; a value is the name that a call returned.
 
     Raises:
         MissingExtraError: onnx is not installed.
@@ -29,49 +30,49 @@ class Graph:
         self._inputs: list[Any] = []
 
     def constant(self, value: Any, dtype: type | str = np.float32) -> str:
-        """Return a constant; the same twice is stored once."""
+        """Return a constant; equal constants are stored once."""
         array = np.ascontiguousarray(value, dtype)
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
-            self._constants[key] = self._stored(f"c{len(self._initializers)}", array)
+            self._constants[key] = self._store(f"c{len(self._initializers)}", array)
         return self._constants[key]
 
     def input(self, name: str, *shape: int, default: np.ndarray | None = None) -> str:
-        """Return an input of floats; with a default it may be left out."""
+        """Return an input of floats, optional if it has a default."""
         self._inputs.append(self._onnx.helper.make_tensor_value_info(name, self._onnx.TensorProto.FLOAT, shape))
         if default is not None:
-            self._stored(name, np.ascontiguousarray(default, np.float32))
+            self._store(name, np.ascontiguousarray(default, np.float32))
         return name
 
     def __call__(self, operator: str, *values: Any, **attributes: Any) -> str:
-        """Return what an operator gives; values that are no names are constants of floats."""
+        """Return the output of an operator; arguments that are not names become float constants."""
         return self.split(operator, 1, *values, **attributes)[0]
 
     def split(self, operator: str, outputs: int, *values: Any, **attributes: Any) -> list[str]:
-        """Return all outputs of an operator."""
+        """Return all outputs of an operator by their names."""
         names = [value if isinstance(value, str) else self.constant(value) for value in values]
         out = [f"v{len(self._nodes)}_{k}" for k in range(outputs)]
         self._nodes.append(self._onnx.helper.make_node(operator, names, out, **attributes))
         return out
 
     def gather(self, value: str, rows: Any) -> str:
-        """Return rows of a value."""
+        """Return selected rows of a value along its first axis."""
         return self("Gather", value, self.constant(rows, np.int32), axis=0)
 
     def reshape(self, value: str, *shape: int) -> str:
-        """Return the same numbers in another shape."""
+        """Return a value in another shape, with its numbers in order."""
         return self("Reshape", value, self.constant(shape, np.int64))
 
     def sum(self, value: str, axis: int, *, keep: bool = False) -> str:
-        """Return the sum along an axis."""
+        """Return the sum of a value along one axis."""
         return self("ReduceSum", value, self.constant([axis], np.int64), keepdims=int(keep))
 
     def norm(self, value: str) -> str:
-        """Return lengths along the last axis, which is kept."""
+        """Return Euclidean norms along the last axis, which is kept."""
         return self("Sqrt", self.sum(self("Mul", value, value), -1, keep=True))
 
-    def spread(self, value: str, rows: np.ndarray, count: int, width: int) -> str:
-        """Return (count, width) with the rows of a value at `rows` (increasing), and zeros elsewhere."""
+    def scatter(self, value: str, rows: np.ndarray, count: int, width: int) -> str:
+        """Scatter the rows of a value to `rows` (ascending) of a (count, width) array of zeros."""
         if len(rows) == count:
             return value
         place = np.full(count, len(rows), np.int64)
@@ -79,10 +80,11 @@ class Graph:
         return self.gather(self("Concat", value, np.zeros((1, width)), axis=0), place)
 
     def model(self, outputs: Mapping[str, tuple[str, tuple[int, ...]]], about: Mapping[str, str]) -> bytes:
-        """Return the file.
+        """Return the bytes of the ONNX file, checked.
 
         Args:
-            outputs: value and shape by name. about: what the file says of itself.
+            outputs: value and shape by name.
+            about: metadata of the file.
         """
         helper, infos = self._onnx.helper, []
         for name, (value, shape) in outputs.items():
@@ -96,7 +98,7 @@ class Graph:
         self._onnx.checker.check_model(model)
         return model.SerializeToString()
 
-    def _stored(self, name: str, array: np.ndarray) -> str:
+    def _store(self, name: str, array: np.ndarray) -> str:
         self._initializers.append(self._onnx.numpy_helper.from_array(array, name))
         return name
 

@@ -1,4 +1,4 @@
-"""World-space splats of one pose, as all files of splats hold them."""
+"""World-space splats of one pose, the common input of all splat files."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from avatar.formats.harmonics import C0, MOST_COEFFICIENTS, rotate_sh
 from avatar.runtime.splatting import WorldSplats
 from smplxpp.core.errors import InputError
+from smplxpp.core.spherical_harmonics import C0, MAX_DEGREE, coefficient_count, degree_of, rotate_sh
 
 REST_COUNTS = (0, 9, 24, 45)
-"""Numbers of harmonics beyond degree 0 that a splat may have: those of whole degrees, three colours each."""
-_FULLY = 1e-7
-"""Opacities stay so far away from 0 and 1, where the logit is infinite."""
+"""Numbers of `f_rest` values of a splat for degrees 0 to 3, three colours each."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Splats:
-    """N Gaussians in the world as the file holds them; the arrays are kept as float32.
+    """N Gaussians in world coordinates, stored as float32.
 
     Attributes:
         means: metres.
@@ -31,7 +29,7 @@ class Splats:
         quats: wxyz, any length but zero.
 
     Raises:
-        InputError: arrays that do not fit each other, NaN or infinity, a quaternion of length 0.
+        InputError: inconsistent shapes, NaN or infinity, a quaternion of length 0.
     """
 
     means: Float[np.ndarray, "N 3"]
@@ -74,48 +72,49 @@ class Splats:
 
     @property
     def degree(self) -> int:
-        """Of the harmonics."""
-        return round((self.f_rest.shape[1] + 1) ** 0.5) - 1
+        """The degree of the spherical harmonics, 0 to 3."""
+        return degree_of(self.f_rest)
 
     @property
     def opacities(self) -> Float64[np.ndarray, " N"]:
-        """In (0, 1)."""
+        """The opacities of all splats, in (0, 1)."""
         return 1.0 / (1.0 + np.exp(-self.opacity_logits.astype(np.float64)))
 
     @property
     def unit_quats(self) -> Float32[np.ndarray, "N 4"]:
-        """wxyz, of length 1, w not below 0."""
+        """The quaternions wxyz of length 1, with w not negative."""
         quats = self.quats.astype(np.float64)
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
         return np.where(quats[:, :1] < 0, -quats, quats).astype(np.float32)
 
     def padded(self) -> Splats:
-        """Return the same splats with harmonics of all three degrees, those that they have not being zero."""
-        missing = MOST_COEFFICIENTS - self.f_rest.shape[1]
+        """Return the same splats with harmonics of all three degrees, missing coefficients set to 0."""
+        missing = coefficient_count(MAX_DEGREE) - self.f_rest.shape[1]
         return replace(self, f_rest=np.pad(self.f_rest, ((0, 0), (0, missing), (0, 0))))
 
-    def turned(self, rotation: Float[np.ndarray, "3 3"]) -> Splats:
-        """Return the splats turned about the origin, their harmonics with them."""
+    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> Splats:
+        """Return the splats rotated about the origin, with their spherical harmonics."""
         R = np.asarray(rotation, np.float64)
         return replace(
             self,
             means=self.means @ R.T,
             normals=self.normals @ R.T,
             f_rest=rotate_sh(self.f_rest, R[None], np.zeros(len(self), np.int64)),
-            quats=_turned_quats(R, self.quats),
+            quats=_rotate_quats(R, self.quats),
         )
 
 
 def world_splats(posed: WorldSplats) -> Splats:
-    """Return a pose of the runtime as files have it, the harmonics turned from the triangles' axes to the world's.
+    """Convert a pose of the player: rotate its spherical harmonics from the triangles' axes to the world's.
 
     Args:
-        posed: what a player gave; its arrays are copied.
+        posed: splats of a player; its arrays are copied.
     """
     w, x, y, z = posed.quats.astype(np.float64).T
-    # A Gaussian is flat along its own first axis, which is the normal.
+    # The normal is the first axis of a Gaussian, along which it is flat.
     normals = np.stack([w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    opacities = np.clip(posed.opacities.astype(np.float64), _FULLY, 1.0 - _FULLY)
+    # Opacities keep 1e-7 from 0 and 1, where the logit is infinite.
+    opacities = np.clip(posed.opacities.astype(np.float64), 1e-7, 1.0 - 1e-7)
     return Splats(
         means=posed.means.copy(),
         normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
@@ -127,9 +126,9 @@ def world_splats(posed: WorldSplats) -> Splats:
     )
 
 
-def _turned_quats(R: Float[np.ndarray, "3 3"], quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
-    """Return Hamilton products of a rotation's quaternion and others, wxyz."""
-    # Rows of 4 q q^T; the longest is the best conditioned.
+def _rotate_quats(R: Float[np.ndarray, "3 3"], quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
+    """Return the Hamilton products of a rotation's quaternion with others, wxyz."""
+    # Rows of 4 q q^T; the one with the largest diagonal entry is the best conditioned.
     outer = np.array(
         [
             [1 + R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],

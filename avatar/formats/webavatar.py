@@ -1,4 +1,4 @@
-"""What WebAvatar's published npz can hold of an avatar: its Gaussians at rest, skinned."""
+"""Write WebAvatar's published npz: the Gaussians of an avatar at rest, skinned."""
 
 from __future__ import annotations
 
@@ -25,24 +25,22 @@ NOT_FILLED = (
     "harmonics above degree 0 have no field; loose clothes are not simulated",
 )
 """What an export leaves out, in sentences."""
-_JOINTS, _INFLUENCES, _SHAPES = 55, 4, 16
-_LAYERS = ((80, 32), (32, 32), (32, 32), (32, 2 * _SHAPES))  # inputs and outputs: pose and expression, coefficients
-_HIP = np.radians(25.0)  # of the rest pose: legs apart, about z
+_INFLUENCES, _SHAPES = 4, 16  # the format's joints a Gaussian, and blend shapes
 
 
 def write_webavatar(path: str | Path, player: AvatarPlayer) -> None:
-    """Write the arrays that WebAvatar's Unity reader asks for, whole or not at all.
+    """Write the arrays that WebAvatar's Unity reader requires; a failed write leaves no file.
 
     Filled: `_xyz`, `_scaling` (logarithms), `_rotation` (wxyz), `_sh0` (colour less 0.5), float16, and `opacity`
-    (8 bits), so that a typical pose of the training is the student's; `t_joints`; `weights_idx`, `weights_val`
-    (8 bits), each Gaussian's four strongest joints by its triangle's corners. There with zeros, for its player to run:
-    one feature network, one control point, one Gaussian with bases. See `NOT_FILLED`.
+    (8 bits), so that the avatar equals the student in a typical pose of the training; `t_joints`; `weights_idx`,
+    `weights_val` (8 bits), each Gaussian's four strongest joints by its triangle's corners. Its player also requires
+    one feature network, one control point and one Gaussian with bases, which are zero. See `NOT_FILLED`.
 
     Raises:
         InputError: an avatar whose skeleton is not SMPL-X's.
     """
     t, sizes = player.bundle.tensors, player.bundle.sizes
-    if sizes["J"] != _JOINTS:
+    if sizes["J"] != 55:
         raise InputError("avatar", expected="the 55 joints of SMPL-X", received=f"{sizes['J']}")
     weights, joints = _influences(player)
     shown = typical_pose(player)
@@ -69,7 +67,8 @@ def write_webavatar(path: str | Path, player: AvatarPlayer) -> None:
     for name, width in (("rot", 4), ("scale", 3), ("color", 3)):
         basis = {"rot": "rotation_basis", "scale": "scaling_basis", "color": "color_basis"}[name]
         arrays |= {f"{name}_idxs": np.zeros(1, np.uint32), basis: np.zeros((1, width, _SHAPES), np.float16)}
-    for k, (inputs, outputs) in enumerate(_LAYERS):
+    # The feature network from pose and expression to coefficients.
+    for k, (inputs, outputs) in enumerate(((80, 32), (32, 32), (32, 32), (32, 2 * _SHAPES))):
         arrays[f"layers.{2 * k}.weight"] = np.zeros((outputs, 1, inputs), np.float16)
         arrays[f"layers.{2 * k}.bias"] = np.zeros((outputs, 1), np.float16)
     stream = io.BytesIO()
@@ -88,10 +87,10 @@ def typical_pose(player: AvatarPlayer) -> BodyParams:
 
 def rest_pose() -> BodyParams:
     """Return the pose in which WebAvatar keeps its Gaussians: the T-pose with hips turned 25 degrees outward."""
-    still = BodyParams.rest(betas=0, expressions=0)
+    standing = BodyParams.rest(betas=0, expressions=0)
     theta = np.zeros((1, 63))
-    theta[0, 2], theta[0, 5] = _HIP, -_HIP
-    return replace(still, body_pose=theta)
+    theta[0, 2], theta[0, 5] = np.radians(25.0), -np.radians(25.0)
+    return replace(standing, body_pose=theta)
 
 
 def _at_rest(
@@ -101,21 +100,22 @@ def _at_rest(
     weights: Float[np.ndarray, "N 4"],
     joints: UInt8[np.ndarray, "N 4"],
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 4"]]:
-    """Return places and rotations (wxyz) at rest that its skinning takes to where the student is in a pose.
+    """Return positions and rotations (wxyz) at rest that its skinning maps to the student's in a given pose.
 
-    Places go by the mean of the joints' transforms, rotations by the mean of their quaternions, as its shaders do.
+    Its shaders blend positions by the mean of the joints' transforms, and rotations by the mean of their quaternions.
     """
     to_pose, to_rest = (_square(player.joints(one)[0]) for one in (params, rest_pose()))
     own = (to_pose @ np.linalg.inv(to_rest))[joints]
     mean = np.einsum("nk,nkij->nij", weights, own)
-    places = np.linalg.solve(mean[:, :3, :3], (posed.means - mean[:, :3, 3])[..., None])[..., 0]
+    positions = np.linalg.solve(mean[:, :3, :3], (posed.means - mean[:, :3, 3])[..., None])[..., 0]
     turns = Rotation.from_matrix(own[:, :, :3, :3].reshape(-1, 3, 3)).as_quat().reshape(len(own), _INFLUENCES, 4)
+    # Mean quaternion, with the signs aligned.
     total = weights[:, :1] * turns[:, 0]
     for k in range(1, _INFLUENCES):
         sign = np.where(np.sum(total * turns[:, k], axis=1, keepdims=True) < 0, -1.0, 1.0)
         total = total + weights[:, k : k + 1] * sign * turns[:, k]
     quats = (Rotation.from_quat(total).inv() * Rotation.from_quat(np.roll(posed.quats, -1, axis=1))).as_quat()
-    return places, np.roll(quats, 1, axis=1)
+    return positions, np.roll(quats, 1, axis=1)
 
 
 def _square(transforms: Float[np.ndarray, "J 3 4"]) -> Float64[np.ndarray, "J 4 4"]:

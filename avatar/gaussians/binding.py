@@ -1,4 +1,4 @@
-"""Gaussians bound to the triangles of a mesh: local attributes, and their way to the world."""
+"""Bind Gaussians to the triangles of a mesh: local attributes, their transform to the world, and their penalties."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from torch import Tensor
 
 from avatar.gaussians.frames import TriangleFrames, triangle_frames
 from avatar.gaussians.native_kernels import WorldFunction, is_native
-from avatar.gaussians.quaternions import multiply_quats
+from avatar.gaussians.tensor_operations import gather_rows, multiply_quats
 from smplxpp.core.errors import InputError
+from smplxpp.core.spherical_harmonics import degree_of
 
 THICKNESS = 0.01
 """Scale of every Gaussian along its normal, in mean edge lengths of its triangle (TaoAvatar's epsilon)."""
@@ -22,23 +23,23 @@ THICKNESS = 0.01
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoundGaussians:
-    """N Gaussians in the frames of their triangles (`TriangleFrames`); make variants with `dataclasses.replace`.
+    """N Gaussians in the frames of their triangles (`TriangleFrames`).
 
     Attributes:
-        face_index: the triangle.
+        face_index: index of the triangle.
         barycentric: weights u of the first corner and v of the second; 1 - u - v is the third's.
         normal_offset: gamma, metres along the triangle's normal.
         offset: metres in the triangle's frame: (normal, median, their cross product).
         log_scales: logarithms of the two tangential standard deviations, in mean edge lengths.
         quats: wxyz, any length but zero: from the Gaussian's axes to the triangle's frame.
         opacity_logits: opacities before the sigmoid.
-        dc: colour that does not depend on the view, in sRGB as the images.
+        dc: view-independent colour, in sRGB as the images.
         sh: real spherical harmonics of degree 1 and up in the triangle's frame; K = 0, 3, 8 or 15.
-        face_count: triangles of the mesh.
+        face_count: number of triangles of the mesh.
         topology: digest of the mesh's faces, see `topology_digest`.
 
     Raises:
-        InputError: tensors that do not fit each other, or triangles out of range (looked at on the CPU only).
+        InputError: tensors of inconsistent shapes or types, or triangles out of range (checked on the CPU only).
     """
 
     face_index: Int64[Tensor, " N"]
@@ -54,6 +55,7 @@ class BoundGaussians:
     topology: str
 
     def __post_init__(self) -> None:
+        # Shapes, types and devices, then indices; indices on a GPU are not checked, which would wait for it.
         N, K = len(self.face_index), self.sh.shape[1] if self.sh.ndim == 3 else -1
         shapes: dict[str, tuple[int, ...]] = {
             "face_index": (N,),
@@ -69,28 +71,28 @@ class BoundGaussians:
         for name, shape in shapes.items():
             value = getattr(self, name)
             if tuple(value.shape) != shape:
-                raise _misfit(name, f"shape {shape}", f"shape {tuple(value.shape)}")
+                raise _mismatch(name, f"shape {shape}", f"shape {tuple(value.shape)}")
             dtype = torch.int64 if name == "face_index" else self.offset.dtype
             if value.dtype != dtype or value.device != self.offset.device:
-                raise _misfit(name, f"{dtype} on {self.offset.device}", f"{value.dtype} on {value.device}")
+                raise _mismatch(name, f"{dtype} on {self.offset.device}", f"{value.dtype} on {value.device}")
         if N and self.face_index.device.type == "cpu":
             low, high = (int(bound) for bound in self.face_index.aminmax())
             if low < 0 or high >= self.face_count:
-                raise _misfit("face_index", f"indices in [0, {self.face_count})", f"[{low}, {high}]")
+                raise _mismatch("face_index", f"indices in [0, {self.face_count})", f"[{low}, {high}]")
         if K not in (0, 3, 8, 15):
-            raise _misfit("sh", "0, 3, 8 or 15 coefficients (degrees 0 to 3)", str(K))
+            raise _mismatch("sh", "0, 3, 8 or 15 coefficients (degrees 0 to 3)", str(K))
 
     def __len__(self) -> int:
         return len(self.face_index)
 
     @property
     def sh_degree(self) -> int:
-        """The degree of the harmonics, 0 to 3."""
-        return int((self.sh.shape[1] + 1) ** 0.5) - 1
+        """The degree of the spherical harmonics, 0 to 3."""
+        return degree_of(self.sh)
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name."""
+        """All tensors by name, without face count and topology."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("face_count", "topology")}
 
     @property
@@ -105,7 +107,7 @@ class BoundGaussians:
         return torch.cat([torch.full_like(tangential[:, :1], THICKNESS), tangential], 1)
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> BoundGaussians:
-        """The same Gaussians on another device or with floats of another type."""
+        """Return the same Gaussians on another device or with floats of another type."""
         moved = {
             name: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
             for name, value in self.tensors.items()
@@ -113,11 +115,11 @@ class BoundGaussians:
         return self._with(moved)
 
     def select(self, index: Bool[Tensor, " N"] | Int[Tensor, " M"]) -> BoundGaussians:
-        """The Gaussians of a mask or index tensor, in its order."""
+        """Return the Gaussians of a mask or index tensor, in its order."""
         return self._with({name: value[index] for name, value in self.tensors.items()})
 
     def _with(self, tensors: Mapping[str, Tensor]) -> BoundGaussians:
-        """Make Gaussians of the same mesh with these tensors, all of them."""
+        """Return Gaussians of the same mesh with other tensors, all of them given."""
         return BoundGaussians(**tensors, face_count=self.face_count, topology=self.topology)
 
     def check_topology(self, faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"], subject: str = "mesh") -> None:
@@ -127,20 +129,20 @@ class BoundGaussians:
                 subject,
                 expected=f"the {self.face_count} faces that the Gaussians are bound to",
                 received=f"{len(faces)} other faces",
-                remedy="use the template that the Gaussians were sampled on, or sample anew",
+                remedy="use the template that the Gaussians were sampled on, or sample again",
             )
 
 
 @dataclass(frozen=True, eq=False)
 class WorldGaussians:
-    """N Gaussians in the world, in a pose.
+    """N Gaussians of one or more poses in world coordinates.
 
     Attributes:
         means: metres.
         quats: wxyz, as long as the local ones: from the Gaussian's axes to the world.
         scales: standard deviations, metres.
         opacities: in (0, 1).
-        normals: unit: the first axis.
+        normals: unit vectors, the first axis of each Gaussian.
     """
 
     means: Float[Tensor, "*B N 3"]
@@ -159,7 +161,7 @@ def topology_digest(faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"]) -> str:
 def world_from_local(
     bound: BoundGaussians, vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3"]
 ) -> WorldGaussians:
-    """Put Gaussians where their triangles are; see `world_from_frames`, which takes frames already at hand.
+    """Transform Gaussians to the world by posed vertices; see `world_from_frames`, which takes computed frames.
 
     Args:
         bound: the local attributes.
@@ -170,7 +172,7 @@ def world_from_local(
 
 
 def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
-    """Put Gaussians into the world, with gradients to their attributes and to the vertices.
+    """Transform Gaussians to the world, with gradients to their attributes and to the vertices.
 
     `u_w = u v1 + v v2 + (1 - u - v) v3 + R (gamma [1, 0, 0] + du)`, `r_w = R r`, `s_w = e s` with
     `s = [THICKNESS, exp, exp]`, and `normal = R r [1, 0, 0]` (TaoAvatar; offsets are metres, scales are edges).
@@ -196,7 +198,7 @@ def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGau
 
 
 def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
-    """Do as `world_from_frames` in plain torch: the native kernel's oracle, and the way for other types and devices."""
+    """Return `world_from_frames` in plain torch: the oracle of the native kernel, used for other types and devices."""
     rotations = frames.rotations[..., bound.face_index, :, :]
     corners = frames.corners[..., bound.face_index, :, :]
     weights = corner_weights(bound.barycentric)
@@ -209,7 +211,7 @@ def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -
 
 
 def corner_weights(barycentric: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-    """The weights of all corners of a triangle from those of the first two."""
+    """Return the weights of all three corners of a triangle from those of the first two."""
     u, v = barycentric.unbind(-1)
     return torch.stack([u, v, 1.0 - u - v], dim=-1)
 
@@ -219,13 +221,31 @@ def on_triangles(corners: Float[Tensor, "N 3 C"], barycentric: Float[Tensor, "N 
     return (corner_weights(barycentric)[..., None] * corners).sum(1)
 
 
+def scale_penalty(bound: BoundGaussians) -> Float[Tensor, ""]:
+    """Return the mean of `|relu(s - 0.6)|`, s the tangential scales in mean edge lengths (Qian et al. 2024).
+
+    It keeps Gaussians small: scales up to 0.6 edges are free.
+    """
+    return torch.relu(torch.exp(bound.log_scales) - 0.6).norm(dim=-1).mean()
+
+
+def offset_penalty(bound: BoundGaussians, frames: TriangleFrames) -> Float[Tensor, ""]:
+    """Return 0.01 times the mean of `relu(|du + gamma [1, 0, 0]| / e - 1)`, e the mean edge length (Qian et al. 2024).
+
+    It keeps Gaussians near their triangles: offsets up to one edge are free. 0.01 weights it against `scale_penalty`.
+    """
+    total = torch.cat([bound.offset[:, :1] + bound.normal_offset[:, None], bound.offset[:, 1:]], 1)
+    lengths = gather_rows(frames.lengths, bound.face_index)
+    return 0.01 * torch.relu(total.norm(dim=-1) / lengths - 1.0).mean()
+
+
 def _first_axes(quats: Tensor) -> Tensor:
-    """The unit x axes turned by quaternions of any length: (..., 4) -> (..., 3)."""
+    """Return the unit x axes rotated by quaternions of any length: (..., 4) -> (..., 3)."""
     w, x, y, z = quats.unbind(-1)
     ww, xx, yy, zz = w * w, x * x, y * y, z * z
     axes = torch.stack([ww + xx - yy - zz, 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
     return axes / (ww + xx + yy + zz)[..., None]
 
 
-def _misfit(name: str, expected: str, received: str) -> InputError:
+def _mismatch(name: str, expected: str, received: str) -> InputError:
     return InputError(f"bound Gaussians: {name}", expected=expected, received=received)

@@ -1,4 +1,4 @@
-"""The file of bound Gaussians: safetensors with the digest of the mesh they belong to."""
+"""Read and write files of bound Gaussians: safetensors with the digest of their mesh."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _REMEDY = "take the file that `smplxpp fit` wrote, or fit again"
 
 
 def save_bound(bound: BoundGaussians, path: str | Path) -> None:
-    """Write all tensors and the mesh's digest, whole or not at all."""
-    # One entry: safetensors writes several in an order that differs from run to run.
+    """Write all tensors and the mesh's digest; a failed write leaves no file."""
+    # One metadata entry, because safetensors writes several in an order that differs from run to run.
     about = {"schema": SCHEMA, "face_count": bound.face_count, "topology": bound.topology}
     metadata = {_KIND: json.dumps(about, sort_keys=True)}
     tensors = {name: value.detach().cpu().contiguous() for name, value in bound.tensors.items()}
@@ -38,7 +38,7 @@ def load_bound(path: str | Path, *, faces: Int[np.ndarray, "F 3"] | None = None)
 
     Args:
         path: the file.
-        faces: of the template it is to be used with, checked when given.
+        faces: of the template, to check that the Gaussians belong to it; None: no check.
 
     Raises:
         InputError: a missing, damaged or foreign file, numbers that are not finite, or Gaussians of another mesh.
@@ -55,17 +55,18 @@ def load_bound(path: str | Path, *, faces: Int[np.ndarray, "F 3"] | None = None)
 
 
 def bound_from_tensors(tensors: Mapping[str, Tensor], about: Mapping[str, Any], *, subject: str) -> BoundGaussians:
-    """Make the Gaussians that a file holds.
+    """Make Gaussians from the tensors of a file, checked.
 
     Args:
         tensors: the attributes by name, no others; integers of any size.
-        about: what the file says of them: `face_count` and `topology`.
-        subject: of messages.
+        about: metadata of the file: `face_count` and `topology`.
+        subject: name of the file in errors.
 
     Raises:
-        InputError: attributes that are missing, unknown, of other shapes or types, or not finite; a quaternion of no
-            length.
+        InputError: attributes that are missing, unknown, of other shapes or types, or not finite; a quaternion of
+            length 0.
     """
+    # The set of tensors has to be exactly that of `BoundGaussians`.
     names = [field.name for field in fields(BoundGaussians) if field.name not in ("face_count", "topology")]
     if set(tensors) != set(names):
         missing, unknown = sorted(set(names) - set(tensors)), sorted(set(tensors) - set(names))
@@ -79,6 +80,7 @@ def bound_from_tensors(tensors: Mapping[str, Tensor], about: Mapping[str, Any], 
         )
     count = as_integer(about.get("face_count"), subject=f"{subject}: face_count", least=0)
     topology = as_text(about.get("topology"), subject=f"{subject}: topology")
+    # Types and finite values here; shapes and ranges in `BoundGaussians`.
     index = tensors["face_index"]
     if index.is_floating_point() or index.is_complex() or index.ndim != 1:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The frame of every triangle: where its Gaussians hang."""
+"""Compute the local frame of every triangle, to which its Gaussians are bound."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from avatar.gaussians.native_kernels import FramesFunction, is_native
-from avatar.gaussians.quaternions import quat_from_matrix
+from avatar.gaussians.tensor_operations import quat_from_matrix
 from smplxpp.core.errors import GeometryWarning, InputError
 
 MIN_EDGE = 1e-6
-"""Metres: mean edge lengths are clamped to this, so that no Gaussian gets a scale of zero."""
+"""Smallest mean edge length, metres. Shorter ones are clamped, so that no Gaussian gets a scale of zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class TriangleFrames:
 
     @property
     def face_count(self) -> int:
-        """The number of triangles, F."""
+        """The number of triangles, F, of each batch entry."""
         return self.lengths.shape[-1]
 
 
@@ -47,8 +47,9 @@ def triangle_frames(vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3
     edge length: TaoAvatar's equations with an outward unit normal for counter-clockwise faces (the printed one points
     inward and is not unit). q lies in the triangle's plane, so that R is a rotation.
 
-    A triangle whose height is lost in rounding gets some normal across its longest direction, constant for gradients,
-    with a GeometryWarning; mean edges below `MIN_EDGE` are clamped. float32 on the CPU goes through the native library.
+    A triangle whose height vanishes in rounding gets an arbitrary normal across its longest direction, constant for
+    gradients, with a GeometryWarning; mean edges below `MIN_EDGE` are clamped. float32 on the CPU goes through the
+    native library.
 
     Args:
         vertices: metres.
@@ -71,6 +72,7 @@ def triangle_frames(vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3
         low, high = (int(bound) for bound in faces.aminmax())
         if low < 0 or high >= vertices.shape[-2]:
             raise InputError("faces", expected=f"indices in [0, {vertices.shape[-2]})", received=f"[{low}, {high}]")
+    # The native kernel and its oracle return the same tensors.
     if is_native(vertices):
         *arrays, degenerate = FramesFunction.apply(vertices, faces)
     else:
@@ -95,7 +97,7 @@ def triangle_frames_reference(
 ]:
     """Return the tensors of `TriangleFrames` and the number of triangles without area, in plain torch.
 
-    The oracle of the native kernel, and the way for other types and devices.
+    It is the oracle of the native kernel, and is used for other types and devices.
     """
     corners = vertices[..., faces, :]
     v1, v2, v3 = corners.unbind(-2)

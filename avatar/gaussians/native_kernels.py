@@ -1,6 +1,6 @@
-"""Kernels of the native library for bound Gaussians: float32 on the CPU, with gradients.
+"""Call the native kernels for bound Gaussians: float32 on the CPU, with gradients.
 
-The torch formulas in `frames`, `binding` and `spherical_harmonics` are what they compute, and their oracle in tests.
+The torch formulas in `frames`, `binding` and `colors` define their results, and are their oracle in tests.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _FRAMES = ("corners", "rotations", "frame_quats", "lengths")
 
 
 class _Binding(ctypes.Structure):
-    """SmplxppBinding of binding.cpp."""
+    """Arguments of the kernels, `SmplxppBinding` of binding.cpp."""
 
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("face", *_LOCAL, *_FRAMES)),
@@ -33,18 +33,18 @@ class _Binding(ctypes.Structure):
 
 
 class _BindingGradients(ctypes.Structure):
-    """SmplxppBindingGradients of binding.cpp."""
+    """Gradients of the arguments, `SmplxppBindingGradients` of binding.cpp."""
 
     _fields_ = [(name, ctypes.c_void_p) for name in ("means", "out_quats", "scales", "normals", *_LOCAL, *_FRAMES)]
 
 
 def is_native(*tensors: Tensor) -> bool:
-    """Whether the kernels take these tensors: all float32 on the CPU."""
+    """Return whether the kernels take these tensors: all float32 on the CPU."""
     return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
 
 
 class FramesFunction(torch.autograd.Function):
-    """Takes (..., V, 3) vertices and (F, 3) faces to the tensors of `TriangleFrames`, and how many have no area."""
+    """Map (..., V, 3) vertices and (F, 3) faces to the tensors of `TriangleFrames` and the number without area."""
 
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, ...]:
@@ -85,7 +85,7 @@ class FramesFunction(torch.autograd.Function):
 
 
 class WorldFunction(torch.autograd.Function):
-    """Takes local attributes and frames, in the order of `_LOCAL` and `_FRAMES`, to means, quats, scales, normals."""
+    """Map local attributes and frames, in the order of `_LOCAL` and `_FRAMES`, to means, quats, scales, normals."""
 
     @staticmethod
     def forward(ctx: Any, thickness: float, face: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -120,7 +120,7 @@ class WorldFunction(torch.autograd.Function):
 
 
 class ColorsFunction(torch.autograd.Function):
-    """Takes faces of the Gaussians, rotations of the faces, dc, sh, means, camera positions to (C, N, 3) colours."""
+    """Map faces of Gaussians, rotations of faces, dc, sh, means and camera positions to (C, N, 3) colours."""
 
     @staticmethod
     def forward(ctx: Any, face: Tensor, *inputs: Tensor) -> Tensor:

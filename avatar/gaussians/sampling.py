@@ -1,4 +1,4 @@
-"""Gaussians placed on a template: how many where, how large, in which colour."""
+"""Sample Gaussians on a template: their density, size and initial colour."""
 
 from __future__ import annotations
 
@@ -11,33 +11,30 @@ from jaxtyping import Bool, Float
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.frames import MIN_EDGE
-from avatar.gaussians.spherical_harmonics import coefficient_count
 from smplxpp.cloth.opening_webs import find_opening_webs
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core.spherical_harmonics import coefficient_count
 from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
 from smplxpp.raster import outer_visible_faces
 from smplxpp.template.template import Template
 
-# Irrational steps of a Kronecker sequence: consecutive points of a face keep away from each other.
-_GOLDEN = (5.0**0.5 - 1.0) / 2.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingConfig:
-    """How Gaussians are spread.
+    """Number, density and initial attributes of the Gaussians.
 
     Attributes:
-        count: Gaussians in all.
-        head_share: share of them on the head, TaoAvatar's 70k of 270k by default; None treats the head like the rest.
-        spread_by: "area" for one density, or "face" for equally many in every triangle (k of them when `count` is k
-            times the number of faces and neither head nor hidden faces are treated apart).
-        hidden_density: density on faces that no view from outside sees in the T-pose, against the seen ones; 0 leaves
-            them bare. They need some: motion uncovers legs under a skirt, and teeth.
-        touch: initial standard deviation against the distance of neighbours.
+        count: total number of Gaussians.
+        head_share: share of them on the head, by default TaoAvatar's 70k of 270k; None treats the head like the rest.
+        spread_by: "area" for a uniform density, or "face" for the same number in every triangle (exactly k if `count`
+            is k times the number of faces and neither head nor hidden faces are treated separately).
+        hidden_density: density on faces invisible from outside in the T-pose, relative to visible ones. 0 leaves them
+            bare; they need some, because motion uncovers legs under a skirt, and teeth.
+        touch: initial standard deviation relative to the distance of neighbours.
         opacity: initial opacity.
-        sh_degree: of the colour, 0 to 3; its coefficients start at 0.
-        seed: of all random numbers.
+        sh_degree: degree of the spherical harmonics, 0 to 3; the coefficients start at 0.
+        seed: of all random draws.
     """
 
     count: int = 220_000
@@ -67,15 +64,17 @@ def sample_on_mesh(
     *,
     density: Float[np.ndarray, " F"] | None = None,
 ) -> BoundGaussians:
-    """Place Gaussians on the faces of a template, float32, lying flat, coloured as it is.
+    """Sample flat Gaussians, float32, on the faces of a template, with its colours.
 
     Every region (head, rest) gets its count in proportion to area or faces, hidden faces less, and faces that close an
-    opening of the clothes none: they are no cloth, and would hang in the air when it swings. Samples are stratified
+    opening of the clothes none, because they are not cloth and would float when it swings. Samples are stratified
     along the faces' order and follow a low-discrepancy sequence inside each face. Tangential scales start at
     `touch / sqrt(density)`, so that neighbours overlap.
 
     Args:
-        density: positive factors of how densely each face is covered beside the others of its region; None: all 1.
+        template: the clothed body.
+        config: how many, where and how large.
+        density: positive factors of each face's density relative to the others of its region; None: all 1.
 
     Raises:
         InputError: a share for the head of a body that has no joint "head", a region without a face to sample, or
@@ -83,6 +82,7 @@ def sample_on_mesh(
     """
     config = config or SamplingConfig()
     mesh = template.mesh
+    # Relative density of every face.
     weights = mesh.face_areas * 1.0 if config.spread_by == "area" else (mesh.face_areas > 0).astype(float)
     if density is not None:
         weights *= _positive(density, mesh.face_count)
@@ -90,6 +90,7 @@ def sample_on_mesh(
     head = np.zeros(mesh.face_count, dtype=bool) if config.head_share is None else head_faces(template)
     if config.hidden_density < 1.0:
         weights *= np.where(seen_faces(mesh), 1.0, config.hidden_density)
+    # Each region gets its count of samples; `expected` is their mean number a face.
     on_head = round(config.count * (config.head_share or 0.0))
     rng = np.random.Generator(np.random.PCG64(config.seed))
     expected = np.zeros(mesh.face_count)
@@ -105,9 +106,10 @@ def sample_on_mesh(
         regions.append(_stratified(inside, count, rng))
         expected += inside * (count / inside.sum())
     face, barycentric = (np.concatenate(arrays) for arrays in zip(*regions, strict=True))
+    # Gaussians in the order of faces; their size follows from the density, samples a square metre.
     order = np.argsort(face, kind="stable")
     each = np.divide(expected, mesh.face_areas, out=np.zeros_like(expected), where=expected > 0)
-    return _initial(template, face[order], barycentric[order], each, config)
+    return _initial_gaussians(template, face[order], barycentric[order], each, config)
 
 
 def _positive(density: Float[np.ndarray, " F"], count: int) -> Float[np.ndarray, " F"]:
@@ -118,7 +120,7 @@ def _positive(density: Float[np.ndarray, " F"], count: int) -> Float[np.ndarray,
 
 
 def head_faces(template: Template) -> Bool[np.ndarray, " F"]:
-    """Mark the faces that follow the joint "head" and what hangs on it (jaw, eyes) by more than half their weight.
+    """Return a mask of the faces with more than half their weight on the joint "head" and its children (jaw, eyes).
 
     Raises:
         InputError: no joint of that name.
@@ -140,7 +142,7 @@ def head_faces(template: Template) -> Bool[np.ndarray, " F"]:
 
 
 def seen_faces(mesh: TriangleMesh) -> Bool[np.ndarray, " F"]:
-    """Mark the faces that views from outside see, and their neighbours, as small faces may own no pixel."""
+    """Return a mask of the faces visible from outside, and their neighbours, because small faces may cover no pixel."""
     touched = np.zeros(mesh.vertex_count, dtype=bool)
     touched[mesh.faces[outer_visible_faces(mesh)]] = True
     return touched[mesh.faces].any(1)
@@ -151,17 +153,19 @@ def _stratified(weights: np.ndarray, count: int, rng: np.random.Generator) -> tu
     cumulative = np.cumsum(weights)
     share = (np.arange(count) + rng.random(count)) * (cumulative[-1] / count)
     face = np.searchsorted(cumulative, share, side="right")
-    # A share that rounds up to the whole sum would fall behind the last face that has any.
+    # A share that rounds up to the whole sum would fall after the last face with a weight.
     face = np.minimum(face, np.flatnonzero(weights)[-1])
-    # How far through its face's interval a share falls is uniform, and stratified over the samples of the face.
+    # The position of a share within its face's interval is uniform, and stratified over the samples of the face.
     across = np.clip((share - (cumulative - weights)[face]) / weights[face], 0.0, 1.0)
-    along = (rng.random() + _GOLDEN * np.arange(count)) % 1.0
+    # A Kronecker sequence with the golden ratio keeps consecutive points of a face apart.
+    golden = (5.0**0.5 - 1.0) / 2.0
+    along = (rng.random() + golden * np.arange(count)) % 1.0
     # Uniform on a triangle (Osada et al. 2002).
     root = np.sqrt(across)
     return face, np.stack([1.0 - root, root * (1.0 - along)], axis=1)
 
 
-def _initial(
+def _initial_gaussians(
     template: Template, face: np.ndarray, barycentric: np.ndarray, density: np.ndarray, config: SamplingConfig
 ) -> BoundGaussians:
     corners = template.mesh.triangles

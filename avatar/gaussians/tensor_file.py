@@ -1,4 +1,4 @@
-"""The one door for files of tensors: safetensors with a header of our own, everything checked before it is used."""
+"""Read safetensors files with a JSON header of their own, checked before their tensors are used."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from smplxpp.core.files.json_file import as_object, parse_json
 from smplxpp.core.files.paths import regular_file
 
 _DAMAGED = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError)
-"""What a damaged file, or a type that torch does not know, makes the library raise."""
+"""Exceptions that the library raises for a damaged file or a type that torch does not know."""
 
 
 @dataclass(frozen=True)
 class TensorFile:
-    """A file of tensors whose header was read; the tensors come when they are asked for.
+    """A file of tensors whose header has been read; its tensors are read on demand.
 
     Attributes:
-        path, subject: of the file; the subject names it in messages.
-        expected: what it should be, for messages.
-        about: what the header says; empty for a file without one.
+        path: of the file.
+        subject: name of the file in errors.
+        expected: description of a right file, for errors.
+        about: the header; empty for a file without one.
     """
 
     path: Path
@@ -35,7 +36,9 @@ class TensorFile:
     about: Mapping[str, Any]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Read all tensors by name. They take the file's size at most: their shapes are held against it.
+        """Read all tensors by name.
+
+        They take at most the file's size, because the library checks their shapes against it.
 
         Raises:
             InputError: a damaged file, or a type that torch does not know.
@@ -44,7 +47,7 @@ class TensorFile:
             with safe_open(self.path, framework="pt") as file:
                 return {name: file.get_tensor(name) for name in file.keys()}
         except _DAMAGED as error:
-            raise InputError(self.subject, expected=self.expected, received=_words(error)) from None
+            raise InputError(self.subject, expected=self.expected, received=_message(error)) from None
 
 
 def open_tensor_file(
@@ -54,10 +57,10 @@ def open_tensor_file(
 
     Args:
         path: of the file.
-        subject: names it in messages.
-        header: key of the metadata under which the file tells, as a JSON object, what it is; None: it does not.
-        expected: what it should be, for messages.
-        remedy: what a user can do where there is none.
+        subject: name of the file in errors.
+        header: key of the metadata that holds a JSON object describing the file; None: there is none.
+        expected: description of a right file, for errors.
+        remedy: advice for a missing file.
 
     Raises:
         InputError: missing, damaged or foreign file.
@@ -67,11 +70,11 @@ def open_tensor_file(
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
     except _DAMAGED as error:
-        raise InputError(subject, expected=expected, received=_words(error), remedy=remedy) from None
+        raise InputError(subject, expected=expected, received=_message(error), remedy=remedy) from None
     if header is None:
         return TensorFile(path, subject, expected, {})
     if header not in metadata:
-        received = f"one that is something else: it has no {header!r} in its metadata"
+        received = f"another file, without {header!r} in its metadata"
         raise InputError(subject, expected=expected, received=received, remedy=remedy)
     about = as_object(parse_json(metadata[header], subject=f"{subject}: metadata"), subject=f"{subject}: metadata")
     return TensorFile(path, subject, expected, about)
@@ -95,7 +98,7 @@ def require_like(
 ) -> None:
     """Raise `InputError` unless each of `wanted` is among the tensors, of its shape and kind (floats, integers, bools).
 
-    Of `wanted` shapes and types alone are looked at: it may lie on torch's device "meta".
+    Only shapes and types of `wanted` are used, so it may lie on torch's device "meta".
     """
     for name, model in wanted.items():
         given = tensors.get(name)
@@ -114,5 +117,5 @@ def _kind(value: Tensor) -> str:
     return "floats" if value.is_floating_point() else "complex numbers" if value.is_complex() else "integers"
 
 
-def _words(error: Exception) -> str:
+def _message(error: Exception) -> str:
     return (str(error) or type(error).__name__)[:300]

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
+from avatar.gaussians.colors import view_colors
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.colors import view_colors
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.control_points import template_control_points
 from avatar.models.networks.sparse_rows import SparseRows

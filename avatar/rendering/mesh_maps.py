@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
-from avatar.gaussians.gather import gather_rows
 from avatar.gaussians.native_kernels import is_native
+from avatar.gaussians.tensor_operations import gather_rows
 from avatar.rendering.barycentrics import barycentrics_reference, interpolate_reference
 from avatar.rendering.native_maps import BarycentricFunction, InterpolateFunction
 from smplxpp.core.camera import Camera

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.gaussians.quaternions import matrix_from_quat
+from avatar.gaussians.tensor_operations import matrix_from_quat
 from avatar.rendering.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterMeta, RasterSettings
 
 BLOCK = 16

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from avatar.gaussians.binding import world_from_frames_reference
+from avatar.gaussians.colors import view_colors
 from avatar.gaussians.frames import MIN_EDGE, TriangleFrames
-from avatar.gaussians.quaternions import quat_from_matrix
-from avatar.gaussians.spherical_harmonics import view_colors
+from avatar.gaussians.tensor_operations import quat_from_matrix
 from avatar.models.student import Student
 from avatar.rendering import rasterize
 from avatar.rig.rig import Pose

@@ -35,9 +35,9 @@ from PIL import Image
 from avatar.export.posed import posed_splats
 from avatar.formats import Splats, read_splat_ply, write_splat_ply
 from avatar.gaussians.binding import BoundGaussians, world_from_frames
+from avatar.gaussians.colors import sh_color, view_colors
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.gaussians.spherical_harmonics import C0, sh_color, view_colors
 from avatar.losses.psnr import psnr_from_mse
 from avatar.rendering import rasterize
 from benchmarks.support.results import FIXTURE, store_results
@@ -45,6 +45,7 @@ from pipelines.runs import layout
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.camera import Camera
 from smplxpp.core.params import BodyParams
+from smplxpp.core.spherical_harmonics import C0
 from smplxpp.template.template import Template
 
 PACKAGES = ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.170.0")

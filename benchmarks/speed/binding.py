@@ -22,9 +22,9 @@ import torch
 import tyro
 
 from avatar.gaussians.binding import BoundGaussians, world_from_frames, world_from_frames_reference
+from avatar.gaussians.colors import view_colors, view_colors_reference
 from avatar.gaussians.frames import TriangleFrames, triangle_frames, triangle_frames_reference
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.gaussians.spherical_harmonics import view_colors, view_colors_reference
 from benchmarks.peers.viewer_check import build_fixture
 from benchmarks.support.results import store_results
 from pipelines.runs import layout

@@ -22,8 +22,8 @@ from avatar.data.one_frame import FRAME
 from avatar.data.sequence import camera_centers_of
 from avatar.data.views import read_views
 from avatar.gaussians.binding import world_from_frames
+from avatar.gaussians.colors import view_colors
 from avatar.gaussians.sampling import SamplingConfig
-from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.rig.posed import PosedAvatar
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics

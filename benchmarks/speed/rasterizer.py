@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from avatar.gaussians.quaternions import matrix_from_quat
+from avatar.gaussians.tensor_operations import matrix_from_quat
 from avatar.rendering import rasterize
 from avatar.rendering.native import STAGES, CameraCall, Workspace
 from avatar.rendering.reference import rasterize_reference

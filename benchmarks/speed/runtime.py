@@ -27,9 +27,9 @@ import tyro
 from avatar.data.views import View
 from avatar.export.bundle import BundleExtras, write_bundle
 from avatar.gaussians.binding import world_from_frames
+from avatar.gaussians.colors import view_colors
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.gaussians.spherical_harmonics import view_colors
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view

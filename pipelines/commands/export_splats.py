@@ -54,7 +54,7 @@ def splat_writers(
         disable=request.quiet or fps is None,
     )
     if request.format == "usd":
-        from avatar.formats.splat_usd import write_splat_usd
+        from avatar.formats.splat_scenes import write_splat_usd
 
         return fps, iter([(len(rows), partial(write_splat_usd, frames=shown, fps=fps))]), notes
     write = _writer(request)
@@ -87,7 +87,7 @@ def _writer(request: FileRequest) -> Callable[..., None]:
         }[request.format]
 
     def write(path: Path, *, splats: Splats) -> None:
-        turned = splats if request.up == "y" else splats.turned(_TURNS[request.up])
+        turned = splats if request.up == "y" else splats.rotated(_TURNS[request.up])
         formats.write_splat_ply(path, turned.padded() if request.full_harmonics else turned)
 
     return write

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from avatar.export.posed import posed_splats
-from avatar.formats.harmonics import C0
 from avatar.gaussians.binding import world_from_local
+from avatar.gaussians.colors import sh_color, view_colors
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.quaternions import matrix_from_quat
-from avatar.gaussians.spherical_harmonics import sh_color, view_colors
+from avatar.gaussians.tensor_operations import matrix_from_quat
+from smplxpp.core.spherical_harmonics import C0
 from tests.gaussians.bound_scenes import random_bound, rotation, sphere
 
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from avatar.formats import Splats, write_splat_sog, write_splat_spz
-from avatar.formats.sog import _palette
+from avatar.formats.packed_splats import _palette
 from smplxpp.core.errors import InputError
 from tests.formats.foreign import gsply_splats
 
@@ -154,7 +154,7 @@ def test_packed_files_repeat_and_take_few_splats(tmp_path, write):
 
 
 def test_a_palette_too_small_takes_what_is_near(monkeypatch):
-    monkeypatch.setattr("avatar.formats.sog._MOST_PALETTE", 16)
+    monkeypatch.setattr("avatar.formats.packed_splats._MAX_PALETTE", 16)
     rng = np.random.default_rng(0)
     kinds = rng.normal(size=(4, 9))
     sets = (kinds[rng.integers(0, 4, 500)] + rng.normal(scale=1e-3, size=(500, 9))).astype(np.float32)

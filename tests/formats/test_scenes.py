@@ -10,7 +10,7 @@ import pygltflib
 import pytest
 
 from avatar.formats import write_splat_glb
-from avatar.formats.splat_usd import write_splat_usd
+from avatar.formats.splat_scenes import write_splat_usd
 from smplxpp.core.errors import InputError, MissingExtraError
 from tests.export.glb_reader import GlbReader
 from tests.export.test_glb_validator import validate

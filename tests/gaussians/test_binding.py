@@ -9,7 +9,7 @@ import torch
 
 from avatar.gaussians.binding import THICKNESS, BoundGaussians, topology_digest, world_from_frames, world_from_local
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.quaternions import matrix_from_quat
+from avatar.gaussians.tensor_operations import matrix_from_quat
 from smplxpp.core.errors import InputError
 from tests.gaussians.bound_scenes import random_bound, rotation, sphere
 
@@ -146,5 +146,5 @@ def test_topology_tells_meshes_apart():
     bound.check_topology(faces)
     bound.check_topology(faces.numpy().astype("int32"))
     for other in (faces[1:], faces.flip(0)):
-        with pytest.raises(InputError, match="sample anew"):
+        with pytest.raises(InputError, match="sample again"):
             bound.check_topology(other)

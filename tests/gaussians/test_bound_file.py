@@ -54,7 +54,7 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
     tensors = load_file(good)
     about = {"schema": 1, "face_count": 128, "topology": "x"}
     cases = {
-        "something else": (tensors, None),
+        "another file": (tensors, None),
         "schema: 9": (tensors, about | {"schema": 9}),
         "all tensors": ({k: v for k, v in tensors.items() if k != "dc"}, about),
         "all tensors.*extra": (tensors | {"extra": tensors["dc"].clone()}, about),

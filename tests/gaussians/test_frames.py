@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from avatar.gaussians.frames import MIN_EDGE, triangle_frames
-from avatar.gaussians.quaternions import matrix_from_quat
+from avatar.gaussians.tensor_operations import matrix_from_quat
 from smplxpp.core.errors import GeometryWarning, InputError
 from tests.gaussians.bound_scenes import rotation, sphere
 

@@ -9,8 +9,8 @@ import torch
 
 from avatar.gaussians import native_kernels
 from avatar.gaussians.binding import world_from_frames, world_from_frames_reference
+from avatar.gaussians.colors import view_colors, view_colors_reference
 from avatar.gaussians.frames import TriangleFrames, triangle_frames, triangle_frames_reference
-from avatar.gaussians.spherical_harmonics import view_colors, view_colors_reference
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.native import _FEATURES, LEVELS, _cpu_features, native_library
 from tests.gaussians.bound_scenes import random_bound, rotation, sphere

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from avatar.gaussians.quaternions import matrix_from_quat, multiply_quats, quat_from_matrix
+from avatar.gaussians.tensor_operations import matrix_from_quat, multiply_quats, quat_from_matrix
 from smplxpp.core.rotations import matrix_from_rotvec
 
 

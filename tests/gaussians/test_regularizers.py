@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import torch
 
+from avatar.gaussians.binding import offset_penalty, scale_penalty
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.regularizers import offset_penalty, scale_penalty
 from tests.gaussians.bound_scenes import random_bound, sphere
 
 

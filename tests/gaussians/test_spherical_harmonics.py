@@ -8,9 +8,10 @@ import torch
 from scipy.special import sph_harm_y
 
 from avatar.gaussians.binding import world_from_frames
+from avatar.gaussians.colors import sh_color, view_colors
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.spherical_harmonics import C0, coefficient_count, rotate_sh, sh_basis, sh_color, view_colors
 from smplxpp.core.errors import InputError
+from smplxpp.core.spherical_harmonics import C0, coefficient_count, rotate_sh, sh_basis
 from tests.gaussians.bound_scenes import random_bound, rotation, sphere
 
 

@@ -23,13 +23,14 @@ from torch import Tensor
 
 from avatar.export.posed import posed_splats
 from avatar.gaussians.binding import world_from_frames
+from avatar.gaussians.colors import view_colors
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.spherical_harmonics import C0, coefficient_count, sh_basis, view_colors
 from avatar.rendering.gsplat_backend import SUPPORTED
 from avatar.rendering.map_frame import MapFrame
 from avatar.rendering.reference import _project, rasterize_reference
 from avatar.rendering.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from smplxpp.core.camera import Camera
+from smplxpp.core.spherical_harmonics import C0, coefficient_count, sh_basis
 from tests.gaussians.bound_scenes import random_bound, sphere
 from tests.rendering.scenes import Scene, draw, random_scene
 

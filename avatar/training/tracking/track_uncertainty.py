@@ -12,7 +12,7 @@ from torch import Tensor
 from avatar.data.views import View
 from avatar.gaussians.binding import on_triangles
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.gather import gather_rows
+from avatar.gaussians.tensor_operations import gather_rows
 from avatar.models.tracked_surface import TrackedAvatar
 from avatar.rig.rig import Pose
 from avatar.training.refinement.config import RefineConfig

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from avatar.gaussians.gather import gather_rows
+from avatar.gaussians.tensor_operations import gather_rows
 from avatar.rendering.mesh_maps import vertex_normals
 
 

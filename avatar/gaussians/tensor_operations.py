@@ -1,17 +1,17 @@
-"""Quaternions (w, x, y, z) and rotation matrices in torch, differentiable everywhere."""
+"""Differentiable operations on tensors: quaternions (w, x, y, z), rotation matrices, rows by index."""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
 def quat_from_matrix(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 4"]:
     """Return unit quaternions wxyz of rotation matrices; their sign is free.
 
-    `4 q q^T` is linear in the matrix. The row of its largest diagonal entry, normalised, is q: that entry is at least
-    1, so that neither the value nor the gradient has a weak spot (Shepperd 1978, without the branches).
+    `4 q q^T` is linear in the matrix. The row of its largest diagonal entry, normalised, is q. That entry is at
+    least 1, so value and gradient are well conditioned everywhere (Shepperd 1978, without the branches).
     """
     a, b, c, d, e, f, g, h, i = matrix.flatten(-2).unbind(-1)
     wx, wy, wz, xy, xz, yz = h - f, c - g, d - b, b + d, c + g, f + h
@@ -36,7 +36,7 @@ def matrix_from_quat(quat: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 3 3"]:
 
 
 def multiply_quats(a: Float[Tensor, "*#B 4"], b: Float[Tensor, "*#B 4"]) -> Float[Tensor, "*B 4"]:
-    """Return the Hamilton product of quaternions wxyz: first turn by `b`, then by `a`."""
+    """Return the Hamilton product of quaternions wxyz: rotate by `b` first, then by `a`."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(
@@ -48,3 +48,12 @@ def multiply_quats(a: Float[Tensor, "*#B 4"], b: Float[Tensor, "*#B 4"]) -> Floa
         ],
         -1,
     )
+
+
+def gather_rows(values: Float[Tensor, "V ..."], index: Int[Tensor, "*N"]) -> Tensor:
+    """Return `values[index]`, with a deterministic backward pass.
+
+    On the CPU the gradients of `values[index]` are summed in an order that depends on thread timing; those of
+    `index_select` are not.
+    """
+    return values.index_select(0, index.flatten()).view(*index.shape, *values.shape[1:])
