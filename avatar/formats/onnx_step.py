@@ -9,7 +9,7 @@ import numpy as np
 
 from avatar.formats.onnx_graph import Graph
 from avatar.runtime.bundle import AvatarBundle
-from avatar.runtime.field import Field, positional_encoding
+from avatar.runtime.networks import DisplacementField, positional_encoding
 from avatar.runtime.player import THICKNESS
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.spherical_harmonics import sh_basis
@@ -141,13 +141,13 @@ def _rotations(g: Graph, pose: str, J: int) -> str:
 def field(g: Graph, bundle: AvatarBundle, theta: str) -> str:
     """Return the displacements of the vertices (V, 3), interpolated from the field's control points."""
     t, sizes = bundle.tensors, bundle.sizes
-    whole = Field(bundle)
-    neighbours, shares = whole.interpolation
-    if whole.regression is not None:
-        moved = _regress(g, whole.regression, theta)
+    bundle_field = DisplacementField(bundle)
+    neighbours, shares = bundle_field.interpolation
+    if bundle_field.regression is not None:
+        moved = _regress(g, bundle_field.regression, theta)
         return g.sum(g("Mul", g.gather(moved, neighbours), shares[:, :, None]), 1)
     # The networks of body and cloth, evaluated at the control points.
-    code = g.input("code", sizes["Z"], default=whole.null_code)
+    code = g.input("code", sizes["Z"], default=bundle_field.null_code)
     sets = np.repeat(t["field.sets"], 3, axis=1)
     codes = g("Expand", g.reshape(code, 1, sizes["Z"]), g.constant([len(sets), sizes["Z"]], np.int64))
     frames = g("Concat", g("Mul", theta, sets), codes, axis=1)

@@ -38,7 +38,7 @@ def splats_along(
         return
     begin = max(0, rows[0] - round(PRE_ROLL * rate))
     for k, way in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
-        posed = player.step(motion.frame(k), 1.0 / rate, way=way)
+        posed = player.step(motion.frame(k), 1.0 / rate, path=way)
         if k in rows:
             yield world_splats(posed)
     if notes is not None:

@@ -1,4 +1,4 @@
-"""Losses that the trainer minimises, and the image metrics it reports."""
+"""Losses that trainings minimise, and the image metrics that they report."""
 
 from smplxpp.core.lazy import lazy_exports
 
@@ -8,7 +8,7 @@ _EXPORTS = {
     "Target": "avatar.losses.reconstruction",
     "load_metric": "avatar.losses.perceptual",
     "reconstruction_loss": "avatar.losses.reconstruction",
-    "ssim_map": "avatar.losses.ssim",
+    "ssim_map": "avatar.losses.image_similarity",
 }
 __all__ = [*_EXPORTS]
 __getattr__, __dir__ = lazy_exports("avatar.losses", _EXPORTS)

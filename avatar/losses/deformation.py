@@ -1,30 +1,37 @@
-"""The bake's losses on the mesh: its displacements against the teacher's maps, and its labels against the teacher's."""
+"""Losses on deformation: displacement and labels against the teacher, and coherence of neighbouring Gaussians."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avatar.gaussians.binding import BoundGaussians, on_triangles
+from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
+from avatar.gaussians.frames import triangle_frames
 from avatar.rendering.map_frame import MapFrame
 from avatar.rendering.mesh_maps import front_back_maps
 from avatar.rig.rig import Rig
 
 TAU = 8.0 * math.pi
-"""Radians a metre of the semantic labels' waves: one every 25 cm."""
+"""Spatial frequency of the semantic labels, radians a metre: a wavelength of 25 cm."""
 
 
 class DisplacementLoss:
     """`L_non = mean |dV - dU|` over the mesh's pixels of the front and back maps of the T-pose.
 
-    dV are the mesh's displacements rasterised, dU the teacher's maps. Both are divided by `unit`, the metres of an
-    output of 1 of the teacher, so that the loss is one between maps and does not depend on the unit of length.
+    dV are the mesh's rasterised displacements, dU the teacher's maps. Both are divided by `unit`, so that the loss
+    compares maps and does not depend on the unit of length.
 
     Args:
-        rig: that of the template. frame, size: those of the teacher's maps. unit: metres.
+        rig: of the template.
+        frame: square of the teacher's maps.
+        size: side of the teacher's maps, pixels.
+        unit: metres of a teacher's output of 1.
     """
 
     def __init__(self, rig: Rig, frame: MapFrame, size: int, unit: float) -> None:
@@ -36,7 +43,8 @@ class DisplacementLoss:
         """Return the loss, with gradients to the displacements.
 
         Args:
-            displacements: metres. teacher: its maps, metres.
+            displacements: of the vertices, metres.
+            teacher: its maps, metres.
         """
         difference = (self.maps.interpolate(displacements) - teacher).abs().sum(-1)
         return difference[self.mask].mean() / self.unit
@@ -55,3 +63,86 @@ def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) ->
     """
     corners = vertex_labels(rig, tau=tau)[rig.faces[gaussians.face_index]]
     return on_triangles(corners, gaussians.barycentric)
+
+
+NEIGHBOURS = 8
+"""Number of nearest Gaussians in the T-pose, on the same part, that each Gaussian is compared with."""
+SHARE = 1 / 16
+"""Share of the Gaussians that a step compares, each with one neighbour; more cost more time a step."""
+
+
+class Coherence:
+    """`mean |R_i dU_i - R_j dU_j|^2` over neighbouring Gaussians i, j: coherence of learned blend shapes.
+
+    dU is the change of the shapes U (3, n) since the start, R rotates a triangle's axes to those of the T-pose, and the
+    squares are summed over the columns: for coefficients of unit deviation, the expected squared distance between two
+    neighbours, square metres. Penalties on neighbours are usual for Gaussians that move freely (Luiten et al. 2024).
+    Without one, cameras that disagree about a fold each pull other Gaussians of a patch to where they see the pattern,
+    and the patch tears between the cameras.
+
+    Args:
+        rig: of the template.
+        gaussians: those with blend shapes.
+        start: initial U, metres.
+    """
+
+    def __init__(self, rig: Rig, gaussians: BoundGaussians, start: Float[Tensor, "N 3 n"]) -> None:
+        faces = gaussians.face_index
+        with torch.no_grad():
+            frames = triangle_frames(rig.vertices, rig.faces)
+            axes, self._start = frames.rotations[faces], start.detach().clone()
+            places = world_from_frames(gaussians, frames).means.double().cpu().numpy()
+        part = rig.template.vertex_part[rig.template.faces[faces.cpu().numpy(), 0]]
+        self._near = _neighbours(places, part)
+        near = torch.as_tensor(self._near, device=axes.device)
+        # (N, k, 3, 3): R_i^T R_j
+        self._own_from_other = torch.stack([axes.mT @ axes[others] for others in near.unbind(1)], dim=1)
+
+    def __call__(self, shapes: Float[Tensor, "N 3 n"], random: np.random.Generator) -> Float[Tensor, ""]:
+        """Return the penalty of shapes, estimated on a random sixteenth of the Gaussians with one neighbour each."""
+        count, near = self._near.shape
+        rows = random.choice(count, size=max(1, round(SHARE * count)), replace=False)
+        which = random.integers(near, size=len(rows))
+        drawn = np.stack([rows, self._near[rows, which], which])
+        own, other, turned = torch.as_tensor(drawn, device=shapes.device)
+        turn = self._own_from_other[own, turned]
+        apart: Tensor = _PairDistance.apply(shapes, self._start, torch.stack([own, other]), turn)
+        return apart
+
+
+class _PairDistance(torch.autograd.Function):
+    """Mean over P pairs i, j of `|a_i - Q a_j|^2`, `a = shapes - start`, with one dense gradient for all of them."""
+
+    @staticmethod
+    def forward(ctx: Any, shapes: Tensor, start: Tensor, pairs: Tensor, turn: Tensor) -> Tensor:
+        learned = shapes.index_select(0, pairs.flatten()) - start.index_select(0, pairs.flatten())
+        own, other = learned.unflatten(0, (2, -1))
+        apart = own - _rotated(turn, other)
+        ctx.save_for_backward(pairs, turn, apart)
+        ctx.shape = shapes.shape
+        return apart.square().sum((1, 2)).mean()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None, None, None]:
+        pairs, turn, apart = ctx.saved_tensors
+        own = (2.0 / len(apart) * slope) * apart
+        both = torch.cat([own, -_rotated(turn.mT, own)])
+        index = pairs.flatten()[:, None, None].expand_as(both)
+        return apart.new_zeros(ctx.shape).scatter_add_(0, index, both), None, None, None
+
+
+def _rotated(turn: Float[Tensor, "P 3 3"], values: Float[Tensor, "P 3 n"]) -> Tensor:
+    """Return the matrix products, column by column because `bmm` is slow for many small matrices."""
+    return sum((turn[:, :, k, None] * values[:, None, k] for k in (1, 2)), turn[:, :, 0, None] * values[:, None, 0])
+
+
+def _neighbours(places: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return the nearest others of the same part (N, k), filled with the Gaussian itself if the part has too few."""
+    near = np.repeat(np.arange(len(places))[:, None], NEIGHBOURS, axis=1)
+    for one in np.unique(part):
+        own = np.flatnonzero(part == one)
+        count = min(NEIGHBOURS + 1, len(own))
+        found = cKDTree(places[own]).query(places[own], k=count)[1].reshape(len(own), count)[:, 1:]
+        near[own, : count - 1] = own[found]
+    return near

@@ -1,6 +1,6 @@
-"""Perceptual distances between images: ST-LPIPS, and LPIPS where the user has it.
+"""Measure perceptual distances between images: ST-LPIPS, and LPIPS if its package is installed.
 
-They are different metrics with different numbers: each carries its own name, which goes wherever its value is shown.
+Their values are not comparable, so each metric carries its name, which is printed with its values.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ log = logging.getLogger(__name__)
 MetricName = Literal["st-lpips", "lpips", "none"]
 
 MIN_SIZE = 32
-"""Pixels: the coarsest features of a smaller image vanish."""
+"""Smallest side of an image, pixels; the coarsest features of a smaller one vanish."""
+# The layers of AlexNet: channels, kernel sizes, and names in the authors' file.
 CHANNELS = (64, 192, 384, 256, 256)
 KERNELS = (11, 5, 3, 3, 3)
 STORED_CONVS = ("net.slice1.0", "net.slice2.5", "net.slice3.9", "net.slice4.11", "net.slice5.13")
@@ -34,7 +35,7 @@ WEIGHT_FILE = Path("weights", "vST0.0", "alex_shift_tolerant.pth")
 
 
 class MissingPackageError(MissingExtraError):
-    """A package is not installed that no extra of ours can name."""
+    """An error for a missing package that no extra of this project installs."""
 
     def __init__(self, package: str, *, command: str, purpose: str) -> None:
         ImportError.__init__(self, f"{purpose} needs {package}, which is not installed: {command}")
@@ -44,7 +45,7 @@ class PerceptualDistance(nn.Module, ABC):
     """Distance between features of two images; differentiable in the images, its own weights are fixed.
 
     Attributes:
-        name: the metric's, to be printed with its values.
+        name: of the metric, printed with its values.
     """
 
     name: str
@@ -53,10 +54,11 @@ class PerceptualDistance(nn.Module, ABC):
         """Return the distance of each pair, 0 for equal images.
 
         Args:
-            image, reference: in [0, 1], at least 32 pixels a side.
+            image: in [0, 1], at least 32 pixels a side.
+            reference: of the same shape.
 
         Raises:
-            InputError: images of another or of different shapes, or too small.
+            InputError: images of wrong or different shapes, or too small.
         """
         if image.shape != reference.shape or image.ndim != 4 or image.shape[3] != 3 or min(image.shape[1:3]) < MIN_SIZE:
             raise InputError(
@@ -73,10 +75,10 @@ class PerceptualDistance(nn.Module, ABC):
 
 
 class ShiftTolerantLPIPS(PerceptualDistance):
-    """ST-LPIPS (Ghildyal and Liu 2022): LPIPS on an AlexNet whose every reduction is low-pass filtered.
+    """ST-LPIPS (Ghildyal and Liu 2022): LPIPS on an AlexNet with a low-pass filter before every reduction.
 
     `sum over 5 layers of mean over pixels of w . (f/|f| - g/|g|)^2`, f and g the layer's features of the two images and
-    w its learnt weights. A shift of the image by a pixel barely changes the distance.
+    w its learnt weights. A shift of the image by one pixel hardly changes the distance.
     """
 
     name = "ST-LPIPS"
@@ -152,7 +154,7 @@ class ShiftTolerantLPIPS(PerceptualDistance):
 
 
 class PackagedLPIPS(PerceptualDistance):
-    """LPIPS (Zhang et al. 2018) as the user's `lpips` package computes it."""
+    """LPIPS (Zhang et al. 2018), computed by the installed `lpips` package."""
 
     def __init__(self, network: nn.Module, backbone: str) -> None:
         super().__init__()
@@ -172,11 +174,11 @@ def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
     """Make ST-LPIPS with the authors' AlexNet weights.
 
     Args:
-        weights: their file; None: that of the installed package `stlpips-pytorch`, whose code is not run.
+        weights: their file; None: that of the installed package `stlpips-pytorch`, without running its code.
 
     Raises:
         MissingPackageError: no file given and the package is not installed.
-        InputError: a file that holds something else.
+        InputError: another kind of file.
     """
     if weights is None:
         found = importlib.util.find_spec("stlpips_pytorch")
@@ -198,7 +200,7 @@ def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
 
 
 def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
-    """Make LPIPS by the `lpips` package, with the backbone that it finds or downloads: "alex" or "vgg".
+    """Make LPIPS by the `lpips` package, with the backbone "alex" or "vgg", which the package finds or downloads.
 
     Raises:
         MissingPackageError: `lpips`, or torchvision which it needs, is not installed.
@@ -213,7 +215,7 @@ def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
 
 
 def load_metric(name: str, *, device: str = "cpu") -> PerceptualDistance | None:
-    """Make the metric of a name; None for "none", and where its package is not installed, which is logged.
+    """Make a metric by name; None for "none", and, with a log line, if its package is not installed.
 
     Raises:
         InputError: another name.

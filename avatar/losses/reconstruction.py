@@ -1,4 +1,4 @@
-"""The loss between a rendered view and its photograph that teacher, bake and compensation share."""
+"""Compute the loss between a rendered view and its photograph, shared by teacher, bake and compensation."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.losses.image_similarity import psnr_from_mse, ssim
 from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
-from avatar.losses.psnr import psnr_from_mse
-from avatar.losses.ssim import ssim
 from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
@@ -23,11 +22,13 @@ class ReconstructionWeights:
     """Weights of `L_rec = w L1 + a D-SSIM + b LPIPS + c L_nor + d L_alpha + e L2`. The defaults are the paper's.
 
     Attributes:
-        l1: of the mean absolute difference of colours. dssim: of `1 - SSIM`. perceptual: of LPIPS or ST-LPIPS.
-        normal: of the L1 between normals.
-        alpha: of the L1 between opacity and mask, which the paper does not have: on a black background dark hair could
-            be a hole.
-        l2: of the mean squared difference of colours, which the paper does not have: what lies far off counts more.
+        l1: weight of the mean absolute difference of colours.
+        dssim: weight of `1 - SSIM`.
+        perceptual: weight of LPIPS or ST-LPIPS.
+        normal: weight of the L1 between normals.
+        alpha: weight of the L1 between opacity and mask. The paper does not have it; without it, dark hair before a
+            black background may become transparent.
+        l2: weight of the mean squared difference of colours, which emphasises large errors. The paper does not have it.
     """
 
     l1: float = 1.0
@@ -44,11 +45,12 @@ class ReconstructionWeights:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a rendering should look like.
+    """The target of a rendering.
 
     Attributes:
-        image: sRGB on the background. alpha: the person's opacity.
-        normals: in the world's axes, 0 on the background; None where there are none.
+        image: sRGB on the background.
+        alpha: opacity of the person.
+        normals: in world axes, 0 on the background; None without normals.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -63,11 +65,12 @@ def reconstruction_loss(
     *,
     perceptual: PerceptualDistance | None = None,
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    """Return the weighted sum, and its terms as numbers.
+    """Return the weighted sum of the losses, and its terms as numbers.
 
-    D-SSIM is `1 - SSIM` as in 3DGS's code. `L_nor = mean |N_t - N_g|_1` over the pixels where the target has a normal.
-    Terms without what they need (no normals, no perceptual distance, an image below its size) are left out.
+    D-SSIM is `1 - SSIM`, as in the code of 3DGS. `L_nor = mean |N_t - N_g|_1` over the pixels where the target has a
+    normal. Terms without their inputs (normals, a perceptual distance, an image of its minimum size) are left out.
     """
+    # Each term is added in this order, because the order of a sum decides its last bits.
     difference = rendering.image - target.image
     l1 = difference.abs().mean()
     total, terms = weights.l1 * l1, {"l1": l1}

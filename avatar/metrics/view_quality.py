@@ -13,9 +13,8 @@ from torch import Tensor
 
 from avatar.data.views import View
 from avatar.gaussians.sampling import head_faces
+from avatar.losses.image_similarity import psnr_from_mse, ssim
 from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
-from avatar.losses.psnr import psnr_from_mse
-from avatar.losses.ssim import ssim
 from smplxpp.core.camera import Camera
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh

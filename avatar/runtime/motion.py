@@ -1,4 +1,4 @@
-"""Motions made ready for a player: another frame rate, and poses held within what training saw."""
+"""Prepare motions for a player: resample them, and give the range of poses of the training."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from smplxpp.cloth.poses import pose_between
 from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_positive
 
-_SECOND = 1e-9
-
 
 def resampled(params: BodyParams, fps: float, *, source_fps: float | None = None) -> BodyParams:
-    """Return a motion at another rate, every joint turned along the shortest way between two poses (slerp).
+    """Resample a motion to another frame rate, with spherical linear interpolation (slerp) of every joint.
 
-    Two vectors of one rotation, such as those of either hemisphere of quaternions, are one pose here: nothing spins.
+    Different vectors of one rotation are the same pose, so that a joint never spins between them.
 
     Args:
-        fps: frames a second of the result. source_fps: of `params`; None: as they say.
+        params: the motion.
+        fps: frames a second of the result.
+        source_fps: frames a second of `params`; None: their own.
 
     Raises:
         InputError: no positive rate.
@@ -29,9 +29,10 @@ def resampled(params: BodyParams, fps: float, *, source_fps: float | None = None
     rate = source_fps or params.fps or 0.0
     for name, value in (("frames a second", fps), ("frames a second of the motion", rate)):
         require_positive(name, value)
+    # Interpolate between the two neighbouring frames of each new time.
     last = len(params) - 1
     frames = []
-    for k in range(int(np.floor(last / rate * fps + _SECOND)) + 1):
+    for k in range(int(np.floor(last / rate * fps + 1e-9)) + 1):
         at = min(k * rate / fps, float(last))
         low = min(int(at), max(last - 1, 0))
         high = min(low + 1, last)
@@ -40,6 +41,6 @@ def resampled(params: BodyParams, fps: float, *, source_fps: float | None = None
 
 
 def pose_range(bundle: AvatarBundle) -> PoseRange | None:
-    """Return the range of the poses that a bundle knows; None where it knows none."""
+    """Return the range of the training's poses in a bundle; None if it stores none."""
     known = bundle.tensors.get("poses.known")
     return None if known is None else PoseRange.of(known)

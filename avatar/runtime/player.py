@@ -1,4 +1,4 @@
-"""A bundle moved and drawn: body parameters to splats in the world to a picture, in numpy and native kernels."""
+"""Pose and draw the avatar of a bundle, in numpy and native kernels."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ from time import perf_counter
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from avatar.runtime.blend import BlendSide
 from avatar.runtime.bundle import AvatarBundle, load_bundle
-from avatar.runtime.clothes import Clothes
-from avatar.runtime.field import Field
 from avatar.runtime.kernels import SurfaceKernel, WorldKernel, add_basis, joint_transforms
-from avatar.runtime.relighting import facing_normals, relit_picture
-from avatar.runtime.skeleton import skeleton_body
-from avatar.runtime.splatting import Splatter, WorldSplats
+from avatar.runtime.networks import BlendShapes, DisplacementField
+from avatar.runtime.skeleton import LooseClothes, skeleton_body
+from avatar.runtime.splatting import Splatter, WorldSplats, facing_normals, relit_picture
 from smplxpp.cloth.driver import ClothShape, DriverConfig
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
@@ -26,23 +23,23 @@ from smplxpp.core.params import BodyParams
 from smplxpp.native import thread_count
 
 PARTS = ("pose", "field", "blend", "world", "draw")
-"""What a picture takes time for: joints and expression; displacements; blend shapes; skinning, frames of
-triangles and the way to the world; colours and drawing."""
+"""Steps whose time is measured: joints and expression; displacement field; blend shapes; skinning and the transform of
+Gaussians to the world; colours and drawing."""
 THICKNESS = 0.01
 """Scale of every Gaussian along its normal, in mean edge lengths of its triangle."""
 
 
 class AvatarPlayer:
-    """An avatar that takes poses.
+    """A player of an avatar: body parameters in, splats and pictures out.
 
     Args:
         bundle: the avatar, or its file.
-        threads: of the kernels; None: up to 8, a CPU each.
-        cloth: how loose clothes follow motions that are stepped through.
-        clock: gives seconds.
+        threads: of the kernels; None: the number of CPUs, at most 8.
+        cloth: configuration of the cloth simulation.
+        clock: returns seconds.
 
     Attributes:
-        seconds: that the last pose and picture took, by `PARTS`.
+        seconds: duration of the last pose and picture, by `PARTS`.
 
     Example:
         >>> player = AvatarPlayer("me.avatar")
@@ -67,9 +64,10 @@ class AvatarPlayer:
         self._body = skeleton_body(self.bundle)
         self._parents = np.ascontiguousarray(t["skeleton.parents"], dtype=np.int32)
         self._joints, self._joint_basis = t["skeleton.joints"].astype(np.float64), t["skeleton.expression"]
-        self._field = Field(self.bundle) if "field" in self.bundle else None
-        self._sides = [BlendSide(self.bundle, side) for side in ("head", "body")] if "blend" in self.bundle else []
-        self._clothes = Clothes(self.bundle, cloth) if self.bundle.garments else None
+        self._field = DisplacementField(self.bundle) if "field" in self.bundle else None
+        self._sides = [BlendShapes(self.bundle, side) for side in ("head", "body")] if "blend" in self.bundle else []
+        self._clothes = LooseClothes(self.bundle, cloth) if self.bundle.garments else None
+        # Kernels, prepared once: skinning, and Gaussians to the world.
         weights = t["surface.joint_weights"] / t["surface.joint_weights"].sum(axis=1, keepdims=True)
         neighbours, shares = (None, None) if self._field is None else self._field.interpolation
         self._surface = SurfaceKernel(
@@ -92,6 +90,7 @@ class AvatarPlayer:
             vertices=sizes["V"],
             thickness=THICKNESS,
         )
+        # Output arrays, reused for every pose.
         count = sizes["N"]
         means, quats, scales, dc = (np.empty((count, width), np.float32) for width in (3, 4, 3, 3))
         self._splats = WorldSplats(
@@ -109,7 +108,7 @@ class AvatarPlayer:
 
     @property
     def motion(self) -> BodyParams | None:
-        """What the bundle has to play; None where it has nothing."""
+        """The motion stored in the bundle; None if there is none."""
         if not self.bundle.motion:
             return None
         arrays = {name: np.asarray(value, np.float64) for name, value in self.bundle.motion.items()}
@@ -117,36 +116,37 @@ class AvatarPlayer:
 
     @property
     def has_clothes(self) -> bool:
-        """Whether there are loose clothes, which `step` simulates."""
+        """Whether the avatar has loose clothes, which `step` simulates."""
         return self._clothes is not None
 
     @property
     def notes(self) -> list[str]:
-        """What went otherwise than asked for with the loose clothes, a sentence each."""
+        """Remarks on the simulation of the loose clothes, a sentence each."""
         return [] if self._clothes is None else self._clothes.notes
 
     @property
     def skinned_clothes(self) -> ClothShape | None:
-        """The loose clothes where the joints alone have them, for `pose`; None where there are none."""
+        """The loose clothes after linear blend skinning, for `pose`; None if there are none."""
         return None if self._clothes is None else self._clothes.skinned
 
-    def step(self, params: BodyParams, seconds: float, *, way: Sequence[BodyParams] = ()) -> WorldSplats:
-        """Go on to a pose, the loose clothes simulated; as `pose` where the avatar has none.
+    def step(self, params: BodyParams, seconds: float, *, path: Sequence[BodyParams] = ()) -> WorldSplats:
+        """Step to a pose with simulated loose clothes; without such clothes it is `pose`.
 
         Args:
-            params: one frame. seconds: since the last step; of the first one it does not matter.
-            way: poses, even in time, that the clothes follow to it instead: those of `smplxpp.cloth.following.ways`
-                for a motion that is known whole, or what a `smplxpp.cloth.poses.CausalSmoother` makes of it.
+            params: one frame.
+            seconds: since the last step; ignored in the first one.
+            path: poses, evenly spaced in time, that the clothes follow to it: those of `smplxpp.cloth.following.ways`
+                for a motion that is known whole, or the output of a `smplxpp.cloth.poses.CausalSmoother`.
 
         Raises:
             InputError: several frames, no positive time, parameters of another body.
         """
         if self._clothes is None:
             return self.pose(params)
-        return self.pose(params, cloth=self._clothes.step(params, seconds, way))
+        return self.pose(params, cloth=self._clothes.step(params, seconds, path))
 
     def restart(self) -> None:
-        """Forget how the clothes moved: the next step starts anew."""
+        """Discard the state of the clothes; the next step starts a new simulation."""
         if self._clothes is not None:
             self._clothes.restart()
 
@@ -157,25 +157,26 @@ class AvatarPlayer:
         frame: int | None = None,
         cloth: ClothShape | None = None,
     ) -> WorldSplats:
-        """Return the avatar in a pose; its arrays are the player's own, which the next pose writes anew.
+        """Return the splats of a pose, in arrays that the next pose overwrites.
 
         Args:
-            params: one frame; its shape is not looked at.
-            frame: of the training, whose code is taken; None, or one that has none: a new pose.
-            cloth: where loose clothes are, over the bundle's vertices; None: where field and skinning have them.
+            params: one frame; its shape coefficients are ignored.
+            frame: frame of the training whose code is used; None, or one without a code: a new pose.
+            cloth: positions of loose clothes, with the bundle's vertices; None: they follow field and skinning.
 
         Raises:
             InputError: several frames, or parameters of another body.
         """
+        # Joints and T-pose, displacement field, blend shapes, then skinning and the world; each is timed.
         times = [self._clock()]
         transforms, features, expression = self.joints(params)
-        rest = self._shaped(expression, features)
+        rest = self._shape(expression, features)
         theta = params.body_pose[0].astype(np.float32)
         times.append(self._clock())
         moved = None if self._field is None else self._field.displacements(theta, frame, self.threads)
         times.append(self._clock())
-        displaced = None if cloth is None else self._over_all(cloth)
-        added = self._added(theta, expression, params.jaw_pose[0], frame, displaced)
+        displaced = None if cloth is None else self._spread_cloth(cloth)
+        added = self._blend(theta, expression, params.jaw_pose[0], frame, displaced)
         times.append(self._clock())
         self._surface(rest, moved, displaced, transforms, self._posed, self.threads)
         out = self._splats
@@ -191,13 +192,15 @@ class AvatarPlayer:
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         relighting: Relighting | None = None,
     ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
-        """Return the last pose as a camera sees it: sRGB, not clamped, and its opacity.
+        """Draw the last pose: sRGB, not clamped, and its opacity.
 
         Args:
-            relighting: the picture is shown in another light, by the normals that are drawn beside it.
+            camera: a pinhole camera.
+            background: sRGB.
+            relighting: another light, applied by the drawn normals; None: the capture's.
 
         Raises:
-            InputError: what `Splatter.draw` refuses.
+            InputError: as `Splatter.draw`.
         """
         begin = self._clock()
         image, alpha = self._splatter.draw(
@@ -214,7 +217,7 @@ class AvatarPlayer:
 
     @property
     def normals(self) -> Float32[np.ndarray, "N 3"]:
-        """The unit normals of the posed surface where the Gaussians hang on it, smooth over its triangles."""
+        """The unit normals of the posed surface at the Gaussians, interpolated from the vertices."""
         t = self.bundle.tensors
         faces = t["surface.faces"]
         smooth = TriangleMesh(self._posed, faces).vertex_normals
@@ -225,13 +228,13 @@ class AvatarPlayer:
 
     @property
     def vertices(self) -> Float32[np.ndarray, "V 3"]:
-        """The posed vertices that carry Gaussians, metres; the next pose writes them anew."""
+        """The posed vertices that carry Gaussians, metres; the next pose overwrites them."""
         return self._posed
 
     def joints(
         self, params: BodyParams
     ) -> tuple[Float32[np.ndarray, "J 3 4"], Float32[np.ndarray, " P"] | None, Float32[np.ndarray, " E"]]:
-        """Return transforms of the joints, what drives pose correctives (None: there are none), and the expression."""
+        """Return the joints' transforms, the features of pose correctives (None without them), and the expression."""
         if len(params) != 1:
             raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
         size, given = self.bundle.sizes["E"], params.expression.shape[1]
@@ -256,10 +259,10 @@ class AvatarPlayer:
         )
         return transforms, features, expression
 
-    def _shaped(
+    def _shape(
         self, expression: Float32[np.ndarray, " E"], features: Float32[np.ndarray, " P"] | None
     ) -> Float32[np.ndarray, "V 3"]:
-        """The T-pose with expression and pose correctives."""
+        """Return the T-pose with expression and pose correctives."""
         t = self.bundle.tensors
         drives = [("expression", expression)] if expression.any() else []
         drives += [] if features is None else [("pose", features)]
@@ -268,12 +271,12 @@ class AvatarPlayer:
             add_basis(rest, t[f"surface.{name}_rows"], t[f"surface.{name}"], coefficients)
         return rest
 
-    def _over_all(self, cloth: ClothShape) -> tuple[Float32[np.ndarray, "V 3"], Float32[np.ndarray, " V"]]:
+    def _spread_cloth(self, cloth: ClothShape) -> tuple[Float32[np.ndarray, "V 3"], Float32[np.ndarray, " V"]]:
         displacements, share = np.zeros_like(self._rest), np.zeros(len(self._rest), np.float32)
         displacements[cloth.vertices], share[cloth.vertices] = cloth.displacements, cloth.share
         return displacements, share
 
-    def _added(
+    def _blend(
         self,
         theta: Float32[np.ndarray, " 63"],
         expression: Float32[np.ndarray, " E"],
@@ -281,22 +284,23 @@ class AvatarPlayer:
         frame: int | None,
         displaced: tuple[Float32[np.ndarray, "V 3"], Float32[np.ndarray, " V"]] | None,
     ) -> Float32[np.ndarray, "N 6"] | None:
-        """What blend shapes add to position and colour; those of the body fade far from what training saw."""
+        """Return the blend shapes' contribution to position and colour; the body's fades for unknown poses."""
         if not self._sides:
             return None
+        # Simulated cloth takes no blend shapes, because they were learned on the tracked surface.
         keep = None
-        if displaced is not None:  # what was learned from a followed surface says nothing of one that is simulated
-            still = 1.0 - displaced[1][self.bundle.tensors["surface.faces"]].mean(axis=1)
-            keep = np.ascontiguousarray(still[self._face_of], dtype=np.float32)
+        if displaced is not None:
+            unsimulated = 1.0 - displaced[1][self.bundle.tensors["surface.faces"]].mean(axis=1)
+            keep = np.ascontiguousarray(unsimulated[self._face_of], dtype=np.float32)
         head, body = self._sides
         of_head = np.concatenate([expression, jaw]) if self.bundle.about.jaw else expression
         added = np.zeros((self.bundle.sizes["N"], 6), np.float32)
         head.add(of_head.astype(np.float32), 1.0, None, added, self.threads)
-        body.add(theta, self.known(theta, frame), keep, added, self.threads)
+        body.add(theta, self.pose_similarity(theta, frame), keep, added, self.threads)
         return added
 
-    def known(self, theta: Float32[np.ndarray, " 63"], frame: int | None = None) -> float:
-        """Return how much a pose counts as one that training saw, in [0, 1]."""
+    def pose_similarity(self, theta: Float32[np.ndarray, " 63"], frame: int | None = None) -> float:
+        """Return the similarity of a pose to the training's poses, in [0, 1]: 1 within their usual distance."""
         poses = self.bundle.tensors.get("poses.known")
         if poses is None or frame in self.bundle.about.frames:
             return 1.0

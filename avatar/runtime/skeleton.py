@@ -1,18 +1,24 @@
-"""The skeleton of a bundle as a body model, its surface as a template: what takes parameters, what clothes need."""
+"""Convert a bundle's skeleton to a body model, its surface to a template, and simulate its loose clothes."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int64
 
 from avatar.runtime.bundle import AvatarBundle
 from smplxpp.body.model import BodyModel
+from smplxpp.cloth.driver import ClothDriver, ClothShape, DriverConfig
+from smplxpp.cloth.garment_file import garments_from_arrays
+from smplxpp.core.params import BodyParams
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.template.template import Template
 
 
 def skeleton_body(bundle: AvatarBundle) -> BodyModel:
-    """Return a body whose vertices are its joints: it completes hands, and moves joints with the expression."""
+    """Return a body model with the joints as vertices, which completes hands and applies expressions to joints."""
     count = bundle.sizes["J"]
     joints = bundle.tensors["skeleton.joints"].astype(np.float64)
     moved = bundle.tensors["skeleton.expression"].astype(np.float64)
@@ -20,12 +26,13 @@ def skeleton_body(bundle: AvatarBundle) -> BodyModel:
 
 
 def clothed_template(bundle: AvatarBundle) -> tuple[Template, Int64[np.ndarray, " V"]]:
-    """Return a template of the bundle's vertices, and where in it each of them is.
+    """Return a template of the bundle's vertices, and the index of each of them in it.
 
-    A joint is a vertex too, behind those of the body: so that few vertices give the same joints as all of them did.
+    Joints are appended to the body's vertices, because a bundle has too few vertices to regress them.
     """
     t, sizes = bundle.tensors, bundle.sizes
     vertices, parts, J = t["surface.vertices"], t["surface.parts"], sizes["J"]
+    # Order of vertices: skin, joints, then the other parts.
     skin = int((parts == 0).sum())
     at = np.arange(len(vertices)) + J * (parts > 0)
     total = len(vertices) + J
@@ -36,6 +43,7 @@ def clothed_template(bundle: AvatarBundle) -> tuple[Template, Int64[np.ndarray, 
         out[at], out[joints] = values, of_joints
         return out
 
+    # Skin weights; a joint follows itself.
     dense = np.zeros((total, J))
     rows = np.repeat(at, t["surface.joint_indices"].shape[1])
     np.add.at(dense, (rows, t["surface.joint_indices"].ravel()), t["surface.joint_weights"].ravel())
@@ -62,7 +70,7 @@ def clothed_template(bundle: AvatarBundle) -> tuple[Template, Int64[np.ndarray, 
 
 
 def _dense_basis(bundle: AvatarBundle, name: str, skin: int) -> np.ndarray | None:
-    """A basis over the skin's vertices and the joints behind them."""
+    """Return a dense basis over the vertices of the skin and the joints after them."""
     basis = bundle.tensors.get(f"surface.{name}")
     if basis is None:
         return None
@@ -107,3 +115,51 @@ def _body(
         left_hand_mean=of_hands("left_hand_mean"),
         right_hand_mean=of_hands("right_hand_mean"),
     )
+
+
+class LooseClothes:
+    """The cloth simulation of a bundle's garments, with indices of the bundle's own vertices."""
+
+    def __init__(self, bundle: AvatarBundle, config: DriverConfig | None = None) -> None:
+        # Garments in the types of their reader, and with the template's indices.
+        template, at = clothed_template(bundle)
+        wide = {
+            name: value.astype(np.float64) if value.dtype == np.float32 and _is_wide(name) else value
+            for name, value in bundle.garments.items()
+        }
+        for name, value in wide.items():
+            if name.split(".")[-1] in ("particles", "vertices", "collider_vertices"):
+                inside = value.size == 0 or (value.dtype.kind in "iu" and 0 <= value.min() <= value.max() < len(at))
+                wide[name] = at[value] if inside else np.full_like(value, -1)  # the reader refuses -1
+        garments = garments_from_arrays(wide, bundle.garments_about, template, subject="garments of the avatar")
+        self._driver = ClothDriver(template, garments, config)
+        self._place = np.full(template.vertex_count, -1, dtype=np.int64)
+        self._place[at] = np.arange(len(at))
+
+    @property
+    def notes(self) -> list[str]:
+        """Remarks on the simulation, a sentence each."""
+        return self._driver.notes
+
+    def step(self, params: BodyParams, seconds: float, path: Sequence[BodyParams] = ()) -> ClothShape:
+        """Simulate to a pose, along a path of poses if there is one; see `ClothDriver.step` and `follow`."""
+        driver = self._driver
+        shape = driver.follow(path, seconds, params) if path else driver.step(params, seconds)
+        return replace(shape, vertices=self._place[shape.vertices])
+
+    @property
+    def skinned(self) -> ClothShape:
+        """The clothes after linear blend skinning, without simulation."""
+        garments = self._driver.garments
+        vertices = self._place[np.concatenate([one.vertices for one in garments])]
+        share = np.concatenate([one.share() for one in garments])
+        return ClothShape(vertices, np.zeros((len(vertices), 3), np.float32), share)
+
+    def restart(self) -> None:
+        """Discard the state; the next step starts a new simulation."""
+        self._driver.restart()
+
+
+def _is_wide(name: str) -> bool:
+    """Return whether an array of garments is float64 in its own file."""
+    return ".params." in name or name.split(".")[-1] in ("rest_vertices", "lengths", "depth", "vertex_depth")

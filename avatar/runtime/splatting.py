@@ -1,4 +1,4 @@
-"""Splats to a picture through the native library, without torch: the forward pass of `avatar.rendering.cpu`."""
+"""Draw splats with the native library, without torch: the forward pass of `avatar.rendering.cpu`; relight pictures."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import ctypes
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
+from smplxpp.core.light import Relighting
 from smplxpp.native import OverLimitError, address, check_size, native_library
 
 STAGES = ("project", "sort", "bin", "blend")
-# Entries of the lists of Gaussians by tile: a GiB of them while they are made.
-_MOST_ENTRIES = (1 << 30) // 24
-_NEAR, _FAR = 0.01, 1e10
+"""Stages of drawing whose seconds can be measured."""
+_MAX_ENTRIES = (1 << 30) // 24  # of the lists of Gaussians by tile: one GiB while they are built
 
 
 class SceneCall(ctypes.Structure):
-    """Scene of smplxpp/native/gaussians/gaussian.hpp."""
+    """Arguments of the kernels, `Scene` of smplxpp/native/gaussians/gaussian.hpp."""
 
     _fields_ = [
         ("count", ctypes.c_int64),
@@ -29,7 +29,7 @@ class SceneCall(ctypes.Structure):
 
 
 class CameraCall(ctypes.Structure):
-    """Camera of smplxpp/native/gaussians/gaussian.hpp."""
+    """Arguments of the kernels, `Camera` of smplxpp/native/gaussians/gaussian.hpp."""
 
     _fields_ = [
         *((name, ctypes.c_int32) for name in ("width", "height")),
@@ -41,12 +41,17 @@ class CameraCall(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class WorldSplats:
-    """N Gaussians in the world, in one pose; the arrays may be a player's own, which the next pose writes anew.
+    """N Gaussians in world coordinates, in one pose. A player overwrites its arrays at the next pose.
 
     Attributes:
-        means: metres. quats: wxyz. scales: standard deviations, metres. opacities: in [0, 1].
-        dc: colour that does not depend on the view, sRGB. sh: harmonics of degree 1 and up in the triangles' frames.
-        face: the triangle of each. rotations: world from triangle.
+        means: metres.
+        quats: wxyz.
+        scales: standard deviations, metres.
+        opacities: in [0, 1].
+        dc: view-independent colour, sRGB.
+        sh: spherical harmonics of degree 1 and up in the triangles' frames.
+        face: index of each Gaussian's triangle.
+        rotations: of the triangles, world from triangle.
     """
 
     means: Float32[np.ndarray, "N 3"]
@@ -73,7 +78,7 @@ class WorldSplats:
 
 
 class Splatter:
-    """Draws splats, with memory that it keeps from picture to picture; not for two threads at once."""
+    """A renderer of splats that reuses its memory from picture to picture; it is not thread-safe."""
 
     def __init__(self) -> None:
         self._library = native_library()
@@ -100,11 +105,16 @@ class Splatter:
         """Return the picture, sRGB and not clamped, and its opacity.
 
         Args:
-            camera: a pinhole. background: sRGB. eps2d: pixels squared by which splats are blurred.
-            seconds: float64, added to by `STAGES`. features: in the place of colours; None: the splats' own.
+            splats: one pose.
+            camera: a pinhole camera.
+            background: sRGB.
+            eps2d: blur of the splats, pixels squared.
+            threads: of the kernels.
+            seconds: float64, increased by the time of each of `STAGES`.
+            features: drawn in the place of colours; None: the splats' colours.
 
         Raises:
-            InputError: a parallel camera, a picture too large, or splats that would fill the memory.
+            InputError: an orthographic camera, a picture too large, or splats that would fill the memory.
         """
         if camera.orthographic:
             raise InputError(f"camera {camera.name!r}", expected="a pinhole", received="an orthographic one")
@@ -113,11 +123,12 @@ class Splatter:
         colors = features
         if colors is None:
             colors = splats.colors(camera.position.astype(np.float32), threads=threads)
+        # Arguments of the kernel.
         view = np.ascontiguousarray(camera.cam_from_world, dtype=np.float32)
         K, behind = np.ascontiguousarray(camera.K, dtype=np.float32), np.array(background, dtype=np.float32)
         gaussians = (splats.means, splats.quats, splats.scales, splats.opacities, colors)
         scene = SceneCall(count, 3, 0, *(address(array) for array in gaussians))
-        call = CameraCall(camera.width, camera.height, _NEAR, _FAR, eps2d, 0, *map(address, (view, K, behind)))
+        call = CameraCall(camera.width, camera.height, 0.01, 1e10, eps2d, 0, *map(address, (view, K, behind)))
         image, alpha = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
         scratch = tuple(np.empty(shape, np.float32) for shape in ((count, 2), (count, 2), (count,)))
         try:
@@ -126,15 +137,52 @@ class Splatter:
                 ctypes.byref(scene),
                 ctypes.byref(call),
                 *(address(array) for array in (image, alpha, *scratch)),
-                ctypes.c_int64(_MOST_ENTRIES),
+                ctypes.c_int64(_MAX_ENTRIES),
                 ctypes.c_int32(threads),
                 address(seconds, "float64"),
             )
         except OverLimitError:
             raise InputError(
                 "Gaussians to draw",
-                expected=f"at most {_MOST_ENTRIES:,} entries of Gaussians in tiles of the picture",
+                expected=f"at most {_MAX_ENTRIES:,} entries of Gaussians in tiles of the picture",
                 received="more: they are too large for it",
                 remedy="draw a smaller picture, or from farther away",
             ) from None
         return image, alpha
+
+
+def facing_normals(
+    normals: Float32[np.ndarray, "N 3"], splats: WorldSplats, eye: Float[np.ndarray, " 3"]
+) -> Float32[np.ndarray, "N 3"]:
+    """Return normals of the side that a point, metres, sees, flipped where the surface clearly faces away.
+
+    A cosine above 0.35 counts as facing away. Nearer to the outline the normal stays, because the outer side is seen
+    there.
+    """
+    towards = splats.means - np.asarray(eye, dtype=np.float32)
+    cosine = np.einsum("nx,nx->n", normals, towards) / np.maximum(np.linalg.norm(towards, axis=1), 1e-9)
+    return normals * np.where(cosine > 0.35, np.float32(-1.0), np.float32(1.0))[:, None]
+
+
+def relit_picture(
+    image: Float32[np.ndarray, "H W 3"],
+    alpha: Float32[np.ndarray, "H W"],
+    normals: Float32[np.ndarray, "H W 3"],
+    relighting: Relighting,
+    background: tuple[float, float, float],
+) -> Float32[np.ndarray, "H W 3"]:
+    """Relight a picture by deferred shading; the background does not change.
+
+    Args:
+        image: sRGB on the background.
+        alpha: opacity; pixels below 1e-3 are left as they are.
+        normals: splatted, so that they are shorter where the picture is transparent.
+        relighting: the other light.
+        background: sRGB.
+    """
+    out = image.copy()
+    seen = alpha > 1e-3
+    share, behind = alpha[seen][:, None], np.asarray(background, dtype=np.float32)
+    own = (image[seen] - (1.0 - share) * behind) / share
+    out[seen] = share * relighting.colors(own, normals[seen]) + (1.0 - share) * behind
+    return out

@@ -23,7 +23,7 @@ import tyro
 
 from avatar.data.sequence import AvatarSequence, MeasuredView
 from avatar.export.bundle import BundleConfig, BundleExtras, write_bundle
-from avatar.losses.psnr import psnr_from_mse
+from avatar.losses.image_similarity import psnr_from_mse
 from avatar.metrics.view_quality import view_quality
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student

@@ -38,7 +38,7 @@ from avatar.gaussians.binding import BoundGaussians, world_from_frames
 from avatar.gaussians.colors import sh_color, view_colors
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
-from avatar.losses.psnr import psnr_from_mse
+from avatar.losses.image_similarity import psnr_from_mse
 from avatar.rendering import rasterize
 from benchmarks.support.results import FIXTURE, store_results
 from pipelines.runs import layout

@@ -17,7 +17,7 @@ import fast_simplification
 import numpy as np
 import torch
 
-from avatar.losses.ssim import ssim, ssim_reference
+from avatar.losses.image_similarity import ssim, ssim_reference
 from avatar.rendering.barycentrics import barycentrics_reference, interpolate_reference
 from avatar.rendering.mesh_maps import mesh_maps
 from benchmarks.support.results import store_results

@@ -113,7 +113,7 @@ def _pictures(
     for k, way in enumerate(paths):
         number = k + (film.numbered_from or 0)
         if simulate:
-            player.step(motion.frame(k), 1.0 / fps, way=way)
+            player.step(motion.frame(k), 1.0 / fps, path=way)
         if k not in picture:
             continue
         if not simulate:

@@ -8,8 +8,8 @@ import torch
 
 from avatar.gaussians.binding import world_from_local
 from avatar.gaussians.frames import triangle_frames
-from avatar.losses import coherence
-from avatar.losses.coherence import NEIGHBOURS, Coherence, _neighbours
+from avatar.losses import deformation
+from avatar.losses.deformation import NEIGHBOURS, Coherence, _neighbours
 from tests.dolls.dancing import gaussians, sequence, varied, write_dance
 
 WAY = torch.tensor([[0.01, 0.0], [-0.02, 0.03], [0.03, 0.01]])
@@ -44,7 +44,7 @@ def test_a_patch_that_learns_to_move_as_one_is_free(rig, bound, start):
 
 
 def test_it_is_the_mean_over_gaussians_and_their_neighbours(rig, bound, start, monkeypatch):
-    monkeypatch.setattr(coherence, "SHARE", 1.0)
+    monkeypatch.setattr(deformation, "SHARE", 1.0)
     learned = 0.01 * torch.randn(start.shape, generator=torch.Generator().manual_seed(0))
     penalty = Coherence(rig, bound, start)
     estimates = [float(penalty(start + learned, np.random.default_rng(seed))) for seed in range(400)]
@@ -60,7 +60,7 @@ def test_it_is_the_mean_over_gaussians_and_their_neighbours(rig, bound, start, m
 
 
 def test_gradients_draw_a_gaussian_to_its_neighbours(rig, bound, start, monkeypatch):
-    monkeypatch.setattr(coherence, "SHARE", 1.0)
+    monkeypatch.setattr(deformation, "SHARE", 1.0)
     penalty, shapes = Coherence(rig, bound, start), start.clone()
     shapes[7, 1, 0] += 0.01
     shapes.requires_grad_(True)
@@ -69,7 +69,7 @@ def test_gradients_draw_a_gaussian_to_its_neighbours(rig, bound, start, monkeypa
 
 
 def test_gradients_are_those_of_finite_differences(rig, bound, start, monkeypatch):
-    monkeypatch.setattr(coherence, "SHARE", 1.0)
+    monkeypatch.setattr(deformation, "SHARE", 1.0)
     few = bound.select(torch.arange(12))
     penalty = Coherence(rig, few, start[:12])
     penalty._start, penalty._own_from_other = penalty._start.double(), penalty._own_from_other.double()

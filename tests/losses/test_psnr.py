@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from avatar.losses.psnr import psnr_from_mse
+from avatar.losses.image_similarity import psnr_from_mse
 
 
 def test_values_by_hand():

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
+from avatar.losses.image_similarity import ssim
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
-from avatar.losses.ssim import ssim
 from avatar.rendering.avatar_view import Rendering
 from smplxpp.core.errors import InputError
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avatar.losses.ssim import ssim, ssim_map, ssim_map_reference, ssim_reference
+from avatar.losses.image_similarity import ssim, ssim_map, ssim_map_reference, ssim_reference
 from smplxpp.core.errors import InputError
 from smplxpp.native import _FEATURES, LEVELS, _cpu_features, native_library
 
@@ -70,7 +70,7 @@ def test_every_instruction_set_gives_the_same_within_rounding(level, monkeypatch
     if not _FEATURES[level] <= _cpu_features():
         pytest.skip(f"this CPU has no {level}")
     library = native_library(level)
-    monkeypatch.setattr("avatar.losses.ssim.native_library", lambda: library)
+    monkeypatch.setattr("avatar.losses.image_similarity.native_library", lambda: library)
     x, y = pair((70, 90, 3))
     assert_equal_to_reference(gradients(ssim, x, y), gradients(ssim_reference, x.double(), y.double()))
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
-from avatar.losses.ssim import ssim, ssim_map
+from avatar.losses.image_similarity import ssim, ssim_map
 from avatar.rendering import rasterize
 from avatar.rendering.mesh_maps import mesh_maps
 from smplxpp.capture.distortion import RationalDistortion, undistort

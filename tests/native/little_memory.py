@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from avatar.gaussians import native_kernels
-from avatar.losses.ssim import ssim
+from avatar.losses.image_similarity import ssim
 from avatar.rendering import rasterize
 from avatar.rendering.mesh_maps import mesh_maps
 from smplxpp.capture.distortion import RationalDistortion, undistort

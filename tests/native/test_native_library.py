@@ -111,7 +111,7 @@ def run(program: str) -> str:
 WORK = """
 import os, signal, sys
 import torch
-from avatar.losses.ssim import ssim
+from avatar.losses.image_similarity import ssim
 from tests.rendering.scenes import gradients, random_scene
 
 def work():

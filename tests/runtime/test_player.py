@@ -112,8 +112,11 @@ def test_poses_count_as_known_as_in_torch(tmp_path):
     player = AvatarPlayer(tmp_path / "a.avatar", threads=1)
     for scale in (0.0, 1.0, 1.7, 6.0):
         theta = (scale * dance().body_pose[5]).astype(np.float32)
-        assert player.known(theta) == pytest.approx(float(it.pose_gate(torch.tensor(theta))), abs=1e-4)
-    assert player.known(np.float32(9.0 * np.ones(63))) < 0.01 and player.known(np.float32(9.0 * np.ones(63)), 1) == 1.0
+        assert player.pose_similarity(theta) == pytest.approx(float(it.pose_gate(torch.tensor(theta))), abs=1e-4)
+    assert (
+        player.pose_similarity(np.float32(9.0 * np.ones(63))) < 0.01
+        and player.pose_similarity(np.float32(9.0 * np.ones(63)), 1) == 1.0
+    )
 
 
 def test_the_motion_comes_along(tmp_path):

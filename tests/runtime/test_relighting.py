@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar.runtime import AvatarPlayer
-from avatar.runtime.relighting import facing_normals
+from avatar.runtime.splatting import facing_normals
 from smplxpp.core.colors import linear_from_srgb
 from smplxpp.core.light import Irradiance, Relighting, panorama_directions
 from tests.dolls.dancing import cameras, dance

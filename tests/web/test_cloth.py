@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from avatar.runtime import AvatarPlayer
-from avatar.runtime.clothes import Clothes
+from avatar.runtime.skeleton import LooseClothes
 from smplxpp.cloth import DriverConfig
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import standing
@@ -84,7 +84,7 @@ def test_constraints_are_those_of_the_driver(dressed):
     const result = { ...model, fixed, share: m.shareOf(garment) };
     for (const [name, value] of Object.entries(result)) result[name] = [...value];"""
     found = node(script, given=str(dressed))
-    garment = Clothes(AvatarPlayer(dressed).bundle)._driver.garments[0]
+    garment = LooseClothes(AvatarPlayer(dressed).bundle)._driver.garments[0]
     model = garment.model()
     np.testing.assert_array_equal(np.array(found["fixed"], bool), garment.pinned)
     np.testing.assert_allclose(found["share"], garment.share(), atol=1e-6)

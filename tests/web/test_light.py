@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from avatar.runtime import AvatarPlayer
-from avatar.runtime.relighting import facing_normals
+from avatar.runtime.splatting import facing_normals
 from pipelines.cli import main
 from pipelines.commands.options import read_light
 from pipelines.web.page import PageContent, PageLight, page_files

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
-from avatar.losses.coherence import Coherence
+from avatar.losses.deformation import Coherence
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from avatar.data.sequence import camera_centers_of
-from avatar.losses.coherence import Coherence
+from avatar.losses.deformation import Coherence
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.learned_gaussians import LEARNED
 from avatar.models.networks.blend_shapes import BlendShapeConfig

@@ -1,16 +1,17 @@
-"""Structural similarity of images: a readable reference, and the fused kernel of the native library with gradients.
+"""Measure the similarity of images: PSNR, and SSIM by a readable reference or a fused native kernel with gradients.
 
 SSIM (Wang et al. 2004) at a pixel, from Gaussian-weighted means over its 11x11 window (sigma 1.5):
 
     SSIM = (2 mu_x mu_y + C1) (2 cov_xy + C2) / ((mu_x^2 + mu_y^2 + C1) (var_x + var_y + C2)),  C1 = 0.01^2, C2 = 0.03^2
 
-with biased variances, for images in [0, 1], each channel for itself. `padding="zero"` takes pixels outside of the image
-as 0, as the code of 3D Gaussian Splatting does; `"valid"` uses only windows that lie within the image.
+with biased variances, for images in [0, 1], each channel separately. `padding="zero"` takes pixels outside of the image
+as 0, like the code of 3D Gaussian Splatting; `"valid"` uses only windows that lie within the image.
 """
 
 from __future__ import annotations
 
 import ctypes
+import math
 from typing import Any
 
 import torch
@@ -18,15 +19,13 @@ import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from avatar.losses.checks import check_images, mean, total_weight
 from avatar.rendering.memory import pooled_empty
 from smplxpp.core.errors import InputError
 from smplxpp.native import address, check_size, native_library, thread_count
 
 WINDOW = 11
-"""Pixels on a side of the window."""
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2
+"""Side of the window, pixels."""
+_C1, _C2 = 0.01**2, 0.03**2
 _BORDER = {"zero": 0, "valid": WINDOW // 2}
 
 
@@ -49,7 +48,7 @@ def ssim(
         padding: "zero" or "valid".
 
     Raises:
-        InputError: shapes, types or devices that do not fit; a mask without weight; "valid" on images under 11 pixels.
+        InputError: different shapes, types or devices; a mask without weight; "valid" on images under 11 pixels.
     """
     if not _native(x):
         return ssim_reference(x, y, mask=mask, padding=padding)
@@ -60,7 +59,7 @@ def ssim(
 def ssim_map(
     x: Float[Tensor, "*B H W C"], y: Float[Tensor, "*B H W C"], *, padding: str = "zero"
 ) -> Float[Tensor, "*B h w C"]:
-    """Return the similarity at every pixel and channel; for "valid" the map is 10 pixels less each way.
+    """Return the similarity at every pixel and channel; with "valid" the map is 10 pixels smaller along each axis.
 
     Arguments and errors are those of `ssim`.
     """
@@ -79,21 +78,22 @@ def ssim_reference(
     mask: Shaped[Tensor, "*B H W"] | Shaped[Tensor, "H W"] | None = None,
     padding: str = "zero",
 ) -> Float[Tensor, ""]:
-    """Do as `ssim` in plain torch, in the images' own precision and on their device."""
+    """Return `ssim` in plain torch, in the images' own precision and on their device."""
     value = ssim_map_reference(x, y, padding=padding)
-    check_images(x, y, mask)
-    return mean(value, None if mask is None else _inner(mask, _BORDER[padding]))
+    _check_images(x, y, mask)
+    return _masked_mean(value, None if mask is None else _inner(mask, _BORDER[padding]))
 
 
 def ssim_map_reference(
     x: Float[Tensor, "*B H W C"], y: Float[Tensor, "*B H W C"], *, padding: str = "zero"
 ) -> Float[Tensor, "*B h w C"]:
-    """Do as `ssim_map` in plain torch, by its definition, in the images' own precision and on their device."""
+    """Return `ssim_map` in plain torch by its definition, in the images' own precision and on their device."""
     batched = x.dim() == 4
     x, y, _ = _checked(x, y, None, padding)
     C = x.shape[-1]
+    # Separable Gaussian window, then local means, variances and covariance.
     k = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    g = torch.exp(-(k**2) / (2 * SIGMA**2))
+    g = torch.exp(-(k**2) / (2 * 1.5**2))
     g = (g / g.sum()).to(x)
     kernel = torch.outer(g, g).expand(C, 1, WINDOW, WINDOW)
 
@@ -103,13 +103,21 @@ def ssim_map_reference(
     x, y = x.permute(0, 3, 1, 2), y.permute(0, 3, 1, 2)
     mu_x, mu_y = blur(x), blur(y)
     var_x, var_y, cov = blur(x * x) - mu_x**2, blur(y * y) - mu_y**2, blur(x * y) - mu_x * mu_y
-    value = (2 * mu_x * mu_y + C1) * (2 * cov + C2) / ((mu_x**2 + mu_y**2 + C1) * (var_x + var_y + C2))
+    value = (2 * mu_x * mu_y + _C1) * (2 * cov + _C2) / ((mu_x**2 + mu_y**2 + _C1) * (var_x + var_y + _C2))
     value = value.permute(0, 2, 3, 1)
     return value if batched else value[0]
 
 
+def psnr_from_mse(mean_square: float) -> float:
+    """Return `-10 log10(mean square error)` of images in [0, 1], in dB.
+
+    Errors below 1e-12 count as 1e-12, so that equal images have 120 dB and means over images stay finite.
+    """
+    return -10.0 * math.log10(max(mean_square, 1e-12))
+
+
 class _SsimMean(torch.autograd.Function):
-    """The kernel gives value and gradient in one sweep, so the backward pass only scales."""
+    """Mean SSIM; the kernel returns value and gradient in one sweep, so the backward pass only scales."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, y: Tensor, mask: Tensor | None, border: int, differentiate: bool) -> Tensor:
@@ -118,7 +126,7 @@ class _SsimMean(torch.autograd.Function):
         if mask is None:
             weight = B * (H - 2 * border) * (W - 2 * border)
         else:
-            weight = total_weight(_inner(mask, border), x.shape).item()
+            weight = _total_weight(_inner(mask, border), x.shape).item()
         want_x, want_y = (differentiate and wanted for wanted in ctx.needs_input_grad[:2])
         value, _, grad_x, grad_y = _call(x, y, mask, border, scale=1.0 / (weight * C), grad_x=want_x, grad_y=want_y)
         ctx.save_for_backward(grad_x, grad_y)
@@ -132,7 +140,7 @@ class _SsimMean(torch.autograd.Function):
 
 
 class _SsimMap(torch.autograd.Function):
-    """The gradient of a map needs the gradient by it: the kernel runs again with that as its weights."""
+    """SSIM map; its backward pass runs the kernel again, weighted by the incoming gradient."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, y: Tensor, border: int) -> Tensor:
@@ -168,6 +176,7 @@ def _call(
 
     `weight` is (H, W), (B, H, W) or (B, H, W, C).
     """
+    # The kernel gives the gradient of its first image; SSIM is symmetric, so swap them if only the second needs one.
     if grad_y and not grad_x:
         swapped, values, by_y, _ = _call(y, x, weight, border, scale=scale, map_=map_, grad_x=True)
         return swapped, values, None, by_y
@@ -201,7 +210,7 @@ def _native(x: Tensor) -> bool:
 
 
 def _inner(value: Tensor, border: int) -> Tensor:
-    """Cut the border of the image axes off: those before the channels of a map (B, H, W, C), the last two of a mask."""
+    """Crop a border off the image axes: those before the channels of a map (B, H, W, C), or the last two of a mask."""
     if not border:
         return value
     inside = slice(border, -border)
@@ -212,8 +221,61 @@ def _checked(x: Tensor, y: Tensor, mask: Tensor | None, padding: str) -> tuple[T
     """Return contiguous images with a batch axis, and the mask in their type."""
     if padding not in _BORDER:
         raise InputError("padding of SSIM", expected="'zero' or 'valid'", received=repr(padding))
-    check_images(x, y, mask, least=1 if padding == "zero" else WINDOW)
+    _check_images(x, y, mask, least=1 if padding == "zero" else WINDOW)
     if mask is not None:
         mask = mask.detach().to(x.dtype).contiguous()
     x, y = (v.contiguous() if v.dim() == 4 else v.contiguous()[None] for v in (x, y))
     return x, y, mask
+
+
+def _check_images(x: Tensor, y: Tensor, mask: Tensor | None = None, *, least: int = 1) -> None:
+    """Check the inputs of an image loss: two float images (H, W, C) or (B, H, W, C) of one shape and type, and a mask.
+
+    Raises:
+        InputError: anything else; images under `least` pixels a side; a mask that is neither (H, W) nor one an image.
+    """
+    # Shape of the first image, agreement of the second, then device and shape of the mask.
+    if x.dim() not in (3, 4) or 0 in x.shape or min(x.shape[-3:-1]) < least:
+        raise InputError(
+            "image",
+            expected=f"(H, W, C) or (B, H, W, C) of at least {least} x {least} pixels and one channel",
+            received=f"shape {tuple(x.shape)}",
+        )
+    if y.shape != x.shape or y.dtype != x.dtype or not x.is_floating_point():
+        raise InputError(
+            "images to compare",
+            expected="two floating-point images of one shape and type",
+            received=f"{tuple(x.shape)} {x.dtype} and {tuple(y.shape)} {y.dtype}",
+            remedy="divide 8-bit images by 255",
+        )
+    for name, other in (("second image", y), ("mask", mask)):
+        if other is not None and other.device != x.device:
+            raise InputError(name, expected=f"device {x.device}, as the image", received=str(other.device))
+    if mask is not None and mask.shape not in (x.shape[-3:-1], x.shape[:-1]):
+        raise InputError(
+            "mask of an image loss",
+            expected=f"shape {tuple(x.shape[-3:-1])}" + (f" or {tuple(x.shape[:-1])}" if x.dim() == 4 else ""),
+            received=str(tuple(mask.shape)),
+        )
+
+
+def _total_weight(mask: Shaped[Tensor, "... H W"], shape: tuple[int, ...]) -> Shaped[Tensor, ""]:
+    """Return the sum of a mask's weights over images (..., H, W, C) of `shape`, without the channels.
+
+    Raises:
+        InputError: the sum is not positive.
+    """
+    total = mask.sum() * (shape[0] if len(shape) > mask.dim() + 1 else 1)
+    if not total > 0:
+        raise InputError("mask of an image loss", expected="some weight above 0", received=f"a sum of {float(total)}")
+    return total
+
+
+def _masked_mean(
+    value: Float[Tensor, "*B H W C"], mask: Shaped[Tensor, "*B H W"] | Shaped[Tensor, "H W"] | None = None
+) -> Float[Tensor, ""]:
+    """Return the mean, or `sum(mask value) / (C sum(mask))` with a mask, one for each image or for all."""
+    if mask is None:
+        return value.mean()
+    weight = mask.to(value.dtype)
+    return (weight[..., None] * value).sum() / (_total_weight(weight, value.shape) * value.shape[-1])
