@@ -312,7 +312,7 @@ def test_files_are_opened_by_their_doors():
 READS: dict[str, set[str]] = {
     "read_bytes": {"smplxpp/core/files/paths.py", "pipelines/stages/build_config.py"},
     "read_text": {  # the system's, and our own sources
-        *("smplxpp/native/__init__.py", "avatar/rendering/list_limit.py"),
+        *("smplxpp/native/__init__.py", "avatar/rendering/memory.py"),
         *("pipelines/report/builder.py", "pipelines/runs/code.py"),
     },
     "open": {

@@ -91,7 +91,7 @@ def read_splat_ply(path: str | Path) -> Splats:
 
     def columns(wanted: tuple[str, ...]) -> np.ndarray:
         out = np.empty((len(table), len(wanted)), np.float32)
-        with np.errstate(over="ignore"):  # values beyond float32 become infinite and are refused below
+        with np.errstate(over="ignore"):  # values outside of float32 become infinite and are refused below
             for k, name in enumerate(wanted):
                 out[:, k] = table[name]
         return out

@@ -97,7 +97,7 @@ class BoundGaussians:
 
     @property
     def opacities(self) -> Float[Tensor, " N"]:
-        """The opacities, in (0, 1)."""
+        """The opacities of the Gaussians, in (0, 1)."""
         return torch.sigmoid(self.opacity_logits)
 
     @property

@@ -36,7 +36,7 @@ class TensorFile:
     about: Mapping[str, Any]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Read all tensors by name.
+        """Read all tensors of the file by name.
 
         They take at most the file's size, because the library checks their shapes against it.
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
 from avatar.gaussians.frames import triangle_frames
-from avatar.rendering.map_frame import MapFrame
-from avatar.rendering.mesh_maps import front_back_maps
+from avatar.rendering.mesh_maps import MapFrame, front_back_maps
 from avatar.rig.rig import Rig
 
 TAU = 8.0 * math.pi

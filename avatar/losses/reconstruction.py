@@ -45,7 +45,7 @@ class ReconstructionWeights:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The target of a rendering.
+    """The target that a rendering is compared with.
 
     Attributes:
         image: sRGB on the background.

@@ -1,4 +1,4 @@
-"""One differentiable rasteriser for the trainer: checked arguments, the backend chosen by device, depth on request."""
+"""Rasterise Gaussians with gradients: check arguments, choose the backend by device, add depth on request."""
 
 from __future__ import annotations
 
@@ -58,22 +58,24 @@ def rasterize(
         features: D channels, given a camera where they differ from camera to camera (colours that depend on the view).
         viewmats: world to camera: x right, y down, z forward.
         Ks: intrinsics in pixels, without skew; pixel centres at +0.5.
-        width, height: size of every image in pixels.
+        width: of every image, pixels.
+        height: of every image, pixels.
         background: one for all cameras or one for each; None is 0.
-        near, far: metres along z; a Gaussian whose centre is outside is dropped.
+        near: metres along z; a Gaussian with a nearer centre is dropped.
+        far: metres along z; a Gaussian with a farther centre is dropped.
         eps2d: pixels squared added to the diagonal of the projected covariance.
         depth: also blend z in metres, as `meta.depth`: "accumulated" is `sum alpha_i T_i z_i`, "expected" that over
             alpha, and 0 where alpha is 0. It has gradients to means (and viewmats).
         camera_gradients: gradients to `viewmats`, which are constants otherwise.
         backend: None takes "gsplat" for CUDA tensors and "cpu" for float32 tensors on the CPU. "reference" is the slow
             oracle, in any dtype and on any device.
-        check: look for NaN and unusable values. Without it they give undefined images.
+        check: whether to refuse NaN and invalid values. Without the check they give undefined images.
 
     Returns:
         Images, their alpha before the background, and the `RasterMeta`.
 
     Raises:
-        InputError: an argument cannot be used; it says which, what was expected and what came.
+        InputError: an invalid argument.
         MissingExtraError: CUDA tensors, and gsplat is not installed.
 
     Example:
@@ -88,6 +90,7 @@ def rasterize(
             strict=True,
         )
     )
+    # Layout first, then values, because the checks of values assume right shapes.
     check_layout(tensors, background)
     draw = _choose_backend(backend, means, Ks)
     if depth is not None and depth not in DEPTHS:
@@ -101,6 +104,7 @@ def rasterize(
         background = background.expand(len(viewmats), -1)
     if depth is not None:
         tensors["features"], background = _with_depth_channel(tensors, background)
+    # The kernels need at least one Gaussian and one camera.
     if len(means) == 0 or len(viewmats) == 0:
         image, alpha, meta = _draw_nothing(tensors, background, settings)
     else:
@@ -158,7 +162,7 @@ def _with_depth_channel(tensors: dict[str, Tensor], background: Tensor | None) -
 def _draw_nothing(
     tensors: dict[str, Tensor], background: Tensor | None, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, RasterMeta]:
-    """Return the background alone, for no Gaussians or no cameras; still a result that gradients can be asked of."""
+    """Return the background alone, for no Gaussians or no cameras; a result with (zero) gradients."""
     cameras, count, features = len(tensors["viewmats"]), len(tensors["means"]), tensors["features"]
     nothing = torch.stack([tensor.sum() for tensor in tensors.values()]).sum() * 0
     image = nothing.expand(cameras, settings.height, settings.width, features.shape[-1])

@@ -1,4 +1,4 @@
-"""A posed avatar drawn as one camera of a capture sees it."""
+"""Render a posed avatar from one camera of a capture, with gradients."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What one camera sees.
+    """The image of one camera, and its further channels.
 
     Attributes:
-        image: sRGB on the background, not clamped. alpha: its opacity.
-        normals: blended world normals, 0 where nothing is; None if not asked for.
-        extra: blended values of the Gaussians; None if there were none.
+        image: sRGB on the background, not clamped.
+        alpha: opacity of the image.
+        normals: blended world normals, 0 on the background; None if not requested.
+        extra: blended further values of the Gaussians; None without them.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -47,11 +48,15 @@ def render_view(
     """Rasterise camera `index` of the posed avatar's C, through the pixels of `view`, with gradients.
 
     Args:
+        posed: the avatar, with the colours of C cameras.
+        index: of the camera among them.
         view: a photograph's camera, or a camera alone.
-        background: the colour behind the person; normals and extra values have 0 there.
+        background: colour behind the person; normals and extra values are 0 there.
         eps2d: see `rasterize`.
-        normals: draw the Gaussians' normals too. extra: D more values a Gaussian.
+        normals: also draw the Gaussians' normals.
+        extra: D further values a Gaussian to draw.
     """
+    # Colours, normals and extra values are channels of one rasterisation.
     world = posed.gaussians
     camera, viewmat, intrinsics = _camera_of(view, world.means)
     features = [posed.colors[index]]

@@ -1,4 +1,4 @@
-"""The rasteriser on CPUs: autograd around the native kernels, one camera after another."""
+"""Rasterise on CPUs: autograd around the native kernels, one camera after another."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avatar.rendering.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError
 
 MAX_COUNT = 2**31 - 1
-"""Gaussians that a scene may have: lists hold 32-bit numbers."""
+"""Largest number of Gaussians, because lists hold 32-bit indices."""
 
 
 def rasterize_cpu(
@@ -46,7 +46,7 @@ def rasterize_cpu(
         settings: image size and constants; without `camera_gradients` the poses get none.
 
     Returns:
-        Images, their alpha, and what was found on the way.
+        Images, their alpha, and the `RasterMeta`.
 
     Raises:
         InputError: not float32.
@@ -113,6 +113,7 @@ class _Rasterize(torch.autograd.Function):
         grads = [torch.empty_like(tensor) for tensor in (*gaussians, features)]
         poses = viewmats.new_zeros(len(viewmats), 3, 4, dtype=torch.float64) if ctx.needs_input_grad[5] else None
         grad_background = torch.empty_like(background) if ctx.needs_input_grad[7] else None
+        # Cameras after the first add to the gradients that the first one wrote.
         own_features = features.ndim == 3
         for camera, (view, workspace) in enumerate(
             zip(_views(tuple(inputs), ctx.settings), ctx.workspaces, strict=True)
@@ -136,7 +137,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _views(inputs: _Inputs, settings: RasterSettings) -> list[CameraCall]:
-    """Return what the library needs to know of each camera."""
+    """Return the arguments of the library for each camera."""
     means, quats, scales, opacities, features, viewmats, Ks, background = inputs
     return [
         CameraCall(

@@ -1,7 +1,6 @@
-"""The CUDA backend: gsplat's kernels behind the signature that all backends share.
+"""Rasterise on CUDA by gsplat's kernels, with the signature of all backends.
 
-gsplat compiles its kernels when it is imported, and fails to where there is no GPU: nothing here touches it before a
-CUDA tensor asks for it.
+gsplat compiles its kernels at import, and fails without a GPU, so it is imported only for CUDA tensors.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from avatar.rendering.settings import RasterMeta, RasterSettings
 from smplxpp.core.errors import InputError, MissingExtraError
 
 SUPPORTED = "1.5."
-"""gsplat's releases with these semantics: from 1.6 on alpha is clamped to 0.99 rather than 0.999."""
+"""Releases of gsplat with these semantics; from 1.6 on alpha is clamped to 0.99 rather than 0.999."""
 
 
 def rasterize_gsplat(
@@ -31,7 +30,7 @@ def rasterize_gsplat(
     background: Float[Tensor, "C D"] | None,
     settings: RasterSettings,
 ) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], RasterMeta]:
-    """Do as `rasterize_reference` on a GPU in float32; arguments and results as there, but no gradient to `Ks`.
+    """Return the result of `rasterize_reference` on a GPU in float32, without a gradient to `Ks`.
 
     Its gradients are summed by atomic additions: two runs differ in the last digits.
 
@@ -62,13 +61,14 @@ def rasterize_gsplat(
         camera_model="pinhole",
     )
     radii = found["radii"].to(means.dtype)
-    # gsplat leaves what it culls uninitialised.
+    # gsplat leaves culled Gaussians uninitialised.
     means2d = torch.where((radii > 0).all(-1, keepdim=True), found["means2d"].detach(), 0.0)
     depths = camera_depths(means.detach(), viewmats.detach())
     return image, alpha, RasterMeta(means2d=means2d, radii=radii, depths=depths)
 
 
 def _load_gsplat() -> ModuleType:
+    # Device, package, version and compiled kernels are checked in this order, each with its own remedy.
     if not torch.cuda.is_available():
         raise InputError(
             "backend gsplat",

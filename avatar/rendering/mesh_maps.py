@@ -1,4 +1,4 @@
-"""Maps of a mesh with gradients: what a z-buffer sees, as tensors.
+"""Rasterise maps of a mesh with gradients by a z-buffer, and define the frame of front and back maps.
 
 Gradients reach vertex values, and vertices through the barycentrics and the depth at fixed pixels, as in nvdiffrast's
 rasterise and interpolate. Which face a pixel shows is a constant: there is no gradient of silhouettes.
@@ -12,35 +12,76 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
 from avatar.gaussians.native_kernels import is_native
 from avatar.gaussians.tensor_operations import gather_rows
-from avatar.rendering.barycentrics import barycentrics_reference, interpolate_reference
-from avatar.rendering.native_maps import BarycentricFunction, InterpolateFunction
+from avatar.rendering.barycentrics import (
+    BarycentricFunction,
+    InterpolateFunction,
+    barycentrics_reference,
+    interpolate_reference,
+)
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 from smplxpp.native import thread_count
 from smplxpp.raster import MeshMaps, rasterize_triangles
 
-if TYPE_CHECKING:
-    from avatar.rendering.map_frame import MapFrame
+
+@dataclass(frozen=True)
+class MapFrame:
+    """The square that front and back maps cover: `center` +- `half_extent` along x and y of the canonical pose.
+
+    Row 0 is at the top (+y) and column 0 at the left (-x) of *both* maps: the back map is mirrored, so that one pixel
+    shows the front and the back of the same place.
+
+    Attributes:
+        center: metres, the middle of the canonical box.
+        half_extent: metres from the middle of a map to its border.
+    """
+
+    center: tuple[float, float, float]
+    half_extent: float = 1.0
+
+    @staticmethod
+    def of(vertices: Float[np.ndarray, "V 3"], *, half_extent: float = 1.0) -> MapFrame:
+        """Make the frame about the middle of the box of canonical vertices, metres."""
+        x, y, z = 0.5 * (np.min(vertices, axis=0) + np.max(vertices, axis=0))
+        return MapFrame((float(x), float(y), float(z)), half_extent)
+
+    def cameras(self, size: int) -> tuple[Camera, Camera]:
+        """Make the orthographic cameras of the front and the mirrored back map, `size` pixels a side."""
+        front, back = (
+            Camera.orthographic_view(
+                center=np.array(self.center), direction=np.array([0.0, 0.0, z]), half_extent=self.half_extent, size=size
+            )
+            for z in (1.0, -1.0)
+        )
+        # The back view's x axis is -x of the world: a negative focal length turns its columns round.
+        mirrored = back.K * np.array([[-1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+        return replace(front, name="front"), replace(back, K=mirrored, name="back")
+
+    def pixels_from_canonical(self, points: Float[Tensor, "*P 3"], size: int) -> Float[Tensor, "*P 2"]:
+        """Return column and row in pixels, pixel centres at +0.5, of canonical points in metres."""
+        x, y = points[..., 0] - self.center[0], points[..., 1] - self.center[1]
+        return torch.stack([x, -y], dim=-1) * (0.5 * size / self.half_extent) + 0.5 * size
 
 
 @dataclass(frozen=True)
 class MeshMapsTensor:
-    """What one camera, or B cameras of one size, see of a mesh. The leading axis is there for a sequence of cameras.
+    """Maps of a mesh from one camera, or from B cameras of one size with a leading axis.
 
     Attributes:
-        faces: of the mesh. vertex_count: V of the mesh.
-        face_id: -1 on the background.
+        faces: of the mesh.
+        vertex_count: number of vertices of the mesh, V.
+        face_id: visible face, -1 on the background.
         barycentric: weights of the face's corners, perspective-correct; 0 on the background.
         depth: metres along the camera's z axis; inf on the background, so mask it before arithmetic.
-        attributes: interpolated vertex values, where they were asked for; 0 on the background.
+        attributes: interpolated vertex values if requested; 0 on the background.
     """
 
     faces: Int64[Tensor, "F 3"]
@@ -84,13 +125,14 @@ def mesh_maps(
     *,
     near: float = 1e-3,
 ) -> MeshMapsTensor:
-    """Rasterise a mesh; both sides of every face are drawn.
+    """Rasterise a mesh to maps, with both sides of every face drawn.
 
     float32 on the CPU runs in the native library; other tensors get faces from the same z-buffer on the CPU and the
-    rest in torch on their device. The same input gives the same bits at one number of threads.
+    rest in torch on their device. The same input gives the same bits at a fixed number of threads.
 
     Args:
         vertices: world coordinates, metres.
+        faces: indices of their corners.
         camera: perspective or orthographic, one or several of one image size.
         attributes: values to interpolate, as `MeshMapsTensor.interpolate`.
         near: metres; a face with a corner nearer than this to a perspective camera is skipped whole.

@@ -9,17 +9,17 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from avatar.rendering.list_limit import list_bytes, too_many_entries
+from avatar.rendering.memory import list_bytes, too_many_entries
 from avatar.rendering.settings import RasterSettings
 from smplxpp.native import OverLimitError, address, native_library, thread_count
 
 STAGES = ("project", "sort", "bin", "blend", "unblend", "chain")
 """Stages of a forward (the first four) and a backward pass, as they are timed."""
 IDLE_BYTES = 2 << 30
-"""Workspaces beyond this much memory are freed rather than kept for the next call."""
+"""Total memory of idle workspaces, bytes; more is freed."""
 
 BYTES_OF_ENTRY = 24
-"""What an entry of the tile lists takes while they are made: a note of 12, twice while its list grows."""
+"""Bytes of an entry of the tile lists while they are built: 12, twice while a list grows."""
 
 _POINTER = ctypes.c_void_p
 
@@ -43,7 +43,7 @@ class _Gradients(ctypes.Structure):
 
 
 class CameraCall:
-    """One camera's call: the tensors (float32, contiguous) as the library wants them. It keeps them alive."""
+    """One camera's call: the tensors (float32, contiguous) in the layout of the library. It keeps them alive."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class CameraCall:
         self.camera = _Camera(
             settings.width,
             settings.height,
-            # Limits of float32, which the library takes: beyond them there is nothing to drop.
+            # The library takes float32; outside of its range there is nothing to drop.
             *(max(-3e38, min(3e38, value)) for value in (settings.near, settings.far, settings.eps2d)),
             0,
             *map(address, camera),
@@ -65,7 +65,7 @@ class CameraCall:
 
 
 class Workspace:
-    """Memory of the library for one camera, from a forward pass to its backward pass; goes back to the pool by itself.
+    """Memory of the library for one camera, from a forward pass to its backward pass; it returns to the pool by itself.
 
     `seconds`, if given, are added to by stage, in the order of `STAGES`.
     """
@@ -83,8 +83,8 @@ class Workspace:
         """Write image (H, W, D), alpha (H, W), means2d (N, 2), radii (N, 2) and depths (N).
 
         Raises:
-            InputError: the lists of Gaussians by tile would need more memory than they may have.
-            MemoryError: there is none.
+            InputError: the lists of Gaussians by tile would exceed their memory limit.
+            MemoryError: no memory is left.
         """
         with self._lock:
             most = list_bytes()

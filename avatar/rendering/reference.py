@@ -1,7 +1,7 @@
-"""The rasteriser in plain torch, for any dtype and device: the truth that the fast backends are tested against.
+"""Rasterise in plain torch, for any dtype and device: the oracle of the fast backends.
 
-Read it as the definition. It is exact about every rule (what is skipped, where blending stops) and makes no attempt at
-speed beyond working on blocks of pixels, so that memory stays bounded and autograd can give all gradients.
+It defines every rule exactly (what is skipped, where blending stops). It works on blocks of pixels, so that memory
+stays bounded and autograd can give all gradients, and is not optimised otherwise.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from avatar.rendering.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, R
 BLOCK = 16
 """Side in pixels of the square blocks that are blended at once."""
 FRUSTUM_MARGIN = 0.3
-"""The Jacobian of the projection is taken no farther outside the image than this share of half its width and height."""
+"""Clamp of the point at which the projection is linearised: this share of half the image outside of its border."""
 
 
 def rasterize_reference(
@@ -49,7 +49,7 @@ def rasterize_reference(
         settings: image size and constants.
 
     Returns:
-        Images, their alpha, and what was found on the way.
+        Images, their alpha, and the `RasterMeta`.
     """
     views = [
         _render_view(
@@ -71,7 +71,7 @@ def rasterize_reference(
 class _Splats:
     """The M of the N Gaussians that a camera can see, nearest first."""
 
-    index: Tensor  # (M,) which of the N
+    index: Tensor  # (M,) indices among the N
     means2d: Tensor  # (M, 2) pixels
     conics: Tensor  # (M, 3) inverse covariance in the image: xx, xy, yy
     radii: Tensor  # (M, 2) half width and height in pixels of the box outside of which alpha < ALPHA_MIN

@@ -1,4 +1,4 @@
-"""What every rasteriser backend is asked for, and what it answers besides the image."""
+"""Define the settings of every rasteriser backend, and its results besides the image."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+# Rules of 3D Gaussian Splatting, the same in all backends and kernels.
 ALPHA_MAX = 0.999
 """Opacity of one Gaussian at a pixel is clamped to this."""
 ALPHA_MIN = 1.0 / 255.0
@@ -20,10 +21,12 @@ class RasterSettings:
     """Image size and constants of a rasterisation, the same for every camera of the batch.
 
     Attributes:
-        width, height: pixels.
-        near, far: metres along the camera's z; Gaussians whose centre is outside are dropped.
+        width: pixels.
+        height: pixels.
+        near: metres along the camera's z; Gaussians with a nearer centre are dropped.
+        far: metres along the camera's z; Gaussians with a farther centre are dropped.
         eps2d: pixels squared, added to the diagonal of the projected covariance (the low-pass filter of 3DGS).
-        camera_gradients: also give gradients to `viewmats`.
+        camera_gradients: whether `viewmats` get gradients.
     """
 
     width: int
@@ -36,14 +39,14 @@ class RasterSettings:
 
 @dataclass(frozen=True)
 class RasterMeta:
-    """What a backend found on the way; none of it carries gradients, but `depth`.
+    """Intermediate results of a backend, without gradients except for `depth`.
 
     Attributes:
         means2d: projected centres in pixels; 0 where culled.
         radii: half width and height in pixels of the box that can reach `ALPHA_MIN` (gsplat rounds them up);
             0 where culled.
         depths: metres along the camera's z, of culled Gaussians too.
-        depth: accumulated or expected depth in metres, where it was asked for.
+        depth: accumulated or expected depth in metres, if requested.
     """
 
     means2d: Float[Tensor, "C N 2"]
@@ -53,5 +56,5 @@ class RasterMeta:
 
     @property
     def visible(self) -> Bool[Tensor, "C N"]:
-        """The Gaussians that can reach some pixel of the image."""
+        """Mask of the Gaussians that can reach a pixel of the image."""
         return (self.radii > 0).all(-1)

@@ -1,6 +1,6 @@
-"""What a rasterisation accepts, checked before any kernel sees it.
+"""Check the arguments of a rasterisation before any kernel reads them.
 
-Every message names the argument, what was expected and what came. The checks of values read each tensor once, which
+Every error names the argument, the expected and the received value. The checks of values read each tensor once, which
 takes about 1 % of the rasterisation of a large scene. On a GPU they wait for it.
 """
 
@@ -19,9 +19,9 @@ from smplxpp.core.errors import InputError
 from smplxpp.native import MOST_SIDE
 
 FEATURE_MAX = 1e20
-"""Largest feature in single precision: gradients are sums over pixels of its products, and would overflow beyond."""
+"""Largest feature in single precision: gradients are sums over pixels of its products, and would overflow above it."""
 QUAT_NORM_MIN = 1e-12
-"""A shorter quaternion has no direction that could be trusted."""
+"""Shortest quaternion; the direction of a shorter one is lost in rounding."""
 ROTATION_TOLERANCE = 1e-3
 """Largest accepted entry of R R^T - I: float32 matrices multiplied along a chain pass, a scale or a shear does not."""
 SKEW_TOLERANCE = 1e-6
@@ -33,11 +33,11 @@ _RANGES = {
     "features": (-FEATURE_MAX, FEATURE_MAX),
     "background": (-FEATURE_MAX, FEATURE_MAX),
 }
-"""What a quick look clears: least and greatest value, both included."""
+"""Accepted ranges of values, both ends included."""
 
 
 def checked_settings(settings: RasterSettings) -> RasterSettings:
-    """Return image size, clipping planes and blur as Python's own numbers (numpy's are welcome).
+    """Return image size, clipping planes and blur as Python's own numbers (numpy's are converted).
 
     Raises:
         InputError: one of them cannot be used.

@@ -1,4 +1,4 @@
-"""An avatar for players: its tensors by piece, what they are of, and its file `NAME.avatar`; torch is not needed."""
+"""Read and write avatars for players: tensors by piece, their description, and the file `NAME.avatar`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.runtime.layout import MOST_GAUSSIANS, NEEDED, PIECES, REMEDY, check_shapes, decoded
+from avatar.runtime.layout import MAX_GAUSSIANS, NEEDED, PIECES, REMEDY, check_shapes, decode
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, parse_json
@@ -20,7 +20,7 @@ from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
 from smplxpp.core.params import BodyParams
 
 FORMAT, VERSION = "smplxpp-avatar", 2
-"""2: there may be a regression for poses without a code."""
+"""Version 2 added a regression for poses without a code."""
 SUFFIX = ".avatar"
 GARMENTS, MOTION = "garments", "motion"
 _MANIFEST = "manifest.json"
@@ -29,16 +29,20 @@ _EXPECTED = "an avatar that `smplxpp export` wrote"
 
 @dataclass(frozen=True, kw_only=True)
 class AboutAvatar:
-    """What a bundle says of its avatar.
+    """The description of an avatar in its bundle.
 
     Attributes:
-        name: of the person or the run. licence: of the avatar. provenance: short texts: what it was made from, and how.
-        joint_names, expression_names, part_names: of the skeleton, its expressions, the parts of the surface.
-        frames: those that have a code, in the order of the codes. null_code_shown: new poses take the zero code, else
-            the first frame's.
-        jaw: the jaw's rotation drives the head's blend shapes too.
-        eps2d: pixels squared by which splats were blurred in training.
-        reductions: what was done to the numbers, by piece.
+        name: of the person or the run.
+        licence: of the avatar.
+        provenance: short texts on its sources and training.
+        joint_names: of the skeleton.
+        expression_names: of the expressions.
+        part_names: of the parts of the surface.
+        frames: frames with a code, in the order of the codes.
+        null_code_shown: whether new poses use the zero code; else that of the first frame.
+        jaw: whether the jaw's rotation also drives the head's blend shapes.
+        eps2d: blur of the splats in training, pixels squared.
+        reductions: quantisation of the tensors, by piece.
     """
 
     name: str
@@ -56,14 +60,15 @@ class AboutAvatar:
 
 @dataclass(frozen=True, eq=False)
 class AvatarBundle:
-    """An avatar as a file holds it, decoded.
+    """The decoded content of an avatar's file.
 
     Attributes:
-        about: what it is.
+        about: description.
         tensors: by "piece.name" (`avatar.runtime.layout.PIECES`), float32 and int32; blend shapes may stay int8.
-        sizes: numbers of joints J, vertices V, faces F, Gaussians N, expressions E and of what the table names.
-        garments, motion: arrays of the loose clothes and of a motion, as their own readers take them; empty: none.
-        garments_about: what the garments' file says of them.
+        sizes: numbers of joints J, vertices V, faces F, Gaussians N, expressions E and the other letters of `PIECES`.
+        garments: arrays of the loose clothes for their own reader; empty: none.
+        garments_about: metadata of the garments' file.
+        motion: arrays of a motion for their own reader; empty: none.
     """
 
     about: AboutAvatar
@@ -80,24 +85,26 @@ class AvatarBundle:
 def save_bundle(
     path: str | Path, about: AboutAvatar, pieces: Mapping[str, tuple[Mapping[str, np.ndarray], Mapping[str, Any]]]
 ) -> dict[str, int]:
-    """Write a bundle, whole or not at all; the same content gives the same bytes.
+    """Write a bundle; the same content gives the same bytes, and a failed write leaves no file.
 
     Args:
-        pieces: tensors as they are to be stored and what else a piece says, by the piece's name.
+        path: the file.
+        about: description of the avatar.
+        pieces: tensors as they are stored, and metadata, by the name of the piece.
 
     Returns:
-        Bytes of each piece in the file, and of all of it as "total".
+        Bytes of each piece in the file, and of the whole file as "total".
     """
-    data = {f"{name}.safetensors": pack_tensors(tensors, said) for name, (tensors, said) in pieces.items()}
+    data = {f"{name}.safetensors": pack_tensors(tensors, metadata) for name, (tensors, metadata) in pieces.items()}
     packed = write_package(path, {_MANIFEST: _manifest(asdict(about), data), **data})
     return {**{file.split(".")[0]: size for file, size in packed.items()}, "total": Path(path).stat().st_size}
 
 
 def save_with_motion(path: str | Path, bundle: str | Path, motion: BodyParams) -> None:
-    """Write a bundle's file anew with another motion to play, whole or not at all; all other pieces keep their bytes.
+    """Write a copy of a bundle with another motion; all other pieces keep their bytes.
 
     Raises:
-        InputError: what `load_bundle` refuses.
+        InputError: as `load_bundle`.
     """
     load_bundle(bundle)
     data = read_package(bundle, subject="avatar", expected=_EXPECTED, remedy=REMEDY)
@@ -108,7 +115,7 @@ def save_with_motion(path: str | Path, bundle: str | Path, motion: BodyParams) -
 
 
 def motion_tensors(motion: BodyParams) -> dict[str, np.ndarray]:
-    """The piece `motion` of a bundle: body parameters without the shape, which the bundle has."""
+    """Return the piece `motion` of a bundle: body parameters without the shape, which the bundle has."""
     return {name: np.asarray(value, np.float32) for name, value in motion.without_shape().as_dict().items()}
 
 
@@ -122,13 +129,13 @@ def _manifest(model: Mapping[str, Any], data: Mapping[str, bytes]) -> bytes:
 
 
 def load_bundle(path: str | Path) -> AvatarBundle:
-    """Read what `save_bundle` wrote, every piece held against its digest and every tensor against the table.
+    """Read a bundle, and check every piece against its digest and every tensor against `PIECES`.
 
-    The digests tell damage; who changes a piece and the manifest alike is not found out.
+    Digests reveal damage, but no change of both a piece and the manifest.
 
     Raises:
-        InputError: a missing, damaged, changed or foreign file, one of a newer version, one that would unpack to more
-            than half a GiB, numbers that are not finite or do not fit each other.
+        InputError: a missing, damaged, changed or foreign file, a newer version, more than half a GiB
+            unpacked, numbers that are not finite or inconsistent.
     """
     subject = f"avatar {path}"
     data = read_package(path, subject="avatar", expected=_EXPECTED, remedy=REMEDY)
@@ -143,10 +150,10 @@ def load_bundle(path: str | Path) -> AvatarBundle:
     tensors: dict[str, np.ndarray] = {}
     there = tuple(piece for piece in PIECES if piece in raw or piece in NEEDED)
     for piece in there:
-        own = decoded(raw.get(piece, ({}, {}))[0], piece, f"{subject}: {piece}")
+        own = decode(raw.get(piece, ({}, {}))[0], piece, f"{subject}: {piece}")
         tensors |= {f"{piece}.{name}": value for name, value in own.items()}
     sizes = check_shapes(tensors, there, subject)
-    _check_sense(about, tensors, sizes, subject)
+    _check_consistency(about, tensors, sizes, subject)
     garments, garments_about = raw.get(GARMENTS, ({}, {}))
     return AvatarBundle(about, tensors, sizes, garments, garments_about, raw.get(MOTION, ({}, {}))[0])
 
@@ -167,6 +174,7 @@ def _check_version(manifest: Mapping[str, Any], subject: str) -> None:
 def _checked_pieces(
     manifest: Mapping[str, Any], data: Mapping[str, bytes], subject: str
 ) -> dict[str, tuple[dict[str, np.ndarray], dict[str, Any]]]:
+    # Every piece of the manifest has to be a known one, with the digest of its bytes.
     entries = as_object(manifest.get("pieces"), subject=f"{subject}: pieces")
     out, files = {}, set()
     for name, value in entries.items():
@@ -187,7 +195,7 @@ def _checked_pieces(
                 f"{subject}: piece {name}",
                 expected=f"the {entry.get('bytes')!r} bytes that the manifest's digest is of",
                 received=f"{len(content)} bytes with SHA-256 {digest[:16]}...",
-                remedy="it was changed or damaged since: take the file as it was written",
+                remedy="the file was changed or damaged: use the original",
             )
         out[name] = unpack_tensors(content, subject=f"{subject}: {name}", remedy=REMEDY)
     if set(data) - files:
@@ -230,13 +238,16 @@ def _about(stored: Mapping[str, Any], subject: str) -> AboutAvatar:
     )
 
 
-def _check_sense(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], subject: str) -> None:
-    """What shapes alone do not say."""
+def _check_consistency(
+    about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], subject: str
+) -> None:
+    """Check the values of tensors, and their agreement with the description, where shapes do not suffice."""
 
     def require(condition: bool, what: str, expected: str, received: object) -> None:
         if not condition:
             raise InputError(f"{subject}: {what}", expected=expected, received=str(received)[:200], remedy=REMEDY)
 
+    # Skeleton, then Gaussians, surface, field, regression and blend shapes.
     parents, faces, count = tensors["skeleton.parents"], tensors["gaussians.per_face"], sizes["N"]
     require(sizes["J"] in JOINT_NAMES, "joints", f"{' or '.join(map(str, JOINT_NAMES))} of them", sizes["J"])
     ordered = parents[0] == -1 and bool((parents[1:] >= 0).all() and (parents[1:] < np.arange(1, sizes["J"])).all())
@@ -246,7 +257,7 @@ def _check_sense(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: M
         ("expression_names", about.expression_names, "E"),
     ):
         require(len(names) == sizes[letter], what, f"{sizes[letter]} names", len(names))
-    require(0 < count <= MOST_GAUSSIANS, "gaussians", f"1 to {MOST_GAUSSIANS}", count)
+    require(0 < count <= MAX_GAUSSIANS, "gaussians", f"1 to {MAX_GAUSSIANS}", count)
     require(
         bool((faces >= 0).all()) and int(faces.sum()) == count, "gaussians.per_face", f"counts of {count}", "others"
     )

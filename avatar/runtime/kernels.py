@@ -1,4 +1,4 @@
-"""Kernels of `smplxpp/native/runtime` over numpy arrays: what is prepared once, and a call a frame."""
+"""Call the kernels of `smplxpp/native/runtime` on numpy arrays: arguments prepared once, and a call a frame."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from jaxtyping import Float32, Float64, Int32
 from smplxpp.native import address, native_library
 
 LANES = 16
-"""Rows that kernels take at a time: prepared arrays are padded to it."""
-NUMBERS = 6
-"""What a blend shape moves of a Gaussian: position and colour."""
+"""Rows that a kernel processes at a time; prepared arrays are padded to a multiple."""
+CHANNELS = 6
+"""Values of a Gaussian that a blend shape changes: position and colour."""
 
 
 class _Struct(ctypes.Structure):
-    """A structure of the kernels that keeps alive what it points at."""
+    """A structure of the kernels that keeps the arrays alive that it points to."""
 
     def point(self, **arrays: tuple[np.ndarray | None, str]) -> None:
         self.kept = {
@@ -59,11 +59,14 @@ def joint_transforms(
     *,
     features: bool = False,
 ) -> tuple[Float32[np.ndarray, "J 3 4"], Float32[np.ndarray, " P"] | None]:
-    """Return the transforms of a skeleton from the T-pose, and what drives pose correctives where it is asked for.
+    """Return the transforms of a skeleton from the T-pose, and the features of pose correctives if requested.
 
     Args:
-        parents: -1 first, each before its children. turns: axis-angle relative to the parent, radians.
-        rest: joints in the T-pose, metres. transl: metres.
+        parents: -1 first, each before its children.
+        turns: axis-angle vectors relative to the parent, radians.
+        rest: joints in the T-pose, metres.
+        transl: metres.
+        features: whether to return the features of pose correctives.
     """
     count = len(parents)
     out = np.empty((count, 3, 4), np.float32)
@@ -93,11 +96,13 @@ def add_basis(
 
 
 class FieldKernel:
-    """One network of the field at its points.
+    """One network of the displacement field, evaluated at its control points.
 
     Args:
-        tensors: the network's, as the bundle names them. encodings: of its points.
-        member: the set of joints that each point sees. at: rows that are added to; None: the points' own, written.
+        tensors: of the network, as the bundle names them.
+        encodings: of its points.
+        member: index of the set of joints that each point depends on.
+        at: rows of the output to add to; None: the output is overwritten, row by row.
     """
 
     def __init__(
@@ -120,7 +125,7 @@ class FieldKernel:
         )
 
     def __call__(self, frames: Float32[np.ndarray, "S Y"], out: Float32[np.ndarray, "C 3"], threads: int) -> None:
-        """Write, or add, the displacements of the points; `frames` is what each set sees of pose and code."""
+        """Write, or add, the displacements of the points; `frames` is pose and code of each set of joints."""
         if self._native.points:
             native_library().smplxpp_runtime_field(
                 ctypes.byref(self._native),
@@ -135,7 +140,7 @@ class FieldKernel:
 
 
 class SurfaceKernel:
-    """Vertices from the T-pose to the pose."""
+    """Skinning of the surface, with displacements of field and cloth."""
 
     def __init__(
         self,
@@ -164,7 +169,7 @@ class SurfaceKernel:
         posed: Float32[np.ndarray, "V 3"],
         threads: int,
     ) -> None:
-        """Write the posed vertices, metres; `cloth` is displacements and how much of each they are."""
+        """Write the posed vertices, metres; `cloth` is displacements and their weights."""
         native_library().smplxpp_runtime_surface(
             ctypes.byref(self._native),
             *(address(array) for array in (rest, moved, *(cloth or (None, None)), transforms, posed)),
@@ -173,11 +178,15 @@ class SurfaceKernel:
 
 
 class BlendKernel:
-    """Blend shapes of one side.
+    """The blend shapes of head or body.
 
     Args:
-        values: steps in int8, or numbers. steps: their size; None for numbers. exponent: of a row's steps; None: none.
-        rows: the Gaussians; None: all. part: of each of them; None: there is one. count: of all Gaussians.
+        values: int8 multiples of `steps`, or floats.
+        steps: quantisation steps; None for floats.
+        exponent: powers of 2 that scale each row; None: 0.
+        rows: indices of the Gaussians; None: all.
+        part: part of each of them; None: a single part.
+        count: number of all Gaussians.
     """
 
     def __init__(
@@ -190,11 +199,12 @@ class BlendKernel:
         *,
         count: int,
     ) -> None:
+        # The layout of the kernel: blocks of 16 rows, shapes and channels inside.
         shapes, _, held = values.shape
-        self._steps = np.ones((shapes, NUMBERS), np.float32) if steps is None else steps
-        padded = np.zeros((-(-held // LANES) * LANES, shapes, NUMBERS), values.dtype)
+        self._steps = np.ones((shapes, CHANNELS), np.float32) if steps is None else steps
+        padded = np.zeros((-(-held // LANES) * LANES, shapes, CHANNELS), values.dtype)
         padded[:held] = values.transpose(2, 0, 1)
-        blocks = padded.reshape(-1, LANES, shapes, NUMBERS).transpose(0, 2, 3, 1)
+        blocks = padded.reshape(-1, LANES, shapes, CHANNELS).transpose(0, 2, 3, 1)
         scale = np.ones(len(padded), np.float32)
         if exponent is not None:
             scale[:held] = np.exp2(exponent)
@@ -216,7 +226,7 @@ class BlendKernel:
         added: Float32[np.ndarray, "N 6"],
         threads: int,
     ) -> None:
-        """Add what coefficients move; `keep` is what part of it each Gaussian takes, None: all of it."""
+        """Add the shapes times their coefficients; `keep` is a factor of each Gaussian, None: 1."""
         if self._native.rows:
             scaled = np.ascontiguousarray(coefficients[:, :, None] * self._steps, dtype=np.float32)
             native_library().smplxpp_runtime_blend(
@@ -227,7 +237,7 @@ class BlendKernel:
 
 
 class WorldKernel:
-    """Gaussians from their triangles to the world."""
+    """The transform of Gaussians from their triangles to the world."""
 
     def __init__(
         self,
@@ -260,7 +270,7 @@ class WorldKernel:
 
 
 def in_lanes(rows: Float32[np.ndarray, "C W"]) -> Float32[np.ndarray, "b W 16"]:
-    """Return rows side by side, sixteen a block, the last block filled up with zeros."""
+    """Return rows in blocks of sixteen side by side, the last block padded with zeros."""
     blocks = -(-len(rows) // LANES)
     padded = np.zeros((blocks * LANES, rows.shape[1]), np.float32)
     padded[: len(rows)] = rows

@@ -1,4 +1,4 @@
-"""What a bundle holds: every tensor by piece and name, its kind and its shape; docs/runtime.md says it in words."""
+"""Define and check the tensors of a bundle: kind and shape by piece and name; docs/runtime.md describes them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from smplxpp.core.errors import InputError
 
-REMEDY = "export the avatar anew with `smplxpp export RUN --out NAME.avatar`"
+REMEDY = "export the avatar again with `smplxpp export RUN --out NAME.avatar`"
 
-# Piece -> tensor -> kind, shape, bound. Kinds: f floats (or integers with a step), i integers, q integers that stay so
-# with their steps, or floats. Letters are sizes, the same in all pieces; `<J`
-# bounds indices; a question mark: may be missing.
+# Piece -> tensor -> kind, shape, bound. Kinds: f floats (or integers with a step), i integers, q integers kept with
+# their steps, or floats. Letters are sizes, the same in all pieces. `<J` bounds indices. A question mark marks an
+# optional tensor.
 _NETWORK = {
     "of_point.weight": "f W X",
     "of_frame.weight": "f W Y",
@@ -95,16 +95,16 @@ PIECES: Mapping[str, Mapping[str, str]] = {
     "blend": {**_shapes("head"), **_shapes("body"), "part": "i? N"},
     "poses": {"known": "f D 63", "scale": "f"},
 }
-"""Pieces that the reader knows; `garments` and `motion` have readers of their own."""
+"""Tensors of all pieces; `garments` and `motion` have their own readers."""
 NEEDED = ("skeleton", "surface", "gaussians")
-MOST_GAUSSIANS = 1 << 22
+MAX_GAUSSIANS = 1 << 22
 
 
-def decoded(tensors: Mapping[str, np.ndarray], piece: str, subject: str) -> dict[str, np.ndarray]:
-    """Return a piece's tensors as what they stand for: floats in float32, `step q + start` of integers, int32 indices.
+def decode(tensors: Mapping[str, np.ndarray], piece: str, subject: str) -> dict[str, np.ndarray]:
+    """Decode the tensors of a piece: floats to float32, integers to `step q + start`, indices to int32.
 
     Raises:
-        InputError: a tensor of another kind, one that is not known, numbers that are not finite.
+        InputError: a tensor of another kind, an unknown tensor, numbers that are not finite.
     """
     known = PIECES[piece]
     left = dict(tensors)
@@ -113,6 +113,7 @@ def decoded(tensors: Mapping[str, np.ndarray], piece: str, subject: str) -> dict
         value = left.pop(name, None)
         if value is None:
             continue
+        # Steps and offsets of quantised floats are tensors beside them.
         kind = spec[0]
         step, start = (left.pop(f"{name}.{word}", None) for word in ("step", "start")) if kind == "f" else (None, None)
         if kind == "i":
@@ -140,17 +141,20 @@ def decoded(tensors: Mapping[str, np.ndarray], piece: str, subject: str) -> dict
 
 
 def check_shapes(tensors: Mapping[str, np.ndarray], pieces: tuple[str, ...], subject: str) -> dict[str, int]:
-    """Hold every tensor against the table.
+    """Check the shapes and indices of all tensors against `PIECES`.
 
     Args:
-        tensors: by "piece.name", decoded. pieces: that are there.
+        tensors: by "piece.name", decoded.
+        pieces: pieces of the bundle.
+        subject: name of the file in errors.
 
     Returns:
         The sizes by letter.
 
     Raises:
-        InputError: a tensor that is missing or has another shape, an index beyond what it points into.
+        InputError: a missing tensor, a wrong shape, or an index out of range.
     """
+    # The first tensor with a letter defines its size. Bounds are checked last, when all sizes are known.
     sizes: dict[str, int] = {}
     bounds: list[tuple[str, str]] = []
     for piece in pieces:

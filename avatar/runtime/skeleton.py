@@ -90,6 +90,7 @@ def _body(
     regressor: np.ndarray,
     weights: np.ndarray,
 ) -> BodyModel:
+    # Shape, faces and labels are not used by players, so they are empty.
     count = len(vertices)
 
     def of_hands(name: str) -> np.ndarray | None:

@@ -27,7 +27,7 @@ from avatar.models.networks.deformation_field import DeformationField, FieldConf
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.presets import NETWORK_PRESETS, network_preset
 from avatar.models.networks.teacher import Teacher
-from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import MapFrame
 from benchmarks.support.results import store_results
 
 VERTICES, GAUSSIANS = 22_000, {"paper": 220_000, "gpu": 220_000, "paper-small": 50_000, "cpu": 50_000, "demo": 20_000}

@@ -85,7 +85,7 @@ def test_a_status_is_an_exception():
 
 
 def test_face_ids_beyond_the_faces_are_refused():
-    from avatar.rendering.native_maps import InterpolateFunction
+    from avatar.rendering.barycentrics import InterpolateFunction
 
     values, weights, faces = torch.rand(3, 2), torch.rand(2, 2, 3), torch.tensor([[0, 1, 2]], dtype=torch.int32)
     for ids, corners in ((1, faces), (2**30, faces), (0, faces + 1)):

@@ -26,7 +26,7 @@ from avatar.gaussians.binding import world_from_frames
 from avatar.gaussians.colors import view_colors
 from avatar.gaussians.frames import triangle_frames
 from avatar.rendering.gsplat_backend import SUPPORTED
-from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import MapFrame
 from avatar.rendering.reference import _project, rasterize_reference
 from avatar.rendering.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from smplxpp.core.camera import Camera

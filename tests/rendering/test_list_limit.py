@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from avatar.rendering import list_limit, rasterize
+from avatar.rendering import memory, rasterize
 from smplxpp.core.errors import InputError
 
 
@@ -14,12 +14,12 @@ def limit(monkeypatch):
     """Sets the limit in GiB."""
 
     def set_limit(value: str) -> None:
-        monkeypatch.setenv(list_limit.VARIABLE, value)
-        list_limit.list_bytes.cache_clear()
+        monkeypatch.setenv(memory.VARIABLE, value)
+        memory.list_bytes.cache_clear()
 
     yield set_limit
     monkeypatch.undo()
-    list_limit.list_bytes.cache_clear()
+    memory.list_bytes.cache_clear()
 
 
 def walls(count: int, size: int = 640) -> tuple[torch.Tensor, ...]:
@@ -45,7 +45,7 @@ def test_too_many_large_gaussians_are_refused_with_their_number(limit):
         rasterize(*walls(700), 640, 640)
     message = str(caught.value)
     assert "1,120,000 entries (0.025 GiB): 700 visible Gaussians that cover 1,600 tiles each of 640 x 640" in message
-    assert "within 0.005 GiB" in message and f"{list_limit.VARIABLE}=GIB raises the limit" in message
+    assert "within 0.005 GiB" in message and f"{memory.VARIABLE}=GIB raises the limit" in message
 
 
 def test_they_are_drawn_where_the_limit_allows(limit):
@@ -64,16 +64,16 @@ def test_the_rasteriser_draws_on_after_a_refusal(limit):
 @pytest.mark.parametrize("value", ["", "much", "-1", "0", "nan", "inf"])
 def test_a_limit_that_is_no_number_is_refused(limit, value):
     limit(value)
-    with pytest.raises(InputError, match=list_limit.VARIABLE):
+    with pytest.raises(InputError, match=memory.VARIABLE):
         rasterize(*walls(1), 16, 16)
 
 
 def test_without_a_word_of_the_environment_it_is_half_a_gibibyte_or_more(limit, monkeypatch):
-    monkeypatch.delenv(list_limit.VARIABLE, raising=False)
+    monkeypatch.delenv(memory.VARIABLE, raising=False)
     for free, expected in ((0, 1 / 2), (8 << 30, 2), (1 << 40, 4)):
-        list_limit.list_bytes.cache_clear()
-        monkeypatch.setattr(list_limit, "_free_bytes", lambda free=free: free)
-        assert list_limit.list_bytes() == expected * 2**30
+        memory.list_bytes.cache_clear()
+        monkeypatch.setattr(memory, "_free_bytes", lambda free=free: free)
+        assert memory.list_bytes() == expected * 2**30
 
 
 def test_features_that_would_overflow_the_gradients_are_refused():

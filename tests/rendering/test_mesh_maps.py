@@ -6,8 +6,7 @@ import torch
 import trimesh
 
 from avatar.rendering.barycentrics import barycentrics_reference
-from avatar.rendering.map_frame import MapFrame
-from avatar.rendering.mesh_maps import front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
+from avatar.rendering.mesh_maps import MapFrame, front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
 from smplxpp.core.camera import Camera
 from smplxpp.core.errors import InputError
 

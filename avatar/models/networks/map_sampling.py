@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from avatar.models.networks.sparse_rows import SparseRows
-from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import MapFrame
 from smplxpp.core.errors import InputError
 
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 import trimesh
 
 from avatar.models.networks.map_sampling import MapSampler
-from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import MapFrame
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh

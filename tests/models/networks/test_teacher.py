@@ -11,7 +11,7 @@ import torch
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.presets import NETWORK_PRESETS, network_preset
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
-from avatar.rendering.map_frame import MapFrame
+from avatar.rendering.mesh_maps import MapFrame
 from smplxpp.core.errors import InputError
 
 TINY = TeacherConfig(
