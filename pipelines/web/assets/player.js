@@ -1,4 +1,4 @@
-/* smplxpp player, Apache-2.0; web/ of the project has its sources 86082d49aa771b8d7ded17942db797f63313edfe4ce8d525cd08c59f18b4265e */
+/* smplxpp player, Apache-2.0; web/ of the project has its sources a4d451bca706a5785ecd1081bb5b8872959aae5b91b72040824226f1858a80cd */
 "use strict";(()=>{var Ce=`:root {
   --ground: #121418;
   --raised: rgba(28, 31, 37, 0.86);
