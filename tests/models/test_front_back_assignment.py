@@ -11,8 +11,7 @@ import torch
 import trimesh
 
 from avatar.models.teacher_avatar import FrontBackAssignment, assign_front_back, map_frame
-from avatar.rendering.map_frame import MapFrame
-from avatar.rendering.mesh_maps import vertex_normals
+from avatar.rendering.mesh_maps import MapFrame, vertex_normals
 from avatar.rig.rig import Rig
 from tests.dolls.dancing import template
 
