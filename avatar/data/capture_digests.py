@@ -1,4 +1,4 @@
-"""What a training reads of a capture, as digests."""
+"""Digests of the parts of a capture that a training reads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from smplxpp.core.params import ARRAY_NAMES, BodyParams
 def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, str]:
     """Return the SHA-256 of cameras, parameters, splits, and of names and sizes of all files that training may read.
 
-    The content of the files is left out: a sequence has hundreds of gigabytes of them.
+    The content of the files is left out, because a sequence has hundreds of gigabytes of them.
     """
     cameras, numbers, files = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
     for name, camera in capture.cameras.items():

@@ -1,4 +1,4 @@
-"""One frame of a capture as views to train on: composited colour, opacity, and the camera of the part that matters."""
+"""Training views of a capture: composited colour, opacity, normals, and the camera of the cropped part."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ class View:
 
     @property
     def name(self) -> str:
-        """Name of the camera."""
+        """Name of the view's camera."""
         return self.camera.name
 
     @cached_property
     def viewmat(self) -> Float32[Tensor, "4 4"]:
-        """Camera from world."""
+        """Transform from the world to the camera."""
         return torch.tensor(self.camera.cam_from_world, dtype=torch.float32, device=self.alpha.device)
 
     @cached_property
     def K(self) -> Float32[Tensor, "3 3"]:
-        """Intrinsics in pixels."""
+        """Intrinsics of the camera, pixels."""
         return torch.tensor(self.camera.K, dtype=torch.float32, device=self.alpha.device)
 
     @cached_property
@@ -62,13 +62,13 @@ class View:
         return self.foreground / 255.0 + (1.0 - self.opacity())[..., None] * background
 
     def photograph(self, background: Sequence[float]) -> UInt8[np.ndarray, "H W 3"]:
-        """Return the composited image, to look at."""
+        """Return the image composited on a background, in 8 bits."""
         return (self.composited(torch.tensor(background, dtype=torch.float32)) * 255.0).round().to(torch.uint8).numpy()
 
     def cropped(self, margin: int) -> View:
-        """Only the silhouette's bounding box and `margin` pixels around it; the principal point moves with it.
+        """Crop to the silhouette's bounding box and `margin` pixels around it; the principal point moves with it.
 
-        Rasterising and comparing nothing but the person is what makes a step cheap.
+        Steps are cheap because only the person is rasterised and compared.
         """
         rows, columns = (torch.nonzero(self.alpha.any(dim)).flatten() for dim in (1, 0))
         if not len(rows):
@@ -81,7 +81,7 @@ class View:
         return View(camera, self.foreground[part].contiguous(), self.alpha[part].contiguous(), normals)
 
     def halved(self) -> View:
-        """Every 2 x 2 pixels averaged to one; a last odd row or column is left out. Normals are sampled."""
+        """Average every 2 x 2 pixels; a last odd row or column is left out, and normals are sampled."""
         height, width = self.camera.height // 2, self.camera.width // 2
         camera = self.camera.cropped((0, 0, 2 * width, 2 * height), size=(width, height))
         stacked = torch.cat([self.foreground, self.alpha[..., None]], dim=-1)[: 2 * height, : 2 * width]
@@ -96,7 +96,7 @@ class View:
 
 
 def read_view(capture: Capture, camera: str, frame: int, *, normals: bool = False) -> View:
-    """Read the whole image of a camera, composited as the capture says, with its normal map if asked for and there.
+    """Read the whole image of a camera, composited as the capture says, with its normal map if requested and present.
 
     Raises:
         InputError: an unknown camera, a damaged image or one of another size than its camera's, or no mask.
@@ -129,7 +129,7 @@ def read_views(capture: Capture, frame: int, cameras: Iterable[str]) -> list[Vie
         view = read_view(capture, name, frame)
         if not view.alpha.any():
             warnings.warn(
-                f"camera {name}: nobody in the mask of frame {frame}; it is left out", GeometryWarning, stacklevel=2
+                f"camera {name}: no person in the mask of frame {frame}; it is left out", GeometryWarning, stacklevel=2
             )
             continue
         views.append(view)

@@ -39,7 +39,7 @@ _REMEDY = "take the file as `smplxpp train` wrote it, or train again"
 
 
 def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bool = False) -> int:
-    """Write a trained avatar atomically.
+    """Write a trained avatar to a file, atomically.
 
     Args:
         path: of the file.

@@ -44,7 +44,7 @@ RUN_FILES = StudentFiles(
 
 
 def load(path: str | Path, *, template: Template | None = None, device: str = "cpu") -> Student | AvatarPlayer:
-    """Open a trained avatar.
+    """Open a trained avatar from a bundle, a file or a folder.
 
     Args:
         path: a bundle `NAME.avatar`; a student's file `NAME.safetensors`; or a folder that `avatar.train` or

@@ -98,6 +98,7 @@ class Student(nn.Module):
     ) -> None:
         super().__init__()
         gaussians.check_topology(rig.faces, "template of the student")
+        # Field and codes move the mesh; Gaussians and blend shapes hang on it.
         self.config, self.rig, self.origin = config, rig, StudentOrigin()
         self.gaussians = LearnedGaussians(gaussians)
         self.field = None if config.field is None else _make_field(config.field, config, rig)

@@ -194,7 +194,7 @@ def map_frame(rig: Rig) -> MapFrame:
 
 @dataclass(frozen=True, eq=False)
 class FrontBackAssignment:
-    """Sides of P points.
+    """Sides of P points on the canonical maps.
 
     Attributes:
         front: whether the front map's surface is the nearer one along z.

@@ -65,7 +65,7 @@ class ControlCage(nn.Module):
     def motion_off_clothes(self, controls: Float[Tensor, "K 3"], *, reach: float = 0.0) -> Float[Tensor, ""]:
         """Return the mean displacement from skinning of control points off the clothes, metres; 0 without any.
 
-        Body, hair and shoes have the pseudo-Huber penalty `m = sqrt(|d|^2 + e^2) - e`, linear beyond e = 1 mm. Clothes
+        Body, hair and shoes have the pseudo-Huber penalty `m = sqrt(|d|^2 + e^2) - e`, linear above e = 1 mm. Clothes
         within `reach` of the skin add the saturating penalty `S m / (S + m)`, S = 5 mm, weighted by `1 - distance /
         reach`. It holds a shirt on the skin, and costs a skirt that lies on the thighs in the T-pose little more than
         S when it swings.

@@ -1,4 +1,4 @@
-"""The neural surface fitted to photographs: colour, mask and eikonal terms over rays that enter the hull."""
+"""Fit of the neural surface to photographs: colour, mask and eikonal terms over rays that enter the hull."""
 
 from __future__ import annotations
 
@@ -21,25 +21,29 @@ from smplxpp.reconstruct import PhotoView
 from smplxpp.reconstruct.hull import main_body, zero_surface
 from smplxpp.reconstruct.views import Box
 
-_CHUNK = 1 << 17
-_FAR = 0.05
+_CHUNK = 1 << 17  # points evaluated at once, which bounds the memory
 
 
 @dataclass(frozen=True)
 class SurfaceConfig:
-    """How a neural surface is fitted; lengths in metres.
+    """Choices of the fit of a neural surface; lengths in metres.
 
     Attributes:
-        iterations: steps.
-        rays, samples: of a step, and of a ray.
-        before, behind: of the hull's surface, between which a ray is sampled.
-        levels, finest, log2_entries: of the hash grid.
-        rate: of Adam.
-        eikonal, mask, residual: weights beside the colours': of a gradient of length 1, of the ray's opacity, of
-            staying at the hull.
-        hull_cell: of the grid that holds the hull's distance.
-        cell: of the grid that the surface is taken from.
-        seed: of what is drawn.
+        iterations: number of steps.
+        rays: of a step.
+        samples: of a ray.
+        before: distance in front of the hull's surface from which a ray is sampled.
+        behind: distance behind the hull's surface to which a ray is sampled.
+        levels: of the hash grid.
+        finest: cells along a side of its finest level.
+        log2_entries: of its tables.
+        rate: learning rate of Adam at the start.
+        eikonal: weight of `(|grad f| - 1)^2`, relative to the colours.
+        mask: weight of the cross-entropy of a ray's opacity and its mask.
+        residual: weight of the mean distance from the hull.
+        hull_cell: of the grid with the hull's distance.
+        cell: of the grid from which the surface is extracted.
+        seed: of the sampled rays.
     """
 
     iterations: int = 15_000
@@ -67,7 +71,7 @@ class SurfaceConfig:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """A fitted surface.
+    """A fitted surface with its network and losses.
 
     Attributes:
         mesh: closed.
@@ -98,6 +102,7 @@ def fit_surface(
     Raises:
         InputError: the hull is in no photograph, or the fit lost its surface.
     """
+    # Grid of the hull's distance, network, rays and optimiser.
     config = config or SurfaceConfig()
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
@@ -119,7 +124,7 @@ def fit_surface(
         if k % 50 == 0:
             progress("surface", k / config.iterations)
         rows = torch.randint(len(rays), (config.rays,), generator=generator).to(device)
-        # Gradients are taken over cells that become smaller: coarse form first.
+        # Gradients are differences over cells that shrink from 2 cm to twice the final cell: coarse shape first.
         share = k / max(config.iterations - 1, 1)
         step = float(np.exp((1 - share) * np.log(0.02) + share * np.log(2 * config.cell)))
         loss = surface_loss(model, rays.select(rows), config, generator, step=step)
@@ -137,7 +142,8 @@ def fit_surface(
 def surface_loss(
     model: NeuralSurface, rays: Rays, config: SurfaceConfig, generator: torch.Generator, *, step: float
 ) -> Float[Tensor, ""]:
-    """Colours of rays where they are the person's, their opacity against the mask, eikonal and residual terms."""
+    """Return the loss of rays: L1 of colours inside the mask, cross-entropy of opacity, eikonal and residual terms."""
+    # Stratified samples around the hull's surface, and the weights of the intervals between them.
     count, samples = len(rays), config.samples
     jitter = torch.rand((count, samples + 1), generator=generator).to(rays.enter.device)
     along = (torch.arange(samples + 1, device=jitter.device) + jitter) / (samples + 1)
@@ -145,11 +151,13 @@ def surface_loss(
     points = rays.origin[:, None] + depth[..., None] * rays.direction[:, None]
     distance = model.distance(points.reshape(-1, 3)).reshape(count, samples + 1)
     weights = weights_of(opacities(distance, model.sharpness))
+    # Gradients and colours in the middle of the intervals.
     middle = 0.5 * (points[:, :-1] + points[:, 1:]).reshape(-1, 3)
     gradient = model.gradient(middle, step=step)
     normals = torch.nn.functional.normalize(gradient, dim=1)
     directions = rays.direction[:, None].expand(-1, samples, -1).reshape(-1, 3)
     colors = model.look(middle, normals, directions).reshape(count, samples, 3)
+    # Volume rendering, then the four terms.
     opacity = weights.sum(dim=1)
     seen = (weights[..., None] * colors).sum(dim=1)
     person = (rays.opacity > 0.99).float()
@@ -161,7 +169,7 @@ def surface_loss(
 
 
 def hull_grid(hull: TriangleMesh, box: Box, cell: float) -> Float[Tensor, "X Y Z"]:
-    """The hull's signed distance on a grid over the box, negative inside."""
+    """Return the hull's signed distance on a grid over the box, negative inside."""
     counts = np.maximum(np.ceil((box.high - box.low) / cell).astype(int) + 1, 2)
     axes = [np.linspace(low, high, count) for low, high, count in zip(box.low, box.high, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -173,18 +181,19 @@ def hull_grid(hull: TriangleMesh, box: Box, cell: float) -> Float[Tensor, "X Y Z
 
 @torch.no_grad()
 def extract(model: NeuralSurface, box: Box, cell: float) -> TriangleMesh:
-    """The closed surface on which the distance is zero.
+    """Extract the closed surface on which the distance is zero.
 
     Raises:
         InputError: there is none.
     """
     device = model.low.device
+    far = 0.05  # metres, to which distances are clamped
 
     def inside(points: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
         found = np.empty(len(points), np.float32)
         for first in range(0, len(points), _CHUNK):
             part = torch.from_numpy(points[first : first + _CHUNK]).to(device)
             found[first : first + _CHUNK] = -model.distance(part).float().cpu().numpy()
-        return np.clip(found, -_FAR, _FAR)
+        return np.clip(found, -far, far)
 
     return zero_surface(inside, box, cell=cell)

@@ -12,9 +12,9 @@ _PRIMES = (1, 2_654_435_761, 805_459_861)
 
 
 class HashGrid(nn.Module):
-    """Trilinear features of the corners of the cell that holds a point, level by level.
+    """Trilinear interpolation of learned features at the corners of a point's cell, level by level.
 
-    A level whose corners fit its table has one entry a corner; others share entries by a hash.
+    A level with fewer corners than table entries has one entry for each; other levels share entries by a hash.
 
     Args:
         levels: how many.
@@ -50,11 +50,11 @@ class HashGrid(nn.Module):
 
     @property
     def width(self) -> int:
-        """Numbers a point."""
+        """Length of a point's features."""
         return len(self.sizes) * int(self.tables[0].shape[1])
 
     def forward(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N width"]:
-        """Features of points in the unit cube; those outside have the ones of its nearest side."""
+        """Return the features of points in the unit cube; points outside are clamped to its nearest side."""
         found = []
         for size, table in zip(self.sizes, self.tables, strict=True):
             place = points.clamp(0, 1) * size

@@ -1,4 +1,4 @@
-"""A signed distance that starts as the visual hull's and learns what is left of it, and the colour of its points."""
+"""Neural surface: a signed distance, the visual hull's plus a learned residual, and the colour of its points."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ from torch import Tensor, nn
 
 from avatar.reconstruct.hash_grid import HashGrid
 
-_HIDDEN = 64
-_SHARED = 15
-"""Numbers that the distance's network hands to the colours'."""
-_SHARPNESS = 200.0
-"""1/metre, before training: the surface is a few centimetres thick."""
+# Sizes of the networks: width of hidden layers, and features that the distance's network passes to the colour's.
+_HIDDEN, _SHARED = 64, 15
 
 
 class NeuralSurface(nn.Module):
-    """f(x) = hull(x) + residual(x) in metres, negative inside; colours by place, normal and direction of view.
+    """f(x) = hull(x) + residual(x) in metres, negative inside; colours depend on place, normal and viewing direction.
 
-    The residual starts at zero: before it learns, the surface is the hull.
+    The residual starts at zero, so that the initial surface is the hull.
 
     Args:
         hull: (X, Y, Z) signed distance on a grid, negative inside.
@@ -52,15 +49,16 @@ class NeuralSurface(nn.Module):
             nn.ReLU(),
             nn.Linear(_HIDDEN, 3),
         )
-        self.log_sharpness = nn.Parameter(torch.tensor(math.log(_SHARPNESS)))
+        initial_sharpness = 200.0  # 1/metre: the density is a few centimetres thick at first
+        self.log_sharpness = nn.Parameter(torch.tensor(math.log(initial_sharpness)))
 
     @property
     def sharpness(self) -> Float[Tensor, ""]:
-        """How steep the density is at the surface, 1/metre."""
+        """Slope of the density at the surface, 1/metre."""
         return torch.exp(self.log_sharpness)
 
     def hull_distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """The hull's signed distance, metres; beyond the grid that of its nearest side."""
+        """Return the hull's signed distance, metres; outside the grid that of its nearest side."""
         place = 2 * (points - self.low) / (self.high - self.low) - 1
         sampled = nn.functional.grid_sample(
             self.hull[None, None],
@@ -71,24 +69,24 @@ class NeuralSurface(nn.Module):
         return sampled.reshape(-1)
 
     def distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """Signed distance of points in the world, metres."""
+        """Return the signed distance of points in the world, metres."""
         return self.hull_distance(points) + self._learned(points)[0][:, 0]
 
     def _learned(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 16"], Float[Tensor, "N W"]]:
-        """The residual and its features, and the grid's."""
+        """Return the residual with its features, and the features of the grid."""
         unit = (points - self.low) / (self.high - self.low).max()
         features = self.grid(unit)
         return self.residual(torch.cat([features, 2 * unit - 1], dim=1)), features
 
     def gradient(self, points: Float[Tensor, "N 3"], *, step: float) -> Float[Tensor, "N 3"]:
-        """The distance's gradient by central differences, which spread over neighbouring cells (Li et al. 2023)."""
-        ways = step * torch.eye(3, dtype=points.dtype, device=points.device)
-        ends = [self.distance(points + way) - self.distance(points - way) for way in ways]
+        """Return the gradient of the distance by central differences over neighbouring cells (Li et al. 2023)."""
+        offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
+        ends = [self.distance(points + offset) - self.distance(points - offset) for offset in offsets]
         return torch.stack(ends, dim=1) / (2 * step)
 
     def look(
         self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Colours of points, sRGB in [0, 1]."""
+        """Return the colours of points in viewing directions, sRGB in [0, 1]."""
         learned, features = self._learned(points)
         return torch.sigmoid(self.color(torch.cat([features, learned[:, 1:], normals, directions], dim=1)))

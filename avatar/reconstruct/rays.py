@@ -18,7 +18,7 @@ from smplxpp.reconstruct import PhotoView
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """N rays.
+    """N rays with the colour and opacity of their pixels.
 
     Attributes:
         origin, direction: in the world, directions of unit length.
@@ -37,18 +37,19 @@ class Rays:
         return len(self.origin)
 
     def select(self, rows: Tensor) -> Rays:
-        """Some of the rays."""
+        """Return the rays of chosen rows."""
         return Rays(self.origin[rows], self.direction[rows], self.enter[rows], self.color[rows], self.opacity[rows])
 
 
 def rays_of(views: Sequence[PhotoView], hull: TriangleMesh, device: torch.device | str) -> Rays:
-    """The rays of all pixels that the hull covers; others say what the masks have said already.
+    """Return the rays of all pixels that the hull covers; the masks exclude all others.
 
     Raises:
         InputError: the hull is in no photograph.
     """
     parts: dict[str, list[np.ndarray]] = {name: [] for name in ("origin", "direction", "enter", "color", "opacity")}
     for view in views:
+        # Pixels of the hull, their directions in the world, and the distance along the ray to the hull.
         depth = rasterize_mesh(hull, view.camera).depth
         row, column = np.nonzero(np.isfinite(depth))
         pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
@@ -68,13 +69,16 @@ def rays_of(views: Sequence[PhotoView], hull: TriangleMesh, device: torch.device
 
 
 def opacities(distance: Float[Tensor, "R S"], sharpness: Float[Tensor, ""]) -> Float[Tensor, "R T"]:
-    """Opacity of each interval between samples: how much of the logistic of the distance falls across it."""
+    """Return the opacity of each interval between samples, `max((s_i - s_{i+1}) / s_i, 0)`, s the logistic of f.
+
+    Wang et al. (2021), "NeuS": unbiased at the zero of the distance f.
+    """
     at = torch.sigmoid(distance * sharpness)
     return ((at[:, :-1] - at[:, 1:]) / at[:, :-1].clamp(min=1e-6)).clamp(0, 1)
 
 
 def weights_of(opacity: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
-    """How much each interval adds to the pixel: its opacity times what those before it let through."""
+    """Return the weight of each interval in the pixel: its opacity times the transmittance before it."""
     through = torch.cumprod(1 - opacity + 1e-7, dim=1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], dim=1)
     return opacity * before

@@ -1,4 +1,4 @@
-"""A template that torch can pose, and what a posed avatar is."""
+"""The rig: a template that torch poses and skins, and the posed avatar."""
 
 from smplxpp.core.lazy import lazy_exports
 

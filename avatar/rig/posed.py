@@ -1,4 +1,4 @@
-"""What every avatar gives for one pose, whatever network is behind it."""
+"""The posed avatar, and the protocol of every model that can be posed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PosedAvatar:
         gaussians: N of them in the world.
         colors: sRGB, towards each camera.
         bound: the same Gaussians in their triangles' frames, with this pose's residuals.
-        displacements: metres by which the mesh left the T-pose before skinning; None: skinning alone.
+        displacements: of the mesh in the T-pose before skinning, metres; None: skinning alone.
     """
 
     vertices: Float[Tensor, "V 3"]
@@ -48,18 +48,18 @@ class AvatarModel(Protocol):
         """
 
     def train(self, mode: bool = True) -> Any:
-        """Go into the training mode or out of it, as modules do."""
+        """Set the training mode, as modules do."""
 
     def eval(self) -> Any:
-        """Go into the evaluation mode, as modules do."""
+        """Set the evaluation mode, as modules do."""
 
     def named_parameters(self) -> Iterable[tuple[str, Tensor]]:
-        """Return what is learned, by name, as modules do."""
+        """Return the learned parameters by name, as modules do."""
 
 
 @contextmanager
 def at_rest(model: AvatarModel | nn.Module) -> Iterator[None]:
-    """Run the block without gradients and with the module in its evaluation mode; afterwards it trains as before."""
+    """Run the block without gradients and with the module in its evaluation mode, and restore its mode."""
     was_training = model.training
     model.eval()
     try:

@@ -23,7 +23,7 @@ LOCAL_PARTS = 256
 
 
 def with_local_shapes(shapes: BlendShapeConfig) -> BlendShapeConfig:
-    """Return local blend shapes in the place of the paper's: parts of the Gaussians have coefficients of their own."""
+    """Return local blend shapes in the place of the paper's: each part of the Gaussians has its own coefficients."""
     return replace(shapes, parts=LOCAL_PARTS, head_shapes=5, body_shapes=11)
 
 
@@ -34,9 +34,12 @@ class TrainingPreset:
     Attributes:
         networks: sizes of the teacher and the field.
         fit: the fit, which makes the Gaussians.
-        teacher, bake, compensate: the three trainings.
+        teacher: training of the teacher.
+        bake: training of the student's field.
+        compensate: training of the student's blend shapes.
         blend_shapes: of the student.
-        control_points, still_body: see `StudentConfig`.
+        control_points: number of vertices on which the field is evaluated, see `StudentConfig`.
+        still_body: the body's own surface follows its joints alone, see `StudentConfig`.
     """
 
     networks: NetworkPreset
@@ -53,7 +56,7 @@ class TrainingPreset:
         return StudentConfig(self.networks.field, None, self.control_points, self.still_body)
 
     def with_seed(self, seed: int) -> TrainingPreset:
-        """Return the same with another seed everywhere."""
+        """Return the preset with another seed in all trainings."""
         track = self.teacher.track
         return replace(
             self,
@@ -64,7 +67,7 @@ class TrainingPreset:
         )
 
     def shortened(self, share: float) -> TrainingPreset:
-        """Return the same with `share` of the iterations of every training."""
+        """Return the preset with `share` of the iterations of every training."""
 
         def fewer(iterations: int) -> int:
             return max(1, round(share * iterations))
@@ -90,9 +93,9 @@ def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
 
 
 _LEAN_WEIGHTS = ReconstructionWeights(perceptual=0.0, alpha=0.1)
-# Not before the compensation: where textures are not in place yet, the mean of what cameras show is a blur.
+# Squared differences only in the compensation: before textures are in place, their least squares solution is a blur.
 _LAST_WEIGHTS = replace(_LEAN_WEIGHTS, l2=5.0)
-# Of 0 to 10 the best on three captures: docs/training.md, "Where Gaussians lie".
+# The best of 0 to 10 on three captures (docs/training_choices.md, "denser where photographs change").
 _DETAIL = 2.0
 
 
@@ -134,10 +137,11 @@ class _Size:
 
 
 def _lean(name: str, size: _Size) -> TrainingPreset:
-    """Make a preset for two cores: the surface is followed first, networks learn it before they see photographs.
+    """Make a preset for two cores: the surface is tracked first, networks learn it before they see photographs.
 
-    A teacher of minutes draws worse than the photographs are: the bake compares with those, and takes from the teacher
-    the followed surface. Several views a step, attributes that learn in every stage, no perceptual term.
+    A teacher trained for minutes draws worse pictures than the photographs, so that the bake compares with photographs
+    and takes from the teacher the tracked surface. Several views a step, attributes that learn in every stage, no
+    perceptual term.
     """
     pretrain = PretrainConfig(
         iterations=size.pretrain, batch=8, lr=1e-2, lr_final_factor=0.02, warmup=20, betas=(0.9, 0.99)
@@ -168,7 +172,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         ),
         bake=BakeConfig(
             iterations=size.bake.iterations,
-            # Many steps of few frames: three times as many frames a step told a field less in the same time.
+            # Many steps of few frames: with three times as many frames a step the field learned less in the same time.
             pretrain=replace(pretrain, iterations=size.field.iterations, batch=4, lr=size.field.lr),
             images="photographs",
             semantic=0.0,
@@ -193,7 +197,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             attributes=size.compensate.attributes,
             scale_penalty=size.penalties * CompensateConfig.scale_penalty,
             offset_penalty=size.penalties * CompensateConfig.offset_penalty,
-            # What shines, hair above all, is not learned by then at the usual rate.
+            # At the usual rate highlights, above all of hair, are not learned in these steps.
             rates=LearningRates(sh=1e-3),
             init_from_track=True,
             coherence=200.0,
@@ -208,10 +212,10 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
 
 
 def _paper_small() -> TrainingPreset:
-    """Make the paper's recipe in the minutes of `cpu`: no surface is followed, the bake imitates the teacher.
+    """Make the paper's recipe in the minutes of `cpu`: no surface is tracked, the bake imitates the teacher.
 
-    What is compared, how often and how fast is that of `cpu` wherever the paper has no say, so that what tells the two
-    apart is the recipe.
+    Losses, views and rates are those of `cpu` wherever the paper states none, so that the two differ in the recipe
+    alone.
     """
     return TrainingPreset(
         networks=network_preset("paper-small"),
@@ -254,44 +258,44 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             control_points=2400,
             track=TrackConfig().levels,
             body_motion_weight=1.0,
-            # Plain shirts followed chance: photographs do not say where on the skin they lie.
+            # Photographs do not determine where a plain shirt lies on the skin; without this it drifts.
             tight_reach=0.04,
             pretrain=350,
             field=_Steps(3000, 3e-3),
             fit=600,
             rates=LearningRates(),
-            # At the usual rates Gaussians of hair end millimetres short of where they go, and heads a decibel.
+            # At the usual rates Gaussians of hair end millimetres short of their place, which costs heads a decibel.
             teacher=_Steps(350, 2e-3, 3.0),
             bake=_Steps(900, 1e-3, 3.0),
             compensate=_Steps(2400, 1e-3, 2.0),
-            # What leaks through from behind others moves fast Gaussians farther.
+            # Light that leaks through from hidden places moves Gaussians farther at these rates.
             penalties=5.0,
         ),
     ),
     "demo": _lean(
         "demo",
         _Size(
-            # A body of 250 pixels shows its clothes first: a head of 30 pixels has no use for a quarter of them.
+            # In pictures of 250 pixels a head has 30, too few for a quarter of the Gaussians.
             gaussians=22_000,
             head_share=0.15,
             control_points=800,
             track=(Level(1, 12, 5e-3), Level(0, 12, 2e-3)),
-            # A pixel is 6 mm of the person: photographs cannot say that cloth 1 cm off the skin slides by 2 mm.
+            # A pixel is 6 mm of the person: photographs do not show cloth 1 cm off the skin sliding by 2 mm.
             body_motion_weight=4.0,
             tight_reach=0.02,
             pretrain=100,
             field=_Steps(600, 2e-3),
             fit=150,
-            # Few steps, of one view each: colours learn fast or not at all.
+            # Few steps, of one view each: colours need a high rate.
             rates=LearningRates(dc=6e-3, offset=0.03),
             # Where poses are tracked, networks of few frames learn the poses' errors; colours, which all frames share,
             # do not. So networks learn slowly after their pretraining, and colours fast.
             teacher=_Steps(250, 3e-4, 3.5),
             bake=_Steps(250, 3e-4, 2.0),
-            # Faster networks learn more of few frames' poses than new ones bear.
+            # Faster networks overfit to the poses of few frames.
             compensate=_Steps(500, 1.5e-4, 2.0),
             averaged=0.6,
-            # Seven cameras of 250 pixels say less about folds than the surface that was followed.
+            # Seven cameras of 250 pixels show less of folds than the tracked surface.
             surface_normals=True,
         ),
     ),

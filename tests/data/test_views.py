@@ -68,7 +68,7 @@ def test_cameras_without_an_image_or_a_person_are_left_out_with_their_names(capt
     with pytest.warns(GeometryWarning) as caught:
         views = read_views(open_capture(capture_folder), 0, TRAIN)
     assert [view.name for view in views] == [name for name in TRAIN if name not in ("Ring1", "Ring2")]
-    assert "Ring1: no image" in str(caught[0].message) and "Ring2: nobody" in str(caught[1].message)
+    assert "Ring1: no image" in str(caught[0].message) and "Ring2: no person" in str(caught[1].message)
 
 
 def test_unknown_cameras_and_images_of_another_size_are_refused(capture_folder):

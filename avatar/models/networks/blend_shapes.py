@@ -1,4 +1,4 @@
-"""Blend shapes of the Gaussians: residuals of position and colour beyond the mesh's displacement."""
+"""Blend shapes of the Gaussians: residuals of position and colour that the mesh leaves over."""
 
 from __future__ import annotations
 
@@ -107,6 +107,7 @@ class BlendShapes(nn.Module):
         active: Int64[Tensor, " M"] | None = None,
     ) -> None:
         super().__init__()
+        # Check the arguments against the configuration and each other.
         if (part is not None) != (config.parts > 1):
             raise InputError(
                 "parts of the Gaussians",
@@ -132,6 +133,7 @@ class BlendShapes(nn.Module):
             raise InputError(
                 "active Gaussians", expected=f"increasing indices below {count}", received=f"{active.tolist()[:8]} ..."
             )
+        # Mapping networks, and bases that start at zero.
         self.config, self.count = config, count
         networks = mapping_networks(config)
         self.head, self.body = networks["head"], networks["body"]

@@ -14,7 +14,7 @@ from smplxpp.core.errors import InputError
 class MapSampler(nn.Module):
     """Looks N Gaussians up in front and back maps, bilinearly, each on its own side.
 
-    Values hold at pixel centres (`grid_sample`'s `align_corners=False`); beyond the outermost centres the border's
+    Values hold at pixel centres (`grid_sample`'s `align_corners=False`); outside the outermost centres the border's
     value holds. The lookup is linear in the maps and the same for every frame, so it is prepared as a sparse matrix:
     several times faster than `grid_sample` on a CPU.
 

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A training after `iteration` steps.
+    """State of a training after `iteration` steps.
 
     Attributes:
         iteration: number of finished steps.

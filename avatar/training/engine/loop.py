@@ -69,7 +69,7 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a training.
+    """Progress of a training: finished steps, time and figures.
 
     Attributes:
         iteration: number of finished steps.
@@ -91,7 +91,7 @@ class Progress:
 
     @property
     def finished(self) -> bool:
-        """Whether all steps are done."""
+        """Whether all steps of the training are done."""
         return self.iteration >= self.iterations
 
 

@@ -145,7 +145,7 @@ class PhotometricConfig:
 
     @property
     def evaluate_every(self) -> int:
-        """Number of steps between evaluations."""
+        """Number of steps between two evaluations."""
         return max(1, self.iterations // self.evaluations)
 
 

@@ -17,7 +17,7 @@ CACHE_BYTES = 1 << 30
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig:
-    """Choices of a pretraining.
+    """Choices of a pretraining: batch, steps and learning rate.
 
     Attributes:
         iterations: steps of Adam.

@@ -1,4 +1,4 @@
-"""What decides a fit, and presets that differ in time and detail."""
+"""Configuration of a fit of Gaussians to one frame, and presets that differ in time and detail."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from smplxpp.core.validation import require_between
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """Choices of a fit.
+    """Choices of a fit of Gaussians to one frame.
 
     Attributes:
-        sampling: number of Gaussians and where they start.
-        detail: how much denser they lie where the photographs
-            change quickly, see `density_of_detail`; 0, as in the paper, one density.
-        iterations: steps; each renders one view.
-        rates: learning rates.
-        dssim: share of `1 - SSIM` in the loss, the rest is L1.
-        alpha: weight of the L1 between rendered opacity and mask. Without it dark hair on a black background could be
-            holes.
-        scale_penalty, offset_penalty: weights of GaussianAvatars' penalties.
-        eps2d: pixels squared that the rasteriser blurs every Gaussian by. 1/12 is the variance of a pixel's own square;
-            viewers use 0.3, which widens silhouettes by a pixel, and the surface would have to shrink to meet them.
+        sampling: number and distribution of the Gaussians.
+        detail: additional density where the photographs change quickly, see `density_of_detail`; 0, as in the paper:
+            one density.
+        iterations: number of steps; each renders one view.
+        rates: learning rates of the attributes.
+        dssim: share of `1 - SSIM` in the loss; the rest is L1.
+        alpha: weight of the L1 distance of rendered opacity and mask. Without it dark hair on a black background could
+            become holes.
+        scale_penalty: weight of GaussianAvatars' penalty of large scales.
+        offset_penalty: weight of GaussianAvatars' penalty of large offsets.
+        eps2d: blur of every Gaussian by the rasteriser, pixels squared. 1/12 is the variance of a pixel's own square;
+            the 0.3 of viewers widens silhouettes by a pixel, so that the surface shrinks to meet the masks.
         margin: pixels kept around the silhouette of a training view.
-        evaluations: how often quality is measured, spread evenly.
-        seed: of the views' order. The Gaussians' places have their own in `sampling`.
+        evaluations: number of evaluations, evenly spaced.
+        seed: of the views' order; `sampling` has the seed of the Gaussians' places.
     """
 
     sampling: SamplingConfig = field(default_factory=SamplingConfig)

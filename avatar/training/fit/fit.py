@@ -75,7 +75,7 @@ def fit_scene(scene: TrainScene, template: Template) -> FitScene:
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """What a fit gives.
+    """Fitted Gaussians with their figures and images.
 
     Attributes:
         gaussians: on the CPU.

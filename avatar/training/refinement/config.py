@@ -24,7 +24,7 @@ class Level:
 
 @dataclass(frozen=True, kw_only=True)
 class RefineConfig:
-    """Choices of a refinement.
+    """Choices of a refinement of poses.
 
     Attributes:
         sampling: Gaussians that carry the appearance, one colour each.
@@ -44,7 +44,7 @@ class RefineConfig:
         camera_rotation_sigma: standard deviation of a camera's rotation, degrees.
         camera_translation_sigma: standard deviation of a camera's position, metres at the person.
         acceleration_sigma: scale of a joint's acceleration, degrees a frame squared at 20 frames a second; it falls
-            with the square of the frame rate. Accelerations beyond twice the scale cost little (Student's t), so that
+            with the square of the frame rate. Accelerations above twice the scale cost little (Student's t), so that
             fast motion is kept.
         translation_acceleration_sigma: the same for the translation, metres a frame squared.
         reach: distance from the skin over which the rigidity of clothes falls to 1/e, metres.

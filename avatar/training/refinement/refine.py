@@ -27,7 +27,7 @@ from smplxpp.register import BodyState
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Refined poses with their figures.
+    """Refined poses of frames with their figures.
 
     Attributes:
         frames: numbers of the refined frames, ascending.

@@ -62,7 +62,7 @@ def smoothness(
 ) -> Smoothness:
     """Return accelerations of a state and their weights under Student's t, for reweighted least squares.
 
-    `w = 1 / (sigma^2 (1 + |a|^2 / (tail sigma)^2))`, with |a| over the three numbers of a joint: accelerations beyond
+    `w = 1 / (sigma^2 (1 + |a|^2 / (tail sigma)^2))`, with |a| over the three numbers of a joint: accelerations above
     `tail` sigma are fast motion and cost little.
 
     Args:

@@ -129,7 +129,7 @@ class CentreJacobian:
             placed: the template in the frame's pose.
             linear: linearisation of the loss about that pose.
         """
-        # Gaussians below this share of the mean curvature are left out; at least so many of the others are summed.
+        # Gaussians below this share of the mean curvature are left out; at least this number of the others is summed.
         least_share, sampled = 1e-3, 6000
         strength = linear.curvature.diagonal(dim1=1, dim2=2).sum(-1) * self.rigidity
         rows = torch.nonzero(strength > least_share * strength.mean()).flatten()

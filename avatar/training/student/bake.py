@@ -101,6 +101,7 @@ class BakeTask(PhotometricTask):
         *,
         teacher: TeacherAvatar | None = None,
     ) -> None:
+        # Parameters: field and codes; the base class adds the attributes.
         groups = []
         if student.field is not None and student.codes is not None:
             groups = [
@@ -113,6 +114,7 @@ class BakeTask(PhotometricTask):
         self.student, self.targets = student, None
         if config.null_share and student.regression is None:
             show_null_code(student)
+        # Targets and losses of a bake with a teacher.
         if teacher is not None:
             self.targets = DistillationTargets(
                 teacher, sequence, eps2d=config.eps2d, tau=config.tau, normals=bool(config.weights.normal)

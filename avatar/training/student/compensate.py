@@ -32,7 +32,7 @@ from smplxpp.core.validation import require_at_least, require_between
 
 @dataclass(frozen=True, kw_only=True)
 class CompensateConfig(PhotometricConfig):
-    """Choices of the compensation.
+    """Choices of the compensation: rates, coherence, initialisation.
 
     Attributes:
         iterations: 100k in the paper.

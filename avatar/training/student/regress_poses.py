@@ -35,7 +35,7 @@ class RegressionConfig:
         fades: grid of factors on a joint angle's feature for every step along the skeleton.
         reaches: grid of the standard deviation of a spatial Gaussian filter of the surfaces, metres; 0: none.
         ridges: grid of lambda, radians squared.
-        margin: share of the training's range of an angle by which new angles may exceed it before they are clamped.
+        margin: new angles are clamped to the training's range, extended by this share of it.
         lost: RMS displacement that the low-rank form may lose, metres, over poses spread as the training's are.
         new_pose_sigma: assumed standard deviation of unseen pose variation per angle, radians.
     """

@@ -1,1 +1,1 @@
-"""The teacher: pretraining and training."""
+"""Training of the teacher: tracking, pretraining, then photographs."""

@@ -28,7 +28,7 @@ from smplxpp.core.spread import spread_inside
 
 @dataclass(frozen=True, kw_only=True)
 class FitTeacherConfig(PhotometricConfig):
-    """Choices of the teacher's training.
+    """Choices of the teacher's tracking, pretraining and training.
 
     Attributes:
         iterations: 600k in the paper.
