@@ -31,6 +31,7 @@ class ByteCache:
             return self._kept[key]
         with torch.no_grad():
             made = make()
+        # Tensors above the bound are not cached; the least recently used ones make room.
         size = _bytes(made)
         if size <= self.max_bytes:
             self._kept[key] = made

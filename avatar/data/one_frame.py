@@ -95,6 +95,7 @@ class OneFrame:
         return self._center
 
     def _camera_at(self, number: int, seed: int) -> str:
+        # A new random order of the cameras each epoch.
         epoch, place = divmod(number, len(self.train_cameras))
         order = np.random.default_rng([seed, epoch]).permutation(len(self.train_cameras))
         return self.train_cameras[int(order[place])]

@@ -238,6 +238,7 @@ class AvatarSequence:
         """
         out = []
         for number in range(step * count, (step + 1) * count):
+            # Each epoch visits all frames once, each with its next cameras.
             epoch, place = divmod(number, len(self.train_frames))
             frame = self.train_frames[_shuffled((seed, 0, epoch), len(self.train_frames))[place]]
             out.append(Item(frame, self.cameras(frame, epoch, views, seed)))
@@ -280,6 +281,7 @@ class AvatarSequence:
 
     def _run_of(self, frame: int) -> list[int]:
         """Return the run of frames with parameters around a frame, bounded by training frames."""
+        # Extend the run in both directions up to training frames.
         frames, seen = self.capture.frames, set(self.train_frames)
         at = first = last = frames.index(frame)
         while first > 0 and frames[first - 1] not in seen:
@@ -302,6 +304,7 @@ def camera_centers_of(views: Sequence[View]) -> Float[Tensor, "C 3"]:
 def _training_part(capture: Capture) -> tuple[tuple[str, ...], tuple[int, ...]]:
     cameras = capture.splits.train_cameras
     presence = capture.presence()
+    # Training frames with an image in some training camera.
     rows = [row for row, name in enumerate(capture.cameras) if name in set(cameras)]
     seen = {frame for frame, there in zip(capture.frames, np.asarray(presence[rows].any(axis=0)), strict=True) if there}
     frames = tuple(frame for frame in capture.splits.train_frames if frame in seen)

@@ -70,6 +70,7 @@ class View:
 
         Steps are cheap because only the person is rasterised and compared.
         """
+        # Bounding box of the mask with a margin, inside the image.
         rows, columns = (torch.nonzero(self.alpha.any(dim)).flatten() for dim in (1, 0))
         if not len(rows):
             return self
@@ -84,6 +85,7 @@ class View:
         """Average every 2 x 2 pixels; a last odd row or column is left out, and normals are sampled."""
         height, width = self.camera.height // 2, self.camera.width // 2
         camera = self.camera.cropped((0, 0, 2 * width, 2 * height), size=(width, height))
+        # Mean of 2 x 2 pixels of colour and opacity, rounded to 8 bits.
         stacked = torch.cat([self.foreground, self.alpha[..., None]], dim=-1)[: 2 * height, : 2 * width]
         small = stacked.view(height, 2, width, 2, 4).float().mean(dim=(1, 3)).round().to(torch.uint8)
         normals = None if self.normals is None else self.normals[: 2 * height : 2, : 2 * width : 2].contiguous()

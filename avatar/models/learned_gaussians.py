@@ -31,6 +31,7 @@ class LearnedGaussians(nn.Module):
     def __init__(self, start: BoundGaussians) -> None:
         super().__init__()
         self.face_count, self.topology = start.face_count, start.topology
+        # Learned attributes become parameters, all other tensors buffers.
         for name, value in start.tensors.items():
             if name in LEARNED:
                 setattr(self, name, nn.Parameter(value.detach().clone()))

@@ -49,6 +49,7 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
     Returns:
         Size of the file, bytes.
     """
+    # Header: everything from which the model is made before its tensors are loaded.
     about = {"schema": SCHEMA, "face_count": model.gaussians.face_count, "topology": model.gaussians.topology}
     if isinstance(model, TeacherAvatar):
         track = model.track
@@ -65,6 +66,7 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
             "field": None if config.field is None else config_to_dict(config.field),
             "blend_shapes": None if config.blend_shapes is None else config_to_dict(config.blend_shapes),
         }
+    # Tensors by the names of the module's state.
     tensors = {name: _stored(value, compact) for name, value in model.state_dict().items()}
     data = save(tensors, metadata={HEADER: json.dumps(about)})
     atomic_write_bytes(path, data)

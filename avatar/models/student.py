@@ -182,6 +182,7 @@ class Student(nn.Module):
             blend_shapes: the new ones, their configuration, or None for none.
             known_poses: theta of the poses near which body shapes act; None: those of this student.
         """
+        # A copy with the new blend shapes and the same Gaussians, gate and regression.
         given = blend_shapes if isinstance(blend_shapes, BlendShapes) else None
         shapes_config = blend_shapes.config if isinstance(blend_shapes, BlendShapes) else blend_shapes
         other = Student(
@@ -193,6 +194,7 @@ class Student(nn.Module):
             known_poses=self.pose_gate.poses if known_poses is None and self.pose_gate is not None else known_poses,
             regression=copy.deepcopy(self.regression),
         )
+        # Copy field and codes.
         for mine, its in ((self.field, other.field), (self.codes, other.codes)):
             if mine is not None and its is not None:
                 its.load_state_dict(mine.state_dict())

@@ -135,6 +135,7 @@ def fit_surface(
         losses[k] = float(loss.detach())
     if not np.isfinite(losses).all():
         raise InputError("neural surface", expected="a loss that stays finite", received="NaN", remedy="lower the rate")
+    # Extract the zero level set, and keep the main body.
     mesh, _ = main_body(extract(model, box, config.cell))
     return SurfaceFit(mesh, model, losses)
 
@@ -170,6 +171,7 @@ def surface_loss(
 
 def hull_grid(hull: TriangleMesh, box: Box, cell: float) -> Float[Tensor, "X Y Z"]:
     """Return the hull's signed distance on a grid over the box, negative inside."""
+    # Grid points of the box, evaluated in chunks.
     counts = np.maximum(np.ceil((box.high - box.low) / cell).astype(int) + 1, 2)
     axes = [np.linspace(low, high, count) for low, high, count in zip(box.low, box.high, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

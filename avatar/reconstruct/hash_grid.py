@@ -38,6 +38,7 @@ class HashGrid(nn.Module):
                 expected="a level or more, cells that do not become fewer, tables of 2^4 to 2^24",
                 received=f"{levels} levels of {coarsest} to {finest} cells, 2^{log2_entries}, {features} features",
             )
+        # Sides of the levels grow geometrically; coarse levels have smaller tables.
         growth = (finest / coarsest) ** (1 / max(levels - 1, 1))
         self.sizes = [round(coarsest * growth**k) for k in range(levels)]
         self.entries = 1 << log2_entries
@@ -57,6 +58,7 @@ class HashGrid(nn.Module):
         """Return the features of points in the unit cube; points outside are clamped to its nearest side."""
         found = []
         for size, table in zip(self.sizes, self.tables, strict=True):
+            # Trilinear weights of the eight corners of the cell.
             place = points.clamp(0, 1) * size
             cell = place.detach().floor().clamp(max=size - 1)
             part = (place - cell)[:, None]

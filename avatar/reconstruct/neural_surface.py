@@ -37,11 +37,13 @@ class NeuralSurface(nn.Module):
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.grid = grid
+        # Residual distance with features for the colour; its last layer starts at zero.
         self.residual = nn.Sequential(
             nn.Linear(grid.width + 3, _HIDDEN), nn.Softplus(beta=100), nn.Linear(_HIDDEN, 1 + _SHARED)
         )
         for parameter in self.residual[2].parameters():
             nn.init.zeros_(parameter)
+        # Colour from grid features, the distance's features, normal and viewing direction.
         self.color = nn.Sequential(
             nn.Linear(grid.width + 15 + 6, _HIDDEN),
             nn.ReLU(),

@@ -117,6 +117,7 @@ class Rig:
             posed = self.template.posed_body(params)
             transforms = posed.posed_from_rest[0]
             blended = self._weights @ transforms[:, :3].reshape(len(transforms), 12).astype(np.float32)
+        # Rest shape: the template with the body's expression and pose correctives.
         rest = self.template.vertices.astype(np.float32)
         rest[: self.template.body.vertex_count] = posed.rest_vertices[0]
         expression = np.zeros(self.expression_size)
@@ -155,6 +156,7 @@ class Rig:
 
     def with_cloth(self, pose: Pose, shape: ClothShape, *, time: float | None = None) -> Pose:
         """Return the pose with a simulation's cloth displacements, scattered to all vertices."""
+        # Scatter displacements and shares to all vertices.
         at = torch.as_tensor(shape.vertices, device=self.device)
         displacements = torch.zeros(len(self.vertices), 3, device=self.device)
         share = torch.zeros(len(self.vertices), 1, device=self.device)

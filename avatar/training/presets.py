@@ -143,6 +143,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
     and takes from the teacher the tracked surface. Several views a step, attributes that learn in every stage, no
     perceptual term.
     """
+    # A step without rendering costs little, so that it has eight poses.
     pretrain = PretrainConfig(
         iterations=size.pretrain, batch=8, lr=1e-2, lr_final_factor=0.02, warmup=20, betas=(0.9, 0.99)
     )
@@ -154,6 +155,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             iterations=size.fit,
             rates=size.rates,
         ),
+        # Tracking, pretraining on the track, then photographs of three views a step.
         teacher=FitTeacherConfig(
             iterations=size.teacher.iterations,
             pretrain=pretrain,
@@ -186,6 +188,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             weights=_LEAN_WEIGHTS,
             surface_normals=size.surface_normals,
         ),
+        # Rates of U and C in proportion to that of the mapping networks.
         compensate=CompensateConfig(
             iterations=size.compensate.iterations,
             poses_per_step=1,

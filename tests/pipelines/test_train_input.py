@@ -120,7 +120,10 @@ def test_images_of_another_size_than_their_camera(run, capture, capsys):
 def test_masks_that_are_zero(run, capture, capsys):
     for path in (capture / "masks").rglob("*.png"):
         Image.new("L", (WIDTH, HEIGHT)).save(path)
-    with pytest.warns(GeometryWarning, match="no person in the mask"), pytest.raises(InputError, match="a person in them"):
+    with (
+        pytest.warns(GeometryWarning, match="no person in the mask"),
+        pytest.raises(InputError, match="a person in them"),
+    ):
         opened(run, capture)
     assert train(run, capture) == 2
     assert "capture check" in json.loads(capsys.readouterr().out)["error"]["message"]

@@ -177,6 +177,7 @@ class BlendShapes(nn.Module):
         return self._blend(self.U, coefficients), self._blend(self.C, coefficients)
 
     def _blend(self, basis: Tensor, z: Tensor) -> Tensor:
+        # Coefficients of each Gaussian's part, or one set for all, gated by the head's weight.
         B, M = len(z), len(basis)
         if self.part is not None:
             of_gaussian = z[:, self.part[self.active]]
@@ -240,6 +241,7 @@ class BlendShapes(nn.Module):
         """
         if not 0.0 < keep <= 1.0:
             raise InputError("share of blend shapes to keep", expected="above 0, at most 1", received=f"{keep:g}")
+        # Keep the most important Gaussians, in the order of their indices.
         importance = self.importance(coefficient_std)[self.active]
         kept = torch.argsort(importance, descending=True, stable=True)[: max(1, round(keep * self.count))].sort().values
         small = BlendShapes(

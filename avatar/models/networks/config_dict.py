@@ -31,6 +31,7 @@ def config_from_dict(cls: type[Config], stored: Mapping[str, Any]) -> Config:
     Raises:
         InputError: a field is missing, unknown or of another type, or a value is refused by the configuration itself.
     """
+    # Exactly the fields of the dataclass.
     defaults: dict[str, Any] = {field.name: field.default for field in fields(cls)}
     if set(stored) != set(defaults):
         raise InputError(

@@ -53,6 +53,7 @@ def choose_control_points(
     Raises:
         InputError: fewer control points than groups or more than vertices, or no neighbour.
     """
+    # Number the groups, and check the count.
     vertices = np.asarray(vertices, dtype=np.float64)
     names, group = np.unique(np.asarray(groups), return_inverse=True)
     importance = np.ones(len(vertices)) if importance is None else np.asarray(importance, dtype=np.float64)
@@ -104,6 +105,7 @@ def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
     """
     shares = np.ones(len(sizes), dtype=np.int64)
     while (left := count - shares.sum()) > 0:
+        # Distribute what is left among the groups that are not full.
         open_wishes = np.where(shares < sizes, wishes, 0.0)
         more = left * open_wishes / open_wishes.sum()
         whole = np.minimum(np.floor(more).astype(np.int64), sizes - shares)
@@ -128,6 +130,7 @@ def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 def _local_weights(points: np.ndarray, controls: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the `count` nearest controls of each point, and their weights."""
+    # One neighbour more than is used: its distance is where the weights fade to zero.
     asked = min(count + 1, len(controls))
     distance, nearest = cKDTree(controls).query(points, k=np.arange(1, asked + 1))
     distance = np.maximum(distance, 1e-9)

@@ -137,6 +137,7 @@ class DeformationField(nn.Module):
         still: Bool[Tensor, " V"] | None = None,
     ) -> None:
         super().__init__()
+        # Check that all arguments are of one template.
         if vertices.ndim != 2 or vertices.shape[1] != 3 or cloth_mask.shape != vertices.shape[:1]:
             raise InputError(
                 "template of the field",
@@ -213,8 +214,10 @@ class DeformationField(nn.Module):
                 expected=f"shapes (B, {expected[0]}) and (B, {expected[1]})",
                 received=f"shapes {tuple(pose.shape)} and {tuple(code.shape)}",
             )
+        # Mask theta by the joints that each set of points depends on, and append the code.
         local = pose[:, None] if self.sets is None else pose[:, None] * self.sets
         frames = torch.cat([local, code[:, None].expand(-1, local.shape[1], -1)], dim=2)
+        # S_b on all points, plus S_c on the clothes.
         moved = self.body(self.encodings, frames, self.member)
         clothes = self.cloth_index
         member = None if self.member is None else self.member[clothes]
@@ -225,6 +228,7 @@ def _evaluated(
     vertices: Float[Tensor, "V 3"], control: ControlPoints | None, still: Bool[Tensor, " V"] | None
 ) -> tuple[Tensor, SparseRows | None]:
     """Return the vertices on which the field is evaluated, and the interpolation from them; None: all vertices."""
+    # Without control points the field is evaluated on all vertices.
     every = torch.arange(len(vertices), device=vertices.device)
     if control is None:
         if still is None:
@@ -236,6 +240,7 @@ def _evaluated(
         weights = torch.as_tensor(control.weights, dtype=vertices.dtype, device=vertices.device)
     if still is not None:
         moves = ~still[where]
+        # Renumber the points that move; all others drop out.
         number = moves.cumsum(0) - 1
         # Still vertices have weight 0 on an arbitrary row.
         neighbours, weights = number[neighbours] * ~still[:, None], weights * ~still[:, None]

@@ -30,6 +30,7 @@ class MapSampler(nn.Module):
 
     def __init__(self, frame: MapFrame, size: int, points: Float[Tensor, "N 3"], front: Bool[Tensor, " N"]) -> None:
         super().__init__()
+        # Check the shapes, and that all points lie on the maps.
         if points.ndim != 2 or points.shape[1] != 3 or front.shape != points.shape[:1]:
             raise InputError(
                 "canonical Gaussians",

@@ -41,6 +41,7 @@ class SparseRows(nn.Module):
 
     def __init__(self, rows: Int[Tensor, "P k"], weights: Float[Tensor, "P k"], count: int) -> None:
         super().__init__()
+        # Both matrices in the form of embedding bags: flat indices, offsets, weights.
         points, per_point = rows.shape
         flat, weights = rows.flatten(), weights.flatten()
         # The transposed matrix: entries sorted by the table's row.

@@ -69,6 +69,7 @@ class StyleUNetConfig:
     zero_output: bool = False
 
     def __post_init__(self) -> None:
+        # Sides are powers of two, with room for the scales of encoder and decoder.
         for name in ("in_size", "out_size", "bottleneck"):
             value = getattr(self, name)
             if not 1 <= value <= LARGEST_SIDE or value & (value - 1):
@@ -278,12 +279,14 @@ class StyleUNet(nn.Module):
         Returns:
             (B, 2, out_size, out_size, channels) for each head, with V in place of B where the head sees the view.
         """
+        # Encode the image, and the views' cosines where a head sees them.
         features = self.encoder(image.contiguous(memory_format=torch.channels_last))
         view_features = (None, None)
         if view_cosines is not None and self.view_encoder is not None:
             view_features = self.view_encoder(view_cosines)
         style, skips = self.style(), self.merge.skips(features)
         coarsest = features[self.config.bottleneck]
+        # Decode front and back with shared skip connections.
         sides = [
             decoder(coarsest, lambda x: self.merge(x, skips), style, view)
             for decoder, view in zip(self.decoders, view_features, strict=True)

@@ -72,6 +72,7 @@ class TeacherConfig:
 
     def network_configs(self) -> dict[str, StyleUNetConfig]:
         """Return the configurations of the StyleUNets by name."""
+        # Which residuals each network gives.
         heads: dict[str, tuple[Head, ...]]
         position, other, colour = (Head(POSITION),), (Head(OTHER),), Head(COLOUR, sees_view=self.sees_view)
         if self.networks == "separate":
@@ -81,6 +82,7 @@ class TeacherConfig:
         else:
             heads = {"all": (Head(POSITION + OTHER), colour)}
         configs = {name: self._network_config(its_heads) for name, its_heads in heads.items()}
+        # A smaller network for the position.
         if self.position_size:
             configs["position"] = replace(
                 configs["position"],
@@ -188,6 +190,7 @@ class Teacher(nn.Module):
         Raises:
             InputError: maps of another size.
         """
+        # Check the shapes of the maps.
         size = self.config.in_size
         B, V = len(positions), len(positions) if view_cosines is None else len(view_cosines)
         _require_shape("position maps", positions, (B, 2, size, size, 3))
@@ -228,6 +231,7 @@ class Teacher(nn.Module):
 
     def _position(self, image: Tensor) -> Tensor:
         """Return the maps of the position's own network, (B, 2, R, R, 3)."""
+        # The smaller network sees the input at half its size; its output is enlarged bilinearly.
         network, out = self.networks["position"], self.config.out_size
         assert isinstance(network, StyleUNet)
         if image.shape[-1] != network.config.in_size:

@@ -55,6 +55,7 @@ def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
     if not path.exists():
         return None
     try:
+        # A checkpoint of this key and version is read with checks of its header.
         file = open_tensor_file(path, subject=f"checkpoint {path}", header="training")
         schema, found = file.about["schema"], file.about.get("key")
         if schema == SCHEMA and found == key:
@@ -64,6 +65,7 @@ def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
     except (InputError, KeyError) as error:
         log.warning("%s cannot be read (%s): the training starts over", path, error)
         return None
+    # A readable checkpoint that does not fit is never overwritten silently.
     if schema != SCHEMA:
         raise InputError(
             f"checkpoint {path}",

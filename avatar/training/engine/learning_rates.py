@@ -56,6 +56,7 @@ def attribute_groups(
     if not multiple:
         gaussians.requires_grad_(False)
         return []
+    # Rates of offsets are in pixels, all others in the attribute's own unit.
     unit = {"normal_offset": pixel, "offset": pixel}
     gaussians.requires_grad_(True)
     return [

@@ -34,6 +34,7 @@ class MeanOfSteps:
     @torch.no_grad()
     def after(self, iteration: int) -> None:
         """Update the mean after a step, counted from 0; after the last one copy it into the parameters."""
+        # Running mean of every n-th step: m <- m + (x - m) / k.
         since = iteration - self.first
         if since >= 0 and since % EVERY == 0:
             if not since:
@@ -57,6 +58,7 @@ class MeanOfSteps:
         if not any(key.startswith(_PREFIX) for key in tensors):
             self.mean = {}
             return
+        # Check all tensors before any is taken.
         wanted = {_PREFIX + key: value for key, value in self.learned.items()}
         require_like(tensors, wanted, subject="checkpoint", remedy=remedy)
         require_finite({key: tensors[key] for key in wanted}, subject="checkpoint", remedy=remedy)

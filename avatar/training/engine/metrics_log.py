@@ -36,6 +36,7 @@ def read_metrics(path: str | Path) -> list[dict[str, Any]]:
     except InputError as error:
         log.warning("%s", error)
         return []
+    # Parse line by line; only the last line may be incomplete without a warning.
     read = [_entry(line) for line in lines]
     foreign = [number for number, entry in enumerate(read[:-1], start=1) if entry is None and lines[number - 1].strip()]
     if foreign:

@@ -206,6 +206,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         require_finite({name: tensors[name] for name in wanted}, subject="checkpoint", remedy=_START_AGAIN)
         self.mean.restore(tensors, remedy=_START_AGAIN)
         with torch.no_grad():
+            # Parameters, and Adam's moments in the parameters' memory layout.
             for key, value in self.learned.items():
                 value.copy_(tensors[key])
                 moments = {moment: tensors.get(f"adam.{moment}.{key}") for moment in MOMENTS}

@@ -76,6 +76,7 @@ class Distributed:
         """
         if self.world_size == 1:
             return
+        # One flat tensor: flags of existing gradients, then all gradients.
         pieces = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
         given = torch.tensor([float(p.grad is not None) for p in parameters], device=parameters[0].device)
         flat = torch.cat([given, *(piece.reshape(-1) for piece in pieces)])
@@ -91,6 +92,7 @@ class Distributed:
         """Run `work` on the first process and return its result on all; its error is raised on all."""
         if self.world_size == 1:
             return work()
+        # The result or the error of the first process, broadcast to all.
         box: list[Any] = [None, None]
         error = None
         if self.first:
@@ -120,6 +122,7 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
     if "WORLD_SIZE" not in os.environ:
         yield Distributed(device=device)
         return
+    # Rank, GPU and number of processes from torchrun's environment.
     rank, local, size = (_number(name) for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE"))
     if device == "cuda":
         if local >= torch.cuda.device_count():
@@ -131,6 +134,7 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
             )
         torch.cuda.set_device(local)
         device = f"cuda:{local}"
+    # NCCL between GPUs, gloo between CPUs.
     dist.init_process_group(
         "nccl" if device.startswith("cuda") else "gloo", rank=rank, world_size=size, timeout=TIMEOUT
     )

@@ -41,6 +41,7 @@ def keep_freed_memory() -> bool:
     """
     if not sys.platform.startswith("linux"):
         return False
+    # Only glibc has mallopt with these options.
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "gnu_get_libc_version"):
         return False
@@ -56,6 +57,7 @@ def explain_resource_errors(folder: Path) -> Iterator[None]:
     """
     try:
         yield
+    # Memory: exceptions of Python and torch, or messages of allocators.
     except (MemoryError, RuntimeError) as error:
         words = str(error)
         known = isinstance(error, MemoryError | torch.cuda.OutOfMemoryError)
@@ -68,6 +70,7 @@ def explain_resource_errors(folder: Path) -> Iterator[None]:
             remedy="end other programs and give the same command, which continues from the last checkpoint; or take a "
             "smaller preset, smaller images (--scale) or fewer Gaussians",
         ) from error
+    # Disk: no space, quota, or file size.
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise

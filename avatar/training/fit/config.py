@@ -64,6 +64,7 @@ class FitConfig:
 
     def photometric(self) -> PhotometricConfig:
         """Return what the fit shares with the other trainings on photographs: everything but the start."""
+        # The loss of all trainings, without normals and perceptual term.
         return PhotometricConfig(
             iterations=self.iterations,
             scale_penalty=self.scale_penalty,

@@ -121,6 +121,7 @@ def fit_gaussians(
     Raises:
         InputError: unusable input; `DivergedError` when the loss is not finite.
     """
+    # Fit, from the checkpoint if there is one.
     task = FitTask(scene, config, device, TaskContext(preview=preview))
     loop = LoopConfig(
         iterations=config.iterations,
@@ -128,6 +129,7 @@ def fit_gaussians(
         max_seconds=max_seconds,
     )
     progress = run_training(task, loop, Path(folder), key=key, report=report)
+    # Figures and images of all views, and the Gaussians in the world.
     names = [view.name for view in (*scene.held_out, *scene.train)]
     measured = {name: task.measure(task.sequence.whole_view(name), FRAME) for name in names}
     quality = {name: of_view for name, (of_view, _) in measured.items()}
@@ -155,10 +157,12 @@ class FitTask(PhotometricTask):
             margin=config.margin,
             device=device,
         )
+        # Initial Gaussians with colours from the photographs; the student has no field and no blend shapes.
         start = initial_gaussians(frame.rig, scene.vertices, scene.train, config.sampling, detail=config.detail)
         self.fit_config, self.held_out = config, bool(scene.held_out)
         self.student = Student(StudentConfig(field=None), frame.rig, start, ())
         super().__init__(frame, self.student, config.photometric(), [], context)
+        # Boxes of the head, for figures of its own.
         corners = scene.vertices[head_vertices(scene.template)]
         self.heads = {view.name: head_box(corners, view.camera) for view in (*scene.train, *scene.held_out)}
 

@@ -176,11 +176,13 @@ def density_of_detail(
         detail: 0 covers all faces with equal density.
     """
     neighbours = 16
+    # RMS over the visible places, the unit of the gradients.
     weight = np.ones(len(template.faces))
     square = np.square(rates).sum(1)
     usual = np.sqrt(square[seen].mean()) if seen.any() else 0.0
     if not usual:
         return weight
+    # Part by part, the RMS gradient at the nearest visible places of the part.
     centers = template.mesh.triangles.mean(1)
     of_face = template.vertex_part[template.faces[:, 0]]
     for one in np.unique(of_face):

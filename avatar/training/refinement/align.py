@@ -93,6 +93,7 @@ class Alignment:
         self.history: list[PassReport] = []
         body = scene.posed.body
         self.variables = Variables.of_body(body.joint_count, body.num_expressions, scene.config)
+        # Groups of the depths: one a label.
         self._views, self._cached, self._bytes = views, dict[tuple[int, int], list[View]](), 0
         labels = scene.posed.template.vertex_labels[scene.posed.template.faces[:, 0]]
         self._groups = torch.tensor(labels, dtype=torch.int64)[gaussians.face_index]
@@ -188,6 +189,7 @@ class Alignment:
 
     def _stepped(self, normal: Normal, damping: Float64[np.ndarray, " F"]) -> BodyState:
         """Return the state after one Levenberg-Marquardt step of all frames."""
+        # Gauss-Newton blocks of the photographs, plus the prior, plus the smoothness; then one banded solve.
         change = changes(self.variables, self.start, self.state)
         smooth = smoothness(self.variables, self.state, self.frames, self.scene.config, self.scene.fps)
         with_start = with_prior(normal, change, self.variables.sigma)

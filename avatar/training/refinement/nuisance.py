@@ -63,6 +63,7 @@ class AppearanceUpdate:
         """
         least_mass = 1e-6  # share of the mean mass below which no pixel shows a Gaussian
         depth_sigma, deepest, highest = 0.003, -0.012, 0.002  # metres: prior of a depth and its bounds along the normal
+        # Step of the colours: mean residual of each Gaussian's pixels.
         seen = self.mass > least_mass * self.mass.mean()
         step = torch.where(seen[:, None], self.gradient / torch.where(seen, self.mass, 1.0)[:, None], 0.0)
         # Gauss-Newton step of the depths with a Gaussian prior about 0.
@@ -109,12 +110,14 @@ class CameraCorrections:
     def add(self, linear: Linearization, rigidity: Float32[Tensor, " N"]) -> None:
         """Add the views of a frame to the normal equations of their cameras, `J = [-[x - center]_x, I]`."""
         gradient, curvature = self._sums
+        # Jacobian of a point by a rigid motion about the centre: rotation -[x - c]_x, translation I.
         arm = linear.means - torch.tensor(self.center, dtype=torch.float32)
         zero = torch.zeros_like(arm[:, 0])
         x, y, z = arm.unbind(-1)
         turned = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], dim=-1).view(-1, 3, 3)
         J = torch.cat([turned, torch.eye(3).expand(len(arm), 3, 3)], dim=-1)
         for name, (mean_gradient, own) in linear.cameras.items():
+            # J^T g and J^T M J, summed over the Gaussians with their rigidity.
             row = self.names.index(name)
             gradient[row] += torch.einsum("nij,ni,n->j", J, mean_gradient, rigidity).double().numpy()
             moved = (own * rigidity[:, None, None]) @ J
@@ -124,6 +127,7 @@ class CameraCorrections:
         """Take one Gauss-Newton step of all cameras, with a Gaussian prior about no correction, and clear the sums."""
         gradient, curvature = self._sums
         self._sums = np.zeros_like(gradient), np.zeros_like(curvature)
+        # Prior: Gaussian about no correction.
         sigma = np.repeat([np.radians(self.config.camera_rotation_sigma), self.config.camera_translation_sigma], [3, 3])
         prior = np.diag(1.0 / sigma**2)
         for row in range(len(self.names)):

@@ -203,11 +203,13 @@ def _add_in_world(
     curvature: Float[Tensor, "N 3 3"], tensor: Float[Tensor, "N 3"], means: Float[Tensor, "N 3"], view: View
 ) -> None:
     """Add `D^T T D` of structure tensors T (xx, xy, yy), 1/pixel^2, D the Jacobian of the projection at the centres."""
+    # Project the centres, and take the Jacobian of the perspective projection: dx, dy by world coordinates.
     rows = torch.nonzero((tensor[:, 0] > 0) | (tensor[:, 2] > 0)).flatten()  # Gaussians on the far side have no pixels
     xx, xy, yy = (column[:, None] for column in tensor[rows].unbind(-1))
     right, down, ahead = view.viewmat[:3, :3]
     x, y, z = (means[rows] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).split(1, dim=-1)
     dx = view.K[0, 0] / z * (right - x / z * ahead)
     dy = view.K[1, 1] / z * (down - y / z * ahead)
+    # D^T T D of a symmetric 2 x 2 tensor T.
     left = torch.stack([xx * dx + xy * dy, xy * dx + yy * dy], dim=-1)
     curvature.index_add_(0, rows, left @ torch.stack([dx, dy], dim=1))

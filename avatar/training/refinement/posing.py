@@ -39,6 +39,7 @@ def rigidity(
     """
     least = 0.02  # cloth of less rigidity hangs loosely and would only add noise
     rigid = np.ones(template.vertex_count)
+    # Clothes: a Gaussian of the distance from the body, times the label's factor.
     cloth = np.flatnonzero(template.cloth_mask)
     if len(cloth):
         body = template.part_mesh("body")
@@ -69,8 +70,10 @@ class RigiditySkinning(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:
         rest, blended, weights, rigidity = ctx.saved_tensors
+        # The gradient of every vertex, weighted by its rigidity.
         weighted = gradient * rigidity[:, None]
         to_rest = torch.stack([(weighted * blended[..., k]).sum(-1) for k in range(3)], dim=-1)
+        # Sum of w f g [x; 1]^T over the vertices of each joint.
         outer = torch.cat([weighted[:, :, None] * rest[:, None, :], weighted[:, :, None]], dim=-1)
         to_transforms = (weights.T @ outer.view(len(rest), 12)).view(-1, 3, 4)
         return to_rest, to_transforms, None, None
@@ -179,6 +182,7 @@ class PosedTemplate:
         self, placed: Placed, of_vertices: Float[Tensor, "V 3"]
     ) -> tuple[Float64[np.ndarray, "J 3"], Float64[np.ndarray, " 3"], Float64[np.ndarray, " E"]]:
         """Backpropagate gradients of the posed vertices to turns, translation and expression."""
+        # Steps without influence have no gradient: fill in zeros.
         found = torch.autograd.grad(placed.vertices, placed.steps.tensors, of_vertices, allow_unused=True)
         filled = [torch.zeros_like(s) if g is None else g for s, g in zip(placed.steps.tensors, found, strict=True)]
         turns, transl, expression = (g.numpy() for g in filled)

@@ -164,6 +164,7 @@ def _finish(
     # Losses of start and result with the same, final colours.
     before = alignment.losses(alignment.start, counter.step)
     after = alignment.losses(alignment.state, counter.step)
+    # Frames that did not improve keep the start.
     worse = ~(after < before)
     # Parameters of the better ones.
     body = scene.posed.body
@@ -176,6 +177,7 @@ def _finish(
     change = rotvec_from_matrix(alignment.state.rotations @ alignment.start.rotations.swapaxes(-1, -2))
     turned = np.degrees(np.linalg.norm(change[:, variables.joints], axis=-1))
     moved = 1e3 * np.linalg.norm(alignment.state.transl - alignment.start.transl, axis=-1)
+    # Corrected poses of the cameras, from those of the capture.
     truth = {name: sequence.capture.cameras[name].cam_from_world for name in sequence.train_cameras}
     return Refinement(
         frames=frames,

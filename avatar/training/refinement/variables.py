@@ -40,11 +40,13 @@ class Variables:
     @staticmethod
     def of_body(joint_count: int, expressions: int, config: RefineConfig) -> Variables:
         """Choose the unknowns that a body has and the configuration requests."""
+        # Joints that turn.
         joints = list(range(min(BODY_JOINTS, joint_count)))
         if config.jaw and joint_count > FIRST_FINGER:
             joints.append(JAW)
         if config.hands:
             joints += range(FIRST_FINGER, joint_count)
+        # Standard deviations of the prior, in the order of the unknowns.
         expressions = expressions if config.expression else 0
         sigma = np.concatenate(
             [
@@ -78,6 +80,7 @@ class Variables:
 
     def stepped(self, state: BodyState, steps: Float64[np.ndarray, "T P"]) -> BodyState:
         """Return the state after steps: `R_j <- exp(d_j) R_j`, translation and expression added."""
+        # Left-multiply the rotations by the exponentials of the turns; translation and expression are added.
         rotations = state.rotations.copy()
         turned = matrix_from_rotvec(steps[:, self.turns].reshape(len(steps), -1, 3))
         rotations[:, self.joints] = turned @ rotations[:, self.joints]
@@ -166,6 +169,7 @@ class CentreJacobian:
             means: centres of all Gaussians, world, metres.
             rows: the n chosen ones.
         """
+        # Joints p_j, parents' axes P_j and arms s_j (x - p_j), for the cross product.
         variables = self.variables
         joints = torch.tensor(placed.joints[variables.joints], dtype=torch.float32)
         axes = torch.tensor(placed.parent_turned[variables.joints], dtype=torch.float32)

@@ -84,9 +84,11 @@ class CompensateTask(PhotometricTask):
         shapes = student.blend_shapes
         if shapes is None:
             raise InputError("student of the compensation", expected="blend shapes", received="none")
+        # Freeze the field and the codes.
         for frozen in (student.field, student.codes):
             if frozen is not None:
                 frozen.requires_grad_(False)
+        # Parameters: mapping networks, U in pixels, C in colours.
         mapping = {f"head.{name}": value for name, value in shapes.head.named_parameters()}
         mapping |= {f"body.{name}": value for name, value in shapes.body.named_parameters()}
         groups = [
@@ -98,6 +100,7 @@ class CompensateTask(PhotometricTask):
         ]
         super().__init__(sequence, student, config, groups, context)
         self.student = student
+        # The coherence term is relative to the present U.
         self.shapes, self.coherence = shapes, None
         if config.coherence:
             self.coherence = Coherence(student.rig, student.gaussians().select(shapes.active), shapes.U)

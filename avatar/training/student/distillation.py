@@ -82,6 +82,7 @@ class DistillationTargets:
         keys = [(frame, view.name, view.camera.width, view.camera.height) for view in views]
         # Read the cached ones first: new ones may evict them.
         found = {k: self._cache.get(key, tuple) for k, key in enumerate(keys) if key in self._cache}
+        # Render the missing views with one evaluation of the teacher.
         missing = [k for k in range(len(keys)) if k not in found]
         if missing:
             with torch.no_grad():

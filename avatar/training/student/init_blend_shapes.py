@@ -33,6 +33,7 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
     shapes, rig = student.blend_shapes, sequence.rig
     assert shapes is not None, "a student with blend shapes"
     bound = student.gaussians()
+    # Rotations of the triangles in the T-pose: blend shapes are in the triangles' frames.
     local = triangle_frames(rig.vertices, rig.faces).rotations[bound.face_index]
     residuals, poses = [], []
     with torch.no_grad():
@@ -46,6 +47,7 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
             at_gaussians = on_triangles(left[rig.faces[bound.face_index]], bound.barycentric)
             residuals.append(torch.einsum("nij,ni->nj", local, at_gaussians)[shapes.active])
             poses.append(pose.body_pose)
+        # Principal components of the residuals, and their coefficients as targets of B.
         r, body_poses = torch.stack(residuals), torch.stack(poses)
         targets = _components(shapes, r)
     _fit(shapes, body_poses, targets)

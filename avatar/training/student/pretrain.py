@@ -49,6 +49,7 @@ class PretrainFieldTask(PretrainTask):
     ) -> None:
         field, codes = student.field, student.codes
         assert field is not None and codes is not None, "a student with a field"
+        # Field and codes learn, codes at a multiple of the rate.
         groups = [
             ParameterGroup("field", dict(field.named_parameters()), config.lr, config.lr_final_factor),
             ParameterGroup("codes", {"codes": codes.codes}, config.lr * code_lr_factor, config.lr_final_factor),

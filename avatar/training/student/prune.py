@@ -60,6 +60,7 @@ def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> t
     }
     header_bytes = 16_384  # more than names and shapes of a model file take
     rest = header_bytes + sum(value.numel() * _compact_size(value) for value in tensors.values())
+    # Share of the Gaussians whose blend shapes fit.
     keep = min(1.0, (max_bytes - rest) / (one * count))
     if keep * count < 1:
         raise InputError(

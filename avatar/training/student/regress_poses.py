@@ -84,6 +84,7 @@ def regress_poses(student: Student, sequence: AvatarSequence) -> PoseRegression:
     assert field is not None and codes is not None, "a student with a field"
     frames = spread_inside(sequence.train_frames, DEFAULT.frames)
     poses = torch.stack([sequence.pose(frame).body_pose for frame in frames])
+    # Displacements of the field's points in the training frames, with their codes.
     surfaces = [field.at_points(pose[None], codes([frame]))[0] for frame, pose in zip(frames, poses, strict=True)]
     points = field.points.cpu().numpy()
     made, chosen = fit_pose_regression(
@@ -159,6 +160,7 @@ def _gaussian_filter(places: Float[np.ndarray, "P 3"], reach: float) -> Smooth:
     """Return a filter of points' values (T, P, 3): Gaussian weights of the distance, up to three deviations."""
     if reach == 0.0:
         return lambda values: values
+    # Sparse matrix of weights exp(-d^2 / (2 reach^2)), rows normalised.
     tree = cKDTree(places)
     weights = tree.sparse_distance_matrix(tree, 3.0 * reach, output_type="coo_matrix").tocsr()
     weights.data = np.exp(-0.5 * (weights.data / reach) ** 2)
@@ -171,6 +173,7 @@ def _feature_groups(
     steps: Int[np.ndarray, "P 21"], fade: float
 ) -> Iterator[tuple[np.ndarray, Float[np.ndarray, " 63"]]]:
     """Yield groups of points with equal features: their indices, and the factor on each angle."""
+    # Points with equal steps to all joints have equal features.
     kinds, kind_of = np.unique(steps, axis=0, return_inverse=True)
     for k, kind in enumerate(kinds):
         yield np.flatnonzero(kind_of.ravel() == k), np.repeat(fade ** kind.astype(float), 3)

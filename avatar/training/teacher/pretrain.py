@@ -70,6 +70,7 @@ class PretrainTeacherTask(PretrainTask):
         """
 
         def make() -> tuple[Tensor, ...]:
+            # Interpolate displacements and confidences from the vertices to the Gaussians.
             known = torch.cat([track.displacements(frame), track.confidence(frame)[:, None]], dim=1)
             corners = known[self.sequence.rig.faces[self.teacher.gaussians.face_index]]
             at_gaussians = on_triangles(corners, self.teacher.gaussians.barycentric)

@@ -223,6 +223,7 @@ class ClothPrediction:
 
     def _recent(self, frame: int, solved: Solved) -> list[int]:
         """Return the nearest solved frames on the same side of the first one that had solved frames before them."""
+        # Frames before the first one were predicted from other neighbours than frames after it.
         done = list(solved)
         first = done[0]
         side = [other for other in done[1:] if (other - first) * (frame - first) > 0]
@@ -230,6 +231,7 @@ class ClothPrediction:
 
     def _extrapolated(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
         """Return the last frame's displacements, continued with a share of the last velocity."""
+        # Constant velocity from the nearest frame and the one behind it.
         near = _nearest(frame, solved)
         last = solved[near][0]
         behind = [other for other in solved if (other - near) * (near - frame) > 0]

@@ -184,6 +184,7 @@ class TrackTask(PhotometricTask):
 
     def step(self, iteration: int) -> Mapping[str, Any]:
         """Take one step of the current frame; its first step sets the start and clears the optimiser's moments."""
+        # A new frame starts from its priors, with Adam's moments cleared.
         place, step = divmod(iteration, self.track_config.steps)
         if step == 0:
             with torch.no_grad():
@@ -261,6 +262,7 @@ class TrackTask(PhotometricTask):
         In the reference frame the template is the surface. Displacements found there are an error of the Gaussians,
         the same in all frames, and are subtracted.
         """
+        # Subtract the error of the Gaussians, which the reference frame shows.
         solved = self.solved.clone()
         if self.track_config.reference is not None:
             solved -= self.solved[self.row[self.track_config.reference]]
@@ -268,6 +270,7 @@ class TrackTask(PhotometricTask):
 
     def _sigma(self, solved: Tensor) -> Tensor:
         """Return the expected error (T, K) of displacements, metres, by the Kalman filter of `expected_errors`."""
+        # The filter runs in the order in which the frames were solved.
         structure = {frame: self.structure[self.row[frame]] for frame in self.order}
         seconds, known = 1.0 / (self.sequence.capture.fps or DEFAULT_FPS), self.track_config.reference is not None
         moved = solved.square().sum(-1).mean(0).sqrt()
@@ -307,6 +310,7 @@ def follow_surface(
     Returns:
         The track and the progress of the steps.
     """
+    # Steps on one process; its results go to the others.
     count = min(config.control_points, len(sequence.rig.vertices))
     avatar = TrackedAvatar(sequence.rig, gaussians, count, still_body=config.still_body)
     context = replace(session.context, distributed=None)
