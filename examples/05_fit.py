@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def built(run: Path) -> Path:
-    command = Build(out=run, capture=PERSON)
+    command = Build(run_folder=run, capture=PERSON)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)  # the small scan is repaired here and there
         plan = command.plan()

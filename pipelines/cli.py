@@ -131,6 +131,14 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
 }
 HELP = ("-h", "--help")
+# Options of earlier versions that named the folder of the run, which is the first argument of every command now.
+OLD_RUN_OPTIONS = {
+    "build": ("--out", "-o"),
+    "register": ("--out", "-o"),
+    "reconstruct": ("--out", "-o"),
+    "train": ("--run", "--run-folder"),
+    "ablate": ("--run",),
+}
 USER_ERROR, INTERRUPTED = 2, 130
 
 
@@ -191,7 +199,21 @@ def _answer(args: list[str], console: Console) -> int:
 
 
 def _run(name: str, args: list[str]) -> int:
+    """Parse the options of a command, run it, and print its answer as JSON if asked for.
+
+    Raises:
+        InputError: an option of earlier versions, a run folder of earlier versions, or an error of the command.
+    """
     import tyro
+
+    old = next((option for option in OLD_RUN_OPTIONS.get(name, ()) if option in args), None)
+    if old is not None:
+        raise InputError(
+            f"option {old}",
+            expected="the folder of the run as the first argument",
+            received=f"{old}, which an earlier version took",
+            remedy=f"write `smplxpp {name} RUN ...`",
+        )
 
     module, cls, description = COMMANDS[name]
     command = tyro.cli(

@@ -64,8 +64,6 @@ def person_run(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Pa
     def build(run: Path) -> None:
         from pipelines.cli import main
 
-        assert (
-            main(["build", "--capture", str(ROOT / "data" / "fixtures" / "person"), "--out", str(run), "--json"]) == 0
-        )
+        assert main(["build", str(run), "--capture", str(ROOT / "data" / "fixtures" / "person"), "--json"]) == 0
 
     return made_once("person", build)

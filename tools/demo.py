@@ -56,7 +56,7 @@ class Demo:
         console = Console(stderr=True)
         if not self.capture.is_dir():
             raise InputError("fixture", expected="a folder", received=str(self.capture), remedy="run in a checkout")
-        Build(out=self.out, capture=self.capture, protocol=TRACKED, budgets=BUDGETS).run()
+        Build(run_folder=self.out, capture=self.capture, protocol=TRACKED, budgets=BUDGETS).run()
         Train(run_folder=self.out, capture=self.capture, preset="demo").run()
         Evaluate(run_folder=self.out, capture=self.capture).run()
         film = self.out / "motion.mp4"

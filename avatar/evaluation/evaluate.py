@@ -314,7 +314,7 @@ def _check_models(models: Mapping[str, AvatarModel], sequence: AvatarSequence) -
             "models to evaluate",
             expected="at least one",
             received="none",
-            remedy="train one with `smplxpp train --run RUN --capture DIR`",
+            remedy="train one with `smplxpp train RUN --capture DIR`",
         )
     for name, model in models.items():
         if model.rig.device != torch.device(sequence.device):

@@ -66,7 +66,7 @@ def read_results(run: Path) -> dict[str, Any]:
             f"ablation of {run}",
             expected="finished rows",
             received=f"still to do: {', '.join(results['waiting'])}" if results.get("waiting") else "none",
-            remedy="make them with `smplxpp ablate --run RUN --capture DIR`",
+            remedy="make them with `smplxpp ablate RUN --capture DIR`",
         )
     return results
 

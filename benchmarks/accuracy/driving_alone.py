@@ -87,9 +87,11 @@ def _builds(folder: Path, runs: Path) -> dict[str, Build]:
     labels = folder / "scans" / "scan_000000_labels.npz"
     plain = {"scan": scan, "no_report": True, "json": True, "until_stage": VALIDATE_STAGE}
     return {
-        "everything found": Build(out=runs / "alone", label_source="body", **plain),
-        "exact parameters, labels found": Build(out=runs / "labels", params=params, label_source="body", **plain),
-        "everything true": Build(out=runs / "true", params=params, labels=labels, label_set="capture", **plain),
+        "everything found": Build(run_folder=runs / "alone", label_source="body", **plain),
+        "exact parameters, labels found": Build(
+            run_folder=runs / "labels", params=params, label_source="body", **plain
+        ),
+        "everything true": Build(run_folder=runs / "true", params=params, labels=labels, label_set="capture", **plain),
     }
 
 

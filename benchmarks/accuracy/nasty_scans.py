@@ -170,9 +170,10 @@ def _verdict(scan: Scan) -> dict[str, object]:
         folder = Path(name)
         np.savez(folder / "scan.npz", vertices=scan.vertices, faces=scan.faces, vertex_colors=scan.colors)
         np.savez(folder / "labels.npz", label=scan.labels)
-        command = [sys.executable, "-m", "pipelines.cli", "build", "--scan", str(folder / "scan.npz")]
+        command = [sys.executable, "-m", "pipelines.cli", "build", str(folder / "run")]
+        command += ["--scan", str(folder / "scan.npz")]
         command += ["--labels", str(folder / "labels.npz"), "--label-set", "capture", "--no-report"]
-        command += ["--params", str(FIXTURE / "params/params.npz"), "--out", str(folder / "run"), "--json"]
+        command += ["--params", str(FIXTURE / "params/params.npz"), "--json"]
         # wait4 gives this child's own time and memory.
         with (folder / "said").open("w") as printed:
             actions = [(os.POSIX_SPAWN_DUP2, printed.fileno(), 1), (os.POSIX_SPAWN_DUP2, printed.fileno(), 2)]

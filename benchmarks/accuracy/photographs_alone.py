@@ -1,6 +1,6 @@
 """Measure each step of a run from photographs, cameras and masks alone against the truth.
 
-    smplxpp build --capture PHOTOGRAPHS --out RUN; smplxpp train --run RUN --capture PHOTOGRAPHS --preset cpu
+    smplxpp build RUN --capture PHOTOGRAPHS; smplxpp train RUN --capture PHOTOGRAPHS --preset cpu
     smplxpp evaluate RUN --capture PHOTOGRAPHS
     python -m benchmarks photographs_alone --run RUN --truth CAPTURE [--name NAME]
 

@@ -86,7 +86,7 @@ class TrainingBenchmark:
         name = f"training_{open_capture(self.capture).name}_{self.preset}"
         name += ("" if share == 1 else f"_times_{share:g}") + (f"_{TRACKED}" if protocol == TRACKED else "")
         commands = (
-            f"smplxpp train --run RUN --capture DIR --preset {self.preset}{of_all}",
+            f"smplxpp train RUN --capture DIR --preset {self.preset}{of_all}",
             "smplxpp evaluate RUN --capture DIR",
             f"python -m benchmarks training --run RUN --capture DIR --preset {self.preset}",
         )
@@ -106,7 +106,7 @@ def stage_figures(folder: Path) -> dict[str, Any]:
             f"training {folder.name}",
             expected="a finished one",
             received=str(folder),
-            remedy="train with `smplxpp train --run RUN --capture DIR`",
+            remedy="train with `smplxpp train RUN --capture DIR`",
         )
     numbers = manifest["numbers"]
     kept = (

@@ -96,7 +96,7 @@ def mapping(job: Job, note: Note) -> None:
 def template(job: Job, note: Note) -> None:
     """The template that the parts after it need, built on the CPU unless the run has one."""
     if not (job.run / TEMPLATE).is_file():
-        command("build", "--capture", job.capture, "--out", job.run, "--no-report")
+        command("build", job.run, "--capture", job.capture, "--no-report")
     note(faces=len(_template(job).faces))
 
 
@@ -263,7 +263,7 @@ def _train(job: Job, name: str, preset: str, *options: object) -> dict[str, Any]
     if (job.run / BUILD_FILE).is_file():
         shutil.copyfile(job.run / BUILD_FILE, run / BUILD_FILE)
     toy = ("--gaussians", 300) if job.toy else ()
-    where = ("--run", run, "--capture", job.capture, "--device", job.device, "--no-report")
+    where = (run, "--capture", job.capture, "--device", job.device, "--no-report")
     return command("train", *where, "--preset", preset, *toy, *options)
 
 

@@ -172,7 +172,7 @@ def require_tools(folder: Path) -> str:
 
 def build_fixture(folder: Path) -> Path:
     """The template of the fixture person."""
-    command = [sys.executable, "-m", "pipelines.cli", "build", "--capture", str(FIXTURE), "--out", str(folder / "run")]
+    command = [sys.executable, "-m", "pipelines.cli", "build", str(folder / "run"), "--capture", str(FIXTURE)]
     subprocess.run([*command, "--no-report"], check=True, stdout=subprocess.DEVNULL)
     return folder / "run"
 

@@ -48,7 +48,7 @@ def _measure(capture: Path, repeats: int) -> dict:
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "run"
-            command = [sys.executable, "-m", "pipelines.cli", "build", "--capture", str(capture), "--out", str(run)]
+            command = [sys.executable, "-m", "pipelines.cli", "build", str(run), "--capture", str(capture)]
             begin = time.perf_counter()
             # wait4 gives this child's own peak memory; output goes nowhere.
             null = os.open(os.devnull, os.O_WRONLY)

@@ -81,7 +81,7 @@ class FitBenchmark:
 
 
 def _scene(folder: Path, run: Path) -> FitScene:
-    command = Build(out=run, capture=folder)
+    command = Build(run_folder=run, capture=folder)
     build(run, command.inputs(), command.config(), last=layout.ASSEMBLE_STAGE)
     template = Template.load(run / layout.TEMPLATE)
     capture = open_capture(folder)

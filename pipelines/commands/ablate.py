@@ -30,7 +30,7 @@ UNTOLD = ("run_folder", "capture", "params", "body", "max_minutes", "device", "f
 class Ablate:
     """Options of `smplxpp ablate`. The same command goes on with an ablation that was interrupted."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `smplxpp build` wrote; the ablation goes into RUN/ablation."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters."""
@@ -81,7 +81,7 @@ class Ablate:
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.scene import TrainInputs
 
-        keep_out_of_capture(self.run_folder, self.capture, subject="--run")
+        keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         for name, value in (("max-minutes", self.max_minutes), ("iterations-share", self.iterations_share)):
             if not value > 0:
                 raise InputError(f"option {name}", expected="a number above 0", received=f"{value:g}")
@@ -106,7 +106,7 @@ class Ablate:
 
     def command(self) -> str:
         """What was asked for, without where it lies and how long it may take."""
-        told = ["smplxpp ablate --run RUN --capture DIR"]
+        told = ["smplxpp ablate RUN --capture DIR"]
         for f in fields(self):
             value = getattr(self, f.name)
             if f.name not in UNTOLD and (value != f.default or f.name == "preset"):

@@ -28,8 +28,8 @@ StageName = Literal[BUILD_STAGES]  # type: ignore[valid-type]
 class Build:
     """Options of `smplxpp build`. Give --capture, or --scan: alone, or with what is known of it."""
 
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Folder of the run; stages that stand in it are not run again."""
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder of the run; finished stages in it are not run again."""
     capture: OptionalPath = None
     """Folder of a capture: photographs, cameras and masks; scans/scan_FFFFFF.ply, params/, labels as far as there are
     any. A scan that there is not is reconstructed, and the body is found."""
@@ -111,7 +111,7 @@ class Build:
         from pipelines.report.sections.build import update_build_report
         from pipelines.stages.build import build
 
-        keep_out_of_capture(self.out, self.capture)
+        keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         plan = self.plan()
         self._check_tools()
         # The bar counts the steps that this build has between its first and its last stage, and the report.
@@ -121,7 +121,7 @@ class Build:
         whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report
         with stage_progress(count + whole, enabled=not self.json) as step:
             build(
-                self.out,
+                self.run_folder,
                 plan.inputs,
                 plan.config,
                 registration=plan.registration,
@@ -133,8 +133,8 @@ class Build:
                 report=None if self.no_report else update_build_report,
             )
         if not self.json:
-            Inspect(run_folder=self.out).run()
-        metrics = read_json(self.out / "metrics.json", subject="metrics")
+            Inspect(run_folder=self.run_folder).run()
+        metrics = read_json(self.run_folder / "metrics.json", subject="metrics")
         failed = sum(check["status"] == "fail" for check in metrics["checks"])
         return {**metrics, "failed": failed, "exit_status": 0}
 
@@ -148,7 +148,7 @@ class Build:
 
     def request(self) -> BuildRequest:
         """Turn the options into one request, with what earlier commands have made in the run."""
-        registered = read_manifest(self.out / REGISTER_STAGE) is not None
+        registered = read_manifest(self.run_folder / REGISTER_STAGE) is not None
         return BuildRequest(
             scan=self.scan,
             capture=self.capture,
@@ -156,9 +156,9 @@ class Build:
             labels=self.labels,
             body=self.body,
             config=self.config(),
-            surface=self.out / reconstructed_scan(self.frame),
-            registration=load_register(self.out) if registered else None,
-            reconstruction=load_reconstruct(self.out),
+            surface=self.run_folder / reconstructed_scan(self.frame),
+            registration=load_register(self.run_folder) if registered else None,
+            reconstruction=load_reconstruct(self.run_folder),
         )
 
     def config(self) -> BuildConfig:

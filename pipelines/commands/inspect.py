@@ -77,7 +77,7 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
             "run folder",
             expected="a folder with stages or a metrics.json",
             received=f"{run} with neither" if run.is_dir() else f"{run}, which does not exist",
-            remedy="make one with `smplxpp build --capture DIR --out RUN`",
+            remedy="make one with `smplxpp build RUN --capture DIR`",
         )
     checks = [CheckRow.of(record, stage=stage["stage"]) for stage in stages for record in stage.pop("records")]
     if not checks:
@@ -104,10 +104,10 @@ def _remedy(run: Path, stage: str) -> str:
     if stage == FIT_STAGE:
         return f"smplxpp fit {run} --capture DIR (with the fit's options)"
     if stage in (REFINE_STAGE, *TRAIN_STAGES):
-        return f"smplxpp train --run {run} --capture DIR (with the training's options)"
+        return f"smplxpp train {run} --capture DIR (with the training's options)"
     if stage in (EVALUATE_STAGE, RELIGHT_STAGE):
         return f"smplxpp evaluate {run} --capture DIR (with the evaluation's options)"
-    return f"smplxpp build --out {run} --from-stage {stage} (with the build's options)"
+    return f"smplxpp build {run} --from-stage {stage} (with the build's options)"
 
 
 def _stage(run: Path, name: str) -> dict[str, Any]:

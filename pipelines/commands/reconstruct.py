@@ -28,10 +28,10 @@ _SHOWN = 8
 class ReconstructCommand:
     """Options of `smplxpp reconstruct`."""
 
-    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
-    """Folder of a capture in any layout of docs/captures.md: photographs, cameras and masks."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of the run; surfaces go into it as 02_reconstruct/scan_FFFFFF.ply, which a build takes as its scan."""
+    capture: Path
+    """Folder of a capture in any layout of docs/captures.md: photographs, cameras and masks."""
     frame: str = "0"
     """Frame to reconstruct; all: every training frame; or numbers and ranges START:STOP:STEP with commas."""
     hold_out: tuple[str, ...] = ()
@@ -71,11 +71,11 @@ class ReconstructCommand:
         from pipelines.runs.layout import RECONSTRUCT_STAGE
         from pipelines.stages.reconstruct import reconstruct_capture
 
-        keep_out_of_capture(self.out, self.capture)
+        keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         inputs, method = self.inputs(), self._method()
-        own = own_run_folder(self.out, (RECONSTRUCT_STAGE, "reconstruct"))
+        own = own_run_folder(self.run_folder, (RECONSTRUCT_STAGE, "reconstruct"))
         with own, shared_progress(enabled=not self.json) as progress:
-            record = reconstruct_capture(self.out, inputs, method=method, force=self.force, progress=progress)
+            record = reconstruct_capture(self.run_folder, inputs, method=method, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
         path = record.folder / "reconstruction.json"
         content = as_object(read_json(path, subject="reconstruction"), subject=f"reconstruction {path}")
@@ -87,7 +87,7 @@ class ReconstructCommand:
             _print(record, scans, problems, report)
         return {
             **record.manifest["numbers"],
-            "run": str(self.out),
+            "run": str(self.run_folder),
             "ran": record.ran,
             "scans": scans,
             "problems": problems,
@@ -150,10 +150,10 @@ class ReconstructCommand:
         """Write the reconstruction's own page, unless it is newer than the reconstruction."""
         from pipelines.report.sections.reconstruct import write_reconstruct_report
 
-        page = self.out / "reconstruct.html"
+        page = self.run_folder / "reconstruct.html"
         made = (record.folder / "manifest.json").stat().st_mtime_ns
         if record.ran or not page.is_file() or page.stat().st_mtime_ns < made:
-            write_reconstruct_report(page, self.out, record)
+            write_reconstruct_report(page, self.run_folder, record)
         return page
 
 

@@ -29,7 +29,7 @@ _SHOWN = 8
 class Register:
     """Options of `smplxpp register`. Give --capture, or --scan with --params or --landmarks."""
 
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of the run; the registration goes into it as 05_register, and `smplxpp build` there takes it up."""
     capture: OptionalPath = None
     """Folder of a capture in any layout of docs/captures.md: cameras with keypoints, masks, label maps; scans."""
@@ -85,13 +85,16 @@ class Register:
         from pipelines.stages.register_capture import register_capture
         from smplxpp.register import read_landmarks
 
-        keep_out_of_capture(self.out, self.capture)
+        keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         require_at_least("option seed", self.seed, 0)
         require_at_least("option frame", self.frame, 0)
         inputs = self.inputs()
-        take_file(self.out, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
-        with own_run_folder(self.out, (REGISTER_STAGE, "register")), shared_progress(enabled=not self.json) as progress:
-            record = register_capture(self.out, inputs, force=self.force, progress=progress)
+        take_file(self.run_folder, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
+        with (
+            own_run_folder(self.run_folder, (REGISTER_STAGE, "register")),
+            shared_progress(enabled=not self.json) as progress,
+        ):
+            record = register_capture(self.run_folder, inputs, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
         path = record.folder / "registration.json"
         content = as_object(read_json(path, subject="registration"), subject=f"registration {path}")
@@ -101,7 +104,7 @@ class Register:
                 _print(record, content, report)
         return {
             **record.manifest["numbers"],
-            "run": str(self.out),
+            "run": str(self.run_folder),
             "ran": record.ran,
             "params": str(record.folder / "params.npz"),
             **told,
@@ -163,10 +166,10 @@ class Register:
         """Write the registration's own page, unless it is newer than the registration."""
         from pipelines.report.sections.register import write_register_report
 
-        page = self.out / "register.html"
+        page = self.run_folder / "register.html"
         made = (record.folder / "manifest.json").stat().st_mtime_ns
         if record.ran or not page.is_file() or page.stat().st_mtime_ns < made:
-            write_register_report(page, self.out, record)
+            write_register_report(page, self.run_folder, record)
         return page
 
 

@@ -33,9 +33,9 @@ STEPS = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
 class Train:
     """Options of `smplxpp train`. It trains what a run lacks; the same command continues with what was interrupted."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN", aliases=("--run-folder",))]
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `smplxpp build` wrote; 66_refine, 70_fit, 80_teacher, 83_cloth, 85_bake and 90_compensate go into
-    it. Write --run-folder with torchrun, which takes --run for an option of its own."""
+    it."""
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
     preset: Literal["paper", "gpu", "paper-small", "cpu", "demo"] = "cpu"
@@ -124,7 +124,7 @@ class Train:
         from pipelines.stages.scene import TrainInputs, open_scene
         from pipelines.stages.train import train
 
-        keep_out_of_capture(self.run_folder, self.capture, subject="--run")
+        keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         config, steps = self.config(), self.steps()
         recipe = config.recipe(self.preset, cloth=self.cloth)

@@ -49,7 +49,7 @@ def keep_out_of_capture(out: Path, capture: Path | None, *, subject: str = "--ou
                 subject,
                 expected=f"a folder apart from the capture {capture}",
                 received=received,
-                remedy=f"choose another with {subject}, as {capture / RUNS_OF_A_CAPTURE / 'NAME'} or runs/{root.name}",
+                remedy=f"choose another folder, as {capture / RUNS_OF_A_CAPTURE / 'NAME'} or runs/{root.name}",
             )
 
 

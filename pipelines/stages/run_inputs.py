@@ -92,7 +92,7 @@ def chosen_protocol(run: Path, asked: str | None, *, own_params: bool, measures:
         "option protocol",
         expected=f"that of run {run}" if own else f"none, as run {run} has none",
         received=f"{asked}, for a template that was {built}",
-        remedy=f"build another run by it (smplxpp build --protocol {asked} --out OTHER), or name the parameters alone "
+        remedy=f"build another run by it (smplxpp build OTHER --protocol {asked}), or name the parameters alone "
         "with --params",
     )
 

@@ -62,7 +62,7 @@ def open_template(run: Path) -> Template:
             f"run {run}",
             expected=f"a template, {TEMPLATE}",
             received="none",
-            remedy="make one with `smplxpp build --capture DIR --out RUN`",
+            remedy="make one with `smplxpp build RUN --capture DIR`",
         )
     return Template.load(path)
 

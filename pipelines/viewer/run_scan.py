@@ -88,7 +88,7 @@ def _unbuilt_scan(run: Path) -> LabelledScan:
             f"run {run}",
             expected="a run of `smplxpp build` with a scan",
             received="a folder without one" if run.is_dir() else "no such folder",
-            remedy="build it first: `smplxpp build --scan SCAN --out RUN`; a build that stops is enough",
+            remedy="build it first: `smplxpp build RUN --scan SCAN`; a build that stops is enough",
         )
     inputs, config = found
     with warnings.catch_warnings():

@@ -30,7 +30,7 @@ def capture(tmp_path_factory):
 
 
 def ablate(run, capture, *options: str) -> int:
-    return main(["ablate", "--run", str(run), "--capture", str(capture), *QUICK, "--rows", *ROWS, *options])
+    return main(["ablate", str(run), "--capture", str(capture), *QUICK, "--rows", *ROWS, *options])
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_table_figures_and_pictures(finished, capsys, capture, monkeypatch):
     assert results["waiting"] == [] and results["rows"]["lbs"]["title"] == "LBS Gaussians"
     assert float(rows[1]["novel_view.psnr"]) == results["rows"]["lbs"]["figures"]["novel_view.psnr"]
     assert results["preset"]["fit"]["sampling"]["count"] == 400
-    assert results["command"].startswith("smplxpp ablate --run RUN --capture DIR --preset demo --rows no-gaussians lbs")
+    assert results["command"].startswith("smplxpp ablate RUN --capture DIR --preset demo --rows no-gaussians lbs")
     assert "--iterations-share 0.01 --gaussians 400" in results["command"] and "device" not in results["command"]
     assert "w/o Gau Non." in (folder / "table.txt").read_text() and "toprule" in (folder / "table.tex").read_text()
     names = {path.stem for path in (folder / "pictures").glob("*.png")}

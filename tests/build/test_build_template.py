@@ -42,7 +42,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, Path]
 @pytest.fixture(scope="module")
 def by_command(small: tuple[TriangleMesh, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("command") / "run"
-    command = Build(out=run, scan=small[1], params=PARAMS, budgets=FEW, samples=2000, label_source="body")
+    command = Build(run_folder=run, scan=small[1], params=PARAMS, budgets=FEW, samples=2000, label_source="body")
     plan = command.plan()
     build(run, plan.inputs, plan.config)
     return run
@@ -134,7 +134,7 @@ def test_what_is_asked_for_has_to_be_one_thing():
 def test_the_embedded_person_is_the_same_through_both_doors(tmp_path):
     """As `make demo` builds it: tracked parameters, registered to keypoints, masks and label maps."""
     budgets = {"upper": 8000, "lower": 8000}
-    plan = Build(out=tmp_path / "run", capture=PERSON, protocol="tracked", budgets=budgets).plan()
+    plan = Build(run_folder=tmp_path / "run", capture=PERSON, protocol="tracked", budgets=budgets).plan()
     build(tmp_path / "run", plan.inputs, plan.config, registration=plan.registration)
     config = BuildConfig(protocol="tracked", budgets=BuildConfig().budgets | budgets)
     result = build_template(capture=PERSON, config=config)

@@ -40,7 +40,7 @@ def scan(tmp_path_factory):
 @pytest.fixture(scope="module")
 def alone(scan):
     run = scan.parent / "run"
-    Build(out=run, scan=scan, until_stage=SEGMENT_STAGE, json=True).run()
+    Build(run_folder=run, scan=scan, until_stage=SEGMENT_STAGE, json=True).run()
     return run
 
 
@@ -100,7 +100,7 @@ def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, scan, monkeyp
         return LocatedBody(fit, 0.1, ("one hand is not there",), (Candidate("by hand", 0.0, 1.0, 1.0, 1.0),))
 
     monkeypatch.setattr(locate, "locate_body", look)
-    build = Build(out=tmp_path / "run", scan=scan, until_stage=LOCATE_STAGE, json=True)
+    build = Build(run_folder=tmp_path / "run", scan=scan, until_stage=LOCATE_STAGE, json=True)
     checks = build.run()["checks"]
     assert checks[0]["status"] == "fail" and "one hand is not there" in checks[0]["explanation"]
     (tmp_path / "run" / LANDMARKS_FILE).write_text(json.dumps({"nose": [0.0, 1.5, 0.1]}))
@@ -129,5 +129,5 @@ def test_what_is_no_person_is_refused_before_anything_is_written(tmp_path):
     )
     write_ply(tmp_path / "cube.ply", TriangleMesh(cube * 1.8, faces))
     with pytest.raises(InputError):
-        Build(out=tmp_path / "run", scan=tmp_path / "cube.ply", json=True).run()
+        Build(run_folder=tmp_path / "run", scan=tmp_path / "cube.ply", json=True).run()
     assert not list((tmp_path / "run").glob("[0-9]*"))

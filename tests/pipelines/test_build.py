@@ -177,7 +177,7 @@ def test_webs_stay_where_the_user_wants_them(small):
     faces = [record["40_transfer"].manifest["numbers"]["upper"]["web_faces"] for record in (kept, cut)]
     assert faces[0] == 0 < faces[1]
     assert load_build(small.folder / "run")[1].webs == WebConfig()
-    assert Build(out=small.folder, keep_webs=True).config().webs.rounds == 0
+    assert Build(run_folder=small.folder, keep_webs=True).config().webs.rounds == 0
 
 
 def test_holes_stay_where_the_user_wants_them(small):
@@ -185,7 +185,7 @@ def test_holes_stay_where_the_user_wants_them(small):
     numbers = record.manifest["numbers"]["darned"]["upper"]
     assert numbers["holes"] > 0 == numbers["closed"]
     assert load_build(small.folder / "run")[1].darning == DarnConfig(width=0.0)
-    assert Build(out=small.folder, keep_holes=True).config().darning == DarnConfig(width=0.0)
+    assert Build(run_folder=small.folder, keep_holes=True).config().darning == DarnConfig(width=0.0)
 
 
 def test_metrics_json_and_manifests_state_what_was_done(person_run):
@@ -225,7 +225,7 @@ def test_the_template_poses_onto_the_scan(person_run):
 
 def test_a_second_call_runs_nothing_and_keeps_the_report(person_run, capsys):
     before = {p: p.stat().st_mtime_ns for p in person_run.rglob("*") if p.is_file() and p.name != ".lock"}
-    assert main(["build", "--capture", str(FIXTURE), "--out", str(person_run), "--json"]) == 0
+    assert main(["build", str(person_run), "--capture", str(FIXTURE), "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["failed"] == 0
     after = {p: p.stat().st_mtime_ns for p in before}
@@ -270,7 +270,7 @@ def test_a_build_from_before_the_choice_of_faces_has_quadric_ones(small):
     del content["config"]["remesh"]
     (small.folder / "build.json").write_text(json.dumps(content))
     assert load_build(small.folder)[1] == BuildConfig()
-    assert Build(out=small.folder, remesh="isotropic").config().remesh == "isotropic"
+    assert Build(run_folder=small.folder, remesh="isotropic").config().remesh == "isotropic"
 
 
 def test_leftovers_of_a_killed_build_go_and_other_files_stay(small):
@@ -394,7 +394,7 @@ def test_a_pickle_that_calls_code_is_not_run(small):
     ("name", "options"), [("woman_casual", []), ("woman_casual", ["--label-source", "views"]), ("man_casual", [])]
 )
 def test_captures_build_within_their_gates(captures, tmp_path, capsys, name, options):
-    assert main(["build", "--capture", str(captures / name), "--out", str(tmp_path), "--json", *options]) == 0
+    assert main(["build", str(tmp_path), "--capture", str(captures / name), "--json", *options]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["failed"] == 0, [c for c in summary["checks"] if c["status"] == "fail"]
     assert (tmp_path / "report.html").is_file()

@@ -94,14 +94,14 @@ def test_unknown_commands_are_answered_with_the_known(capsys):
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["build", "--out", "x"], "either --capture or --scan"),
-        (["build", "--out", "x", "--scan", SCAN, "--keypoints", FIXTURE], "with --capture"),
-        (["build", "--out", "x", "--capture", "nowhere"], "an existing folder, received nowhere"),
-        (["build", "--out", "x", "--capture", FIXTURE, "--frame", "99"], "frame"),
-        (["build", "--out", "x", "--capture", FIXTURE, "--budgets", "hat", "500"], "hat"),
-        (["build", "--out", "x", "--capture", FIXTURE, "--clearance-mm", "nan"], "received nan"),
-        (["build", "--out", "x", "--capture", FIXTURE, "--seed", "-1"], "at least 0"),
-        (["build", "--out", SCAN, "--capture", FIXTURE], "another with --out"),
+        (["build", "x"], "either --capture or --scan"),
+        (["build", "x", "--scan", SCAN, "--keypoints", FIXTURE], "with --capture"),
+        (["build", "x", "--capture", "nowhere"], "an existing folder, received nowhere"),
+        (["build", "x", "--capture", FIXTURE, "--frame", "99"], "frame"),
+        (["build", "x", "--capture", FIXTURE, "--budgets", "hat", "500"], "hat"),
+        (["build", "x", "--capture", FIXTURE, "--clearance-mm", "nan"], "received nan"),
+        (["build", "x", "--capture", FIXTURE, "--seed", "-1"], "at least 0"),
+        (["build", SCAN, "--capture", FIXTURE], "another folder"),
         (["inspect", "nowhere"], "smplxpp build"),
         (["animate", "nowhere", "--params", PARAMS, "--out", "x.gif"], "smplxpp build"),
         (["metrics", SCAN, "nowhere.ply"], "existing file"),
@@ -123,7 +123,7 @@ def test_labels_of_views_that_are_not_there(capsys, tmp_path):
     capture.mkdir()
     for part in ("scans", "params"):
         (capture / part).symlink_to(FIXTURE / part)
-    text = fails(capsys, "build", "--out", tmp_path / "x", "--capture", capture, "--label-source", "views")
+    text = fails(capsys, "build", tmp_path / "x", "--capture", capture, "--label-source", "views")
     assert "--labels" in text and not (tmp_path / "x").exists()
 
 
@@ -150,7 +150,7 @@ def test_json_is_all_that_stdout_gets(capsys, tmp_path, cube):
         ["inspect", tmp_path / "run"],
         ["metrics", cube, cube, "--samples", "100"],
         ["params", "convert", PARAMS, "--out", tmp_path / "p.npz"],
-        ["build", "--capture", FIXTURE, "--out", tmp_path / "b", "--until-stage", "08_capture"],
+        ["build", tmp_path / "b", "--capture", FIXTURE, "--until-stage", "08_capture"],
     ):
         assert main([*map(str, args), "--json"]) == 0
         assert isinstance(json.loads(capsys.readouterr().out), dict)
@@ -168,3 +168,12 @@ def test_warnings_are_words_without_lines_of_code(tmp_path, cube):
     )
     text = " ".join(done.stderr.split())
     assert "WARNING" in text and "units" in text and ".py:" not in text and "warnings.warn" not in text
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("build", "--out"), ("register", "-o"), ("reconstruct", "--out"), ("train", "--run"), ("ablate", "--run")],
+)
+def test_options_of_earlier_versions_that_named_the_run_are_explained(capsys, command, option):
+    text = fails(capsys, command, option, "x", "--capture", "y")
+    assert f"option {option}" in text and f"smplxpp {command} RUN" in text

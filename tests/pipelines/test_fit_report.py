@@ -179,10 +179,9 @@ def test_the_report_of_a_build_gains_the_section_and_keeps_it(fitted, tmp_path):
     run = tmp_path / "run"
     build = [
         "build",
+        str(run),
         "--capture",
         str(FIXTURE),
-        "--out",
-        str(run),
         "--budgets",
         "upper",
         "1500",

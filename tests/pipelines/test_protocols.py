@@ -77,7 +77,7 @@ def root(tmp_path):
 def run_of(folder: Path, root: Path, protocol: str | None, **options) -> Path:
     """A run that holds a template, built by a protocol."""
     run = write_dressed(folder)
-    inputs = Build(out=run, capture=root, protocol=protocol, **options).plan().inputs
+    inputs = Build(run_folder=run, capture=root, protocol=protocol, **options).plan().inputs
     save_build(run, inputs, BuildConfig())
     return run
 
@@ -87,7 +87,8 @@ def run_of(folder: Path, root: Path, protocol: str | None, **options) -> Path:
 
 def test_a_build_takes_the_files_of_its_protocol(root, tmp_path):
     exact, tracked = (
-        Build(out=tmp_path, capture=root, protocol=name, register="off").plan().inputs for name in ("exact", "tracked")
+        Build(run_folder=tmp_path, capture=root, protocol=name, register="off").plan().inputs
+        for name in ("exact", "tracked")
     )
     for inputs, params, labels in ((exact, "params.npz", "labels"), (tracked, "params_noisy.npz", "labels_estimated")):
         assert inputs.params.name == inputs.motion.name == params
@@ -98,7 +99,7 @@ def test_a_build_takes_the_files_of_its_protocol(root, tmp_path):
 
 
 def test_a_build_from_before_there_were_protocols_is_read(root, tmp_path):
-    save_build(tmp_path, Build(out=tmp_path, capture=root).plan().inputs, BuildConfig())
+    save_build(tmp_path, Build(run_folder=tmp_path, capture=root).plan().inputs, BuildConfig())
     content = json.loads((tmp_path / "build.json").read_text())
     del content["inputs"]["protocol"]
     (tmp_path / "build.json").write_text(json.dumps(content))
@@ -107,7 +108,7 @@ def test_a_build_from_before_there_were_protocols_is_read(root, tmp_path):
 
 def test_label_maps_come_first_and_the_scans_own_labels_only_when_asked_for(root, tmp_path, caplog):
     def inputs(**options) -> BuildInputs:
-        return Build(out=tmp_path, capture=root, **options).plan().inputs
+        return Build(run_folder=tmp_path, capture=root, **options).plan().inputs
 
     assert inputs().labels is None and inputs(protocol="exact").labels is None
     assert inputs(label_source="scan").labels.name == "scan_000000_labels.npz"
@@ -123,11 +124,11 @@ def test_label_maps_come_first_and_the_scans_own_labels_only_when_asked_for(root
     (root / "scans" / "scan_000000_labels.npz").unlink()
     assert inputs().labels is None and inputs().label_maps == {}  # the body in the scan is to tell
     with pytest.raises(InputError, match="with --capture"):
-        Build(out=tmp_path, scan=root / "scans" / "scan_000000.ply", protocol="tracked").plan()
+        Build(run_folder=tmp_path, scan=root / "scans" / "scan_000000.ply", protocol="tracked").plan()
 
 
 def test_held_out_cameras_do_not_vote(root, tmp_path):
-    assert sorted(Build(out=tmp_path, capture=root).plan().inputs.label_maps) == ["Ring0", "Ring1"]
+    assert sorted(Build(run_folder=tmp_path, capture=root).plan().inputs.label_maps) == ["Ring0", "Ring1"]
 
 
 # --- which protocol later commands read -----------------------------------------------------------------------------
@@ -173,7 +174,7 @@ def test_the_truth_can_be_lost_without_a_training_by_protocol_tracked_noticing(r
         shutil.rmtree(path)
     (root / "params" / "params.npz").unlink()
     (root / "scans" / "scan_000000_labels.npz").unlink()
-    inputs = Build(out=run, capture=root, protocol="tracked").plan().inputs
+    inputs = Build(run_folder=run, capture=root, protocol="tracked").plan().inputs
     assert inputs == load_build(run)[0]
     after = open_scene(run, TrainInputs(root))
     assert after.digests == before.digests and after.frame == before.frame

@@ -54,7 +54,7 @@ def capture(tmp_path_factory) -> Path:
 
 def refine(run: Path, capture: Path, *options: str) -> int:
     noisy = str(capture / "params" / "params_noisy.npz")
-    command = ["train", "--run", str(run), "--capture", str(capture), "--params", noisy, "--until", "refine"]
+    command = ["train", str(run), "--capture", str(capture), "--params", noisy, "--until", "refine"]
     return main([*command, "--device", "cpu", "--json", "--no-report", *options])
 
 

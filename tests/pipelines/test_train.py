@@ -253,7 +253,7 @@ def test_held_out_cameras_and_scale_are_the_users_choice(fitted, capture):
 def test_the_terminal_shows_figures(own, capture, capsys, monkeypatch):
     monkeypatch.setitem(TRAINING_PRESETS, "demo", QUICK)
     options = [option for option in SMALL if option != "--json"]
-    assert main(["train", "--run", str(own), "--capture", str(capture), *options]) == 0
+    assert main(["train", str(own), "--capture", str(capture), *options]) == 0
     out = capsys.readouterr().out
     assert all(stage in out for stage in ("70_fit", *STAGES)) and "stands" in out and "3 of 3" in out
 
@@ -270,7 +270,6 @@ def test_torchrun_trains_with_two_processes(fitted, capture):
         "-m",
         "pipelines.cli",
         "train",
-        "--run-folder",
         str(fitted),
         "--capture",
         str(capture),

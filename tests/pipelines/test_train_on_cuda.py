@@ -47,7 +47,7 @@ MEASURED = EvaluationConfig(
 
 def on_cuda(command: str, run: Path, capture: Path, *options: str) -> None:
     with pretended_cuda(), mock.patch.dict(TRAINING_PRESETS, demo=DEMO):
-        assert main([command, "--run", str(run), *_told(capture), *options]) == 0
+        assert main([command, str(run), *_told(capture), *options]) == 0
 
 
 def _told(capture: Path) -> tuple[str, ...]:

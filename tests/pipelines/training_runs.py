@@ -43,7 +43,7 @@ QUICK = replace(
 def train(run: Path, capture: Path, *options: str) -> int:
     """The command, with tiny networks as the preset "demo"."""
     with mock.patch.dict(TRAINING_PRESETS, demo=QUICK):
-        return main(["train", "--run", str(run), "--capture", str(capture), *SMALL, *options])
+        return main(["train", str(run), "--capture", str(capture), *SMALL, *options])
 
 
 def refused(capsys, run: Path, capture: Path, *options: str) -> str:

@@ -55,12 +55,12 @@ def test_a_capture_does_not_take_the_place_of_a_stage(tmp_path, name):
 @pytest.mark.parametrize(
     "command",
     [
-        ("build", "--capture", "CAPTURE", "--out", "CAPTURE"),
-        ("register", "--capture", "CAPTURE", "--out", "CAPTURE"),
-        ("train", "--run", "CAPTURE", "--capture", "CAPTURE"),
+        ("build", "CAPTURE", "--capture", "CAPTURE"),
+        ("register", "CAPTURE", "--capture", "CAPTURE"),
+        ("train", "CAPTURE", "--capture", "CAPTURE"),
         ("fit", "CAPTURE", "--capture", "CAPTURE"),
         ("evaluate", "CAPTURE", "--capture", "CAPTURE"),
-        ("ablate", "--run", "CAPTURE", "--capture", "CAPTURE"),
+        ("ablate", "CAPTURE", "--capture", "CAPTURE"),
         ("capture", "check", "CAPTURE", "--out", "CAPTURE"),
         ("capture", "convert", "CAPTURE", "--out", "CAPTURE"),
         ("capture", "degrade", "CAPTURE", "--out", "CAPTURE"),
@@ -99,13 +99,13 @@ def test_a_run_with_stages_of_old_names_is_refused_by_every_command_that_opens_o
     (run / old / "manifest.json").write_text("{}")
     before = sorted(run.rglob("*"))
     commands = (
-        ("build", "--capture", photos, "--out", str(run)),
-        ("register", "--capture", photos, "--out", str(run)),
-        ("reconstruct", photos, "--out", str(run)),
+        ("build", str(run), "--capture", photos),
+        ("register", str(run), "--capture", photos),
+        ("reconstruct", str(run), "--capture", photos),
         ("fit", str(run), "--capture", photos),
-        ("train", "--run", str(run), "--capture", photos),
+        ("train", str(run), "--capture", photos),
         ("evaluate", str(run), "--capture", photos),
-        ("ablate", "--run", str(run), "--capture", photos),
+        ("ablate", str(run), "--capture", photos),
         ("inspect", str(run)),
         ("view", str(run)),
         ("label", str(run)),

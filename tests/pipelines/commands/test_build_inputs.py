@@ -35,7 +35,7 @@ def stages_before(inputs):
 
 
 def test_a_scan_alone(tmp_path):
-    asked = Build(out=tmp_path / "run", scan=PERSON / "scans" / "scan_000000.ply")
+    asked = Build(run_folder=tmp_path / "run", scan=PERSON / "scans" / "scan_000000.ply")
     inputs = asked.plan().inputs
     assert stages_before(inputs) == (LOCATE_STAGE,) and inputs.params is None and inputs.labels is None
     assert asked.plan().registration is None and asked.plan().reconstruction is None
@@ -44,19 +44,19 @@ def test_a_scan_alone(tmp_path):
 
 def test_a_scan_with_parameters_says_its_units(tmp_path):
     params = PERSON / "params" / "params.npz"
-    asked = Build(out=tmp_path / "run", scan=PERSON / "scans" / "scan_000000.ply", params=params)
+    asked = Build(run_folder=tmp_path / "run", scan=PERSON / "scans" / "scan_000000.ply", params=params)
     assert stages_before(asked.plan().inputs) == () and (asked.plan().config.units, asked.plan().config.up) == (
         "m",
         "y",
     )
-    registered = Build(out=tmp_path / "run", scan=asked.scan, params=params, register="on")
+    registered = Build(run_folder=tmp_path / "run", scan=asked.scan, params=params, register="on")
     assert stages_before(registered.plan().inputs) == (REGISTER_STAGE,)
     assert registered.plan().registration.params == params
 
 
 def test_photographs_alone(tmp_path):
     root = capture_of(tmp_path / "capture")
-    asked = Build(out=tmp_path / "run", capture=root, frame=3)
+    asked = Build(run_folder=tmp_path / "run", capture=root, frame=3)
     inputs = asked.plan().inputs
     assert stages_before(inputs) == (RECONSTRUCT_STAGE, LOCATE_STAGE, REGISTER_STAGE)
     assert inputs.scan == tmp_path / "run" / reconstructed_scan(3) and not inputs.label_maps
@@ -67,8 +67,8 @@ def test_photographs_alone(tmp_path):
 
 def test_keypoints_need_no_body_found_in_the_surface(tmp_path):
     root = capture_of(tmp_path / "capture")
-    given = Build(out=tmp_path / "run", capture=root, keypoints=PERSON / "keypoints")
-    own = Build(out=tmp_path / "run", capture=capture_of(tmp_path / "other", "keypoints"))
+    given = Build(run_folder=tmp_path / "run", capture=root, keypoints=PERSON / "keypoints")
+    own = Build(run_folder=tmp_path / "run", capture=capture_of(tmp_path / "other", "keypoints"))
     for asked in (given, own):
         assert stages_before(asked.plan().inputs) == (RECONSTRUCT_STAGE, REGISTER_STAGE)
     assert given.plan().registration.keypoints == given.keypoints
@@ -77,7 +77,7 @@ def test_keypoints_need_no_body_found_in_the_surface(tmp_path):
 def test_a_surface_that_was_reconstructed_stands(tmp_path):
     """What `smplxpp reconstruct --frame all` has made is not made anew for one frame."""
     root, run = capture_of(tmp_path / "capture"), tmp_path / "run"
-    asked, all_frames = Build(out=run, capture=root), ReconstructInputs(root, frames=(0, 1, 2))
+    asked, all_frames = Build(run_folder=run, capture=root), ReconstructInputs(root, frames=(0, 1, 2))
     (run / reconstructed_scan(0)).parent.mkdir(parents=True)
     save_reconstruct(run, all_frames)
     assert asked.plan().reconstruction.frames == (0,)
@@ -87,19 +87,19 @@ def test_a_surface_that_was_reconstructed_stands(tmp_path):
 
 def test_nobody_has_labelled_it(tmp_path):
     root = capture_of(tmp_path / "capture", "scans", "params")
-    by_body = Build(out=tmp_path / "run", capture=root, label_source="body").plan().inputs
+    by_body = Build(run_folder=tmp_path / "run", capture=root, label_source="body").plan().inputs
     assert by_body.labels is None and by_body.label_source == "body"
     with pytest.raises(InputError, match="label maps of its views"):
-        Build(out=tmp_path / "run", capture=root, label_source="views").plan()
+        Build(run_folder=tmp_path / "run", capture=root, label_source="views").plan()
 
 
 def test_options_of_a_capture_beside_a_scan(tmp_path):
     scan = PERSON / "scans" / "scan_000000.ply"
     for name in ("keypoints", "masks"):
         with pytest.raises(InputError, match=f"option {name}"):
-            Build(out=tmp_path / "run", scan=scan, **{name: tmp_path}).plan()
+            Build(run_folder=tmp_path / "run", scan=scan, **{name: tmp_path}).plan()
     with pytest.raises(InputError, match="either --capture or --scan"):
-        Build(out=tmp_path / "run").plan()
+        Build(run_folder=tmp_path / "run").plan()
     assert not (tmp_path / "run").exists()
 
 
@@ -112,9 +112,9 @@ def test_the_frame_of_the_capture_is_kept_apart_from_the_row_of_a_file(tmp_path)
         (capture / "scans" / f"scan_{frame:06d}.ply").touch()
         (capture / "scans" / f"scan_{frame:06d}_labels.npz").touch()
         (capture / "params" / f"{frame:06d}.npz").touch()
-    inputs = Build(out=tmp_path / "run", capture=capture, frame=8).plan().inputs
+    inputs = Build(run_folder=tmp_path / "run", capture=capture, frame=8).plan().inputs
     assert (inputs.frame, inputs.params_row, inputs.params.name) == (8, 0, "000008.npz")
     save_build(tmp_path, inputs, BuildConfig())
     assert load_build(tmp_path)[0].frame == 8
-    stacked = Build(out=tmp_path / "run", scan=inputs.scan, params=inputs.params, frame=8).plan().inputs
+    stacked = Build(run_folder=tmp_path / "run", scan=inputs.scan, params=inputs.params, frame=8).plan().inputs
     assert (stacked.frame, stacked.params_row) == (8, 8)

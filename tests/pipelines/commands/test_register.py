@@ -27,21 +27,21 @@ def solver(monkeypatch):
 
 
 def test_the_command_prints_its_numbers_and_a_table(tmp_path, solver, capsys):
-    assert main(["register", *ASKED, "--out", str(tmp_path), "--json", "--no-report"]) == 0
+    assert main(["register", str(tmp_path), *ASKED, "--json", "--no-report"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["frames"] == 2 and printed["ran"] and Path(printed["params"]).is_file()
     assert (
         printed["residuals"]["before"]["keypoints_px"] == 8.0 and printed["residuals"]["after"]["keypoints_px"] == 1.5
     )
     assert printed["report"] is None and set(printed["by_camera"]) == set(solver.shown[0].cameras)
-    assert main(["register", *ASKED, "--out", str(tmp_path), "--no-report"]) == 0
+    assert main(["register", str(tmp_path), *ASKED, "--no-report"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "keypoints to the body 8.00 px 1.50 px" in shown and "2 frames registered; stands, not run again" in shown
     assert len(solver.shown) == 1
 
 
 def test_the_page_stands_alone(tmp_path, solver, capsys):
-    assert main(["register", *ASKED, "--out", str(tmp_path), "--json"]) == 0
+    assert main(["register", str(tmp_path), *ASKED, "--json"]) == 0
     page = Path(json.loads(capsys.readouterr().out)["report"])
     text = page.read_text()
     for words in (
@@ -53,7 +53,7 @@ def test_the_page_stands_alone(tmp_path, solver, capsys):
     ):
         assert words in text
     made = page.stat().st_mtime_ns
-    assert main(["register", *ASKED, "--out", str(tmp_path), "--json"]) == 0
+    assert main(["register", str(tmp_path), *ASKED, "--json"]) == 0
     assert page.stat().st_mtime_ns == made
 
 
@@ -70,7 +70,7 @@ def test_the_page_stands_alone(tmp_path, solver, capsys):
     ],
 )
 def test_bad_options_are_refused_in_words(tmp_path, solver, capsys, options, words):
-    assert main(["register", *options, "--out", str(tmp_path / "run"), "--json"]) == 2
+    assert main(["register", str(tmp_path / "run"), *options, "--json"]) == 2
     assert words in json.loads(capsys.readouterr().out)["error"]["message"]
     assert not solver.shown
 
@@ -78,12 +78,12 @@ def test_bad_options_are_refused_in_words(tmp_path, solver, capsys, options, wor
 def test_named_landmarks_are_kept_in_the_run(tmp_path, solver, capsys):
     placed, run = tmp_path / "mine.json", tmp_path / "run"
     placed.write_text(json.dumps({"nose": [0.0, 1.5, 0.1]}))
-    assert main(["register", *ASKED, "--out", str(run), "--landmarks", str(placed), "--no-report"]) == 0
+    assert main(["register", str(run), *ASKED, "--landmarks", str(placed), "--no-report"]) == 0
     assert (run / "landmarks.json").read_bytes() == placed.read_bytes()
-    assert main(["register", *ASKED, "--out", str(run), "--no-report", "--force"]) == 0
+    assert main(["register", str(run), *ASKED, "--no-report", "--force"]) == 0
     assert [set(shown.landmarks[0]) for shown in solver.shown] == [{"nose"}] * 2
     placed.write_text("[]")
-    assert main(["register", *ASKED, "--out", str(run), "--landmarks", str(placed), "--json"]) == 2
+    assert main(["register", str(run), *ASKED, "--landmarks", str(placed), "--json"]) == 2
     assert "an object" in capsys.readouterr().out
     assert b"nose" in (run / "landmarks.json").read_bytes()
 
@@ -92,7 +92,7 @@ def test_named_landmarks_are_kept_in_the_run(tmp_path, solver, capsys):
 
 
 def registration_of(out, **options) -> RegisterInputs | None:
-    command = Build(out=out, capture=options.pop("capture", FIXTURE), **options)
+    command = Build(run_folder=out, capture=options.pop("capture", FIXTURE), **options)
     return command.plan().registration
 
 
@@ -110,16 +110,16 @@ def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
     capture = shutil.copytree(FIXTURE, tmp_path / "capture", ignore=unused)
     with pytest.raises(InputError, match=r"params/000000\.npz"):
         registration_of(tmp_path, capture=capture, register="off")
-    without = Build(out=tmp_path / "run", capture=capture).plan().inputs
+    without = Build(run_folder=tmp_path / "run", capture=capture).plan().inputs
     assert stages_of(without)[:2] == ("03_locate", "05_register")
     (capture / "keypoints").mkdir()
-    found = Build(out=tmp_path / "run", capture=capture).plan().inputs
+    found = Build(run_folder=tmp_path / "run", capture=capture).plan().inputs
     assert found.params is None and found.motion is None and stages_of(found)[0] == "05_register"
     assert registration_of(tmp_path, capture=capture).start
 
 
 def test_a_build_takes_up_what_register_has_made(tmp_path, solver, capsys):
-    assert main(["register", *ASKED, "--out", str(tmp_path), "--seed", "3", "--json", "--no-report"]) == 0
+    assert main(["register", str(tmp_path), *ASKED, "--seed", "3", "--json", "--no-report"]) == 0
     options = ["--capture", str(FIXTURE), "--out", str(tmp_path), "--until-stage", "10_body", "--json"]
     assert main(["build", *options]) == 0
     assert len(solver.shown) == 1
@@ -140,7 +140,9 @@ def test_a_scan_is_registered_when_asked(tmp_path):
 
 
 def test_options_reach_the_inputs(tmp_path):
-    command = Register(out=tmp_path, capture=FIXTURE, initial="none", frames="0:4:2", hold_out=("Cam001",), frame=2)
+    command = Register(
+        run_folder=tmp_path, capture=FIXTURE, initial="none", frames="0:4:2", hold_out=("Cam001",), frame=2
+    )
     inputs = command.inputs()
     assert (inputs.start, inputs.frames, inputs.hold_out, inputs.frame) == (False, (0, 2), ("Cam001",), 2)
 
@@ -152,7 +154,9 @@ def test_keypoints_and_masks_of_other_folders_take_the_place_of_the_captures(tmp
 
     apart = shutil.copytree(FIXTURE / "keypoints", tmp_path / "k")
     (apart / "Cam001.npz").unlink()
-    options = Register(out=tmp_path / "run", capture=FIXTURE, initial="none", keypoints=apart, masks=FIXTURE / "masks")
+    options = Register(
+        run_folder=tmp_path / "run", capture=FIXTURE, initial="none", keypoints=apart, masks=FIXTURE / "masks"
+    )
     inputs = options.inputs()
     assert (inputs.keypoints, inputs.masks) == (apart, FIXTURE / "masks")
     seen = observe(inputs, load_body()).observations
@@ -161,7 +165,7 @@ def test_keypoints_and_masks_of_other_folders_take_the_place_of_the_captures(tmp
     save_register(tmp_path / "run", inputs)
     assert load_register(tmp_path / "run") == inputs
     with pytest.raises(InputError, match="option keypoints"):
-        Register(out=tmp_path, scan=FIXTURE / "scans/scan_000000.ply", keypoints=apart).inputs()
+        Register(run_folder=tmp_path, scan=FIXTURE / "scans/scan_000000.ply", keypoints=apart).inputs()
 
 
 def test_a_folder_of_scans_takes_the_place_of_the_captures(tmp_path):
@@ -173,7 +177,7 @@ def test_a_folder_of_scans_takes_the_place_of_the_captures(tmp_path):
     folder.mkdir()
     for frame in (0, 2):
         shutil.copy(FIXTURE / "scans" / "scan_000000.ply", folder / f"scan_{frame:06d}.ply")
-    inputs = Register(out=tmp_path / "run", capture=FIXTURE, frames="0:4", scans=folder).inputs()
+    inputs = Register(run_folder=tmp_path / "run", capture=FIXTURE, frames="0:4", scans=folder).inputs()
     body = load_body()
     seen = observe(inputs, body)
     assert set(seen.observations.scans) == {0, 2} and "scan of frame 2" in observed_digests(
@@ -187,6 +191,6 @@ def test_a_folder_of_scans_takes_the_place_of_the_captures(tmp_path):
         ({"scan": folder / "scan_000000.ply"}, "option scans"),
     ):
         with pytest.raises(InputError, match=words):
-            Register(out=tmp_path, scans=folder, **options).inputs()
+            Register(run_folder=tmp_path, scans=folder, **options).inputs()
     with pytest.raises(InputError, match="option scans"):
-        observe(Register(out=tmp_path, capture=FIXTURE, frames="0:4", scans=tmp_path / "run").inputs(), body)
+        observe(Register(run_folder=tmp_path, capture=FIXTURE, frames="0:4", scans=tmp_path / "run").inputs(), body)

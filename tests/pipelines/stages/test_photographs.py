@@ -30,7 +30,7 @@ def built(person_run):
 
 @pytest.fixture
 def inputs(tmp_path) -> BuildInputs:
-    return Build(out=tmp_path, capture=FIXTURE).plan().inputs
+    return Build(run_folder=tmp_path, capture=FIXTURE).plan().inputs
 
 
 def test_a_build_of_a_capture_looks_at_its_photographs(person_run):
@@ -80,7 +80,7 @@ def test_a_capture_of_many_cameras_gives_a_few_photographs_and_none_held_out(tmp
         (folder / f"C{k:02d}_rgb000000.JPG").write_bytes(b"")
     (root / "capture.json").write_text(json.dumps({"novel_views": ["C00", "C39"]}))
     shutil.copy(FIXTURE / "cameras.json", root)
-    found = Build(out=tmp_path / "run", capture=root, label_source="scan").plan().inputs
+    found = Build(run_folder=tmp_path / "run", capture=root, label_source="scan").plan().inputs
     assert list(found.photographs)[::7] == ["C01", "C38"] and len(found.photographs) == 8
     assert found.cameras == root / "cameras.json"
     save_build(tmp_path, found, BuildConfig())

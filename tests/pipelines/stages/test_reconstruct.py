@@ -32,7 +32,7 @@ COARSE = {"cell": 30.0, "hull_only": True, "json": True}
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reconstruct") / "run"
-    return folder, ReconstructCommand(capture=FIXTURE, out=folder, frame="0", **COARSE).run()
+    return folder, ReconstructCommand(capture=FIXTURE, run_folder=folder, frame="0", **COARSE).run()
 
 
 def test_it_writes_a_closed_coloured_scan_in_metres_and_a_page(run):
@@ -72,10 +72,12 @@ def test_hold_out_takes_the_place_of_the_captures_own():
 
 def test_it_stands_and_is_made_anew_for_other_options(run):
     folder, _ = run
-    again = ReconstructCommand(capture=FIXTURE, out=folder, frame="0", **COARSE).run()
+    again = ReconstructCommand(capture=FIXTURE, run_folder=folder, frame="0", **COARSE).run()
     assert not again["ran"]
     assert load_reconstruct(folder) == ReconstructInputs(FIXTURE, (0,), refine=False, cell_mm=30.0)
-    other = ReconstructCommand(capture=FIXTURE, out=folder, frame="0", **{**COARSE, "cell": 40.0}, no_report=True).run()
+    other = ReconstructCommand(
+        capture=FIXTURE, run_folder=folder, frame="0", **{**COARSE, "cell": 40.0}, no_report=True
+    ).run()
     assert other["ran"] and other["cell_mm"] == pytest.approx(40.0)
 
 
@@ -134,8 +136,8 @@ def test_two_cameras_are_refused_before_work(tmp_path):
 
 def test_a_frame_that_is_not_there_is_refused():
     with pytest.raises(InputError, match="frame"):
-        ReconstructCommand(capture=FIXTURE, out=FIXTURE, frame="99").inputs()
-    inputs = ReconstructCommand(capture=FIXTURE, out=FIXTURE, frame="all").inputs()
+        ReconstructCommand(capture=FIXTURE, run_folder=FIXTURE, frame="99").inputs()
+    inputs = ReconstructCommand(capture=FIXTURE, run_folder=FIXTURE, frame="all").inputs()
     assert inputs.frames is None
     capture = open_photographs(inputs)
     assert set(usable_frames(capture, None)) == set(capture.splits.train_frames)
@@ -150,7 +152,7 @@ def test_another_programs_mesh_is_taken_and_put_into_the_cameras_world(run, tmp_
     with pytest.raises(InputError, match="--mesh"):
         reconstruct_capture(tmp_path / "run", ReconstructInputs(FIXTURE, mesh=tmp_path / "neus2.ply"))
     said = ReconstructCommand(
-        capture=FIXTURE, out=tmp_path / "run", mesh=tmp_path / "neus2.ply", json=True, no_report=True
+        capture=FIXTURE, run_folder=tmp_path / "run", mesh=tmp_path / "neus2.ply", json=True, no_report=True
     ).run()
     found = read_raw_mesh(tmp_path / "run" / reconstructed_scan(0))
     assert found.vertices == pytest.approx(raw.vertices, abs=1e-5)
@@ -170,11 +172,11 @@ def test_a_neural_surface_needs_a_gpu_or_the_word(tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match="sdf") as caught:
-        ReconstructCommand(capture=FIXTURE, out=tmp_path / "run", method="sdf").run()
+        ReconstructCommand(capture=FIXTURE, run_folder=tmp_path / "run", method="sdf").run()
     assert "--device cpu" in caught.value.remedy
     assert not (tmp_path / "run").exists()
     with pytest.raises(InputError, match="neither --mesh nor --hull-only"):
-        ReconstructCommand(capture=FIXTURE, out=tmp_path / "run", method="sdf", hull_only=True).run()
+        ReconstructCommand(capture=FIXTURE, run_folder=tmp_path / "run", method="sdf", hull_only=True).run()
 
 
 def test_a_neural_surface_on_the_cpu_is_a_stage_like_others(tmp_path):
