@@ -47,4 +47,4 @@ _EXPORTS: dict[str, str] = {
 __all__ = [*_EXPORTS]
 
 
-__getattr__, __dir__ = lazy_exports("avatar", _EXPORTS)
+__getattr__, __dir__ = lazy_exports("avatar", {**_EXPORTS, "__version__": "smplxpp"})

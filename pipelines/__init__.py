@@ -2,14 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from smplxpp.core.lazy import lazy_exports
 
-
-def __getattr__(name: str) -> str:
-    if name == "__version__":
-        return import_module("smplxpp").__version__
-    raise AttributeError(f"module 'pipelines' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), "__version__"])
+__getattr__, __dir__ = lazy_exports("pipelines", {"__version__": "smplxpp"})

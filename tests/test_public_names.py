@@ -17,3 +17,9 @@ def test_functions_stay_functions_after_their_packages_are_loaded(package):
         _ = package.nonsense
     assert callable(smplxpp.pose)
     assert callable(smplxpp.unpose)
+
+
+def test_every_package_has_the_version_of_the_distribution():
+    import pipelines
+
+    assert smplxpp.__version__ and avatar.__version__ == pipelines.__version__ == smplxpp.__version__
