@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.synth.checks import depths, free_edge_strain
-from pipelines.synth.person_file import load_person
+from pipelines.synth.person import load_person
 from pipelines.synth.simulate import Take
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture

@@ -16,9 +16,17 @@ import tyro
 from jaxtyping import Float, Float32
 
 from pipelines.commands.options import OptionalPath
-from pipelines.synth.make_capture import SynthConfig, add_tracked_inputs, make_capture
-from pipelines.synth.person import LABEL_NAMES, PART_LABELS, PART_NAMES, PERSON_BETAS, Person, face_marks
-from pipelines.synth.person_file import face_landmarks
+from pipelines.synth.config import SynthConfig
+from pipelines.synth.make_capture import add_tracked_inputs, make_capture
+from pipelines.synth.person import (
+    LABEL_NAMES,
+    PART_LABELS,
+    PART_NAMES,
+    PERSON_BETAS,
+    Person,
+    face_landmarks,
+    face_marks,
+)
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture.writers.arrays import save_compact
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text

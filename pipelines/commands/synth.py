@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
-from pipelines.synth.make_capture import SynthConfig, make_capture
-from pipelines.synth.motions import motion_kind
-from pipelines.synth.outfits import CLOTHES
+from pipelines.synth.config import SynthConfig, motion_kind
+from pipelines.synth.make_capture import make_capture
+from pipelines.synth.person import CLOTHES
 from pipelines.synth.soft_light import Environment
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.panorama_file import read_panorama

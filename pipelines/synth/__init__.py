@@ -1,1 +1,1 @@
-"""The synthetic capture: performance, clothes in motion, soft light, files."""
+"""Synthetic people and captures: performances, clothes in motion, soft light, scans, and procedural people."""

@@ -1,4 +1,4 @@
-"""What was made, in figures: skinning, cloth, contact, silhouettes, the scan."""
+"""Measure a synthetic capture: skinning, cloth strain, depth of clothes in the body, and the scan."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from smplxpp.core.signed_distance import SignedDistanceField
 
 _MM = 1e3
 _GARMENTS = ("upper", "lower")
-_DEPTHS = 100  # frames, evenly chosen, of which depth is measured
 
 
 def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, float]:
-    """Measure body and cloth against skinning, strain of free edges, depth in the body, the tracker's error."""
+    """Return figures of a take: distances from skinning, strain of free edges, depth in the body, tracker's error."""
     count = person.body.vertex_count
     posed = person.body.forward(take.params).vertices
     moved = row_lengths((take.vertices - take.skinned).reshape(-1, 3)).reshape(take.vertices.shape[:2])
@@ -30,7 +29,8 @@ def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, floa
     for name in (*_GARMENTS, "hair"):
         own = person.vertex_part == PART_NAMES.index(name)
         out[f"{name}_vs_skinning_mean_mm"] = _MM * float(moved[:, own].mean())
-    depth = _depths(person, take.vertices[:: -(-len(take.vertices) // _DEPTHS)])
+    # Depth costs a distance query a frame, so that about 100 frames at even steps stand for all.
+    depth = _depths(person, take.vertices[:: -(-len(take.vertices) // 100)])
     for name in _GARMENTS:
         strain = free_edge_strain(person, take, name)
         out |= {
@@ -43,7 +43,7 @@ def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, floa
 
 
 def _depths(person: Person, frames: Float[np.ndarray, "T V 3"]) -> dict[str, Float[np.ndarray, "T _"]]:
-    """Return how deep the garments' vertices lie in the body, metres, 0 outside."""
+    """Return the depth of the garments' vertices in the body by garment, metres; 0 outside."""
     count, own = person.body.vertex_count, {k: person.vertex_part == PART_NAMES.index(k) for k in _GARMENTS}
     found: dict[str, list[np.ndarray]] = {name: [] for name in _GARMENTS}
     for vertices in frames:
@@ -54,12 +54,12 @@ def _depths(person: Person, frames: Float[np.ndarray, "T V 3"]) -> dict[str, Flo
 
 
 def depths(surface: TriangleMesh, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
-    """Return how deep points lie inside a closed surface, metres; 0 outside. Winding numbers tell the sides exactly."""
+    """Return the depth of points inside a closed surface, metres; 0 outside. Winding numbers give the side exactly."""
     return np.maximum(-SignedDistanceField(surface, solid=True).query(points).distance, 0.0)
 
 
 def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarray, "T E"]:
-    """Return the strain, against frame 0's skinned layer, of edges whose ends both are free cloth."""
+    """Return the strain of edges between two free vertices, relative to the skinned layer of frame 0."""
     mesh, used = person.tpose.submesh(person.face_part == PART_NAMES.index(garment))
     edges = used[mesh.edges]
     edges = edges[(take.attachment[edges] < 1.0).all(axis=1)]
@@ -71,7 +71,8 @@ def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarr
 
 
 def scan_checks(reference: TriangleMesh, scan: SimulatedScan) -> dict[str, float]:
-    """Measure the scan against the layers that it shows."""
+    """Return figures of a scan: distances from the layers that it shows, share of webs, topology."""
+    # Vertices farther than 5 mm from what they show belong to webs.
     shown = scan.shown_on(reference)
     distance = row_lengths(scan.mesh.vertices - shown) * _MM
     inside = SignedDistanceField(scan.mesh, solid=True).query(shown[distance < 5]).distance

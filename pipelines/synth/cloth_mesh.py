@@ -1,4 +1,4 @@
-"""Attributed meshes: subdivide, cut along a level set, fair, push out of a body. What garments are made with."""
+"""Operations on meshes with skinning weights: subdivide, clip along a level set, smooth, diffuse, push out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ from smplxpp.core.signed_distance import SignedDistanceField
 
 @dataclass(frozen=True, eq=False)
 class ClothMesh:
-    """A mesh whose vertices carry skinning weights."""
+    """A mesh whose vertices carry skinning weights.
+
+    Attributes:
+        vertices: metres.
+        faces: indices of vertices.
+        weights: weight of each joint.
+    """
 
     vertices: Float[np.ndarray, "N 3"]
     faces: Int[np.ndarray, "M 3"]
@@ -25,11 +31,11 @@ class ClothMesh:
 
     @property
     def mesh(self) -> TriangleMesh:
-        """The mesh without the weights."""
+        """The geometry alone, without skinning weights."""
         return TriangleMesh(self.vertices, self.faces)
 
     def with_vertices(self, vertices: Float[np.ndarray, "N 3"]) -> ClothMesh:
-        """Return the same faces and weights at other places."""
+        """Return the same faces and weights with other vertices."""
         return replace(self, vertices=vertices)
 
 
@@ -53,7 +59,7 @@ def loop_subdivide(cloth: ClothMesh, times: int = 1) -> ClothMesh:
 
 def clip(cloth: ClothMesh, level: Float[np.ndarray, " N"]) -> ClothMesh:
     """Return the part where the piecewise linear `level` is not negative, cut exactly along its zero line."""
-    # A vertex a hair's breadth from the line goes onto its keeping side: slivers would follow otherwise.
+    # Vertices very near the line move to the kept side, because they would make slivers.
     level = np.where(np.abs(level) < 1e-3 * np.abs(level).max(), 1e-12, level)
     keep = level >= 0
     faces = cloth.faces
@@ -63,6 +69,7 @@ def clip(cloth: ClothMesh, level: Float[np.ndarray, " N"]) -> ClothMesh:
     odd = np.where(keep[cut].sum(axis=1) == 1, np.argmax(keep[cut], axis=1), np.argmin(keep[cut], axis=1))
     cut = np.take_along_axis(cut, (odd[:, None] + np.arange(3)) % 3, axis=1)
 
+    # One new vertex on each cut edge, by linear interpolation.
     ends = np.sort(np.concatenate([cut[:, [0, 1]], cut[:, [0, 2]]]), axis=1)
     edges, crossing = np.unique(ends, axis=0, return_inverse=True)
     crossing = crossing.reshape(2, -1) + len(level)
@@ -71,6 +78,7 @@ def clip(cloth: ClothMesh, level: Float[np.ndarray, " N"]) -> ClothMesh:
     def extended(values: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "P D"]:
         return np.concatenate([values, (1 - t) * values[edges[:, 0]] + t * values[edges[:, 1]]])
 
+    # A kept corner leaves one triangle, a dropped one leaves two.
     a, b, c, p, q = cut[:, 0], cut[:, 1], cut[:, 2], crossing[0], crossing[1]
     corner = keep[a]
     new_faces = np.concatenate(
@@ -86,7 +94,7 @@ def clip(cloth: ClothMesh, level: Float[np.ndarray, " N"]) -> ClothMesh:
 
 
 def fairing_operator(mesh: TriangleMesh) -> csr_matrix:
-    """Make the (N, N) mean of neighbours; a border vertex has border neighbours alone, so that hems stay smooth."""
+    """Return the (N, N) mean over neighbours; of border vertices over border neighbours, so that hems stay smooth."""
     n = mesh.vertex_count
     border = np.zeros(n, dtype=bool)
     border[mesh.border_edges] = True
@@ -102,7 +110,7 @@ def fairing_operator(mesh: TriangleMesh) -> csr_matrix:
 
 
 def smooth(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, steps: int) -> Float[np.ndarray, "N D"]:
-    """Move vertex values `steps` times half-way to the mean of their neighbours."""
+    """Return vertex values moved `steps` times halfway to the mean of their neighbours (Laplacian smoothing)."""
     operator = fairing_operator(mesh)
     for _ in range(steps):
         values = 0.5 * (values + operator @ values)
@@ -110,7 +118,7 @@ def smooth(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, steps: int) 
 
 
 def diffuse(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, radius: float) -> Float[np.ndarray, "N D"]:
-    """Diffuse vertex values implicitly over about `radius` metres: `(M + radius^2 L) x = M x0`."""
+    """Return vertex values diffused implicitly over about `radius` metres: `(M + radius^2 L) x = M x0`."""
     laplacian = -igl.cotmatrix(mesh.vertices, mesh.faces)
     mass = igl.massmatrix(mesh.vertices, mesh.faces, igl.MASSMATRIX_TYPE_BARYCENTRIC)
     mass = mass + 1e-12 * identity(mesh.vertex_count)
@@ -120,10 +128,17 @@ def diffuse(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, radius: flo
 def push_out(
     mesh: TriangleMesh, inner: TriangleMesh, *, clearance: float, solid: bool, reach: float = 0.04
 ) -> Float[np.ndarray, "N 3"]:
-    """Return vertices at least `clearance` metres outside `inner`; the moves are smoothed between rounds.
+    """Return the vertices moved at least `clearance` metres outside `inner`, in rounds of less and less smoothed moves.
 
-    `inner` is a body (`solid`) or an open sheet. Vertices deeper than `reach`, or whose closest point is on a border
-    of a sheet, stay: the sign of the distance says nothing there.
+    Vertices deeper than `reach`, or whose closest point is on the border of a sheet, stay, because the sign of the
+    distance is unreliable there.
+
+    Args:
+        mesh: the cloth.
+        inner: a closed body or an open sheet.
+        clearance: least distance, metres.
+        solid: whether `inner` is closed.
+        reach: largest depth of vertices that are moved, metres.
     """
     field = SignedDistanceField(inner, solid=solid)
     vertices = mesh.vertices

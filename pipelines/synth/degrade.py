@@ -1,4 +1,4 @@
-"""degrade_capture: from a capture with exact inputs one as trackers and parsers give it, with both protocols."""
+"""degrade_capture: add to a capture with exact inputs those that trackers and parsers give, with both protocols."""
 
 from __future__ import annotations
 
@@ -10,17 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.synth import tracked_inputs as tracked
 from pipelines.synth.camera_rig import camera_rig
-from pipelines.synth.tracked_inputs import (
-    ESTIMATED_LABELS,
-    EXACT_PARAMETERS,
-    INPUTS,
-    KEYPOINTS,
-    TRACKED_PARAMETERS,
-    protocols,
-    write_estimated_labels,
-    write_tracked_keypoints,
-)
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture, open_capture
@@ -33,20 +24,17 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.validation import require_at_least
 
 _DESCRIPTIONS = ("capture.json", "manifest.json")
-_HEAD = ("neck", "head", "jaw")
-# Boxes about joints hold the flesh around them, metres.
-_FLESH = 0.16
 
 
 @dataclass(frozen=True)
 class DegradeConfig:
-    """What to make.
+    """Errors, files and cameras of a degraded capture.
 
     Attributes:
-        seed: of all errors.
+        seed: seed of all errors.
         copy: copy files rather than link them.
-        rig: cameras of a synthetic ring, for a capture without; 0: none, and no keypoints.
-        size: height of their images in pixels.
+        rig: number of cameras of a synthetic ring, for a capture without cameras; 0: no ring and no keypoints.
+        size: height of the ring's images in pixels.
     """
 
     seed: int = 0
@@ -62,8 +50,15 @@ class DegradeConfig:
 
 @dataclass(frozen=True)
 class Degraded:
-    """What was made: folder, frames with parameters, cameras with keypoints, the share of wrong foreground labels, and
-    what could not be made, in words."""
+    """Figures and notes of a degraded capture.
+
+    Attributes:
+        out: its folder.
+        frames: number of frames with parameters.
+        cameras: number of cameras with keypoints.
+        labels_wrong: share of foreground pixels with a wrong label.
+        left_out: notes on files that could not be made.
+    """
 
     out: Path
     frames: int
@@ -80,21 +75,21 @@ def degrade_capture(
     body: BodyModel | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> Degraded:
-    """Write a capture that has, beside its exact inputs, those that trackers would give; whole or not at all.
+    """Write a capture with exact inputs and those that trackers would give, whole or not at all.
 
-    All files of the old one are linked, but its description and its keypoints. Added are `params/params_noisy.npz`
+    All files of the source are linked except its description and its keypoints. Added are `params/params_noisy.npz`
     where there is none, `keypoints/` from the exact parameters, `labels_estimated/` from the label maps, and
     `capture.json` with the keys of the old description, "inputs" and "protocols".
 
     Args:
         source: folder of a capture in our layout whose parameters and labels are exact.
         out: a new folder apart from it.
-        config: what to make.
-        body: of the parameters; None: the open body.
-        progress: called with the name of the work under way and its share done.
+        config: settings.
+        body: body model of the parameters; None: the open body.
+        progress: called with the name of the current work and the share of it that is done.
 
     Raises:
-        InputError: another layout, no parameters, a rig for a capture that has cameras, or a folder that is in use.
+        InputError: another layout, no parameters, a rig for a capture with cameras, or a folder with other files.
     """
     config, body = config or DegradeConfig(), body or load_body()
     source, out = Path(source).resolve(), Path(out).absolute()
@@ -104,6 +99,7 @@ def degrade_capture(
     description = _description(source)
     left_out = []
     with atomic_folder(out) as root:
+        # Link what stays, then write parameters, cameras, keypoints and labels, and the description last.
         _link(source, root, copy=config.copy)
         _write_params(root / "params", params, config.seed)
         if config.rig:
@@ -112,20 +108,22 @@ def degrade_capture(
         else:
             shown = capture
         if shown.cameras:
-            write_tracked_keypoints(
+            tracked.write_tracked_keypoints(
                 root, shown, body, params, seed=config.seed, progress=lambda share: progress("keypoints", share)
             )
         else:
             left_out.append("keypoints: the capture has no cameras; --rig N makes a ring of them")
-        wrong = write_estimated_labels(root, shown, seed=config.seed, progress=lambda share: progress("labels", share))
+        wrong = tracked.write_estimated_labels(
+            root, shown, seed=config.seed, progress=lambda share: progress("labels", share)
+        )
         has = {kind: any(capture.recording.files.get(kind, {}).values()) for kind in ("label", "normal")}
         if not has["label"]:
-            left_out.append("label maps: the capture has none to err from")
+            left_out.append("label maps: the capture has none to degrade")
         if not description:
             write_description(root / _DESCRIPTIONS[0], capture.recording, shown.splits, capture.frames)
             description = _description(root)
-        kinds = protocols(labels=has["label"], normals=has["normal"], keypoints=bool(shown.cameras))
-        content = {**description, "inputs": description.get("inputs", INPUTS), "protocols": kinds}
+        kinds = tracked.protocols(labels=has["label"], normals=has["normal"], keypoints=bool(shown.cameras))
+        content = {**description, "inputs": description.get("inputs", tracked.INPUTS), "protocols": kinds}
         atomic_write_text(root / _DESCRIPTIONS[0], json.dumps(content, indent=1) + "\n")
     return Degraded(out, len(params), len(shown.cameras), wrong, tuple(left_out))
 
@@ -155,11 +153,11 @@ def _description(root: Path) -> dict:
 
 
 def _link(source: Path, root: Path, *, copy: bool) -> None:
-    """Link or copy every file but what is made anew; links of the source are followed."""
+    """Link or copy every file except those that are written new; links of the source are followed."""
     for folder, folders, files in os.walk(source, followlinks=True):
         place = Path(folder).relative_to(source)
         if place == Path():
-            folders[:] = [name for name in folders if name not in (KEYPOINTS, ESTIMATED_LABELS)]
+            folders[:] = [name for name in folders if name not in (tracked.KEYPOINTS, tracked.ESTIMATED_LABELS)]
             files = [name for name in files if name not in _DESCRIPTIONS]
         (root / place).mkdir(parents=True, exist_ok=True)
         for name in sorted(files):
@@ -171,19 +169,22 @@ def _link(source: Path, root: Path, *, copy: bool) -> None:
 
 
 def _write_params(folder: Path, params: dict[int, BodyParams], seed: int) -> None:
-    """Write the stacked files that the protocols name, where they are missing."""
-    if not (folder / EXACT_PARAMETERS).exists():
-        save_params_by_row(folder / EXACT_PARAMETERS, params)
-    if not (folder / TRACKED_PARAMETERS).exists():
+    """Write the files of parameters that the protocols name, where they are missing."""
+    if not (folder / tracked.EXACT_PARAMETERS).exists():
+        save_params_by_row(folder / tracked.EXACT_PARAMETERS, params)
+    if not (folder / tracked.TRACKED_PARAMETERS).exists():
         noisy = tracker_noise(BodyParams.concatenate(list(params.values())), seed=seed)
-        save_params_by_row(folder / TRACKED_PARAMETERS, {frame: noisy.frame(row) for row, frame in enumerate(params)})
+        save_params_by_row(
+            folder / tracked.TRACKED_PARAMETERS, {frame: noisy.frame(row) for row, frame in enumerate(params)}
+        )
 
 
 def _write_rig(path: Path, body: BodyModel, params: dict[int, BodyParams], config: DegradeConfig) -> None:
     """Write a ring of cameras that see the person in all frames, for keypoints alone."""
+    # Boxes of 16 cm to each side of the joints hold the flesh around them.
     joints = body.forward(BodyParams.concatenate(list(params.values()))).joints
-    around = _FLESH * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    head = joints[:, [body.joint_names.index(name) for name in _HEAD if name in body.joint_names]]
+    around = 0.16 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    head = joints[:, [body.joint_names.index(name) for name in ("neck", "head", "jaw") if name in body.joint_names]]
 
     def boxes(points: np.ndarray) -> np.ndarray:
         return (points.reshape(-1, 1, 3) + around).reshape(-1, 3)

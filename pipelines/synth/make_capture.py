@@ -1,32 +1,26 @@
-"""Make a synthetic capture with moving cloth from the fixture person: one call, seeded, any size."""
+"""Make a synthetic capture with moving cloth from the fixture person, at any size and for a fixed seed."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipelines.synth.atlas import Atlas, paint_atlas
 from pipelines.synth.camera_rig import camera_rig
-from pipelines.synth.capture_readme import capture_readme
 from pipelines.synth.checks import scan_checks, take_checks
-from pipelines.synth.motions import motion_kind
-from pipelines.synth.outfits import CLOTHES
-from pipelines.synth.person import PART_LABELS, PART_NAMES, Person
-from pipelines.synth.person_file import person_of, read_layers
+from pipelines.synth.config import SynthConfig, motion_kind, split_frames
+from pipelines.synth.person import PART_LABELS, PART_NAMES, Person, person_of, read_layers
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
-from pipelines.synth.simulate import SimulationConfig, Take, simulate
-from pipelines.synth.skirt_patterns import PATTERNS
+from pipelines.synth.simulate import Take, simulate
 from pipelines.synth.soft_light import Environment, LightConfig, vertex_light
 from pipelines.synth.tracked_inputs import INPUTS, protocols, write_estimated_labels, write_tracked_keypoints
 from pipelines.synth.tracker import tracker_noise
-from pipelines.synth.views import LitFrame, RenderedView, hidden_faces, normal_map, render_view
+from pipelines.synth.views import Atlas, LitFrame, RenderedView, hidden_faces, normal_map, paint_atlas, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import rounded, save_compact
@@ -37,67 +31,6 @@ from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import write_ply
-from smplxpp.core.validation import require_at_least, require_choice, require_positive
-
-_NOVEL_POSE_SHARE = 0.2
-# Cells of colours on the head, beside those on the body: close-ups look at it.
-_FINER = 0.45
-
-
-@dataclass(frozen=True)
-class SynthConfig:
-    """What to make.
-
-    Attributes:
-        cameras: how many; from four on two of them are close-ups of the face.
-        frames, fps: of the performance.
-        size, aspect: height of body images in pixels, and their width by their height.
-        seed: of the performance, the cameras, the tracker's and the scan's noise.
-        layout: "simple" is ours, with everything; "actorshq" holds images, masks and cameras in ActorsHQ's folders.
-        supersampling: samples a pixel along each axis.
-        quality: of JPEG files.
-        truth_step, normals_step: truth meshes and normal maps of every n-th frame.
-        scan_faces: of the reference frame's scan; 0 makes none.
-        motion, clothes: what she does and wears, by name. skirt_pattern: of a skirt, among `PATTERNS`.
-        texel: colours are painted once on cells of this side, metres (the head's are finer), instead of computed at
-            every sample: several times as fast, 46 dB and more from the computed ones; 0: computed.
-        simulation, light: see there; `simulation.fps` is replaced by `fps`.
-
-    Raises:
-        InputError: numbers below 1, images too small, an unknown layout.
-    """
-
-    cameras: int = 12
-    frames: int = 24
-    fps: float = 10.0
-    size: int = 640
-    seed: int = 0
-    layout: Literal["simple", "actorshq"] = "simple"
-    supersampling: int = 3
-    quality: int = 95
-    truth_step: int = 1
-    normals_step: int = 1
-    scan_faces: int = 80_000
-    motion: str = "turning"
-    clothes: str = "skirt"
-    skirt_pattern: str = "plaid"
-    aspect: float = 0.8
-    texel: float = 0.0
-    simulation: SimulationConfig = field(default_factory=SimulationConfig)
-    light: LightConfig = field(default_factory=LightConfig)
-
-    def __post_init__(self) -> None:
-        for name in ("cameras", "frames", "supersampling", "truth_step", "normals_step"):
-            require_at_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)
-        require_at_least("--frames", self.frames, motion_kind(self.motion).least_frames)
-        require_at_least("--size", self.size, 16)
-        require_at_least("--seed", self.seed, 0)
-        require_positive("--fps", self.fps)
-        require_positive("aspect of images", self.aspect)
-        require_at_least("texel", self.texel, 0.0)
-        require_choice("--layout", self.layout, ("simple", "actorshq"))
-        require_choice("--clothes", self.clothes, CLOTHES)
-        require_choice("--skirt-pattern", self.skirt_pattern, tuple(PATTERNS))
 
 
 def make_capture(
@@ -108,21 +41,22 @@ def make_capture(
     environment: Environment | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> dict[str, float]:
-    """Write a capture to the folder `out`, whole or not at all; what stands there is replaced.
+    """Write a capture to the folder `out`, whole or not at all; an older capture there is replaced.
 
     Args:
         out: folder of the capture.
         topology_file: the person's layers, `geometry/topology.npz` of the fixture.
-        config: what to make.
-        environment: light in the place of the stage's, for the same performance; None: the stage's.
-        progress: called with the name of the work under way and its share done.
+        config: settings.
+        environment: light that replaces the stage's, for the same performance; None: the stage's.
+        progress: called with the name of the current work and the share of it that is done.
 
     Returns:
-        Figures about what was made, as in `checks.json`.
+        Figures about the capture, as in `checks.json`.
 
     Raises:
-        InputError: no person there.
+        InputError: the file of layers is missing or another person's.
     """
+    # Dress the person and simulate her performance.
     layers = read_layers(topology_file, config.clothes)
     person = replace(person_of(layers, config.clothes), skirt_pattern=config.skirt_pattern)
     motion = motion_kind(config.motion).make(
@@ -134,6 +68,7 @@ def make_capture(
     simulation = replace(config.simulation, fps=config.fps)
     take = simulate(person, motion, config.frames, simulation, lambda share: progress("cloth", share))
     take = replace(take, vertices=rounded(take.vertices))
+    # Cameras that see all of it, and the parameters that a tracker would give.
     rig = _rig(person, take, config)
     noisy = tracker_noise(take.params, seed=config.seed + 3)
     checks = take_checks(person, take, noisy)
@@ -160,14 +95,7 @@ def make_capture(
                 progress("scan", 1.0)
             manifest = _manifest(out, rig, config, environment)
             atomic_write_text(root / "manifest.json", json.dumps(manifest, indent=1) + "\n")
-            words = capture_readme(
-                manifest,
-                motion=config.motion,
-                clothes=config.clothes,
-                pattern=config.skirt_pattern,
-                scan=config.scan_faces > 0,
-            )
-            atomic_write_text(root / "README.md", words)
+            atomic_write_text(root / "README.md", _readme(manifest, config))
         _write_views(
             images, _lit_frames(person, take, hidden, config.light, environment), painted, rig, config, progress
         )
@@ -181,12 +109,12 @@ def add_tracked_inputs(root: Path, *, seed: int, progress: ProgressCallback = ig
     """Write a tracker's keypoints and a parser's label maps into a synthetic capture, from its own files.
 
     Args:
-        root: of a capture that `make_capture` wrote in our layout; its manifest gets the protocols.
-        seed: of the errors.
-        progress: as `make_capture`'s.
+        root: folder of a capture that `make_capture` wrote in our layout; its manifest gets the protocols.
+        seed: seed of the errors.
+        progress: called with the name of the current work and the share of it that is done.
 
     Returns:
-        Figures about them.
+        The percentage of foreground pixels with a wrong label.
     """
     capture, body = open_capture(root, cache_bytes=0), load_body()
     params = {frame: found for frame in capture.frames if (found := capture.params(frame)) is not None}
@@ -196,15 +124,6 @@ def add_tracked_inputs(root: Path, *, seed: int, progress: ProgressCallback = ig
     manifest = read_json(path, subject="manifest") | {"protocols": protocols()}
     atomic_write_text(path, json.dumps(manifest, indent=1) + "\n")
     return {"labels_estimated_wrong_percent": 100 * wrong}
-
-
-def split_frames(frames: int) -> tuple[int, int]:
-    """Return how many frames are for training, and how many after them are held out: the last fifth.
-
-    A take shorter than five holds none out.
-    """
-    novel = int(_NOVEL_POSE_SHARE * frames)
-    return frames - novel, novel
 
 
 def _rig(person: Person, take: Take, config: SynthConfig) -> list[RigCamera]:
@@ -227,7 +146,8 @@ def _atlas(person: Person, hidden: Bool[np.ndarray, " M"], texel: float, progres
     if not texel:
         return None
     progress("colours", 0.0)
-    atlas = paint_atlas(person, cell=texel, face_cell=_FINER * texel, shown=np.flatnonzero(~hidden))
+    # Cells of the head are finer, because close-ups show it.
+    atlas = paint_atlas(person, cell=texel, face_cell=0.45 * texel, shown=np.flatnonzero(~hidden))
     progress("colours", 1.0)
     return atlas
 
@@ -255,7 +175,7 @@ def _write_scan(folder: Path, person: Person, take: Take, config: SynthConfig) -
 def _scan_attributes(
     person: Person, scan: SimulatedScan
 ) -> tuple[UInt8[np.ndarray, " N"], UInt8[np.ndarray, " N"], UInt8[np.ndarray, "N 3"]]:
-    """Return part, label and colour of each scan vertex: those of the point of the layers that it shows."""
+    """Return part, label and colour of each vertex of the scan, from the point of the layers that it shows."""
     corners = person.tpose.faces[scan.face]
     rest = scan.shown_on(person.tpose)
     nearest = corners[np.arange(len(corners)), np.argmax(scan.barycentric, axis=1)]
@@ -268,7 +188,7 @@ def _scan_attributes(
 def _lit_frames(
     person: Person, take: Take, hidden: Bool[np.ndarray, " M"], light: LightConfig, environment: Environment | None
 ) -> Iterator[LitFrame]:
-    """Light the take's frames one after the other, without the hidden faces."""
+    """Yield the lit frames of a take in order, without the hidden faces."""
     shown = np.flatnonzero(~hidden)
     faces = person.tpose.faces[shown]
     for vertices in take.vertices:
@@ -332,3 +252,58 @@ def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig, environment:
         **{kind: dict.fromkeys(names, everything) for kind in ("images", "masks", "labels")},
         "normals": dict.fromkeys(names, normals),
     }
+
+
+_TEXT = """# {name}
+
+A synthetic capture by `smplxpp synth`: motion `{motion}`, {frames} frames at {fps:g} a second, {cameras} cameras, seed
+{seed}; {worn}; light: {light}. Axes: y up, z to the front, x to the subject's left; metres; floor y = 0. Frame 0 is the
+reference: a relaxed A-pose, neutral face, cloth settled.
+
+{split} The held-out cameras are named in `manifest.json`.
+
+| path | content | frames |
+|---|---|---|
+| `rgbs/CAM/` | sRGB JPEG on black, colour times opacity | all |
+| `masks/CAM/` | opacity, 8 bits | all |
+| `labels/CAM/` | 0 background, 1 skin, 2 hair, 3 shoes, 4 upper, 5 lower, 6 other | all |
+| `normals/CAM/` | 16-bit RGB, n = value / 65535 * 2 - 1, world axes, towards the camera | {normals} |
+| `geometry/frame_FFFFFF.npz` | `verts` of `topology.npz`: the true surface, rounded to 2^-14 m | {truth} |
+| `params/params.npz` | body parameters, a row a frame: exact | all |
+| `params/params_noisy.npz` | as a tracker would give them | all |
+| `keypoints/`, `labels_estimated/` | as a detector and a parser would give them | all |
+{scan}
+`manifest.json` has the splits and the protocols `exact` and `tracked`, `checks.json` figures measured at its making.
+"""
+_WORN = {
+    "skirt": "she wears a striped half-loose shirt and a loose skirt (pattern: {pattern}), both simulated",
+    "trousers": "she wears a striped half-loose shirt, simulated, over tight trousers that follow the skin",
+}
+
+
+def _readme(manifest: dict, config: SynthConfig) -> str:
+    """Return the README of a capture with the given manifest."""
+    train, novel = manifest["train_frames"], manifest.get("novel_pose_frames")
+    split = f"Frames {train[0]} to {train[1]} are for training"
+    split += f", {novel[0]} to {novel[1]} are held out as new poses." if novel else ", none is held out."
+
+    def listed(frames: list[int]) -> str:
+        step = frames[1] - frames[0] if len(frames) > 1 else 0
+        return "all" if step == 1 else f"{', '.join(map(str, frames[:3]))} ..." if step else str(frames[0])
+
+    return _TEXT.format(
+        name=manifest["name"],
+        motion=config.motion,
+        frames=manifest["frames"],
+        fps=manifest["fps"],
+        seed=manifest["seed"],
+        cameras=len(manifest["images"]),
+        light=manifest["light"]["panorama"] if "light" in manifest else "even, brighter from above",
+        worn=_WORN[config.clothes].format(pattern=config.skirt_pattern),
+        split=split,
+        normals=listed(next(iter(manifest["normals"].values()))),
+        truth=listed(manifest["truth_frames"]),
+        scan="| `scans/` | what a reconstruction of frame 0 would give, its labels | 0 |\n"
+        if config.scan_faces
+        else "",
+    )

@@ -1,7 +1,7 @@
-"""The fixture person's performance: gestures, talking, a turn with steps; and a tracker's noise on it.
+"""The performance of the fixture person: gestures, talking, a turn with steps.
 
-A performance is a smooth curve through key poses, defined at every instant, so that cloth can be simulated at a finer
-step than the frames'. It starts from a relaxed A-pose with a neutral face, at rest.
+A performance is a smooth curve through key poses, defined at every instant, so that cloth can be simulated with shorter
+steps than frames. It starts at rest from a relaxed A-pose with a neutral face.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core.params import POSE_BLOCKS, BodyParams
 
-# Degrees a joint, axis-angle in the T-pose's world axes (x to the subject's left, y up, z to the front). What a pose
-# does not name stays relaxed.
+# Axis-angle rotation of each joint in degrees, in the T-pose's world axes (x to the subject's left, y up, z to the
+# front). Joints that a pose does not name stay relaxed.
 _Angles = dict[str, tuple[float, float, float]]
 _RELAXED: _Angles = {
     "left_collar": (0, 0, -4),
@@ -104,14 +104,14 @@ _POSES: dict[str, _Angles] = {
         "head": (-8, 0, 0),
     },
 }
-# Degrees by which the fingers of the left and of the right hand bend.
+# Bend of the fingers of the left and of the right hand, degrees; other poses have the relaxed bend.
 _FINGERS = {
+    "relaxed": (12.0, 12.0),
     "explain": (22.0, 6.0),
     "stress": (4.0, 16.0),
     "point": (3.0, 12.0),
 }
-_RELAXED_FINGERS = (12.0, 12.0)
-# Seconds and poses of the opening; a longer performance goes on with poses drawn at random.
+# Instants (seconds) and poses of the opening; a longer performance continues with random poses.
 _SCRIPT = (
     (0.0, "relaxed"),
     (0.4, "explain"),
@@ -122,9 +122,8 @@ _SCRIPT = (
     (2.9, "overhead"),
     (3.6, "point"),
 )
-_PAUSE = (0.5, 0.8)  # seconds between poses drawn at random
 
-# Shapes of the mouth while she talks, and looks of the rest of the face; the jaw turns with `jawOpen` as well.
+# Mouth shapes while she talks, and looks of the rest of the face, as weights of expressions.
 _VISEMES: tuple[dict[str, float], ...] = (
     {"jawOpen": 0.30, "mouthLowerDownLeft": 0.3, "mouthLowerDownRight": 0.3},
     {"jawOpen": 0.10, "mouthFunnel": 0.5, "mouthPucker": 0.2},
@@ -140,14 +139,15 @@ _LOOKS: tuple[dict[str, float], ...] = (
     {"browOuterUpLeft": 0.5, "browOuterUpRight": 0.5, "eyeWideLeft": 0.2, "eyeWideRight": 0.2},
     {"browDownLeft": 0.4, "browDownRight": 0.4, "eyeSquintLeft": 0.25, "eyeSquintRight": 0.25},
 )
-JAW_DEGREES = 9.0  # at jawOpen = 1
+JAW_DEGREES = 9.0
+"""Rotation of the jaw at a weight of 1 of `jawOpen`."""
 
 
 class Motion(Protocol):
-    """What a person does, as a function of time.
+    """The motion of a person as a function of time.
 
     Attributes:
-        feet_stay: the feet keep their place on the floor, and the hips move over them.
+        feet_stay: whether the feet keep their place on the floor while the hips move over them.
     """
 
     feet_stay: ClassVar[bool]
@@ -159,13 +159,13 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Performance:
-    """What the person does, as a function of time.
+    """A performance of gestures, speech and a turn, as a function of time.
 
     Attributes:
-        betas: shape.
+        betas: shape coefficients.
         expression_names: names of the E expressions.
-        seconds: how long it lasts; later instants hold the last pose.
-        seed: of timing, sizes of gestures, words and blinks.
+        seconds: duration; later instants hold the last pose.
+        seed: seed of timing, sizes of gestures, mouth shapes and blinks.
     """
 
     feet_stay: ClassVar[bool] = False
@@ -192,23 +192,25 @@ class Performance:
 
     @cached_property
     def _poses(self) -> CubicSpline:
-        """The curve from instants (T,) to poses (T, 55, 3) in radians, at rest at both ends."""
+        """Spline from instants (T,) to poses (T, 55, 3) in radians, at rest at both ends."""
         rng = np.random.default_rng(self.seed)
         times, names = map(list, zip(*_SCRIPT, strict=True))
+        # After the opening, random poses 0.5 to 0.8 s apart.
         while times[-1] < self.seconds + 1.0:
-            times.append(times[-1] + rng.uniform(*_PAUSE))
+            times.append(times[-1] + rng.uniform(0.5, 0.8))
             names.append(rng.choice([name for name in _POSES if name != names[-1]]))
-        keys = np.stack([_pose(_RELAXED | _POSES[name], _FINGERS.get(name, _RELAXED_FINGERS)) for name in names])
+        keys = np.stack([_pose(_RELAXED | _POSES[name], _FINGERS.get(name, _FINGERS["relaxed"])) for name in names])
         relaxed = keys[0]
+        # Each gesture varies by 10 % in size and 40 ms in time.
         size = rng.uniform(0.9, 1.1, size=(len(keys), 1, 1))
         late = rng.uniform(-0.04, 0.04, len(times)) * (np.array(times) > 0)
         return CubicSpline(np.array(times) + late, relaxed + size * (keys - relaxed), bc_type="clamped")
 
     @cached_property
     def _faces(self) -> PchipInterpolator:
-        """The curve from instants (T,) to expressions (T, E): words at about five a second, looks, blinks.
+        """Spline from instants (T,) to expressions (T, E): about five mouth shapes a second, looks and blinks.
 
-        It is monotone between keys, so it stays within [0, 1].
+        It is monotone between keys and so stays within [0, 1].
         """
         rng = np.random.default_rng([self.seed, 1])
         times = np.concatenate([[0.0], 0.12 + np.cumsum(rng.uniform(0.13, 0.26, int(self.seconds / 0.13) + 8))])
@@ -224,7 +226,7 @@ class Performance:
         return PchipInterpolator(times, values)
 
     def _sway(self, t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T 55 3"]:
-        """Return small turns in radians: breath, small movements of the head and the eyes; none at the start."""
+        """Return small rotations in radians: breath, small movements of head and eyes; none at the start."""
         rng = np.random.default_rng([self.seed, 2])
         out = np.zeros((len(t), len(SMPLX_JOINTS), 3))
         sizes = {"spine2": 0.6, "neck": 1.2, "head": 1.8, "left_wrist": 3.0, "right_wrist": 3.0}
@@ -239,18 +241,18 @@ class Performance:
 
 def relaxed_pose() -> Float[np.ndarray, "55 3"]:
     """Return the relaxed A-pose with which a performance starts, axis-angle in radians."""
-    return _pose(_RELAXED, _RELAXED_FINGERS)
+    return _pose(_RELAXED, _FINGERS["relaxed"])
 
 
 def wander(t: Float[np.ndarray, " T"], rng: np.random.Generator, *, hertz: float) -> Float[np.ndarray, "T 3"]:
-    """Return smooth curves of about unit size: a few sines an axis."""
+    """Return smooth curves of about unit size: the sum of four sines on each axis."""
     frequency = hertz * rng.uniform(0.4, 1.6, size=(4, 3))
     phase = rng.uniform(0, 2 * np.pi, size=(4, 3))
     return np.sin(2 * np.pi * frequency * t[:, None, None] + phase).sum(axis=1) / np.sqrt(2.0)
 
 
 def _pose(degrees: _Angles, fingers: tuple[float, float]) -> Float[np.ndarray, "55 3"]:
-    """Return an axis-angle pose in radians; `fingers` are the bends of the left and of the right hand."""
+    """Return an axis-angle pose in radians; `fingers` are the bends of the left and right hand in degrees."""
     pose = np.zeros((sum(joints for _, joints in POSE_BLOCKS), 3))
     for j, name in enumerate(SMPLX_JOINTS):
         if name[-1].isdigit() and not name.startswith("spine") and "thumb" not in name:

@@ -1,15 +1,20 @@
-"""The fixture person: the open body and her clothes as layers in the T-pose, with authored weights and colours."""
+"""The fixture person: the open body and her clothes as layers in the T-pose, with skinning weights and colours."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipelines.synth import textures
-from pipelines.synth.skirt_patterns import skirt_colors
-from smplxpp.body import BodyModel
+from pipelines.synth.cloth_mesh import ClothMesh, clip, loop_subdivide, outer_faces, push_out, smooth, submesh
+from pipelines.synth.patterns import skirt_colors
+from smplxpp.body import BodyModel, load_body
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.array_file import read_arrays
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.skinning import skin
@@ -17,10 +22,10 @@ from smplxpp.skinning import skin
 PART_NAMES = ("body", "upper", "lower", "shoes", "hair")
 LABEL_NAMES = ("background", "skin", "hair", "shoes", "upper", "lower", "other")
 PART_LABELS = np.array([1, 4, 5, 3, 2], dtype=np.uint8)
-_OTHER = LABEL_NAMES.index("other")
-
-# Shape of the person: an adult woman of about average height.
+"""Label of each part."""
+CLOTHES = ("skirt", "trousers")
 PERSON_BETAS = np.array([0.35, 1.4, 0.3, 0.6] + [0.0] * 16)
+"""Shape coefficients of the person: an adult woman of about average height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,15 +33,16 @@ class Person:
     """All layers as one mesh; the body's vertices come first, in the body model's order.
 
     Attributes:
-        tpose: V vertices, M faces; parts share no vertices.
+        tpose: V vertices and M faces; parts share no vertices.
         weights: authored skinning weights.
-        vertex_part, face_part: indices into `PART_NAMES`.
-        vertex_label: indices into `LABEL_NAMES`; eyes, teeth and tongue are "other".
-        betas: shape of the body.
+        vertex_part: index into `PART_NAMES` of each vertex.
+        face_part: index into `PART_NAMES` of each face.
+        vertex_label: index into `LABEL_NAMES` of each vertex; eyes, teeth and tongue are "other".
+        betas: shape coefficients of the body.
         body: the body model; `exprdirs` moves its vertices, the other parts do not follow the face.
         face: landmarks on the T-pose, for the colours.
-        clothes: what the part "lower" is.
-        skirt_pattern: among `skirt_patterns.PATTERNS`.
+        clothes: one of `CLOTHES`, the part "lower".
+        skirt_pattern: name in `patterns.SKIRT_PATTERNS`.
     """
 
     tpose: TriangleMesh
@@ -57,20 +63,25 @@ class Person:
         rest[:, : self.body.vertex_count] = posed.rest_vertices
         return skin(rest, self.weights, posed.posed_from_rest), posed.posed_from_rest
 
+    @property
+    def joints(self) -> dict[str, Float[np.ndarray, " 3"]]:
+        """Joint positions in the T-pose by name, metres."""
+        return rest_joints(self.body, self.tpose.vertices[: self.body.vertex_count])
+
     def colors(
         self, points: Float[np.ndarray, "P 3"], part: UInt8[np.ndarray, " P"], label: UInt8[np.ndarray, " P"]
     ) -> UInt8[np.ndarray, "P 3"]:
-        """Return the colours of points on the T-pose, with the part and the label of each."""
-        joints = self.body.joint_regressor @ self.tpose.vertices[: self.body.vertex_count]
-        joint = dict(zip(self.body.joint_names, joints, strict=True))
+        """Return the sRGB colours of points on the T-pose, given the part and the label of each."""
+        joint = self.joints
         out = np.zeros((len(points), 3))
         left = points[:, 0] > 0
         eye = np.where(left[:, None], joint["left_eye_smplhf"], joint["right_eye_smplhf"])
         for k, name in enumerate(PART_NAMES):
             own = part == k
             if name == "body":
+                # Labels tell eyes from teeth and tongue by the distance from the eyes' centres.
                 out[own] = textures.skin_colors(points[own], self.face, seed=1)
-                own &= (label == _OTHER) & (np.linalg.norm(points - eye, axis=1) < 0.02)
+                own &= (label == LABEL_NAMES.index("other")) & (np.linalg.norm(points - eye, axis=1) < 0.02)
                 out[own] = textures.eye_colors(points[own] - eye[own])
             elif name == "upper":
                 out[own] = textures.shirt_colors(points[own], joint["left_shoulder"])
@@ -87,5 +98,126 @@ class Person:
 
 
 def face_marks(landmarks: Float[np.ndarray, "51 3"]) -> textures.FaceMarks:
-    """Pick what is painted from landmarks in dlib's order from 17."""
+    """Return the landmarks that are painted, of those in dlib's order from 17."""
     return textures.FaceMarks(brows=landmarks[:10], eyes=landmarks[19:31], lips=landmarks[31:43])
+
+
+def load_person(topology_file: Path, clothes: str = "skirt") -> Person:
+    """Return the person of `geometry/topology.npz` of the fixture, in one of `CLOTHES`.
+
+    Raises:
+        InputError: a missing file, missing keys, or parts that are not the fixture person's.
+    """
+    return person_of(read_layers(topology_file, clothes), clothes)
+
+
+def read_layers(topology_file: Path, clothes: str = "skirt") -> dict[str, np.ndarray]:
+    """Return the arrays of `geometry/topology.npz`, with the layers of her clothes.
+
+    Raises:
+        InputError: a missing file, missing keys, or parts that are not the fixture person's.
+    """
+    if not topology_file.is_file():
+        raise InputError(
+            "person",
+            expected="a file geometry/topology.npz of the fixture person",
+            received=str(topology_file),
+            remedy="run in a checkout, or name the folder with --person",
+        )
+    arrays = read_arrays(topology_file, subject="person")
+    needed = ("v_tpose", "faces", "face_part", "vertex_part", "vertex_label", "weights", "betas", "part_names")
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise InputError(f"file {topology_file}", expected=f"the key {missing[0]}", received=", ".join(arrays))
+    parts = tuple(arrays["part_names"].tolist())
+    if parts != PART_NAMES:
+        raise InputError(f"file {topology_file}", expected=f"parts {PART_NAMES}", received=str(parts))
+    return arrays if clothes == "skirt" else with_trousers(arrays, load_body())
+
+
+def person_of(arrays: dict[str, np.ndarray], clothes: str = "skirt") -> Person:
+    """Return the person whose arrays `read_layers` returned."""
+    return Person(
+        tpose=TriangleMesh(arrays["v_tpose"], arrays["faces"]),
+        weights=arrays["weights"].astype(np.float64),
+        vertex_part=arrays["vertex_part"],
+        face_part=arrays["face_part"],
+        vertex_label=arrays["vertex_label"],
+        betas=arrays["betas"].astype(np.float64),
+        body=load_body(),
+        face=face_marks(face_landmarks()),
+        clothes=clothes,
+    )
+
+
+def rest_joints(body: BodyModel, skin: Float[np.ndarray, "V 3"]) -> dict[str, Float[np.ndarray, " 3"]]:
+    """Return the joint positions of the body's vertices in the T-pose by name, metres."""
+    return dict(zip(body.joint_names, body.joint_regressor @ skin, strict=True))
+
+
+def face_landmarks(betas: Float[np.ndarray, " B"] = PERSON_BETAS) -> Float[np.ndarray, "51 3"]:
+    """Return the face landmarks on the open body's T-pose at shape coefficients, in dlib's order from 17."""
+    with resources.as_file(resources.files("smplxpp") / "data" / "open_body.npz") as path:
+        data = read_arrays(path, subject="open body")
+    shaped = data["v_template"] + data["shapedirs"][..., : len(betas)] @ betas
+    corners = shaped[data["f"][data["lmk_faces_idx"]]]
+    return np.einsum("lk,lkx->lx", data["lmk_bary_coords"], corners)
+
+
+def make_trousers(body: BodyModel, skin: Float[np.ndarray, "V 3"]) -> ClothMesh:
+    """Return tight trousers cut from the skin, which follow the body's skinning exactly.
+
+    Args:
+        body: gives faces, weights and joints.
+        skin: its vertices in the T-pose, metres.
+    """
+    joint, outer = rest_joints(body, skin), outer_faces(body)
+    # Cut 12 mm above the pelvis joint and 35 mm above the ankles'. Only legs and pelvis are this low in the T-pose.
+    whole = submesh(ClothMesh(skin, body.faces, body.weights), outer)
+    legs = clip(whole, joint["pelvis"][1] + 0.012 - whole.vertices[:, 1])
+    legs = clip(legs, legs.vertices[:, 1] - joint["left_ankle"][1] - 0.035)
+    # Smoothing lets the cloth span small hollows of the skin; then it keeps 4 mm off the skin.
+    cloth = loop_subdivide(legs)
+    vertices = smooth(cloth.mesh, cloth.vertices, steps=6)
+    inner = TriangleMesh(skin, body.faces[outer])
+    return cloth.with_vertices(push_out(cloth.mesh.with_vertices(vertices), inner, clearance=0.004, solid=True))
+
+
+def with_trousers(arrays: dict[str, np.ndarray], body: BodyModel) -> dict[str, np.ndarray]:
+    """Return the arrays of a person's `topology.npz` with trousers in place of the skirt.
+
+    Args:
+        arrays: arrays of the file; the body's vertices come first.
+        body: body model of the person.
+    """
+    # The trousers take the place of the skirt's vertices and faces; what follows them moves up or down.
+    part = arrays["part_names"].tolist().index("lower")
+    cloth = make_trousers(body, arrays["v_tpose"][: body.vertex_count].astype(np.float64))
+    vertex_part, face_part = arrays["vertex_part"], arrays["face_part"]
+    first = int(np.flatnonzero(vertex_part == part)[0])
+    kept = np.flatnonzero(vertex_part != part)
+    before = kept[kept < first]
+    added, gone = len(cloth.vertices), int((vertex_part == part).sum())
+    new_index = np.arange(len(vertex_part)) + (added - gone) * (np.arange(len(vertex_part)) > first)
+    face_first = int(np.flatnonzero(face_part == part)[0])
+    faces_kept = np.flatnonzero(face_part != part)
+    faces_before = faces_kept[faces_kept < face_first]
+
+    def spliced(old: np.ndarray, new: np.ndarray, kept: np.ndarray, before: np.ndarray) -> np.ndarray:
+        return np.concatenate([old[before], new.astype(old.dtype), old[kept[len(before) :]]])
+
+    # Arrays of the new vertices, in the types of the old ones.
+    like = np.zeros(added)
+    own: dict[str, np.ndarray] = {
+        "v_tpose": cloth.vertices,
+        "weights": cloth.weights / cloth.weights.sum(axis=1, keepdims=True),
+        "vertex_part": like + part,
+        "vertex_label": like + arrays["vertex_label"][first],
+    }
+    if "exprdirs" in arrays:
+        own["exprdirs"] = np.zeros((added, *arrays["exprdirs"].shape[1:]))
+    out = dict(arrays) | {name: spliced(arrays[name], value, kept, before) for name, value in own.items()}
+    faces = new_index[arrays["faces"]]
+    out["faces"] = spliced(faces, cloth.faces + first, faces_kept, faces_before).astype(arrays["faces"].dtype)
+    out["face_part"] = spliced(face_part, np.full(len(cloth.faces), part), faces_kept, faces_before)
+    return {name: value for name, value in out.items() if name not in ("face_hidden", "pin")}

@@ -1,4 +1,4 @@
-"""A scan as image-based reconstruction gives it: one outer surface, noise, webs where no camera sees the gap."""
+"""Simulate the scan of image-based reconstruction: one outer surface, noise, webs where no camera sees a gap."""
 
 from __future__ import annotations
 
@@ -18,26 +18,28 @@ from smplxpp.raster import rasterize_mesh, view_directions
 
 @dataclass(frozen=True)
 class ScanConfig:
-    """How the scan is taken; lengths in metres.
+    """Settings of a simulated scan; lengths in metres.
 
     Attributes:
-        cell: of the grid on which depth is fused.
-        views, resolution: orthographic depth images, pixels a side; none from far below the horizon.
-        min_elevation: lowest y of a unit vector towards a camera.
-        sure_free: a cell is empty when a camera sees at least this far past it.
-        sheet_thickness: given to open sheets (clothes), inwards, so that both their sides exist.
-        faces: of the finished scan.
-        detail_above, detail: edges above this height (metres over the lowest vertex: the head) are shorter by this
-            factor, as captures with cameras on the face have it.
-        noise, noise_radius: standard deviation along the normal, and over what distance it is correlated.
-        seed: of the noise.
+        cell: cell size of the grid on which depth is fused.
+        views: number of orthographic depth images around the person.
+        resolution: pixels a side of a depth image.
+        min_elevation: smallest y of the unit vector towards a camera; none looks from far below the horizon.
+        free_margin: a cell is empty when a camera sees at least this far past it.
+        sheet_thickness: thickness of open sheets (clothes), inwards, so that both their sides exist.
+        faces: number of faces of the scan.
+        detail_above: height over the lowest vertex above which the mesh is finer (the head).
+        detail: ratio of the edges' lengths below and above, as in captures with cameras on the face.
+        noise: standard deviation of the displacement along the normal.
+        noise_radius: correlation length of the noise.
+        seed: seed of the noise.
     """
 
     cell: float = 0.004
     views: int = 96
     resolution: int = 1024
     min_elevation: float = -0.12
-    sure_free: float = 0.006
+    free_margin: float = 0.006
     sheet_thickness: float = 0.009
     faces: int = 80_000
     detail_above: float = 1.45
@@ -49,11 +51,12 @@ class ScanConfig:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedScan:
-    """A closed mesh and, for each vertex, the point of the scanned layers that it shows.
+    """A closed mesh with the point of the scanned layers that each vertex shows.
 
     Attributes:
-        mesh: N vertices.
-        face, barycentric: the layers' face and the point on it.
+        mesh: the scan.
+        face: face of the layers that each vertex shows.
+        barycentric: barycentric coordinates of the point on that face.
     """
 
     mesh: TriangleMesh
@@ -66,20 +69,23 @@ class SimulatedScan:
 
 
 def simulate_scan(layers: TriangleMesh, sheets: list[Bool[np.ndarray, " M"]], config: ScanConfig) -> SimulatedScan:
-    """Scan `layers`, standing on the plane of its lowest vertex.
+    """Return the scan of layers that stand on the plane of their lowest vertex.
 
     Args:
-        layers: closed parts and open sheets, outward.
-        sheets: face masks of the open sheets, one a sheet.
+        layers: closed parts and open sheets, oriented outwards.
+        sheets: face mask of each open sheet.
+        config: settings.
     """
+    # Depth images of the layers, whose sheets get a thickness.
     solid = concatenate_meshes([layers, *(_inner_side(layers, mask, config.sheet_thickness) for mask in sheets)])
     cameras = _cameras(layers, config)
     depths, seen = _depth_images(solid, cameras)
-    # Sub-pixel faces at grazing angles: whoever touches a seen vertex counts as seen.
+    # Faces smaller than a pixel at grazing angles count as seen if one of their vertices is.
     seen_vertex = np.zeros(solid.vertex_count, dtype=bool)
     seen_vertex[solid.faces[seen]] = True
     seen = seen_vertex[solid.faces].any(axis=1)
 
+    # Fuse them to a level set, extract its outer surface, smooth and simplify it.
     grid, size = _grid(solid, config.cell)
     level = _level_set(solid, seen, grid, (cameras, depths), config)
     vertices, faces, _ = igl.marching_cubes(level, grid, *size, 0.0)
@@ -87,6 +93,7 @@ def simulate_scan(layers: TriangleMesh, sheets: list[Bool[np.ndarray, " M"]], co
     surface = surface.with_vertices(smooth(surface, surface.vertices, steps=1))
     surface = _simplified(surface, config)
     face, barycentric = _shown_points(layers, seen[: layers.face_count], surface.vertices)
+    # Correlated noise along the normals.
     rng = np.random.default_rng(config.seed)
     bumps = diffuse(surface, rng.normal(size=(surface.vertex_count, 1)), radius=config.noise_radius)
     noisy = surface.vertices + config.noise * bumps / bumps.std() * surface.vertex_normals
@@ -94,7 +101,7 @@ def simulate_scan(layers: TriangleMesh, sheets: list[Bool[np.ndarray, " M"]], co
 
 
 def _inner_side(layers: TriangleMesh, mask: Bool[np.ndarray, " M"], thickness: float) -> TriangleMesh:
-    """Make the back of a sheet, moved inwards, and the rim that joins it to the front."""
+    """Return the back of a sheet, moved inwards, and the rim that joins it to the front."""
     sheet = layers.submesh(mask)[0]
     n = sheet.vertex_count
     back = sheet.vertices - thickness * sheet.vertex_normals
@@ -118,7 +125,7 @@ def _cameras(mesh: TriangleMesh, config: ScanConfig) -> list[Camera]:
 def _depth_images(
     mesh: TriangleMesh, cameras: list[Camera]
 ) -> tuple[list[Float32[np.ndarray, "H W"]], Bool[np.ndarray, " M"]]:
-    """Return the depth of every view, and which faces own a pixel."""
+    """Return the depth image of every view, and which faces cover a pixel of any."""
     seen = np.zeros(mesh.face_count, dtype=bool)
     depths = []
     for camera in cameras:
@@ -129,7 +136,7 @@ def _depth_images(
 
 
 def _grid(mesh: TriangleMesh, cell: float) -> tuple[Float[np.ndarray, "G 3"], tuple[int, int, int]]:
-    """Return grid points with x fastest, a few cells beyond the mesh, and the counts along x, y, z."""
+    """Return grid points with x fastest, four cells larger than the mesh on each side, and counts along x, y, z."""
     low, high = mesh.vertices.min(axis=0) - 4 * cell, mesh.vertices.max(axis=0) + 4 * cell
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
     size = (nx, ny, nz)
@@ -148,19 +155,21 @@ def _level_set(
     views: tuple[list[Camera], list[Float32[np.ndarray, "H W"]]],
     config: ScanConfig,
 ) -> Float[np.ndarray, " G"]:
-    """Return the distance to the nearest surface within a band; negative in what the cameras take for solid.
+    """Return the distance to the nearest surface, truncated to a band, negative where the cameras leave it solid.
 
-    Near a seen surface its own normal decides the side. Elsewhere a point is free when some camera sees clearly past
-    it, or when it is below the floor; what no camera sees is solid: that makes the webs.
+    Near a seen surface its normal decides the side. Elsewhere a point is free if some camera sees clearly past it or if
+    it is below the floor. Points that no camera sees stay solid, which makes the webs.
     """
+    # Carve away the points that a camera sees past.
     solid = grid[:, 1] >= mesh.vertices[:, 1].min()
     for camera, depth in zip(*views, strict=True):
         left = np.flatnonzero(solid)
         x, y, z = camera.screen_from_world(grid[left]).T[:3]
         column = np.clip(x.astype(int), 0, camera.width - 1)
         row = np.clip(y.astype(int), 0, camera.height - 1)
-        solid[left[depth[row, column] > z + config.sure_free]] = False
+        solid[left[depth[row, column] > z + config.free_margin]] = False
 
+    # Signed distances within two cells of the surface.
     band = 2 * config.cell
     level = np.where(solid, -band, band)
     near = np.flatnonzero(_near_vertices(mesh, grid, config.cell))
@@ -172,7 +181,7 @@ def _level_set(
 
 
 def _near_vertices(mesh: TriangleMesh, grid: Float[np.ndarray, "G 3"], cell: float) -> Bool[np.ndarray, " G"]:
-    """Tell the grid points within about three cells of a face's corner or centre."""
+    """Return which grid points are within about three cells of a corner or centre of a face."""
     low = grid[0]
     size = np.round((grid[-1] - low) / cell).astype(int) + 1
     hit = np.zeros(size[::-1], dtype=bool)
@@ -188,7 +197,7 @@ def _near_vertices(mesh: TriangleMesh, grid: Float[np.ndarray, "G 3"], cell: flo
 
 
 def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
-    """Return the component of most area, outward."""
+    """Return the connected component with the largest area, oriented outwards."""
     component = face_components(mesh.faces)
     areas = np.bincount(component, mesh.face_areas)
     kept = mesh.submesh(component == np.argmax(areas))[0]
@@ -197,9 +206,9 @@ def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _simplified(mesh: TriangleMesh, config: ScanConfig) -> TriangleMesh:
-    """Reduce to `config.faces` faces of about equal size (shortest edges collapse first), smaller ones on the head."""
+    """Return the mesh with `config.faces` faces of about equal size, smaller on the head."""
     floor = mesh.vertices[:, 1].min()
-    # Simplify in a space that is stretched above `detail_above`, then undo the stretch.
+    # Shortest edges collapse first: simplify in a space that is stretched above `detail_above`, then invert the stretch.
     height = np.linspace(-0.1, 2.5, 2601)
     scale = 1 + (config.detail - 1) * np.clip((height - config.detail_above) / 0.1 + 0.5, 0, 1)
     stretched = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(height))])
@@ -224,9 +233,9 @@ def _shown_points(
 
 
 def merge_islands(mesh: TriangleMesh, part: UInt8[np.ndarray, " N"], *, smallest: int = 30) -> UInt8[np.ndarray, " N"]:
-    """Return each vertex's part, where pieces of fewer than `smallest` vertices take the part that lies around them.
+    """Return each vertex's part; connected components below `smallest` vertices take the part around them.
 
-    Where layers touch, the closest one to a noisy vertex is a matter of chance.
+    Where layers touch, it is random which one is closest to a noisy vertex.
     """
     part, edges = part.copy(), mesh.edges
     piece = component_labels(edges[part[edges[:, 0]] == part[edges[:, 1]]], mesh.vertex_count)

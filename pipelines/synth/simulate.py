@@ -1,4 +1,4 @@
-"""All layers of the person through a performance: skinning for body and shoes, dynamics for clothes and hair."""
+"""Move all layers of the person through a performance: skinning for body and shoes, dynamics for clothes and hair."""
 
 from __future__ import annotations
 
@@ -8,31 +8,30 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipelines.synth.garment import Block, Garment, Stepping
+from pipelines.synth.garment_dynamics import ContactSurface, GarmentConfig, GarmentDynamics
 from pipelines.synth.motion import Motion
-from pipelines.synth.noise import ramp
-from pipelines.synth.person import PART_NAMES, Person
+from pipelines.synth.patterns import ramp
+from pipelines.synth.person import PART_NAMES, Person, rest_joints
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
 
-# Metres behind skin and skirt up to which cloth is pushed out of them: half a limb, little of a sheet.
-_SKIN_DEPTH, _SHEET_DEPTH = 0.05, 0.02
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
 
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """Steps in time, distances and materials of a simulation.
+    """Time steps, distances and materials of a simulation.
 
     Attributes:
-        fps: of the frames.
+        fps: frames per second.
         tick: longest time between two poses that move the clothes, seconds.
         settle: seconds in which the clothes come to rest on the first pose before the motion starts.
-        skin_margin, sheet_margin: metres that cloth keeps from the skin, and the shirt from the skirt.
-        substep: seconds at most, a garment: the skirt hangs from its waist alone and needs shorter ones.
-        stepping: material, and how time is stepped.
+        skin_margin: metres that cloth keeps from the skin.
+        sheet_margin: metres that the shirt keeps from the skirt.
+        substep: longest time step of each garment, seconds; the skirt hangs from its waist and needs shorter ones.
+        stepping: material and time steps of the garments.
     """
 
     fps: float = 10.0
@@ -41,18 +40,18 @@ class SimulationConfig:
     skin_margin: float = 0.004
     sheet_margin: float = 0.003
     substep: Mapping[str, float] = field(default_factory=lambda: {"lower": 1.0 / 1000.0, "upper": 1.0 / 600.0})
-    stepping: Stepping = field(default_factory=Stepping)
+    stepping: GarmentConfig = field(default_factory=GarmentConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """T frames of the person.
+    """The simulated frames of a performance.
 
     Attributes:
-        params: exact parameters; she stands on the floor, y = 0.
-        vertices: all layers.
+        params: exact parameters; the floor is y = 0.
+        vertices: vertices of all layers.
         skinned: the same by linear blend skinning alone.
-        attachment: how much a vertex follows skinning: 1 wholly, 0 free cloth.
+        attachment: share of skinning in each vertex's motion: 1 body, 0 free cloth.
     """
 
     params: BodyParams
@@ -68,18 +67,25 @@ def simulate(
     config: SimulationConfig,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Take:
-    """Play `frames` frames of the performance; frame 0 is the first pose with settled clothes.
+    """Simulate frames of a performance; frame 0 is the first pose with settled clothes.
 
-    `progress` is called with the share of the work done.
+    Args:
+        person: the dressed person.
+        performance: her motion.
+        frames: number of frames.
+        config: time steps, distances and materials.
+        progress: called with the share of the work that is done.
     """
     stage = _Stage(person, performance, config)
     ticks_per_frame = int(np.ceil(1.0 / (config.fps * config.tick)))
     settling = int(np.ceil(config.settle / config.tick))
     total = settling + ticks_per_frame * (frames - 1)
+    # Let the clothes settle on the first pose, damped until the last ten ticks.
     for k in range(settling):
         stage.advance(0.0, config.tick, damped=k < settling - 10)
         progress((k + 1) / total)
     states = [stage.layers()]
+    # Then play the motion, each frame in equal ticks.
     for frame in range(1, frames):
         for k in range(ticks_per_frame):
             time = (frame - 1 + (k + 1) / ticks_per_frame) / config.fps
@@ -93,18 +99,19 @@ def simulate(
 def attachment(person: Person) -> Float[np.ndarray, " V"]:
     """Return how much each vertex follows the body: 1 exactly, 0 where it is free.
 
-    Clothes hold on where they are worn tight and something carries them: the skirt at the waist, the shirt on the
-    shoulders and the upper sleeves. Tight is told by the distance to the skin in the T-pose; trousers are
-    tight all over.
+    Clothes are attached where they are tight and carried: the skirt at the waist, the shirt on the shoulders and the
+    upper sleeves. Tight means near the skin in the T-pose; trousers are tight all over.
     """
     vertices, part = person.tpose.vertices, person.vertex_part
     body = TriangleMesh(vertices[: person.body.vertex_count], person.body.faces)
-    joint = dict(zip(person.body.joint_names, person.body.joint_regressor @ body.vertices, strict=True))
+    joint = rest_joints(person.body, body.vertices)
     out = np.ones(len(vertices))
     cloth = np.flatnonzero((part == UPPER) | (part == LOWER))
+    # Tight cloth is within 11 mm of the skin; it is free from 20 mm on.
     distance = SignedDistanceField(body, solid=True).query(vertices[cloth]).distance
     tight = np.zeros(len(vertices))
     tight[cloth] = ramp(distance, 0.020, 0.011)
+    # Carried cloth: the top of the skirt, shoulders and upper sleeves.
     x, y = np.abs(vertices[:, 0]), vertices[:, 1]
     waist = vertices[part == LOWER, 1].max()
     shoulder, elbow = joint["left_shoulder"], joint["left_elbow"]
@@ -114,7 +121,7 @@ def attachment(person: Person) -> Float[np.ndarray, " V"]:
         ramp(y, shoulder[1] - 0.16, shoulder[1] - 0.05)
         * ramp(x, shoulder[0] + 0.30 * (elbow[0] - shoulder[0]), shoulder[0] + 0.05 * (elbow[0] - shoulder[0])),
     )
-    # The waistband is tight by itself.
+    # The waistband holds whatever its distance.
     band = (part == LOWER) & (y > waist - 0.03)
     if person.clothes == "trousers":
         band = part == LOWER
@@ -124,10 +131,10 @@ def attachment(person: Person) -> Float[np.ndarray, " V"]:
 
 
 class HairLag:
-    """The rotation by which hair trails behind its head: a damped rotational spring.
+    """The rotational lag of the hair behind the head: a damped spring.
 
     `w' = -stiffness a - damping w - gain (head's angular acceleration)`, `a' = w`, with `a` the lag as a rotation
-    vector in the world; semi-implicit steps.
+    vector in the world, at most 9 degrees; semi-implicit Euler steps.
 
     Args:
         head: world_from_head at the start, at rest.
@@ -153,18 +160,19 @@ class HairLag:
     def applied(
         self, points: Float[np.ndarray, "N 3"], looseness: Float[np.ndarray, " N"], pivot: Float[np.ndarray, " 3"]
     ) -> Float[np.ndarray, "N 3"]:
-        """Turn points of the hair about `pivot` by their share `looseness` of the lag."""
+        """Rotate points of the hair about `pivot` by their share `looseness` of the lag."""
         turned = matrix_from_rotvec(looseness[:, None] * self._angle)
         return pivot + np.einsum("nij,nj->ni", turned, points - pivot)
 
 
 class _Stage:
-    """The moving things at one instant."""
+    """State of all moving layers at one instant."""
 
     def __init__(self, person: Person, performance: Motion, config: SimulationConfig) -> None:
         self.person, self.performance, self.config = person, performance, config
         self.hair = np.flatnonzero(person.vertex_part == HAIR)
-        self._skin = Block(_contact_faces(person), config.skin_margin, _SKIN_DEPTH)
+        # Cloth is pushed out of the skin from half a limb's depth, out of the skirt from 2 cm.
+        self._skin = ContactSurface(_contact_faces(person), config.skin_margin, deepest=0.05)
         self._head = person.body.joint_names.index("head")
         self._ankles = [person.body.joint_names.index(name) for name in ("left_ankle", "right_ankle")]
         self._planted: Float[np.ndarray, " 3"] | None = None
@@ -174,7 +182,7 @@ class _Stage:
         self.lag = HairLag(transforms[0, self._head, :3, :3])
         self._looseness = self._hair_looseness()
         self._skirt_vertices, self.skirt = self._garment(LOWER, [self._skin])
-        sheet = Block(self.skirt.mesh.faces, config.sheet_margin, _SHEET_DEPTH)
+        sheet = ContactSurface(self.skirt.mesh.faces, config.sheet_margin, deepest=0.02)
         self._shirt_vertices, self.shirt = self._garment(UPPER, [self._skin, sheet])
 
     def standing(
@@ -196,7 +204,7 @@ class _Stage:
         return replace(params, transl=transl), layers, transforms
 
     def _aside(self, transforms: Float[np.ndarray, "T 55 4 4"]) -> Float[np.ndarray, "T 3"]:
-        """Return the level way that keeps the middle between the ankles where it was at first."""
+        """Return the horizontal shift that keeps the midpoint of the ankles at its first place."""
         body = self.person.body
         rest = body.joint_regressor[self._ankles] @ self.person.tpose.vertices[: body.vertex_count]
         of_ankles = transforms[:, self._ankles]
@@ -206,9 +214,12 @@ class _Stage:
         return np.round((self._planted - middle) * [1.0, 0.0, 1.0], 5)
 
     def advance(self, time: float, seconds: float, *, damped: bool = False) -> None:
-        """Go on to `time`, which is `seconds` later: the skirt on the body, then the shirt on both.
+        """Advance to `time`, `seconds` later: the skirt on the body, then the shirt on both.
 
-        `damped` takes most speed away first.
+        Args:
+            time: instant of the performance, seconds.
+            seconds: length of the tick.
+            damped: whether to damp all velocities first.
         """
         _, layers, transforms = self.standing(np.array([time]))
         before, after = self._layers, layers[0]
@@ -222,35 +233,35 @@ class _Stage:
         self._layers = after
 
     def layers(self) -> Float[np.ndarray, "V 3"]:
-        """Return all layers as they are now."""
+        """Return the current vertices of all layers."""
         out = self._layers.copy()
         out[self._skirt_vertices], out[self._shirt_vertices] = self.skirt.position, self.shirt.position
         out[self.hair] = self.lag.applied(out[self.hair], self._looseness, self._pivot)
         return out
 
-    def _garment(self, part: int, touches: list[Block]) -> tuple[Int[np.ndarray, " N"], Garment]:
+    def _garment(self, part: int, touches: list[ContactSurface]) -> tuple[Int[np.ndarray, " N"], GarmentDynamics]:
         """Return the vertices of a part among all, and the part as a garment on the first pose."""
         layers = TriangleMesh(self._layers, self.person.tpose.faces)
         rest, vertices = layers.submesh(self.person.face_part == part)
         stepping = self.config.stepping
         solver = replace(stepping.solver, substep=self.config.substep[PART_NAMES[part]])
         hold = attachment(self.person)[vertices]
-        return vertices, Garment(rest, hold, touches, replace(stepping, solver=solver))
+        return vertices, GarmentDynamics(rest, hold, touches, replace(stepping, solver=solver))
 
     def _head_joint(self, transforms: Float[np.ndarray, "55 4 4"]) -> Float[np.ndarray, " 3"]:
-        """Return where the head's joint is: the hair's pivot."""
+        """Return the position of the head's joint, about which hair rotates."""
         body = self.person.body
         rest = body.joint_regressor[self._head] @ self.person.tpose.vertices[: body.vertex_count]
         return transforms[self._head, :3, :3] @ rest + transforms[self._head, :3, 3]
 
     def _hair_looseness(self) -> Float[np.ndarray, " H"]:
-        """Return 0 on the crown, 1 at the tips."""
+        """Return the share of the lag: 0 on the crown, 1 at the tips."""
         y = self.person.tpose.vertices[self.hair, 1]
         return ramp(y, y.max() - 0.10, y.min() + 0.02)
 
 
 def _contact_faces(person: Person) -> Int[np.ndarray, "F 3"]:
-    """Return the faces of the skin below the head: what cloth can touch."""
+    """Return the faces of the skin below the head, which cloth can touch."""
     body = person.body
     rest = person.tpose.vertices[: body.vertex_count]
     joint = body.joint_regressor @ rest

@@ -1,7 +1,7 @@
-"""Uniform light from all around, with the shadow that the person casts on herself: ambient occlusion a vertex.
+"""Ambient light with the shadows that the person casts on herself: irradiance of every vertex.
 
-Depth images from many directions tell which vertices each part of the surroundings reaches, so the shading changes
-with the pose. No path tracing: light that bounces is estimated from the surface's own colour.
+Depth images from many directions show which vertices light from there reaches, so that shading changes with the pose.
+Interreflection is estimated from the colour of the surface itself, without path tracing.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.validation import require_positive
 from smplxpp.raster import rasterize_mesh, view_directions
 
-# The surroundings are brighter above than below, as a lit stage is.
+# Radiance of the stage from above and from below: brighter above, as lit stages are.
 _SKY, _GROUND = 1.16, 0.68
 
 
 @dataclass(frozen=True)
 class LightConfig:
-    """Quality of the light.
+    """Sampling and accuracy of the ambient light.
 
     Attributes:
-        directions: from which light comes.
-        resolution: of a direction's depth image, pixels a side.
-        lift: metres off the surface at which light is gathered, against the image's grain.
-        slack: metres by which a point may lie behind the depth image.
+        directions: number of directions from which light comes.
+        resolution: pixels a side of a direction's depth image.
+        lift: metres off the surface at which visibility is tested, against self-shadowing by the image's grain.
+        slack: metres that a visible point may lie behind the depth image.
     """
 
     directions: int = 72
@@ -42,12 +42,13 @@ class LightConfig:
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """A panorama in the place of the stage's light.
+    """A panorama that replaces the stage's light.
 
     Attributes:
-        panorama: linear light (`smplxpp.core.light`). name: of it.
-        turn: degrees about +Y by which it is turned.
-        exposure: factor on it; None: as bright in the mean as the stage.
+        panorama: linear radiance (`smplxpp.core.light`).
+        name: name of the panorama.
+        turn: rotation about +Y in degrees.
+        exposure: factor on it; None: the mean brightness of the stage.
 
     Raises:
         InputError: negative light, NaN or infinity, or no light at all; an exposure that is not above 0.
@@ -65,7 +66,7 @@ class Environment:
         object.__setattr__(self, "exposure", exposure)
 
     def at(self, mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray, "2 N 3"]:
-        """Return what `environment_light` does."""
+        """Return the irradiance of the vertices under the exposed panorama; see `environment_light`."""
         assert self.exposure is not None  # set above
         return environment_light(mesh, config, self.exposure * self.panorama, turn=self.turn)
 
@@ -83,7 +84,7 @@ def vertex_light(mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray,
 
 
 def stage_light() -> Irradiance:
-    """The light of `vertex_light`, without the shadows."""
+    """Return the unshadowed irradiance of the stage as spherical harmonics."""
     coefficients = np.zeros((9, 3))
     coefficients[0] = 0.5 * (_SKY + _GROUND) * np.sqrt(4.0 * np.pi)
     coefficients[1] = 0.5 * (_SKY - _GROUND) * np.sqrt(4.0 * np.pi / 3.0)
@@ -93,16 +94,20 @@ def stage_light() -> Irradiance:
 def environment_light(
     mesh: TriangleMesh, config: LightConfig, panorama: Float[np.ndarray, "h w 3"], *, turn: float = 0.0
 ) -> Float64[np.ndarray, "2 N 3"]:
-    """Return the same in the light of a panorama (`smplxpp.core.light`), shadows that the person casts included.
+    """Return the irradiance over pi at each vertex, outside and inside, under a panorama, shadows included.
 
     Args:
-        turn: degrees about +Y by which it is turned.
+        mesh: all layers.
+        config: quality.
+        panorama: linear radiance (`smplxpp.core.light`).
+        turn: rotation of the panorama about +Y in degrees.
     """
+    # Directions and solid angles of the pixels.
     height, width = panorama.shape[:2]
     toward = panorama_directions(height, width, turn=turn).reshape(-1, 3)
     edges = np.cos(np.linspace(0.0, np.pi, height + 1))
     solid = np.repeat(edges[:-1] - edges[1:], width)
-    # Every pixel's light comes from the nearest of the directions, so that none is lost between them.
+    # Every pixel's light is assigned to the nearest direction, so that the total is kept.
     nearest = np.argmax(toward @ view_directions(config.directions).T, axis=1)
     total = np.zeros((config.directions, 3))
     np.add.at(total, nearest, solid[:, None] * panorama.reshape(-1, 3))
@@ -117,13 +122,14 @@ def _gathered(
     config: LightConfig,
     radiance: Callable[[Float64[np.ndarray, " 3"]], Float64[np.ndarray, " C"]],
 ) -> Float64[np.ndarray, "2 N C"]:
-    """Gather the light that reaches each vertex, on both sides."""
+    """Return the light that reaches each vertex on both sides, a sum over directions of visible cosines."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     radius = 0.51 * float(np.linalg.norm(high - low))
     directions = view_directions(config.directions)
     normals = mesh.vertex_normals
     lifted = [mesh.vertices + side * config.lift * normals for side in (1.0, -1.0)]
 
+    # One depth image a direction; visibility times cosine times radiance.
     def from_one(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "2 N C"]:
         camera = Camera.orthographic_view(
             center=0.5 * (low + high), direction=direction, half_extent=radius, size=config.resolution
@@ -144,10 +150,10 @@ def _gathered(
 
 
 def bounced(light: Float[np.ndarray, " P"], albedo: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """Return the colour of surfaces of linear `albedo` in `light`, with light that bounces among them.
+    """Return the linear colour of surfaces in a light, with interreflection.
 
-    What is not open sees surfaces of the same albedo and the same light: `E = a + (1 - a) albedo E`, so
-    `E = a / (1 - (1 - a) albedo)`, with `a` the open share.
+    Occluded directions are taken to see surfaces of the same albedo in the same light: `E = a + (1 - a) albedo E`, so
+    `E = a / (1 - (1 - a) albedo)`, with `a` the unoccluded share.
     """
     albedo = np.minimum(albedo, 0.9)
     share = np.minimum(light, 1.0)[:, None]

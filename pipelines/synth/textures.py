@@ -1,4 +1,4 @@
-"""Procedural colours of the fixture person, as functions of the point on the T-pose."""
+"""Procedural colours of skin, face, hair and clothes, as functions of the point on the T-pose."""
 
 from __future__ import annotations
 
@@ -7,75 +7,62 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipelines.synth.noise import ramp, smooth_noise
+from pipelines.synth.patterns import band, mix, mix_rows, ramp, smooth_noise, weave
 from smplxpp.core.mesh import row_lengths
 
-SKIN, LIPS, BROWS, BLUSH = (222, 176, 150), (188, 104, 98), (66, 44, 32), (224, 132, 116)
-SCLERA, IRIS, IRIS_LIGHT, PUPIL = (232, 227, 222), (72, 98, 84), (112, 134, 110), (18, 14, 14)
-HAIR, HAIR_LIGHT = (62, 38, 24), (112, 72, 44)
-SHOE, SOLE = (124, 74, 46), (232, 226, 214)
-SHIRT, STRIPE = (240, 236, 226), (44, 62, 110)
-DENIM, WORN, SEAM = (52, 74, 108), (104, 128, 158), (198, 148, 88)
-
-Color = tuple[int, int, int]
-
-
-def mix(a: Color, b: Color, t: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
-    """Mix colours between `a` (t = 0) and `b` (t = 1)."""
-    t = np.asarray(t, dtype=float)[:, None]
-    return (1 - t) * np.asarray(a, dtype=float) + t * np.asarray(b, dtype=float)
-
-
-def band(x: Float[np.ndarray, " N"], *, period: float, width: float, edge: float = 0.006) -> Float[np.ndarray, " N"]:
-    """Return 1 within `width` metres about every multiple of `period`, 0 between, soft over `edge`."""
-    distance = np.abs((x + 0.5 * period) % period - 0.5 * period)
-    return ramp(distance, 0.5 * (width + edge), 0.5 * (width - edge))
+SKIN = (222, 176, 150)
+_BROWS, _PUPIL = (66, 44, 32), (18, 14, 14)
 
 
 def shirt_colors(points: Float[np.ndarray, "N 3"], shoulder: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "N 3"]:
-    """Paint stripes around torso and sleeves, in an uneven knit."""
+    """Return stripes around torso and sleeves, in an uneven knit."""
+    shirt, stripe = (240, 236, 226), (44, 62, 110)
     x, y, _ = points.T
     start = shoulder[0] + 0.03
     on_sleeve = (np.abs(x) > start) & (y > shoulder[1] - 0.13)
     along = np.where(on_sleeve, np.abs(x) - start, y)
-    colors = mix(SHIRT, STRIPE, band(along, period=0.048, width=0.02))
+    colors = mix(shirt, stripe, band(along, period=0.048, width=0.02))
     return colors * (1.0 + 0.045 * weave(points, seed=11))[:, None]
 
 
 def trouser_colors(
     points: Float[np.ndarray, "N 3"], hip: Float[np.ndarray, " 3"], ankle: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "N 3"]:
-    """Paint denim: worn on thighs and knees, with a seam along the outside of each leg and two rings at each knee.
+    """Return denim, worn on thighs and knees, with a seam along the outside of each leg and two rings at each knee.
 
-    `hip` and `ankle` are joints of the left leg.
+    Args:
+        points: on the T-pose, metres.
+        hip: joint of the left leg.
+        ankle: joint of the left leg.
     """
+    denim, worn_denim, thread = (52, 74, 108), (104, 128, 158), (198, 148, 88)
     x, y, z = points.T
     along = np.clip((hip[1] - y) / (hip[1] - ankle[1]), 0.0, 1.0)
-    # From the leg's axis: to the front, and to the outside.
+    # Offsets from the leg's axis: to the front, and to the outside.
     front, outside = z - (hip[2] + along * (ankle[2] - hip[2])), np.abs(x) - (hip[0] + along * (ankle[0] - hip[0]))
     patches = smooth_noise(points, scale=(0.03, 0.06, 0.03), seed=13)
     worn = ramp(front, 0.0, 0.08) * np.exp(-(((along - 0.3) / 0.25) ** 2))
-    colors = mix(DENIM, WORN, np.clip(0.8 * worn + 0.12 * patches, 0, 1))
+    colors = mix(denim, worn_denim, np.clip(0.8 * worn + 0.12 * patches, 0, 1))
     side = ramp(np.abs(front + 0.01), 0.006, 0.003) * ramp(outside, 0.02, 0.035)
     knee = band(y - 0.5 * (hip[1] + ankle[1]), period=0.05, width=0.005) * ramp(np.abs(along - 0.5), 0.06, 0.04)
-    colors = colors + (0.8 * np.maximum(side, knee))[:, None] * (np.array(SEAM) - colors)
+    colors = colors + (0.8 * np.maximum(side, knee))[:, None] * (np.array(thread) - colors)
     return colors * (1.0 + 0.08 * weave(points, seed=14))[:, None]
 
 
 def hair_colors(points: Float[np.ndarray, "N 3"], seed: int) -> Float[np.ndarray, "N 3"]:
-    """Paint brown with lighter streaks along the fall."""
+    """Return brown hair with lighter streaks along its fall."""
     locks = smooth_noise(points, scale=(0.007, 0.3, 0.007), seed=seed)
     strands = smooth_noise(points, scale=(0.0009, 0.12, 0.0009), seed=seed + 1)
-    return mix(HAIR, HAIR_LIGHT, np.clip(0.3 + 0.22 * locks + 0.2 * strands, 0, 1))
+    return mix((62, 38, 24), (112, 72, 44), np.clip(0.3 + 0.22 * locks + 0.2 * strands, 0, 1))
 
 
 def shoe_colors(points: Float[np.ndarray, "N 3"], floor: float) -> Float[np.ndarray, "N 3"]:
-    """Paint leather over a light sole."""
-    return mix(SOLE, SHOE, ramp(points[:, 1], floor + 0.010, floor + 0.016))
+    """Return brown leather over a light sole."""
+    return mix((232, 226, 214), (124, 74, 46), ramp(points[:, 1], floor + 0.010, floor + 0.016))
 
 
 def skin_colors(points: Float[np.ndarray, "N 3"], face: FaceMarks, seed: int) -> Float[np.ndarray, "N 3"]:
-    """Paint skin with warm patches and fine mottling; on the face cheeks, lips, brows and lashes."""
+    """Return skin with warm patches and fine mottling; on the face cheeks, lips, brows and lashes."""
     warmth = smooth_noise(points, scale=(0.04, 0.04, 0.04), seed=seed)
     mottling = smooth_noise(points, scale=(0.003, 0.003, 0.003), seed=seed + 1)
     pores = smooth_noise(points, scale=(0.0005, 0.0005, 0.0005), seed=seed + 2)
@@ -88,14 +75,20 @@ def skin_colors(points: Float[np.ndarray, "N 3"], face: FaceMarks, seed: int) ->
 
 @dataclass(frozen=True, eq=False)
 class FaceMarks:
-    """Landmarks on the T-pose in dlib's order; of the lips their outline."""
+    """Landmarks on the T-pose in dlib's order, metres.
+
+    Attributes:
+        brows: both eyebrows.
+        eyes: outlines of both eyes.
+        lips: outer outline of the lips.
+    """
 
     brows: Float[np.ndarray, "10 3"]
     eyes: Float[np.ndarray, "12 3"]
     lips: Float[np.ndarray, "12 3"]
 
     def in_front(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-        """Tell the points on the front of the face."""
+        """Return which points lie on the front of the face."""
         low, high = self.lips.min(axis=0), self.brows.max(axis=0)
         x, y, z = points.T
         return (y > low[1] - 0.02) & (y < high[1] + 0.02) & (z > low[2] - 0.045) & (np.abs(x) < 0.075)
@@ -104,14 +97,16 @@ class FaceMarks:
 def _face_colors(
     colors: Float[np.ndarray, "N 3"], points: Float[np.ndarray, "N 3"], face: FaceMarks, seed: int
 ) -> Float[np.ndarray, "N 3"]:
-    """Paint the face's features over the skin; all are drawn in the frontal plane."""
+    """Return skin colours with the features of the face over them, all drawn in the frontal plane."""
+    # Cheeks and nose: Gaussian spots of blush.
     x, y, _ = points.T
     mirrored = np.stack([np.abs(x), y], axis=1)
     lips, eye, brow = face.lips, face.eyes[6:, :2], face.brows[5:, :2]
     cheek = np.array([1.25 * eye[:, 0].mean(), 0.5 * (eye[:, 1].mean() + lips[:, 1].mean())])
     blush = np.exp(-((row_lengths(mirrored - cheek) / 0.018) ** 2)) + 0.5 * np.exp(-((x / 0.012) ** 2))
-    colors = mix_rows(colors, BLUSH, 0.22 * blush * ramp(y, eye[:, 1].min(), lips[:, 1].max()))
+    colors = mix_rows(colors, (224, 132, 116), 0.22 * blush * ramp(y, eye[:, 1].min(), lips[:, 1].max()))
 
+    # Lips: the outline as a radius by angle about their middle.
     middle = lips[:, :2].mean(axis=0)
     outline = lips[:, :2] - middle
     offset = np.stack([x, y], axis=1) - middle
@@ -124,52 +119,36 @@ def _face_colors(
     )
     lines = smooth_noise(points, scale=(0.0006, 0.006, 0.006), seed=seed + 3)
     tint = ramp(row_lengths(offset) / np.maximum(radius, 1e-6), 1.0, 0.78)
-    colors = mix_rows(colors, LIPS, 0.85 * tint) * (1.0 + 0.04 * tint * lines)[:, None]
+    colors = mix_rows(colors, (188, 104, 98), 0.85 * tint) * (1.0 + 0.04 * tint * lines)[:, None]
 
     # Brows: lower and flatter than the landmarks' arc, broad inside, made of short strokes.
     t = np.clip((mirrored[:, 0] - brow[0, 0]) / (brow[-1, 0] - brow[0, 0]), 0.0, 1.0)
     lowered = np.stack([brow[:, 0], brow[:, 1] - 0.004 - 0.0045 * np.linspace(1, 0, len(brow)) ** 1.5], axis=1)
     half = 0.0038 * (1.0 - t) + 0.0014
-    strokes = smooth_noise(points @ _SLANT.astype(points.dtype), scale=(0.0005, 0.004, 0.004), seed=seed + 4)
+    # Strokes lean to the same side on both halves as seen from the front.
+    slant = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    strokes = smooth_noise(points @ slant.astype(points.dtype), scale=(0.0005, 0.004, 0.004), seed=seed + 4)
     cover = ramp(_off_curve(mirrored, lowered) / half, 1.25, 0.4) * np.clip(0.72 + 0.25 * strokes, 0, 1)
-    colors = mix_rows(colors, BROWS, cover)
+    colors = mix_rows(colors, _BROWS, cover)
 
     # Lashes: a dark line on the upper lid, a faint one on the lower.
     for lid, strength, width in ((eye[:4], 0.85, 0.0013), (eye[[0, 5, 4, 3]], 0.35, 0.0009)):
-        colors = mix_rows(colors, BROWS, strength * ramp(_off_curve(mirrored, lid), 1.6 * width, 0.4 * width))
+        colors = mix_rows(colors, _BROWS, strength * ramp(_off_curve(mirrored, lid), 1.6 * width, 0.4 * width))
     return colors
 
 
-# Strokes of the brows lean outwards, to the same side on both halves as seen from the front.
-_SLANT = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
-
-
 def _off_curve(points: Float[np.ndarray, "N 2"], curve: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, " N"]:
-    """Return about the distance of points from a flat curve with ascending x."""
+    """Return the approximate distance of points from a planar curve with ascending x."""
     x, y = points.T
     beside = np.maximum(np.maximum(curve[0, 0] - x, x - curve[-1, 0]), 0.0)
     return np.hypot(y - np.interp(x, curve[:, 0], curve[:, 1]), beside)
 
 
-def weave(points: Float[np.ndarray, "N 3"], *, seed: int) -> Float[np.ndarray, " N"]:
-    """Return noise of about unit size: threads along and across, uneven, so that no moire shows from afar."""
-    along = smooth_noise(points, scale=(0.0006, 0.010, 0.0006), seed=seed)
-    across = smooth_noise(points, scale=(0.010, 0.0006, 0.010), seed=seed + 1)
-    patches = smooth_noise(points, scale=(0.02, 0.02, 0.02), seed=seed + 2)
-    return 0.6 * along + 0.6 * across + 0.5 * patches
-
-
 def eye_colors(offsets: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Paint white, iris and pupil by the distance from the eye's axis, +z; `offsets` are from its centre."""
+    """Return white, iris and pupil by the distance from the eye's axis, +z; `offsets` are from its centre, metres."""
+    iris, light_iris, white = (72, 98, 84), (112, 134, 110), (232, 227, 222)
     radius, angle = np.hypot(offsets[:, 0], offsets[:, 1]), np.arctan2(offsets[:, 1], offsets[:, 0])
     fibres = 0.5 + 0.25 * np.sin(23 * angle) + 0.25 * np.sin(37 * angle + 900 * radius)
-    colors = mix_rows(mix(IRIS, IRIS_LIGHT, fibres), PUPIL, 0.6 * ramp(radius, 0.0048, 0.0058))
-    colors = mix_rows(colors, SCLERA, ramp(radius, 0.0058, 0.0066))
-    return mix_rows(colors, PUPIL, ramp(radius, 0.003, 0.0022))
-
-
-def mix_rows(
-    colors: Float[np.ndarray, "N 3"], other: tuple[int, int, int], t: Float[np.ndarray, " N"]
-) -> Float[np.ndarray, "N 3"]:
-    """Mix each colour with one other, `t` of it."""
-    return colors + np.asarray(t, dtype=float)[:, None] * (np.asarray(other, dtype=float) - colors)
+    colors = mix_rows(mix(iris, light_iris, fibres), _PUPIL, 0.6 * ramp(radius, 0.0048, 0.0058))
+    colors = mix_rows(colors, white, ramp(radius, 0.0058, 0.0066))
+    return mix_rows(colors, _PUPIL, ramp(radius, 0.003, 0.0022))

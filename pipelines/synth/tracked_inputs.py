@@ -1,6 +1,6 @@
-"""A tracker's keypoints and a parser's label maps for a capture whose inputs are exact; protocols that name both.
+"""Write a tracker's keypoints and a parser's label maps for a capture with exact inputs, and protocols that name both.
 
-What is written follows from the capture's files and the seed alone.
+All files follow from the capture's files and the seed alone.
 """
 
 from __future__ import annotations
@@ -28,19 +28,16 @@ from smplxpp.segment.labels import find_label_set
 
 KEYPOINTS, ESTIMATED_LABELS = "keypoints", "labels_estimated"
 EXACT_PARAMETERS, TRACKED_PARAMETERS = "params.npz", "params_noisy.npz"
-# What is said of the files of a capture that has exact inputs and a tracker's.
 INPUTS = {
     "parameters": {EXACT_PARAMETERS: "exact", TRACKED_PARAMETERS: "tracked"},
     "labels": "true",
     "normals": "true",
 }
-# A joint lies inside of the body: what is nearer to the camera by more than this, metres, hides it.
-_BEHIND = 0.15
-_KEYPOINT_SEED, _LABEL_SEED = 11, 12
+"""The entry "inputs" of the description of a capture with exact and tracked files."""
 
 
 def protocols(*, labels: bool = True, normals: bool = True, keypoints: bool = True) -> dict[str, dict[str, object]]:
-    """The entry "protocols" of a capture's description, by which kinds of files it has."""
+    """Return the entry "protocols" of a capture's description, given the kinds of files that it has."""
     return {
         "exact": {
             "parameters": EXACT_PARAMETERS,
@@ -69,18 +66,18 @@ def write_tracked_keypoints(
     config: DetectorConfig | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> None:
-    """Write `keypoints/CAM.npz` of every camera: all joints of the body, as a detector would find them.
+    """Write `keypoints/CAM.npz` of every camera: all joints of the body with a detector's errors.
 
-    Joints that the body itself hides are found with more noise and less confidence; clothes hide nothing.
+    Joints that the body itself hides get more noise and less confidence; clothes hide nothing.
 
     Args:
-        root: folder that is written into.
+        root: folder of the capture.
         capture: gives the cameras, at full size.
-        body: of the parameters.
-        params: exact, by frame.
-        seed: of the detector's errors.
-        config: how it errs.
-        progress: called with the share of the cameras done.
+        body: body model of the parameters.
+        params: exact parameters by frame.
+        seed: seed of the detector's errors.
+        config: size of the errors.
+        progress: called with the share of the cameras that is done.
     """
     frames = sorted(params)
     posed = body.forward(BodyParams.concatenate([params[frame] for frame in frames]))
@@ -90,12 +87,12 @@ def write_tracked_keypoints(
             camera,
             names=body.joint_names,
             frames=frames,
-            seed=[seed, _KEYPOINT_SEED, k],
+            seed=[seed, 11, k],
             visible=_visible(body, posed.vertices, posed.joints, camera),
             config=config,
         )
         lens = capture.recording.distortions.get(name)
-        if lens is not None:  # the images on disk are the lens's
+        if lens is not None:  # the images on disk are distorted
             found = moved_keypoints(found, camera, lens.distort)
         write_keypoints(root / KEYPOINTS / f"{name}.npz", found)
         progress((k + 1) / len(capture.cameras))
@@ -110,6 +107,7 @@ def write_estimated_labels(
         The share of foreground pixels whose label is wrong, over all maps; 0 without any.
     """
     of_set = find_label_set(capture.label_set).ours
+    # Labels of the capture's set that stand for background count neither as wrong nor as foreground.
     background = [number for number, ours in of_set.items() if ours == BACKGROUND]
     wrong = seen = 0
     for k, name in enumerate(capture.cameras):
@@ -120,7 +118,7 @@ def write_estimated_labels(
         def one(frame: int, k: int = k, name: str = name, series: FileSeries = series) -> tuple[int, int]:
             path = series.required(frame)
             exact = np.asarray(read_labels(path))
-            estimated = estimated_labels(exact, seed=[seed, _LABEL_SEED, k, frame], background=background)
+            estimated = estimated_labels(exact, seed=[seed, 12, k, frame], background=background)
             write_gray_png(root / ESTIMATED_LABELS / name / f"{path.stem}.png", estimated)
             foreground = ~np.isin(exact, background)
             return int((estimated != exact)[foreground].sum()), int(foreground.sum())
@@ -135,7 +133,8 @@ def write_estimated_labels(
 def _visible(
     body: BodyModel, vertices: Float[np.ndarray, "F V 3"], joints: Float[np.ndarray, "F J 3"], camera: Camera
 ) -> Bool[np.ndarray, "F J"]:
-    """Joints that the body's own surface does not hide; those outside the image count as seen."""
+    """Return which joints the body's own surface does not hide; those outside the image count as visible."""
+    # Joints lie inside the body, so only surface more than 15 cm nearer to the camera hides them.
     out = np.ones(joints.shape[:2], dtype=bool)
     for row, (surface, points) in enumerate(zip(vertices, joints, strict=True)):
         depth = rasterize_mesh(body.mesh(surface), camera).depth
@@ -144,5 +143,5 @@ def _visible(
             inside = (screen[:, 2] > 0) & (screen[:, :2] >= 0).all(axis=1)
             inside &= (screen[:, 0] < camera.width) & (screen[:, 1] < camera.height)
         x, y = screen[inside, :2].astype(np.int64).T
-        out[row, inside] = depth[y, x] > screen[inside, 2] - _BEHIND
+        out[row, inside] = depth[y, x] > screen[inside, 2] - 0.15
     return out

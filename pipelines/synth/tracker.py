@@ -1,4 +1,4 @@
-"""What a tracker would have made of exact data: parameters, keypoints and label maps with its errors. Seeded."""
+"""Add the errors of trackers to exact data: parameters, keypoints and label maps, for a fixed seed."""
 
 from __future__ import annotations
 
@@ -16,25 +16,16 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.validation import require_between, require_positive
 
-_NEAR = 0.05  # metres: nothing nearer to a camera is detected
-# Confidences of good, hidden and wrong detections: a detector is less sure of what is hidden or wrong, not always.
-_SURE, _HIDDEN, _WRONG = (0.6, 1.0), (0.15, 0.55), (0.15, 0.8)
-_HIDDEN_NOISE = 2.0
-# Scales of a parser's errors as shares of the image's height: of the smooth wandering of borders, of blobs, and how far
-# borders wander at most.
-_WANDER, _BLOB, _FARTHEST = 0.03, 0.008, 0.06
-_BLOB_AREA, _BLOB_REACH, _AMPLITUDES = 0.12, 3.0, 24
-
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """How a detector errs.
+    """Sizes and shares of a keypoint detector's errors.
 
     Attributes:
-        pixels: standard deviation of a coordinate in an image 640 pixels high; it grows with the height. Twice as much
-            for hidden points.
-        outliers: share of points that are anywhere in the person's box instead.
-        missing: share of points that are not found.
+        pixels: standard deviation of a coordinate in an image 640 pixels high; it is proportional to the height, and
+            doubled for hidden points.
+        outliers: share of points that lie anywhere in the person's box instead.
+        missing: share of points that are not detected.
 
     Raises:
         InputError: shares out of range.
@@ -50,9 +41,6 @@ class DetectorConfig:
             require_between(name, getattr(self, name), 0.0, 1.0)
 
 
-_REFERENCE_HEIGHT = 640.0
-
-
 def tracker_noise(
     params: BodyParams,
     *,
@@ -62,8 +50,16 @@ def tracker_noise(
     expression: float = 0.04,
     betas: float = 0.12,
 ) -> BodyParams:
-    """Return parameters as a tracker would give them; standard deviations of each joint's turn about each axis, of each
-    coordinate in metres (half white, half slow), of expression weights, and of one constant offset of betas."""
+    """Return parameters with the errors of a tracker.
+
+    Args:
+        params: exact parameters.
+        seed: seed of the errors.
+        degrees: standard deviation of each joint's rotation about each axis.
+        transl: standard deviation of each coordinate in metres, half white noise, half a slow sine.
+        expression: standard deviation of expression weights.
+        betas: standard deviation of one constant offset of the shape coefficients.
+    """
     rng = np.random.default_rng(seed)
     count = len(params)
     turns = matrix_from_rotvec(rng.normal(0, np.radians(degrees), (count, len(SMPLX_JOINTS), 3)))
@@ -89,41 +85,46 @@ def detector_keypoints(
     visible: Bool[np.ndarray, "F K"] | None = None,
     config: DetectorConfig | None = None,
 ) -> Keypoints2D:
-    """What a detector would find of points in the images of a camera.
+    """Return the keypoints that a detector would find in the images of a camera.
 
     Args:
-        points: world, metres; of the named points in each frame.
-        camera: takes the images; what is outside of them is not found.
-        names, frames: of the points' axes.
-        seed: of this camera's errors.
-        visible: points that nothing hides; hidden ones are found with more noise and less confidence. None: all.
-        config: how it errs.
+        points: named points in each frame, world, metres.
+        camera: the camera; points outside its images are not found.
+        names: names of the points.
+        frames: numbers of the frames.
+        seed: seed of this camera's errors.
+        visible: which points nothing hides; hidden ones get more noise and less confidence. None: all.
+        config: size of the errors.
     """
     config = config or DetectorConfig()
     rng = np.random.default_rng(seed)
     shape = (len(frames), len(names))
     screen = camera.screen_from_world(points.reshape(-1, 3)).reshape(*shape, 4)
     size = np.array([camera.width, camera.height], dtype=np.float64)
+    # Project; points outside the image or nearer than 5 cm are not detected.
     with np.errstate(invalid="ignore"):
-        inside = (screen[..., 2] > _NEAR) & ((screen[..., :2] >= 0) & (screen[..., :2] <= size)).all(axis=2)
+        inside = (screen[..., 2] > 0.05) & ((screen[..., :2] >= 0) & (screen[..., :2] <= size)).all(axis=2)
     uv = np.where(inside[..., None], screen[..., :2], 0.0)
+    # Gaussian noise, twice as much where a point is hidden.
     hidden = np.zeros(shape, dtype=bool) if visible is None else ~visible
-    noise = config.pixels * camera.height / _REFERENCE_HEIGHT * np.where(hidden, _HIDDEN_NOISE, 1.0)
+    noise = config.pixels * camera.height / 640.0 * np.where(hidden, 2.0, 1.0)
     found = uv + rng.normal(size=uv.shape) * noise[..., None]
+    # Outliers lie anywhere in the box of the person's points.
     low = np.where(inside[..., None], uv, np.inf).min(axis=1, keepdims=True)
     high = np.where(inside[..., None], uv, -np.inf).max(axis=1, keepdims=True)
     low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
     wrong = rng.random(shape) < config.outliers
     anywhere = low + rng.random(uv.shape) * (high - low)
-    limits = np.where(hidden[..., None], _HIDDEN, _SURE)
-    limits = np.where(wrong[..., None], _WRONG, limits)
+    # Ranges of confidence overlap, because detectors are not always less certain of hidden or wrong points.
+    limits = np.where(hidden[..., None], (0.15, 0.55), (0.6, 1.0))
+    limits = np.where(wrong[..., None], (0.15, 0.8), limits)
     confidence = limits[..., 0] + rng.random(shape) * (limits[..., 1] - limits[..., 0])
-    gone = (rng.random(shape) < config.missing) | ~inside
+    missed = (rng.random(shape) < config.missing) | ~inside
     return Keypoints2D(
         tuple(names),
         np.array(frames, dtype=np.int64),
         np.where(wrong[..., None], anywhere, found),
-        np.where(gone, 0.0, confidence),
+        np.where(missed, 0.0, confidence),
     )
 
 
@@ -134,34 +135,35 @@ def estimated_labels(
     share: float = 0.05,
     background: Sequence[int] = (0,),
 ) -> UInt8[np.ndarray, "H W"]:
-    """A label map as a parser would give it: borders between labels wander smoothly, and small blobs beside them are
-    wrong.
+    """Return a label map with the errors of a parser: displaced borders between labels, and wrong blobs beside them.
 
-    The person's outline stays: it comes from the matte. The borders wander as far as makes about `share` of the
-    foreground wrong, less where labels have hardly a border.
+    The person's outline stays, because it comes from the matte. The displacement is as large as makes about `share` of
+    the foreground wrong, less where labels share hardly a border.
 
     Args:
-        labels: numbers of any set.
-        seed: of this view's errors.
-        share: of the foreground's pixels.
-        background: numbers of the background.
+        labels: label numbers of any set.
+        seed: seed of this view's errors.
+        share: share of the foreground's pixels that become wrong.
+        background: label numbers of the background.
     """
     foreground = ~np.isin(labels, background)
     if not foreground.any() or (labels[foreground] == labels[foreground][0]).all():
         return labels.copy()
     rng = np.random.default_rng(seed)
     height = labels.shape[0]
-    # The labels continued beyond the outline, so that a border that meets it can move there.
+    # Continue the labels outside the outline, so that a border that meets it can move there.
     rows, columns = distance_transform_edt(~foreground, return_distances=False, return_indices=True)
     full = labels[rows, columns]
-    shift = np.stack([_smooth(rng, labels.shape, _WANDER * height) for _ in range(2)])
-    blobs = _smooth(rng, labels.shape, max(_BLOB * height, 1.0))
-    shift = shift * np.where(blobs > np.quantile(blobs, 1.0 - _BLOB_AREA), _BLOB_REACH, 1.0)
+    # A smooth displacement field (0.03 of the image's height), tripled within blobs (0.008 of it, 12 % of the area).
+    shift = np.stack([_smooth(rng, labels.shape, 0.03 * height) for _ in range(2)])
+    blobs = _smooth(rng, labels.shape, max(0.008 * height, 1.0))
+    shift = shift * np.where(blobs > np.quantile(blobs, 1.0 - 0.12), 3.0, 1.0)
     # Only the person's pixels change.
     pixels, shift, exact = np.stack(np.nonzero(foreground)), shift[:, foreground], labels[foreground]
     limit = np.array(labels.shape)[:, None] - 1
+    # Of 24 amplitudes keep the one whose share of wrong pixels is nearest to the wanted one.
     best, best_error = exact, np.inf
-    for amplitude in np.geomspace(0.25, max(_FARTHEST * height, 0.5), _AMPLITUDES):
+    for amplitude in np.geomspace(0.25, max(0.06 * height, 0.5), 24):
         y, x = np.clip(np.round(pixels + amplitude * shift).astype(np.int64), 0, limit)
         moved = full[y, x]
         error = abs(float((moved != exact).mean()) - share)
@@ -173,6 +175,6 @@ def estimated_labels(
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, ...], scale: float) -> Float[np.ndarray, "H W"]:
-    """Smooth noise of unit size."""
+    """Return smooth noise of unit standard deviation."""
     noise = gaussian_filter(rng.normal(size=shape), scale, mode="reflect")
     return noise / noise.std()

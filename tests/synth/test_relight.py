@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.synth.person_file import load_person
+from pipelines.synth.person import load_person
 from pipelines.synth.soft_light import Environment, LightConfig, environment_light, stage_light, vertex_light
 from pipelines.synth.views import LitFrame, hidden_faces, normal_map, render_view
 from smplxpp.core.camera import Camera

@@ -8,25 +8,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.synth.person_file import load_person
-from pipelines.synth.skirt_patterns import PATTERNS, RADIUS, TURN, around_and_along, skirt_colors
+from pipelines.synth.patterns import SKIRT_GIRTH, SKIRT_PATTERNS, SKIRT_RADIUS, around_and_along, skirt_colors
+from pipelines.synth.person import load_person
 
 TOPOLOGY = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person" / "geometry" / "topology.npz"
 
 
 def colors(name: str, around=0.0, along=0.0) -> np.ndarray:
     at = np.stack(np.broadcast_arrays(np.asarray(around, float), np.asarray(along, float)), axis=-1).reshape(-1, 2)
-    return PATTERNS[name](at)
+    return SKIRT_PATTERNS[name](at)
 
 
 LINE = np.linspace(-0.4, 0.4, 400)
 
 
-@pytest.mark.parametrize("name", PATTERNS)
+@pytest.mark.parametrize("name", SKIRT_PATTERNS)
 def test_patterns_are_colours_and_close_around(name):
     every = colors(name, LINE[:, None], LINE[None])
     assert np.isfinite(every).all() and every.min() >= 0 and every.max() <= 255
-    left, right = (colors(name, side * 0.5 * TURN, LINE) for side in (-1, 1))
+    left, right = (colors(name, side * 0.5 * SKIRT_GIRTH, LINE) for side in (-1, 1))
     np.testing.assert_allclose(left, right, atol=1e-6)
 
 
@@ -46,7 +46,7 @@ def test_what_a_pattern_tells(name, around, along):
 
 
 def test_dots_are_staggered():
-    apart = TURN / 26
+    apart = SKIRT_GIRTH / 26
     assert (colors("dots", 0.0, 0.0) == colors("dots", apart, 0.0)).all()
     np.testing.assert_allclose(colors("dots", 0.0, 0.0), colors("dots", 0.5 * apart, 0.05))
     assert not np.allclose(colors("dots", 0.0, 0.0), colors("dots", 0.5 * apart, 0.0))
@@ -54,13 +54,13 @@ def test_dots_are_staggered():
 
 def test_places_on_a_skirt():
     at = around_and_along(np.array([[0.0, 0.3, 0.2], [0.2, -0.1, 0.0], [-0.2, 0.0, 0.0]]))
-    np.testing.assert_allclose(at, [[0.0, 0.3], [0.5 * np.pi * RADIUS, -0.1], [-0.5 * np.pi * RADIUS, 0.0]])
+    np.testing.assert_allclose(at, [[0.0, 0.3], [0.5 * np.pi * SKIRT_RADIUS, -0.1], [-0.5 * np.pi * SKIRT_RADIUS, 0.0]])
 
 
 def test_threads_are_in_all_cloth_but_plain():
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (200, 3)).astype(np.float32)
     assert np.ptp(skirt_colors(points, 0.0, "plain"), axis=0).max() == 0
-    flat = PATTERNS["dots"](around_and_along(points))
+    flat = SKIRT_PATTERNS["dots"](around_and_along(points))
     thread = skirt_colors(points, 0.0, "dots") / flat
     assert 0.01 < np.abs(thread - 1.0).mean() < 0.2
 

@@ -12,9 +12,10 @@ from PIL import Image
 
 from pipelines.cli import main
 from pipelines.synth.camera_rig import camera_rig
-from pipelines.synth.make_capture import SynthConfig, make_capture, split_frames
+from pipelines.synth.config import SynthConfig, split_frames
+from pipelines.synth.make_capture import make_capture
 from pipelines.synth.motion import Performance
-from pipelines.synth.person_file import load_person
+from pipelines.synth.person import load_person
 from pipelines.synth.simulate import SimulationConfig
 from pipelines.synth.soft_light import Environment, LightConfig, bounced, vertex_light
 from pipelines.synth.views import LitFrame, normal_map, render_view

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipelines.synth.checks import depths, free_edge_strain
-from pipelines.synth.garment import Block, Garment, Stepping
+from pipelines.synth.garment_dynamics import ContactSurface, GarmentConfig, GarmentDynamics
 from pipelines.synth.motion import Performance
-from pipelines.synth.person_file import load_person
+from pipelines.synth.person import load_person
 from pipelines.synth.simulate import HairLag, SimulationConfig, simulate
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import matrix_from_rotvec
@@ -27,11 +27,11 @@ def free(mesh: TriangleMesh) -> np.ndarray:
     return np.zeros(mesh.vertex_count)
 
 
-class Alone(Garment):
+class Alone(GarmentDynamics):
     """A garment that touches nothing."""
 
     def __init__(self, mesh: TriangleMesh, hold: np.ndarray) -> None:
-        super().__init__(mesh, hold, [Block(FAR.faces, 0.004, 0.05)], Stepping())
+        super().__init__(mesh, hold, [ContactSurface(FAR.faces, 0.004, 0.05)], GarmentConfig())
 
     def go(self, before: np.ndarray, after: np.ndarray) -> None:
         self.advance(SECONDS, (before, after), [(FAR.vertices, FAR.vertices)])
@@ -75,7 +75,7 @@ def test_a_falling_sheet_stays_outside_a_ball():
     core, cloth = ball(0.12), lying(13, 13, 0.025, 0.14)
     # Vertices that no face uses are no part of the surface.
     surface = np.concatenate([[[0.0, 0.14, 0.0]], core.vertices])
-    garment = Garment(cloth, free(cloth), [Block(core.faces + 1, 0.004, 0.05)], Stepping())
+    garment = GarmentDynamics(cloth, free(cloth), [ContactSurface(core.faces + 1, 0.004, 0.05)], GarmentConfig())
     for _ in range(20):
         garment.advance(SECONDS, (cloth.vertices, cloth.vertices), [(surface, surface)])
     assert garment.position[:, 1].min() < 0.08  # it drapes
@@ -88,8 +88,8 @@ def test_every_surface_keeps_its_own_margin():
     patch = lying(3, 3, 0.01, 0.012)
     for side, margin in zip((-0.2, 0.2), (0.01, 0.003), strict=True):
         cloth = patch.with_vertices(patch.vertices + [side, 0, 0])
-        touches = [Block(left.faces, 0.01, 0.02), Block(right.faces, 0.003, 0.02)]
-        garment = Garment(cloth, free(cloth), touches, Stepping())
+        touches = [ContactSurface(left.faces, 0.01, 0.02), ContactSurface(right.faces, 0.003, 0.02)]
+        garment = GarmentDynamics(cloth, free(cloth), touches, GarmentConfig())
         for _ in range(20):
             garment.advance(SECONDS, (cloth.vertices, cloth.vertices), [(x, x) for x in places])
         np.testing.assert_allclose(garment.position[:, 1], margin, atol=1e-3)

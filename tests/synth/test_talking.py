@@ -11,16 +11,15 @@ import pytest
 
 from pipelines.cli import main
 from pipelines.commands.synth import Synth
-from pipelines.synth.atlas import Atlas, _middles, paint_atlas
 from pipelines.synth.camera_rig import camera_rig
-from pipelines.synth.gestures import GESTURES
-from pipelines.synth.make_capture import SynthConfig, make_capture
+from pipelines.synth.config import SynthConfig
+from pipelines.synth.make_capture import make_capture
 from pipelines.synth.motion import Performance
-from pipelines.synth.person_file import load_person, read_layers
+from pipelines.synth.person import load_person, read_layers
 from pipelines.synth.simulate import SimulationConfig, _Stage, attachment
 from pipelines.synth.soft_light import LightConfig
-from pipelines.synth.talking import Talking
-from pipelines.synth.views import LitFrame, render_view
+from pipelines.synth.talking import GESTURES, Talking
+from pipelines.synth.views import Atlas, LitFrame, _cell_centers, paint_atlas, render_view
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import open_capture
@@ -189,7 +188,7 @@ def test_a_cell_is_found_by_its_middle(n):
     cells = np.arange(n * n)
     index = np.stack([cells, cells, cells], axis=1).astype(np.uint8)
     atlas = Atlas(np.array([n], dtype=np.int32), np.array([0]), index)
-    bary = _middles(cells, np.full(n * n, n))
+    bary = _cell_centers(cells, np.full(n * n, n))
     np.testing.assert_allclose(bary.sum(axis=1), 1)
     assert bary.min() > 0
     np.testing.assert_array_equal(atlas.colors(np.zeros(n * n, dtype=int), bary.astype(np.float32)), index)

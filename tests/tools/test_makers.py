@@ -10,8 +10,8 @@ import pytest
 
 from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, loop_subdivide, push_out, smooth
 from pipelines.synth.motion import Performance
+from pipelines.synth.patterns import band
 from pipelines.synth.scan_simulation import ScanConfig, simulate_scan
-from pipelines.synth.textures import band
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import load_body
 from smplxpp.core.mesh import TriangleMesh
@@ -125,7 +125,9 @@ def test_scan_of_a_ball_under_a_sheet_shows_the_outer_surface_only():
         np.concatenate([core.vertices, cap.vertices]), np.concatenate([core.faces, cap.faces + core.vertex_count])
     )
     is_cap = np.arange(layers.face_count) >= core.face_count
-    config = ScanConfig(cell=0.01, views=40, resolution=256, sure_free=0.015, sheet_thickness=0.02, faces=2000, noise=0)
+    config = ScanConfig(
+        cell=0.01, views=40, resolution=256, free_margin=0.015, sheet_thickness=0.02, faces=2000, noise=0
+    )
     scan = simulate_scan(layers, [is_cap], config)
     assert (scan.mesh.edges_with_counts[1] == 2).all()
     radius = np.linalg.norm(scan.mesh.vertices, axis=1)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from pipelines.synth.cloth_mesh import ClothMesh, clip, push_out, smooth, submesh
 from pipelines.synth.garments.mannequin import Mannequin
-from pipelines.synth.noise import ramp
+from pipelines.synth.patterns import ramp
 from smplxpp.core.topology import face_components
 
 Level = Callable[[np.ndarray], np.ndarray]
@@ -20,7 +20,7 @@ Level = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Garment:
-    """A garment in the T-pose.
+    """A garment on a person in the T-pose.
 
     Attributes:
         name: name of the garment.

@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.synth.cloth_mesh import ClothMesh, push_out, smooth
 from pipelines.synth.garments.cut import Garment, Level, facing_out, grid_faces, joined, layer, tube_along
 from pipelines.synth.garments.mannequin import Mannequin
-from pipelines.synth.noise import ramp
+from pipelines.synth.patterns import ramp
 
 _HOOD_UP = "the head from the chin up, from the neck's base down the shoulders' skin straight below, smooth between"
 _HOOD_DOWN = "shirt: as grown; the hood's roll: spine3, at its sides half the collar bone"
@@ -37,6 +37,7 @@ def fitted_garments(mannequin: Mannequin) -> list[Garment]:
     def glove(p: np.ndarray) -> np.ndarray:
         return np.abs(p[:, 0]) - elbow[0] - 0.1
 
+    # Levels are positive inside a garment; `ease` is its distance from the skin in metres.
     tee = _grown(mannequin, "T-shirt", "upper", shirt(cuff=0.5 * (shoulder[0] + elbow[0]), hem=crotch + 0.08), 0.011)
     grown = partial(_grown, mannequin)
     return [
@@ -73,6 +74,7 @@ def tops(mannequin: Mannequin) -> list[Garment]:
     def loose(at_chest: float, at_hem: float) -> Ease:
         return lambda p: at_chest + (at_hem - at_chest) * ramp(p[:, 1], shoulder[1] - 0.1, crotch)
 
+    # Loose garments stand off more at the hem than at the chest, and are smoothed more.
     wide = shirt(cuff=elbow[0] - 0.02, hem=crotch + 0.01, neck=0.085)
     sweatshirt = shirt(cuff=long, hem=crotch + 0.05, neck=0.075)
     return [
@@ -150,7 +152,7 @@ def _shirt(
         hem: height of the hem.
         neck: radius of the neckline.
         deep: metres below the neck's joint down to which the neckline reaches.
-        gap: half the width by which it is open in front; 0: closed.
+        gap: half the width of the opening in front; 0: closed.
     """
     joint = mannequin.joints["neck"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.synth.cloth_mesh import ClothMesh, push_out, smooth
 from pipelines.synth.garments.cut import Garment, facing_out, grid_faces, joined, layer, tube_along
 from pipelines.synth.garments.mannequin import Mannequin
-from pipelines.synth.noise import ramp
+from pipelines.synth.patterns import ramp
 
 
 def hairstyles(mannequin: Mannequin) -> list[Garment]:
@@ -26,6 +26,7 @@ def hairstyles(mannequin: Mannequin) -> list[Garment]:
     def wide() -> ClothMesh:
         return _hanging(mannequin, _curtain(mannequin, j["spine3"][1], spread=0.075, half=np.pi - 0.6), keeps=0.1)
 
+    # Curtains that end higher lie on the shoulders; longer ones hang free.
     return [
         Garment("bob on the shoulders", "hair", bob, head + "the shoulders' skin straight below"),
         Garment("long loose hair", "hair", long, head + "0.8 of the trunk at its height"),

@@ -14,7 +14,7 @@ from pipelines.synth.garments.fitted import bottoms, fitted_garments, tops
 from pipelines.synth.garments.hair import hairstyles, tied_and_short_hair
 from pipelines.synth.garments.loose import loose_garments
 from pipelines.synth.garments.mannequin import HAND_JOINTS, Mannequin, shares
-from pipelines.synth.noise import smooth_noise
+from pipelines.synth.patterns import smooth_noise
 from smplxpp.body import BodyModel
 from smplxpp.clean.simplify import simplify
 from smplxpp.core.mesh import TriangleMesh

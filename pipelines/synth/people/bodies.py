@@ -82,7 +82,7 @@ def _arm(
 
     Args:
         side: "left" or "right".
-        lower: angle by which it is lowered.
+        lower: angle between T-pose and arm, downwards.
         forward: swing to the front.
         twist: rotation of the upper arm about itself, palm turning back.
         elbow: bend of the elbow.
@@ -202,7 +202,7 @@ class Posing:
         body: the body model.
         stance: the stance.
         betas: her shape coefficients.
-        facing: degrees about the vertical by which she is turned to her left.
+        facing: rotation about the vertical to her left, degrees.
         jitter: rotation vectors added at every joint, radians.
     """
 

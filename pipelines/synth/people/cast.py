@@ -9,7 +9,7 @@ from pipelines.synth.people.paint import Dye
 
 @dataclass(frozen=True)
 class Wear:
-    """A layer of clothes.
+    """One layer of clothes of a person.
 
     Attributes:
         garment: name among `garments.wardrobe.all_garments`.
@@ -24,14 +24,14 @@ class Wear:
 
 @dataclass(frozen=True)
 class Member:
-    """One person of the cast.
+    """The description of one person of the cast.
 
     Attributes:
         build: name in `BUILDS`.
         stance: name in `STANCES`.
         wears: layers from the inside out, hair among them.
         tone: name in `SKIN_TONES`.
-        facing: degrees about the vertical by which she is turned to her left.
+        facing: rotation about the vertical to her left, degrees.
         colored: whether the scan has colours.
     """
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from pipelines.synth.cloth_mesh import ClothMesh, outer_faces, push_out, smooth
 from pipelines.synth.garments.mannequin import ARM_JOINTS, HAND_JOINTS, shares
 from pipelines.synth.garments.wardrobe import all_garments
-from pipelines.synth.noise import smooth_noise
+from pipelines.synth.patterns import smooth_noise
 from pipelines.synth.people.bodies import Posing, betas_of, fitting_mannequin
 from pipelines.synth.people.cast import Member, Wear
 from pipelines.synth.people.paint import cloth_paint, hair_paint, photographed, skin_paint
@@ -49,7 +49,7 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Dressed:
-    """A person in her clothes.
+    """A person in her clothes, in the T-pose.
 
     Attributes:
         body: the body model.

@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipelines.synth import textures
-from pipelines.synth.noise import smooth_noise
-from pipelines.synth.person import face_marks
-from pipelines.synth.person_file import face_landmarks
+from pipelines.synth.patterns import Color, band, mix, smooth_noise
+from pipelines.synth.person import face_landmarks, face_marks
 from pipelines.synth.soft_light import LightConfig, bounced, vertex_light
 from smplxpp.core.mesh import TriangleMesh
 
-SKIN_TONES: dict[str, textures.Color] = {
+SKIN_TONES: dict[str, Color] = {
     "pale": (240, 208, 192),
     "light": (222, 176, 150),
     "olive": (198, 152, 116),
@@ -22,7 +21,7 @@ SKIN_TONES: dict[str, textures.Color] = {
     "brown": (128, 84, 58),
     "dark": (82, 54, 42),
 }
-HAIR_COLORS: dict[str, textures.Color] = {
+HAIR_COLORS: dict[str, Color] = {
     "black": (34, 28, 26),
     "brown": (74, 46, 28),
     "blond": (196, 158, 96),
@@ -30,7 +29,7 @@ HAIR_COLORS: dict[str, textures.Color] = {
     "grey": (150, 148, 146),
     "white": (222, 218, 212),
 }
-DYES: dict[str, textures.Color] = {
+DYES: dict[str, Color] = {
     "white": (236, 234, 228),
     "black": (36, 36, 40),
     "grey": (128, 130, 134),
@@ -55,7 +54,7 @@ PATTERNS = ("plain", "stripes", "pinstripes", "check", "dots", "blotches", "prin
 
 @dataclass(frozen=True)
 class Dye:
-    """Colours of a layer.
+    """Colours and pattern of a layer.
 
     Attributes:
         color: name in `DYES`, or in `HAIR_COLORS` for hair.
@@ -109,13 +108,13 @@ def cloth_paint(points: Float[np.ndarray, "P 3"], dye: Dye, *, seed: int) -> Flo
     along = np.where((np.abs(x) > 0.24) & (y > 0.4), np.abs(x), y)
     around = np.arctan2(x, z - 0.03) * 0.18
     if dye.pattern == "stripes":
-        share = textures.band(along, period=rng.uniform(0.035, 0.07), width=0.018)
+        share = band(along, period=rng.uniform(0.035, 0.07), width=0.018)
     elif dye.pattern == "pinstripes":
-        share = textures.band(around, period=0.024, width=0.005)
+        share = band(around, period=0.024, width=0.005)
     elif dye.pattern == "check":
-        share = 0.5 * (textures.band(along, period=0.07, width=0.03) + textures.band(around, period=0.07, width=0.03))
+        share = 0.5 * (band(along, period=0.07, width=0.03) + band(around, period=0.07, width=0.03))
     elif dye.pattern == "dots":
-        share = textures.band(along, period=0.05, width=0.018) * textures.band(around, period=0.05, width=0.018)
+        share = band(along, period=0.05, width=0.018) * band(around, period=0.05, width=0.018)
     elif dye.pattern == "blotches":
         share = 1.0 * (smooth_noise(points, scale=(0.035, 0.035, 0.035), seed=seed) > 0.2)
     elif dye.pattern == "print":
@@ -126,7 +125,7 @@ def cloth_paint(points: Float[np.ndarray, "P 3"], dye: Dye, *, seed: int) -> Flo
     patches = smooth_noise(points, scale=(0.06, 0.06, 0.06), seed=seed + 1)
     weave = smooth_noise(points, scale=(0.004, 0.008, 0.004), seed=seed + 2)
     wear = 0.10 if dye.color == "denim" else 0.035
-    return textures.mix(DYES[dye.color], DYES[dye.second], share) * (1 + wear * patches + 0.03 * weave)[:, None]
+    return mix(DYES[dye.color], DYES[dye.second], share) * (1 + wear * patches + 0.03 * weave)[:, None]
 
 
 def photographed(

@@ -1,4 +1,4 @@
-"""One piece of clothing of the person: its particles among all vertices, what they touch, and their solver."""
+"""Dynamics of one garment: its cloth model, the surfaces that it may touch, and their solver."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from smplxpp.cloth.model import build_model, shuffled
 from smplxpp.cloth.solver import ClothSolver, ClothState, Collider
 from smplxpp.core.mesh import TriangleMesh
 
-# Points at the start and at the end of a tick.
 Ends = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]
+"""Points at the start and at the end of a tick, metres."""
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ContactSurface:
     """A surface that cloth may touch.
 
     Attributes:
-        faces: of the surface, oriented outwards.
-        margin: metres that cloth keeps from it.
-        deepest: metres behind it from which cloth is taken to be on the other side.
+        faces: faces of the surface, oriented outwards.
+        margin: distance in metres that cloth keeps from it.
+        deepest: depth in metres from which cloth counts as on its other side.
     """
 
     faces: Int[np.ndarray, "d 3"]
@@ -33,13 +33,13 @@ class Block:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stepping:
-    """Material and steps of one garment.
+class GarmentConfig:
+    """Material and time steps of a garment.
 
     Attributes:
-        fabric: cotton: it hardly stretches.
-        attach_stiffness: N/m of the spring of a vertex that is nearly wholly attached to its place on the body.
-        solver: contacts are searched once or twice a tick.
+        fabric: cotton, which hardly stretches.
+        attach_stiffness: N/m of the spring that holds a nearly attached vertex to its place on the body.
+        solver: steps of the solver, which searches contacts once or twice a tick.
     """
 
     fabric: Fabric = field(
@@ -58,33 +58,38 @@ class Stepping:
     solver: SolverConfig = field(default_factory=lambda: SolverConfig(contacts_every=12, most_speed=6.0))
 
 
-class Garment:
-    """A garment that is stepped; it starts at rest.
+class GarmentDynamics:
+    """A simulated garment, at rest at first.
 
     Args:
-        rest: N vertices as they are on the body at the start: the garment's own lengths and curvatures.
-        hold: (N,) 1 where a vertex follows the body, 0 where it is free.
+        rest: N vertices on the body at the start, which give rest lengths and curvatures.
+        hold: 1 where a vertex follows the body, 0 where it is free.
         touches: surfaces that it may touch.
+        config: material and steps.
     """
 
     def __init__(
-        self, rest: TriangleMesh, hold: Float[np.ndarray, " N"], touches: Sequence[Block], stepping: Stepping
+        self,
+        rest: TriangleMesh,
+        hold: Float[np.ndarray, " N"],
+        touches: Sequence[ContactSurface],
+        config: GarmentConfig,
     ) -> None:
-        model = shuffled(build_model(rest, hold, stepping.fabric, attach_stiffness=stepping.attach_stiffness))
+        model = shuffled(build_model(rest, hold, config.fabric, attach_stiffness=config.attach_stiffness))
         self._used = [np.unique(block.faces) for block in touches]
-        self._solver = ClothSolver(model, _collider(touches, self._used), stepping.fabric, stepping.solver)
+        self._solver = ClothSolver(model, _collider(touches, self._used), config.fabric, config.solver)
         self._rest, self._state = rest, ClothState.at_rest(rest.vertices)
         self._moves = bool((model.inverse_mass > 0).any())
         self.position = rest.vertices
 
     def advance(self, seconds: float, places: Ends, surfaces: Sequence[Ends], *, damped: bool = False) -> None:
-        """Go on by a tick; what is tight all over goes where the body takes it.
+        """Advance by one tick; a garment without free vertices follows the body.
 
         Args:
-            seconds: the tick's length.
-            places: where the body has the vertices.
-            surfaces: the vertices of what the garment touches.
-            damped: most of its speed is taken away first.
+            seconds: length of the tick.
+            places: vertices as skinning moves them.
+            surfaces: vertices of each surface that the garment touches.
+            damped: whether to reduce all velocities by 30 % first.
         """
         if not self._moves:
             self.position = places[1]
@@ -99,11 +104,12 @@ class Garment:
 
     @property
     def mesh(self) -> TriangleMesh:
-        """The garment as it is now."""
+        """The garment in its current state."""
         return self._rest.with_vertices(self.position)
 
 
-def _collider(touches: Sequence[Block], used: Sequence[Int[np.ndarray, " _"]]) -> Collider:
+def _collider(touches: Sequence[ContactSurface], used: Sequence[Int[np.ndarray, " _"]]) -> Collider:
+    # Join the surfaces into one, renumbering their vertices.
     each = [len(index) for index in used]
     faces = [
         np.searchsorted(index, block.faces) + start
@@ -117,5 +123,5 @@ def _collider(touches: Sequence[Block], used: Sequence[Int[np.ndarray, " _"]]) -
 
 
 def _even_motion(start: Float[np.ndarray, "N 3"], end: Float[np.ndarray, "N 3"]) -> list[np.ndarray]:
-    """Four moments whose curve is the straight way from the second to the third."""
+    """Return four instants of a uniform motion that passes `start` second and `end` third."""
     return [np.ascontiguousarray(x, dtype=np.float32) for x in (2.0 * start - end, start, end, 2.0 * end - start)]
