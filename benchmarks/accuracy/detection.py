@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float64, UInt8
 from benchmarks.accuracy.registration import bare_and_under
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
-from pipelines.captures.detect_keypoints import detect_keypoints, problems_of
+from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes
 from pipelines.commands.capture import selected_frames
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.stages.build_config import RegisterInputs
@@ -83,7 +83,7 @@ class Photographs:
             "frames": len(kept),
             "seconds_an_image": seconds / looked_at if looked_at else None,
             "views_with_a_person": float(np.mean(np.concatenate([one.people > 0 for one in found.values()]))),
-            "problems": problems_of(found),
+            "problems": detection_notes(found),
             **_point_errors(shown, body, kept),
         }
         print(figures, flush=True)

@@ -1,1 +1,1 @@
-"""Captures checked and converted."""
+"""Captures: reports of their checks, conversion, and keypoints and masks of their images."""

@@ -1,7 +1,7 @@
-"""convert_capture: any capture that can be opened, written down in our layout or in ActorsHQ's.
+"""convert_capture: write any capture that can be opened in our layout or in ActorsHQ's.
 
-Images come out as pinholes' images. What needs no change is copied byte for byte; what is copied or written appears
-whole or not at all, and a conversion that was interrupted goes on where it stopped.
+Images become those of pinhole cameras. Files without changes are copied byte for byte. Every file appears whole or not
+at all, and an interrupted conversion continues where it stopped.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ _RECORD = "conversion.json"
 
 @dataclass(frozen=True)
 class ConvertConfig:
-    """What to write.
+    """Layout, size and selection of a conversion.
 
     Attributes:
         layout: "simple" is ours; "actorshq" holds images on black, masks, cameras and parameters.
-        scale: resolution of the images as a factor.
-        frames, cameras: what is kept; None: all.
-        quality: of JPEG images that cannot be copied.
+        scale: factor on the resolution of the images.
+        frames: frames that are kept; None: all.
+        cameras: cameras that are kept; None: all.
+        quality: quality of JPEG images that cannot be copied.
 
     Raises:
         InputError: an unknown layout, a scale that is not above 0, a quality out of range.
@@ -64,13 +65,15 @@ class ConvertConfig:
 
 @dataclass(frozen=True)
 class Conversion:
-    """What was done.
+    """Counts and notes of a finished conversion.
 
     Attributes:
         out: folder of the new capture.
-        views: that are in it.
-        copied, encoded, kept: files copied as they were, written anew, and there already from an earlier call.
-        left_out: what could not be converted, in words.
+        views: number of its views.
+        copied: number of files copied without change.
+        encoded: number of files encoded.
+        kept: number of files that an earlier call had written.
+        left_out: notes on what could not be converted.
     """
 
     out: Path
@@ -84,20 +87,20 @@ class Conversion:
 def convert_capture(
     capture: Capture, out: Path, config: ConvertConfig | None = None, *, progress: ProgressCallback = ignore_progress
 ) -> Conversion:
-    """Write a capture anew.
+    """Write a capture to another folder in another layout, size or selection.
 
-    Rays and pixels are those that the capture gives out: undistorted, resized. Views whose files are damaged are left
-    out and named. Cameras and description are written last, so that an unfinished folder opens as no capture.
+    Rays and pixels are those of the opened capture: undistorted, resized. Views with damaged files are left out and
+    named. Cameras and description are written last, so that an unfinished folder cannot be opened as a capture.
 
     Args:
-        capture: at full size.
+        capture: the capture at full size.
         out: a new or an empty folder, or that of the same conversion, interrupted.
-        config: what to write.
-        progress: called with the share of the views that are written.
+        config: layout, size and selection.
+        progress: called with the share of the views that is written.
 
     Raises:
-        InputError: cameras or frames that the capture does not have, or a folder with something else in it.
-        OSError: the system refused a file, as on a full disk; its notes say how far the conversion came.
+        InputError: cameras or frames that the capture does not have, or a folder with other files.
+        OSError: the system refused a file, as on a full disk; its notes tell how many views are written.
     """
     config = config or ConvertConfig()
     cameras, frames = _chosen(capture, config)
@@ -108,7 +111,7 @@ def convert_capture(
     outcomes: list[ViewOutcome] = []
     try:
         _write_views(source, views, outcomes, out, config, progress)
-        left_out = [outcome.problem for outcome in outcomes if outcome.problem]
+        left_out = [outcome.note for outcome in outcomes if outcome.note]
         left_out += _write_rest(capture, source, out, (cameras, frames), config)
     except OSError as error:
         error.add_note(
@@ -116,7 +119,7 @@ def convert_capture(
         )
         raise
     copied, encoded, kept = (sum(getattr(o, name) for o in outcomes) for name in ("copied", "encoded", "kept"))
-    done = sum(not outcome.problem for outcome in outcomes)
+    done = sum(not outcome.note for outcome in outcomes)
     return Conversion(out, done, copied, encoded, kept, tuple(left_out))
 
 
@@ -128,7 +131,7 @@ def _write_views(
     config: ConvertConfig,
     progress: ProgressCallback,
 ) -> None:
-    """Write the views in parallel; `outcomes` takes what was done, also before an error ends it."""
+    """Write the views in parallel, and append an outcome for each, also before an error."""
     writer = ViewWriter(source, _root(out, config), config.layout, config.quality)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
@@ -143,7 +146,7 @@ def _write_views(
 def _write_rest(
     capture: Capture, source: Capture, out: Path, chosen: tuple[list[str], list[int]], config: ConvertConfig
 ) -> list[str]:
-    """Write what is no view, cameras and description last; return words about what cannot be read."""
+    """Write all but the views, cameras and description last; return notes on files that cannot be read."""
     cameras, frames = chosen
     left_out = _write_params(capture, out, frames, config)
     if config.layout == "simple":
@@ -164,7 +167,7 @@ def _root(out: Path, config: ConvertConfig) -> Path:
 
 
 def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[int]]:
-    """Return the cameras and frames that are kept, in the capture's order."""
+    """Return the selected cameras and frames, in the capture's order."""
     for name, wanted, have in (
         ("--cameras", config.cameras, tuple(capture.cameras)),
         ("--frames", config.frames, capture.frames),
@@ -182,16 +185,18 @@ def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[in
 
 
 def _claim(capture: Capture, out: Path, config: ConvertConfig) -> None:
-    """Make sure that the folder is for this conversion, and say so in it."""
+    """Refuse a folder of anything but this conversion, and record the conversion in it."""
     root = capture.root.resolve()
     if out.resolve() == root or root in out.resolve().parents or out.resolve() in root.parents:
         raise InputError("--out", expected="a folder apart from the capture's", received=str(out))
     record = jsonable({"source": str(root), "format": capture.format, **asdict(config)})
     path = out / _RECORD
     if path.is_file():
-        stands = as_object(read_json(path, subject="record of a conversion"), subject=f"record of a conversion {path}")
-        if stands != record:
-            differ = sorted(key for key in record if record[key] != stands.get(key))
+        recorded = as_object(
+            read_json(path, subject="record of a conversion"), subject=f"record of a conversion {path}"
+        )
+        if recorded != record:
+            differ = sorted(key for key in record if record[key] != recorded.get(key))
             raise InputError(
                 "--out",
                 expected="a new folder, or the one of this very conversion",
@@ -204,7 +209,7 @@ def _claim(capture: Capture, out: Path, config: ConvertConfig) -> None:
 
 
 def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: ConvertConfig) -> list[str]:
-    """Write the parameters of the frames; return words about those that cannot be read."""
+    """Write the parameters of the frames; return notes on those that cannot be read."""
     params: dict[int, BodyParams] = {}
     left_out = []
     for frame in frames:
@@ -228,7 +233,7 @@ def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: Co
 
 
 def _write_keypoints(capture: Capture, out: Path, cameras: Sequence[str], frames: Sequence[int]) -> list[str]:
-    """Write the keypoints of the frames where a detector has looked; return words about files that cannot be read."""
+    """Write the keypoints of the frames that a file has; return notes on files that cannot be read."""
     left_out = []
     for name in cameras:
         try:

@@ -1,4 +1,4 @@
-"""The files of one view in a converted capture: copied where nothing changes, else encoded."""
+"""Write the files of one view of a converted capture: copied where nothing changes, else encoded."""
 
 from __future__ import annotations
 
@@ -21,23 +21,30 @@ _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 
 @dataclass(frozen=True)
 class ViewOutcome:
-    """Files of one view that were copied, encoded, or there already; or what is wrong with it."""
+    """Counts of one view's files, or the reason why it was left out.
+
+    Attributes:
+        copied: number of files copied without change.
+        encoded: number of files encoded.
+        kept: number of files that existed already.
+        note: reason why the view was left out; "" for one that is written.
+    """
 
     copied: int = 0
     encoded: int = 0
     kept: int = 0
-    problem: str = ""
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewWriter:
-    """Writes views of a capture.
+    """A writer of a capture's views in one layout.
 
     Attributes:
-        capture: with the pixels that are wanted.
+        capture: the capture at the wanted resolution.
         root: folder of `rgbs` and the others.
         layout: "simple" or "actorshq" (JPEG on black, PNG masks, nothing else).
-        quality: of JPEG.
+        quality: quality of JPEG files.
     """
 
     capture: Capture
@@ -46,7 +53,7 @@ class ViewWriter:
     quality: int
 
     def write(self, camera: str, frame: int) -> ViewOutcome:
-        """Write all files of a view, or none where one of them cannot be read."""
+        """Write all files of a view, or none if one of them cannot be read."""
         targets = self._targets(camera, frame)
         if all(path.is_file() for path, _ in targets.values()):
             return ViewOutcome(kept=len(targets))
@@ -54,22 +61,22 @@ class ViewWriter:
         contents, copied = {}, 0
         try:
             for kind, (path, source) in targets.items():
-                value = read[kind](camera, frame)  # decoded in any case: a damaged file is not passed on
+                value = read[kind](camera, frame)  # decoded in any case, so that no damaged file is copied
                 if source is not None:
                     contents[path] = read_bytes(source)
                     copied += 1
                 else:
-                    assert value is not None  # only files that are there have a target
+                    assert value is not None  # only existing files have a target
                     contents[path] = encoded_image(value, path.suffix, self.quality)
         except InputError as error:
-            return ViewOutcome(problem=f"camera {camera}, frame {frame} left out: {error}")
-        # The image last: a view that has one is whole.
+            return ViewOutcome(note=f"camera {camera}, frame {frame} left out: {error}")
+        # The image comes last, so that a view with an image is complete.
         for path in reversed(contents):
             atomic_write_bytes(path, contents[path])
         return ViewOutcome(copied=copied, encoded=len(contents) - copied)
 
     def _targets(self, camera: str, frame: int) -> dict[str, tuple[Path, Path | None]]:
-        """For each kind of file its place, and the source's file where its bytes can be taken."""
+        """Return for each kind of file its path, and the source's file if its bytes can be copied."""
         capture = self.capture
         unchanged = camera not in capture.recording.distortions and capture.windows[camera] == Window.full(
             capture.recording.cameras[camera]
@@ -85,7 +92,7 @@ class ViewWriter:
         if self.layout == "actorshq":
             on_black = capture.recording.background == (0.0, 0.0, 0.0)
             same = unchanged and on_black and suffix == ".jpg"
-            # Without a mask the image cannot be put on black, which its reading tells.
+            # An image without a mask cannot be put on black; reading it raises that error.
             return {
                 "image": target("image", ".jpg", image if same else None),
                 "mask": target("mask", ".png", mask_source),
@@ -112,10 +119,10 @@ class ViewWriter:
 
 
 def _is_plain_mask(path: Path | None) -> bool:
-    """Whether a mask's file is a PNG of 8-bit grey; others (mattes in alpha channels, JPEG) are written anew."""
+    """Return whether a mask's file is a PNG of 8-bit grey; others (alpha channels, JPEG) are encoded again."""
     if path is None or path.suffix.lower() != ".png":
         return False
     try:
         return image_mode(path) == "L"
     except InputError:
-        return False  # told when it is decoded
+        return False  # decoding it reports the error

@@ -1,7 +1,7 @@
-"""Keypoints of a capture by a detector: a file a camera, and nothing detected twice.
+"""Detect the keypoints of a capture's images: one file for each camera, and no frame twice.
 
-A file remembers of which image and mask, by their content, and by which detector each frame's points are; what still
-holds is kept when the command runs again.
+A file records the digest of image and mask of each frame, and the detector. Frames whose record is up to date are kept
+when the command runs again.
 """
 
 from __future__ import annotations
@@ -27,21 +27,17 @@ from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.detect import Box, DetectedPerson, Detector, mask_box
 
-# A kill loses at most this many seconds of detecting.
-_SAVE_EVERY_S = 20.0
-_NAMED = 8
-# The grey that takes a background's place; opacity below which a pixel is background; how far, of 255, the background
-# may be from its declared colour.
-_GREY, _OUTSIDE, _SAME_COLOR = 150.0, 8, 6.0
+_SAVE_EVERY_S = 20.0  # a file is written this often, so that a kill loses at most that much work
 
 
 @dataclass(frozen=True, eq=False)
 class DetectedCamera:
-    """What was found in one camera's images.
+    """The detections in one camera's images.
 
     Attributes:
-        keypoints: of the surest person of each frame, or of the one whom the mask shows; pixels of the files.
-        people: a frame, how many were seen. detected: how many frames were looked at now, the others stood.
+        keypoints: keypoints of the most confident person of each frame, or of the one in the mask; pixels of the files.
+        people: number of people in each frame.
+        detected: number of frames that this run has looked at; the others were kept.
     """
 
     keypoints: Keypoints2D
@@ -49,7 +45,7 @@ class DetectedCamera:
     detected: int
 
     def frames_with(self, count: Callable[[np.ndarray], np.ndarray]) -> list[int]:
-        """Numbers of the frames in which so many people were seen."""
+        """Return the numbers of the frames whose count of people meets a condition."""
         return self.keypoints.frames[count(self.people)].tolist()
 
 
@@ -62,19 +58,23 @@ def detect_keypoints(
     frames: Iterable[int] | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> dict[str, DetectedCamera]:
-    """Detect keypoints in the images of a capture and write `folder/CAM.npz`, which `open_capture(keypoints=folder)`
-    reads.
+    """Detect keypoints in the images of a capture and write `folder/CAM.npz` for `open_capture(keypoints=folder)`.
 
-    Images are taken as they lie on disk, distorted where they are. Where a view has a mask, the person is looked for in
-    its box. Frames that stand in a file and are not asked for are kept.
+    Images are read as they are on disk, distorted if they are. Where a view has a mask, the person is detected in its
+    box. Frames of an existing file that were not requested are kept.
 
     Args:
-        capture: at full size. cameras: None: those that training may see; held-out cameras have to be named.
-        frames: None: all.
+        capture: the capture at full size.
+        detector: the keypoint detector.
+        folder: folder of the files.
+        cameras: names of cameras; None: those that training may see. Held-out cameras have to be named.
+        frames: numbers of frames; None: all.
+        progress: called with the share of the images that is done.
 
     Raises:
-        InputError: unknown cameras, no images, a damaged image; nobody in any image.
+        InputError: unknown cameras, no images, a damaged image, or no person in any image.
     """
+    # List the views first, so that a request without images fails at once.
     names = capture.splits.train_cameras if cameras is None else tuple(cameras)
     wanted = None if frames is None else set(frames)
     views = {name: [frame for _, frame in capture.views([name], wanted)] for name in names}
@@ -86,6 +86,7 @@ def detect_keypoints(
             received="none",
             remedy="name cameras with --cameras; held-out ones are left out by default",
         )
+    # Each camera's file grows while its frames are looked at.
     found, done = {}, 0
     for name, numbers in views.items():
         if not numbers:
@@ -100,22 +101,22 @@ def detect_keypoints(
         raise InputError(
             f"images of capture {capture.name}",
             expected="a person in them",
-            received=f"nobody in any of {total}",
+            received=f"no person in any of {total}",
             remedy="look at the images (upright? lit?), give masks, or name another detector",
         )
     return found
 
 
-def problems_of(found: dict[str, DetectedCamera], held_out: Iterable[str] = ()) -> tuple[str, ...]:
-    """What a user should know, in words: views without anybody, with several people, and of held-out cameras."""
+def detection_notes(found: dict[str, DetectedCamera], held_out: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return notes on views without a person, with several people, and on held-out cameras."""
     out = []
     for name, one in found.items():
         none, several = one.frames_with(lambda n: n == 0), one.frames_with(lambda n: n > 1)
         if none:
-            out.append(f"camera {name}: nobody was found in {_in_words(none, len(one.people))}")
+            out.append(f"camera {name}: no person was detected in {_listed(none, len(one.people))}")
         if several:
-            who = "the one in the mask, or else the surest, is taken"
-            out.append(f"camera {name}: more than one person in {_in_words(several, len(one.people))}; {who}")
+            who = "the one in the mask, or else the most confident, is taken"
+            out.append(f"camera {name}: more than one person in {_listed(several, len(one.people))}; {who}")
     apart = [name for name in found if name in set(held_out)]
     if apart:
         out.append(f"held-out cameras {', '.join(apart)}: their keypoints are for measuring, training never reads them")
@@ -125,7 +126,10 @@ def problems_of(found: dict[str, DetectedCamera], held_out: Iterable[str] = ()) 
 def detection_sheet(
     capture: Capture, found: Mapping[str, DetectedCamera], *, height: int = 480, most: int = 16
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """One photograph a camera, with its points: the frame that the most cameras have, of at most `most` cameras."""
+    """Return a contact sheet with one image and its keypoints a camera, for at most `most` cameras.
+
+    It shows the frame that most cameras have.
+    """
     import PIL.Image
 
     frames = np.concatenate([one.keypoints.frames for one in found.values()])
@@ -140,22 +144,22 @@ def detection_sheet(
         image = read_color(capture.required_file(name, frame))
         scale = height / image.height
         small = image.resize((max(round(scale * image.width), 1), height), PIL.Image.Resampling.LANCZOS)
-        points, sure = scale * one.keypoints.points[rows[0]], one.keypoints.confidence[rows[0]]
-        pictures.append(draw_keypoints(np.asarray(small), one.keypoints.names, points, sure))
+        points, confidence = scale * one.keypoints.points[rows[0]], one.keypoints.confidence[rows[0]]
+        pictures.append(draw_keypoints(np.asarray(small), one.keypoints.names, points, confidence))
         captions.append(f"{name}, frame {frame}")
     return contact_sheet(pictures, captions=captions)
 
 
 class _CameraWork:
-    """The file of one camera while it grows."""
+    """The growing file of one camera and its detections."""
 
     def __init__(self, capture: Capture, detector: Detector, path: Path, camera: str) -> None:
         self.capture, self.detector, self.path, self.camera = capture, detector, path, camera
-        self.rows = standing_rows(path, detector)
+        self.rows = kept_rows(path, detector)
         self.detected, self.saved_at = 0, time.monotonic()
 
     def look(self, frame: int) -> None:
-        """Detect in one frame, unless that stands."""
+        """Detect in one frame, unless the file has it for the same image, mask and detector."""
         image_file = self.capture.required_file(self.camera, frame)
         mask_file = self.capture.file(self.camera, frame, "mask")
         mask = None if mask_file is None else np.asarray(read_alpha(mask_file))
@@ -163,6 +167,7 @@ class _CameraWork:
         key = hashlib.sha256(b"".join(hashlib.sha256(read_bytes(path)).digest() for path in files)).hexdigest()
         if frame in self.rows and self.rows[frame].key == key:
             return
+        # A person alone on a declared background is put on grey, and looked for in the mask's box, then anywhere.
         image = np.asarray(read_color(image_file))
         alone = None if mask is None else _on_grey(image, mask, self.capture.recording.background)
         image = image if alone is None else alone
@@ -176,7 +181,7 @@ class _CameraWork:
             self._save()
 
     def finish(self) -> DetectedCamera:
-        """Write the file, where it changed, and return what is in it."""
+        """Write the file if it changed, and return its content."""
         if self.detected or not self.path.is_file():
             self._save()
         return DetectedCamera(self._keypoints(), self._people(), self.detected)
@@ -207,18 +212,24 @@ class _CameraWork:
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """One frame: what it was detected in, who, and how many were seen."""
+    """The detection of one frame.
+
+    Attributes:
+        key: SHA-256 of its image and mask.
+        person: the chosen person; None without any.
+        people: number of people.
+    """
 
     key: str
     person: DetectedPerson | None
     people: int
 
 
-def standing_rows(path: Path, detector: Detector) -> dict[int, _Row]:
-    """The frames of a file that this detector made; none where there is no file, or another detector's.
+def kept_rows(path: Path, detector: Detector) -> dict[int, _Row]:
+    """Return the frames of a file by this detector; none without a file, or for another detector's.
 
     Raises:
-        InputError: a file that is no detector's record, which is not written over.
+        InputError: a file that is no record of a detector, which is never overwritten.
     """
     if not path.is_file():
         return {}
@@ -245,37 +256,39 @@ def standing_rows(path: Path, detector: Detector) -> dict[int, _Row]:
 def _on_grey(
     image: UInt8[np.ndarray, "H W 3"], mask: UInt8[np.ndarray, "H W"], background: Sequence[float] | None
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """The person alone on grey, of an image that a capture declares as put on a colour.
+    """Return the person on grey, for an image whose capture declares the colour of its background.
 
-    Dark hair is not found on black. None where nothing is declared, or the image is not on that colour.
+    Detectors miss dark hair on black. None where no colour is declared, or the image is not on that colour.
     """
-    outside = mask < _OUTSIDE if background is not None and mask.shape == image.shape[:2] else np.zeros(1, dtype=bool)
+    # Pixels below 3 % opacity have to be within 6 levels of the declared colour.
+    outside = mask < 8 if background is not None and mask.shape == image.shape[:2] else np.zeros(1, dtype=bool)
     if background is None or not outside.any():
         return None
     color = 255.0 * np.asarray(background, dtype=np.float32)
-    if np.median(np.abs(image[outside] - color)) > _SAME_COLOR:
+    if np.median(np.abs(image[outside] - color)) > 6.0:
         return None
-    moved = image + (1.0 - mask[..., None] / np.float32(255.0)) * (_GREY - color)
+    # Exchange the background's share in every pixel.
+    moved = image + (1.0 - mask[..., None] / np.float32(255.0)) * (150.0 - color)
     return np.clip(np.round(moved), 0, 255).astype(np.uint8)
 
 
 def _chosen(people: Sequence[DetectedPerson], box: Box | None) -> DetectedPerson | None:
-    """The surest, of those who fill the box best where there is one."""
+    """Return the most confident person, of those with the largest overlap with the box if there is one."""
     if not people or box is None:
         return next(iter(people), None)
     return max(people, key=lambda one: (round(_overlap(one.box, box), 1), one.total_confidence))
 
 
 def _overlap(a: Box, b: Box) -> float:
-    """Intersection over union."""
+    """Return the intersection over union of two boxes."""
     width = max(min(a[2], b[2]) - max(a[0], b[0]), 0.0)
     height = max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
     areas = [(one[2] - one[0]) * (one[3] - one[1]) for one in (a, b)]
     return width * height / max(sum(areas) - width * height, 1e-9)
 
 
-def _in_words(frames: Sequence[int], count: int) -> str:
+def _listed(frames: Sequence[int], count: int) -> str:
     if len(frames) == count and count > 1:
         return f"all {count} frames"
-    more = f" and {len(frames) - _NAMED} more" if len(frames) > _NAMED else ""
-    return f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames[:_NAMED]))}{more}"
+    more = f" and {len(frames) - 8} more" if len(frames) > 8 else ""
+    return f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames[:8]))}{more}"

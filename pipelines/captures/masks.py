@@ -1,4 +1,4 @@
-"""Masks of a capture's images, by a matting model, empty plates or MediaPipe; a folder has one origin."""
+"""Write masks of a capture's images by a matting model, empty plates or MediaPipe; a folder has one origin."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ from smplxpp.detect.plates import PlateConfig, PlateModel
 MatteModel = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
 """Returns the matte of an sRGB image: the opacity of the person, 0 to 255."""
 _RECORD = "masks.json"
-_MOST_PLATES = 64
 
 
 class Plates:
-    """Matte models of cameras from their empty plates, each made when its camera is needed.
+    """Matte models of cameras from their empty plates, each built when its camera is needed.
 
     Plates are images with the cameras' names in the folder (`CAM.png`, `CAM_empty.jpg`), or a folder a camera with one
     or several images. Several give the camera's noise.
@@ -40,8 +39,9 @@ class Plates:
     def __init__(self, folder: Path, cameras: Sequence[str], config: PlateConfig | None = None) -> None:
         if not folder.is_dir():
             raise InputError("folder of plates", expected="an existing folder", received=str(folder))
+        # 64 plates are enough to estimate a camera's noise.
         self.config = config or PlateConfig()
-        self.files = {camera: _plates_of(folder, camera)[:_MOST_PLATES] for camera in cameras}
+        self.files = {camera: _plates_of(folder, camera)[:64] for camera in cameras}
         without = [camera for camera, files in self.files.items() if not files]
         if without:
             raise InputError(
@@ -69,16 +69,18 @@ def write_masks(
     cameras: Sequence[str] | None = None,
     frames: Iterable[int] | None = None,
 ) -> Iterator[Path]:
-    """Write `folder/CAM/CAM_maskFFFFFF.png` for a capture's views, which `open_capture(masks=folder)` reads; those that
-    stand there are kept.
+    """Write missing files `folder/CAM/CAM_maskFFFFFF.png` of a capture's views, for `open_capture(masks=folder)`.
 
     Args:
+        capture: the capture.
         model_of: returns the matte model of a camera.
-        identity: of the matters; the folder remembers it.
-        cameras, frames: None: all, held-out ones too: their masks are what results are measured in.
+        folder: folder of the masks.
+        identity: identity of the matte models, which the folder records.
+        cameras: names of cameras; None: all, held-out ones too, because results are measured within masks.
+        frames: numbers of frames; None: all.
 
     Yields:
-        Each file when it stands.
+        The path of each file once it exists.
 
     Raises:
         InputError: a folder with masks of another origin.
@@ -91,17 +93,17 @@ def write_masks(
 
 
 def _own_folder(folder: Path, identity: str) -> None:
-    """Refuse a folder with anything else in it; write down what is put into a new one."""
+    """Refuse a folder with masks of another origin, and record the origin of a new one."""
     record = folder / _RECORD
     if record.is_file():
-        stands = as_object(read_json(record), subject=f"file {record}").get("identity")
+        present = as_object(read_json(record), subject=f"file {record}").get("identity")
     else:
-        stands = None if not folder.is_dir() or not any(folder.iterdir()) else "files of unknown origin"
-    if stands is not None and stands != identity:
+        present = None if not folder.is_dir() or not any(folder.iterdir()) else "files of unknown origin"
+    if present is not None and present != identity:
         raise InputError(
             "--out",
             expected="a new folder, or the one of the same masks",
-            received=f"{folder} with {stands}",
+            received=f"{folder} with {present}",
             remedy="name another folder",
         )
     atomic_write_text(record, json.dumps({"identity": identity}, indent=1) + "\n")

@@ -93,7 +93,7 @@ class KeypointsDetect:
 
     def run(self) -> dict:
         """Detect; returns what was found of each camera."""
-        from pipelines.captures.detect_keypoints import detect_keypoints, detection_sheet, problems_of
+        from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes, detection_sheet
         from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import shared_progress
         from pipelines.figures import encode_jpeg, encode_png
@@ -128,7 +128,7 @@ class KeypointsDetect:
             seen = float((one.people > 0).mean())
             summary[name] = {"frames": len(one.people), "with_a_person": seen, "detected_now": one.detected}
             log.info("%s: %d frames, a person in %.0f %% of them", name, len(one.people), 100 * seen)
-        problems = problems_of(found, capture.splits.novel_view_cameras)
+        problems = detection_notes(found, capture.splits.novel_view_cameras)
         for words in problems:
             log.warning(words)
         return {"out": str(self.out), "detector": self.detector, "cameras": summary, "problems": problems}

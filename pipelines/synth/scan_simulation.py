@@ -208,7 +208,7 @@ def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
 def _simplified(mesh: TriangleMesh, config: ScanConfig) -> TriangleMesh:
     """Return the mesh with `config.faces` faces of about equal size, smaller on the head."""
     floor = mesh.vertices[:, 1].min()
-    # Shortest edges collapse first: simplify in a space that is stretched above `detail_above`, then invert the stretch.
+    # Shortest edges collapse first, so simplify in a space stretched above `detail_above`, then invert the stretch.
     height = np.linspace(-0.1, 2.5, 2601)
     scale = 1 + (config.detail - 1) * np.clip((height - config.detail_above) / 0.1 + 0.5, 0, 1)
     stretched = np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(height))])

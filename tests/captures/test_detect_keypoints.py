@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.captures.detect_keypoints import detect_keypoints, problems_of
+from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes
 from pipelines.cli import main
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
@@ -59,7 +59,7 @@ def test_files_are_read_again_as_the_captures_keypoints(rig, tmp_path):
             rows, columns = np.nonzero(capture.mask(camera, frame) > 127)
             box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
             np.testing.assert_allclose(points.points[row].ravel(), box)
-    assert problems_of(found) == ()
+    assert detection_notes(found) == ()
 
 
 def test_what_stands_is_kept_and_what_changed_is_detected_anew(rig, tmp_path):
@@ -103,7 +103,7 @@ def test_held_out_cameras_are_left_out_unless_they_are_named(rig, tmp_path):
     assert set(detect_keypoints(capture, Finder(), tmp_path / "k")) == {"A", "B"}
     assert not (tmp_path / "k" / "C.npz").exists()
     found = detect_keypoints(capture, Finder(), tmp_path / "k", cameras=("C",))
-    assert any("held-out" in words for words in problems_of(found, ("C",)))
+    assert any("held-out" in words for words in detection_notes(found, ("C",)))
     with np.load(tmp_path / "k" / "C.npz") as file:
         assert bool(file["held_out"][0])
 
@@ -118,7 +118,7 @@ def test_distorted_images_are_looked_at_as_they_lie(tmp_path):
 
 def test_two_people_are_told_and_the_one_in_the_mask_is_taken(rig, tmp_path):
     found = detect_keypoints(open_capture(rig), Finder(people=2), tmp_path / "k")
-    assert any("more than one person" in words for words in problems_of(found))
+    assert any("more than one person" in words for words in detection_notes(found))
     capture = open_capture(rig)
     rows, columns = np.nonzero(capture.mask("A", 0) > 127)
     # The surer one stands 300 pixels beside the mask.
@@ -148,7 +148,7 @@ def test_images_on_black_are_looked_at_on_grey(tmp_path):
     assert capture.recording.background == (0.0, 0.0, 0.0)
     found = detect_keypoints(capture, looker, tmp_path / "k")
     np.testing.assert_allclose(looker.corner, 150, atol=2)
-    assert problems_of(found) == ()
+    assert detection_notes(found) == ()
     # A capture that declares what is not so keeps its photographs as they are.
     for (camera, frame), photograph in scene.photographs.items():
         (path,) = (rig / "rgbs" / camera).glob(f"*{frame:06d}.*")
@@ -169,7 +169,7 @@ def test_who_is_not_found_in_the_masks_box_is_looked_for_in_the_whole_image(rig,
 
 
 def test_nobody_anywhere_is_refused_and_nobody_somewhere_is_told(rig, tmp_path):
-    with pytest.raises(InputError, match="nobody in any of 6"):
+    with pytest.raises(InputError, match="no person in any of 6"):
         detect_keypoints(open_capture(rig), Finder(people=0), tmp_path / "k")
 
     class Sometimes(Finder):
@@ -177,7 +177,7 @@ def test_nobody_anywhere_is_refused_and_nobody_somewhere_is_told(rig, tmp_path):
             return super().__call__(image, box) if len(self.seen) > 1 else (self.seen.append(None), [])[1]
 
     found = detect_keypoints(open_capture(rig), Sometimes(), tmp_path / "other")
-    assert problems_of(found) == ("camera A: nobody was found in frame 0",)
+    assert detection_notes(found) == ("camera A: no person was detected in frame 0",)
     assert not found["A"].keypoints.confidence[0].any()
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipelines.captures.detect_keypoints import standing_rows
+from pipelines.captures.detect_keypoints import kept_rows
 from smplxpp.body import load_params
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.keypoint_files import read_keypoints
@@ -314,7 +314,7 @@ def _detector_doors() -> list[Door]:
         Door(
             "detected keypoints",
             lambda folder: np.savez(folder / "k.npz", **record),
-            lambda folder: standing_rows(folder / "k.npz", Known()),
+            lambda folder: kept_rows(folder / "k.npz", Known()),
         ),
     ]
 

@@ -1,4 +1,4 @@
-"""The check as files: report.html, contact_sheet.png, check.json."""
+"""Write the check of a capture as report.html, contact_sheet.png and check.json."""
 
 from __future__ import annotations
 
@@ -7,23 +7,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+from scipy import ndimage
 
-from pipelines.captures.check.pictures import BODY_COLOR, MASK_COLOR, contact_sheet_of, draw_strips
-from pipelines.figures import encode_jpeg, encode_png
+from pipelines.figures import caption, contact_sheet, encode_jpeg, encode_png, row
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.runs.code import versions
 from smplxpp.capture.check.check import CaptureCheck
 from smplxpp.capture.check.findings import AREAS, grouped
-from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary
+from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary, body_silhouette
+from smplxpp.capture.check.views import OPAQUE, ViewCheck
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.spread import spread
 
-SHOWN_MESSAGES, SHOWN_FRAMES = 12, 200
+_BODY_COLOR, _MASK_COLOR = (255, 60, 140), (0, 210, 255)
 
 
 def check_as_dict(check: CaptureCheck) -> dict[str, Any]:
-    """Return everything that was found as JSON values."""
+    """Return the whole check as JSON values."""
+    # Figures by camera, then by frame, then the findings.
     capture = check.capture
     images, masks = capture.presence(), capture.presence("mask")
     fits, splits = check.cameras(), capture.splits
@@ -63,11 +68,65 @@ def check_as_dict(check: CaptureCheck) -> dict[str, Any]:
 def write_check_report(check: CaptureCheck, folder: Path) -> Path:
     """Write `report.html`, `contact_sheet.png` and `check.json` to the folder; returns the report's path."""
     atomic_write_text(folder / "check.json", json.dumps(jsonable(check_as_dict(check)), indent=1) + "\n")
-    strips = draw_strips(check)
+    strips = _strips(check)
+    # Several strips lie beside each other where there are many.
     if strips:
-        atomic_write_bytes(folder / "contact_sheet.png", encode_png(contact_sheet_of(strips)))
+        atomic_write_bytes(
+            folder / "contact_sheet.png",
+            encode_png(contact_sheet(list(strips.values()), columns=max(1, round(len(strips) ** 0.5 / 2)), gap=8)),
+        )
     pictures = tuple(Picture(camera, encode_jpeg(strip)) for camera, strip in strips.items())
     return write_report(folder / "report.html", _report(check, pictures))
+
+
+def _strips(check: CaptureCheck) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
+    """Draw four frames of each camera beside each other, for at most 24 cameras, evenly spread."""
+    frames = spread(check.frames, 4)
+    known = {(view.camera, view.frame): view for view in check.views}
+    strips = {}
+    for camera in spread(list(dict.fromkeys(view.camera for view in check.views)), 24):
+        cells = [
+            caption(
+                _widened(_cell(check, camera, frame)), _cell_caption(known.get((camera, frame)), camera, frame), size=13
+            )
+            for frame in frames
+        ]
+        strips[camera] = row(cells, gap=8)
+    return strips
+
+
+def _widened(cell: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H w 3"]:
+    """Pad a cell with white to the width of its caption."""
+    missing = max(0, 190 - cell.shape[1])
+    return np.pad(cell, ((0, 0), (missing // 2, missing - missing // 2), (0, 0)), constant_values=255)
+
+
+def _cell(check: CaptureCheck, camera: str, frame: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw one view with both outlines at the sheet's height."""
+    small, full = check.small, check.small.cameras[camera]
+    try:
+        image = np.array(small.image(camera, frame))
+        mask = small.mask(camera, frame)
+    except InputError:
+        image, mask = np.full((full.height, full.width, 3), 190, np.uint8), None
+    height = min(300, full.height)
+    size = (max(1, round(full.width * height / full.height)), height)
+    cell = np.array(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
+    outlines = [] if mask is None else [(mask > OPAQUE, _MASK_COLOR)]
+    vertices = check.vertices(frame)
+    if vertices is not None:
+        outlines.append((body_silhouette(vertices, check.faces, full), _BODY_COLOR))
+    # An outline is a shape without its erosion.
+    for shape, color in outlines:
+        reduced = np.array(Image.fromarray(shape).resize(size, Image.Resampling.NEAREST))
+        cell[reduced & ~ndimage.binary_erosion(reduced, border_value=1)] = color
+    return cell
+
+
+def _cell_caption(view: ViewCheck | None, camera: str, frame: int) -> str:
+    if view is None:
+        return f"{camera}, {frame}: no image"
+    return f"{camera}, {frame}" + (f": {view.fit.outside:.1%} outside" if view.fit else "")
 
 
 def _report(check: CaptureCheck, pictures: tuple[Picture, ...]) -> Report:
@@ -99,12 +158,12 @@ def _check_row(check: CaptureCheck, area: str) -> CheckRow:
     return CheckRow(area, float(len(own)), "findings", status, "none", stage="capture")
 
 
-def _findings_section(check: CaptureCheck) -> Section:
+def _findings_section(check: CaptureCheck, most: int = 12) -> Section:
     table = []
     for group in grouped(check.findings):
-        messages = [finding.message for finding in group[:SHOWN_MESSAGES]]
-        if len(group) > SHOWN_MESSAGES:
-            messages.append(f"and {len(group) - SHOWN_MESSAGES} more, in check.json")
+        messages = [finding.message for finding in group[:most]]
+        if len(group) > most:
+            messages.append(f"and {len(group) - most} more, in check.json")
         table.append((group[0].status, group[0].kind, len(group), "; ".join(messages), group[0].remedy))
     text = () if table else ("Nothing to complain about.",)
     tables = (Table(("status", "kind", "count", "what", "do"), tuple(table)),) if table else ()
@@ -128,7 +187,7 @@ def _silhouette_section(check: CaptureCheck, pictures: tuple[Picture, ...]) -> S
         ),
         pictures=pictures,
         tables=(Table(header, tuple(rows), "figures by camera"),),
-        legend=(("posed body", BODY_COLOR), ("mask", MASK_COLOR)),
+        legend=(("posed body", _BODY_COLOR), ("mask", _MASK_COLOR)),
     )
 
 
@@ -136,7 +195,7 @@ def _frame_section(check: CaptureCheck) -> Section:
     fits = check.frame_fits()
     rows = tuple(
         (frame, fit.views, 100 * fit.outside, 100 * fit.worst, fit.iou, fit.bad, fit.verdict)
-        for frame, fit in spread(list(fits.items()), SHOWN_FRAMES)
+        for frame, fit in spread(list(fits.items()), 200)
     )
     header = ("frame", "views", "outside, median %", "outside, worst %", "overlap", "bad views", "verdict")
     curves: tuple[Curve, ...] = ()

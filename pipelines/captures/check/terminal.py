@@ -1,4 +1,4 @@
-"""The check in the terminal: what was found, a line a camera, the worst frames."""
+"""Print the check of a capture: its findings, a line for each camera, and the worst frames."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from smplxpp.capture.check.files import in_ranges
 from smplxpp.capture.check.findings import Finding, grouped
 
 _STYLES = {"fail": "red", "warn": "yellow", "good": "green", "doubtful": "yellow", "bad": "red"}
-_MESSAGES, _FRAMES = 6, 8
 
 
 def print_check(check: CaptureCheck, console: Console) -> None:
-    """Print everything that a person needs to act."""
+    """Print all findings of a check with the figures behind them."""
     content = check_as_dict(check)
     _print_head(check, content, console)
     console.print(_camera_table(content))
@@ -74,26 +73,26 @@ def _camera_table(content: dict[str, Any]) -> Table:
     return table
 
 
-def _frame_table(content: dict[str, Any]) -> Table:
+def _frame_table(content: dict[str, Any], most: int = 8) -> Table:
     """List the frames that do not fit well, worst first."""
     table = _table(("frame",), ("bad views", "outside", "worst", "overlap"), ("fit",))
     doubtful = [(frame, fit) for frame, fit in content["frame_fits"].items() if fit["verdict"] != "good"]
     doubtful.sort(key=lambda item: -item[1]["outside"])
-    for frame, fit in doubtful[:_FRAMES]:
+    for frame, fit in doubtful[:most]:
         table.add_row(frame, f"{fit['bad']}/{fit['views']}", *_figures(fit))
-    if len(doubtful) > _FRAMES:
-        table.add_row(Text(f"and {len(doubtful) - _FRAMES} more", style="dim"))
+    if len(doubtful) > most:
+        table.add_row(Text(f"and {len(doubtful) - most} more", style="dim"))
     return table
 
 
-def _print_group(group: tuple[Finding, ...], console: Console) -> None:
+def _print_group(group: tuple[Finding, ...], console: Console, most: int = 6) -> None:
     first = group[0]
     count = f" ({len(group)})" if len(group) > 1 else ""
     console.print(Text(f"{first.status}  ", style=_STYLES[first.status]) + Text(f"{first.kind}{count}", style="bold"))
-    for finding in group[:_MESSAGES]:
+    for finding in group[:most]:
         console.print(Text(f"  {finding.message}"), soft_wrap=True)
-    if len(group) > _MESSAGES:
-        console.print(Text(f"  and {len(group) - _MESSAGES} more (--json lists all)", style="dim"))
+    if len(group) > most:
+        console.print(Text(f"  and {len(group) - most} more (--json lists all)", style="dim"))
     console.print(Text("  do: ", style="cyan") + Text(first.remedy), soft_wrap=True)
 
 
