@@ -1,0 +1,98 @@
+"""Numbers that the page's TypeScript repeats: each is equal to its source in Python, or to the flags of the linker."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from avatar.speech import audio_features
+from avatar.speech.coarticulation import ARTICULATORS
+from avatar.speech.lips import PHONES, VERSION
+from pipelines.chat.conversation import MOST_TYPED
+from pipelines.chat.hearing import RATE
+from pipelines.chat.server import REPLACED
+from smplxpp.cloth.driver import LONGEST_STEP, DriverConfig
+from smplxpp.cloth.fabric import SolverConfig
+from smplxpp.core.params import DEFAULT_FPS
+
+WEB = Path(__file__).resolve().parents[2] / "web"
+
+
+def constants(path: str) -> dict[str, float]:
+    """Return the numeric constants of a TypeScript or JavaScript file by name: `const A = 1, B = 2 ** 3;`."""
+    found: dict[str, float] = {}
+    for line in re.findall(r"^(?:export )?const ([^;]+);", (WEB / path).read_text(encoding="utf-8"), re.MULTILINE):
+        for name, value in re.findall(r"(\w+) = ([^,]+)", line):
+            number = evaluated(value, found)
+            if number is not None:
+                found[name] = number
+    return found
+
+
+def evaluated(text: str, known: dict[str, float]) -> float | None:
+    """Return the value of arithmetic on numbers and known names, or None for anything else."""
+    try:
+        tree = ast.parse(text.strip(), mode="eval")
+    except SyntaxError:
+        return None
+    allowed = (ast.Expression, ast.Constant, ast.BinOp, ast.UnaryOp, ast.Name, ast.operator, ast.unaryop, ast.Load)
+    if not all(isinstance(node, allowed) for node in ast.walk(tree)):
+        return None
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    if not names <= known.keys():
+        return None
+    value = eval(compile(tree, "constant", "eval"), {"__builtins__": {}}, dict(known))
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+DRIVER, SOLVER = DriverConfig(), SolverConfig()
+REPEATED = {
+    "src/bundle/motion.ts": {"USUAL_RATE": DEFAULT_FPS},
+    "src/chat/connection.ts": {"REPLACED": REPLACED},
+    "src/chat/conversation.ts": {"MOST_TYPED": MOST_TYPED},
+    "src/chat/microphone.ts": {"RATE": RATE},
+    "src/cloth/driver.ts": {
+        "LONGEST_STEP": LONGEST_STEP,
+        "RAMP": DRIVER.ramp,
+        "HOLD": DRIVER.hold,
+        "TELEPORT": DRIVER.teleport,
+    },
+    "src/cloth/thread.ts": {
+        "SUBSTEP": SOLVER.substep,
+        "CONTACTS_EVERY": SOLVER.contacts_every,
+        "MOST_SPEED": SOLVER.most_speed,
+        "MOST_STRETCH": DRIVER.most_stretch,
+    },
+    "src/lips/features.ts": {
+        "RATE": audio_features.RATE,
+        "HOP": audio_features.HOP,
+        "WINDOW": audio_features.WINDOW,
+        "BANDS": audio_features.BANDS,
+    },
+    "src/lips/network.ts": {"VERSION": VERSION, "PHONES": len(PHONES), "ARTICULATORS": len(ARTICULATORS)},
+    "src/lips/steady.ts": {name: ARTICULATORS.index(name.lower()) for name in ("JAW", "PRESS")},
+    "src/lips/face.ts": {name: ARTICULATORS.index(name.lower()) for name in ("JAW", "PRESS")},
+}
+
+
+@pytest.mark.parametrize("path", REPEATED)
+def test_the_page_repeats_the_numbers_of_python(path):
+    found = constants(path)
+    for name, value in REPEATED[path].items():
+        assert name in found, f"{path} has no constant {name}"
+        assert math.isclose(found[name], value, rel_tol=1e-12), f"{path}: {name} is {found[name]}, Python has {value}"
+
+
+def test_the_memory_of_the_page_is_that_of_the_linker():
+    page, linker = constants("src/native/memory.ts"), constants("kernels.mjs")
+    assert page["STACK"] == linker["STACK"]
+    assert page["FIRST"] * linker["PAGE"] == linker["FIRST"] and page["MOST"] * linker["PAGE"] == linker["MOST"]
+
+
+def test_constants_are_found_in_the_forms_that_the_page_uses():
+    assert evaluated("1 << 18", {}) == 2**18 and evaluated("16 * PAGE", {"PAGE": 4.0}) == 64.0
+    assert evaluated("fetch()", {}) is None and evaluated("OTHER", {}) is None
