@@ -132,7 +132,7 @@ def test_scan_lies_on_its_layers(person, scan, label, name):
     part = person.part(name, person.posed)
     points = mesh.vertices[labels == label]
     distance = np.sqrt(igl.point_mesh_squared_distance(points, part.vertices, part.faces)[0]) * 1e3
-    # Cloth is given a thickness for the scan and webs leave the layers, so the mean is above the noise.
+    # Cloth is given a thickness for the scan and bridges leave the layers, so the mean is above the noise.
     assert np.median(distance) < 1.0
     assert distance.mean() < 5.0
 

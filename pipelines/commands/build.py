@@ -75,10 +75,10 @@ class Build:
     """Upward axis of the scan file. auto: found where the scan comes alone, else +Y."""
     detector: OptionalText = None
     """`mediapipe` (extra detect) or a pose model in ONNX: asked which way the person faces whose scan comes alone."""
-    keep_webs: bool = False
-    """Keep the scan's surface where it bridges two limbs, as under the arms; it tears when the pose opens them."""
+    keep_bridges: bool = False
+    """Keep faces of the scan that bridge two limbs, as under the arms; they tear when a pose opens the gap."""
     keep_holes: bool = False
-    """Leave open what the cut of such bridges opens, instead of closing it with a patch of the least area."""
+    """Leave the holes of cut bridges open, instead of closing them with patches of least area."""
     method: Literal["ours", "paper"] = "ours"
     """Skin-weight transfer: ours, or robust transfer exactly as published."""
     budgets: Annotated[
@@ -170,8 +170,8 @@ class Build:
         default = BuildConfig()
         changed: dict[str, Any] = {
             "budgets": default.budgets | self.budgets,
-            "webs": replace(default.webs, rounds=0) if self.keep_webs else default.webs,
-            "darning": replace(default.darning, width=0.0) if self.keep_holes else default.darning,
+            "bridges": replace(default.bridges, rounds=0) if self.keep_bridges else default.bridges,
+            "fill_holes": replace(default.fill_holes, width=0.0) if self.keep_holes else default.fill_holes,
             # Landmarks and corrections lie in the run, where every stage finds them.
             "landmarks": None,
             "corrections": None,

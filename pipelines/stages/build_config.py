@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, RECONSTRUCT_FILE, REGISTER_FILE
 from pipelines.runs.manifest import require_plain_fields
-from smplxpp.assemble import DarnConfig
+from smplxpp.assemble import FillHolesConfig
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
-from smplxpp.clean import WebConfig
+from smplxpp.clean import BridgeConfig
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, read_json
@@ -134,11 +134,14 @@ def _frames_and_cameras(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _build_config(values: Mapping[str, Any]) -> BuildConfig:
+    # Builds of earlier versions have other names for two settings.
+    earlier = {"webs": "bridges", "darning": "fill_holes"}
+    values = {earlier.get(name, name): value for name, value in values.items()}
     require_plain_fields(BuildConfig, values, subject=BUILD_FILE)
-    webs, darning = values.get("webs", {}), values.get("darning", {})
-    require_plain_fields(WebConfig, webs, subject=BUILD_FILE)
-    require_plain_fields(DarnConfig, darning, subject=BUILD_FILE)
-    made = {"webs": WebConfig(**webs), "darning": DarnConfig(**darning)}
+    bridges, holes = values.get("bridges", {}), values.get("fill_holes", {})
+    require_plain_fields(BridgeConfig, bridges, subject=BUILD_FILE)
+    require_plain_fields(FillHolesConfig, holes, subject=BUILD_FILE)
+    made = {"bridges": BridgeConfig(**bridges), "fill_holes": FillHolesConfig(**holes)}
     return BuildConfig(**{**values, **_paths(values, _CHOICE_PATHS), **made})
 
 

@@ -131,7 +131,7 @@ def clean(folder: Path, build: BuildContext) -> StageOutput:
 
 
 def transfer(folder: Path, build: BuildContext) -> StageOutput:
-    """Write skin weights of every part from the posed body, and the parts without the webs that the weights show."""
+    """Write skin weights of every part from the posed body, and the parts without the bridges that the weights show."""
     body = load_body(build.inputs.body)
     cleaned, fit = load_cleaned_parts(build.run), load_fit(build.run, body)
     parts, weights, output = transfer_to_parts(cleaned, fit, body, build.config)

@@ -1,8 +1,8 @@
-"""Assembly of body and parts, and the repair of layers that cut into each other."""
+"""Assemble body and parts to a template, fill holes, and push layers that intersect apart."""
 
 from smplxpp.assemble.body_colors import body_colors_from_scan
 from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
-from smplxpp.assemble.darn import DarnConfig, Darning, cut_holes, darn
+from smplxpp.assemble.fill_holes import FilledHoles, FillHolesConfig, cut_holes, fill_holes
 from smplxpp.assemble.layers import Obstacle, Penetration, measure_penetration
 from smplxpp.assemble.left_inside import LeftInside
 from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
@@ -11,8 +11,8 @@ __all__ = [
     "AssemblyConfig",
     "AssemblyReport",
     "CanonicalPart",
-    "DarnConfig",
-    "Darning",
+    "FillHolesConfig",
+    "FilledHoles",
     "LayerReport",
     "LeftInside",
     "Obstacle",
@@ -21,7 +21,7 @@ __all__ = [
     "assemble_template",
     "body_colors_from_scan",
     "cut_holes",
-    "darn",
+    "fill_holes",
     "measure_penetration",
     "push_out",
     "stand_off",

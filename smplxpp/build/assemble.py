@@ -1,4 +1,4 @@
-"""Assemble body and parts into one template: holes of cut webs closed, layers apart, the scan's colours on the skin."""
+"""Assemble body and parts into one template: fill holes of cut bridges, separate layers, colour the skin."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from smplxpp.assemble import (
     assemble_template,
     body_colors_from_scan,
     cut_holes,
-    darn,
+    fill_holes,
 )
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
@@ -46,11 +46,11 @@ def assemble_parts(
         scan: prepared, for the colours of the skin.
         face_labels: of the scan.
         fit: the posed body.
-        cleaned: the parts before webs were cut, which tell the holes of a cut from openings.
-        parts: the same parts without webs, in the T-pose.
+        cleaned: the parts before bridges were cut, which tell the holes of a cut from openings.
+        parts: the same parts without bridges, in the T-pose.
         config: choices of the build.
     """
-    canonical, darned = {}, {}
+    canonical, filled = {}, {}
     for name, before in cleaned.items():
         part = parts[name].posed
         made = CanonicalPart(
@@ -60,9 +60,9 @@ def assemble_parts(
             vertex_colors=part.colors,
             scan_index=_of_file(scan, part.source_vertex),
         )
-        # Close what the cut of a web opened. Cuffs and hems were open before and stay open.
+        # Close the holes that cut bridges left. Cuffs and hems were open before and stay open.
         holes = cut_holes(before.mesh, before.source_vertex, part.mesh, part.source_vertex)
-        canonical[name], darned[name] = darn(made, holes, config=config.darning)
+        canonical[name], filled[name] = fill_holes(made, holes, config=config.fill_holes)
     settings = AssemblyConfig(clearance=config.clearance_mm / MM)
     template, report = assemble_template(body, params, canonical, config=settings)
     template = _with_scan_colors(template, scan, face_labels == SKIN.id, fit, body)
@@ -95,7 +95,7 @@ def assemble_parts(
             "(10 to 30 mm) and the clearance",
         ),
     ]
-    numbers = report.as_dict() | {"darned": {name: one.as_dict() for name, one in darned.items()}}
+    numbers = report.as_dict() | {"darned": {name: one.as_dict() for name, one in filled.items()}}
     return template, StageOutput(checks, numbers)
 
 

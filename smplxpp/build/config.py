@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from smplxpp.assemble import DarnConfig
+from smplxpp.assemble import FillHolesConfig
 from smplxpp.capture import Capture
-from smplxpp.clean import WebConfig
+from smplxpp.clean import BridgeConfig
 from smplxpp.clean.scan_frame import AUTO
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import LABELS
@@ -59,8 +59,8 @@ class BuildConfig:
         remesh: method that makes the parts' faces, "quadric" or "isotropic".
         clearance_mm: distance kept between layers, millimetres, 0.1 to 10.
         max_influences: joints that a vertex may follow.
-        webs: settings for cutting faces that bridge two limbs; `rounds=0` disables it.
-        darning: settings for closing the holes that this leaves; `width=0` disables it.
+        bridges: settings for cutting faces that bridge two limbs; `rounds=0` disables it.
+        fill_holes: settings for closing the holes that this leaves; `width=0` disables it.
         method: skin-weight transfer, "ours", or "paper" for robust transfer as published.
         samples: surface samples of the validation.
         seed: of the samples.
@@ -86,8 +86,8 @@ class BuildConfig:
     remesh: str = "quadric"
     clearance_mm: float = 1.0
     max_influences: int = 8
-    webs: WebConfig = field(default_factory=WebConfig)
-    darning: DarnConfig = field(default_factory=DarnConfig)
+    bridges: BridgeConfig = field(default_factory=BridgeConfig)
+    fill_holes: FillHolesConfig = field(default_factory=FillHolesConfig)
     method: str = "ours"
     samples: int = 100_000
     seed: int = 0

@@ -111,7 +111,7 @@ class RestPart:
     """A loose part in the T-pose.
 
     Attributes:
-        posed: the part in the scan's pose, without webs.
+        posed: the part in the scan's pose, without bridges.
         weights: its skin weights.
         vertices: its vertices in the T-pose.
     """

@@ -21,10 +21,8 @@ from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.detect import load_detector
-from smplxpp.register import bare_of_scan
-from smplxpp.register import read_landmarks
+from smplxpp.register import ScanObservation, bare_of_scan, read_landmarks
 from smplxpp.register.locate import LocatedBody, locate_body
-from smplxpp.register import ScanObservation
 from smplxpp.segment import label_by_body
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64, UInt8
 
 from smplxpp.body import BodyModel, load_params
 from smplxpp.build.config import RegisterInputs
@@ -22,8 +22,7 @@ from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import BACKGROUND
 from smplxpp.core.mesh import MeshLike
 from smplxpp.core.params import BodyParams
-from smplxpp.register import LandmarkModel
-from smplxpp.register import Observations
+from smplxpp.register import LandmarkModel, Observations
 from smplxpp.segment import map_labels
 
 ELSEWHERE = 255

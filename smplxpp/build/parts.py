@@ -12,7 +12,7 @@ from jaxtyping import Integer
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
-from smplxpp.clean import PartsConfig, WebConfig, clean_parts, cut_webs, find_webs
+from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges
 from smplxpp.core.checks import Check, StageOutput
 from smplxpp.core.labels import LABELS
 from smplxpp.core.mesh import TriangleMesh
@@ -45,10 +45,10 @@ def clean_scan(
 def transfer_to_parts(
     cleaned: Mapping[str, Part], fit: PosedFit, body: BodyModel, config: BuildConfig
 ) -> tuple[dict[str, Part], dict[str, SkinWeights], StageOutput]:
-    """Transfer skin weights from the posed body to every part, and cut the webs that the weights show.
+    """Transfer skin weights from the posed body to every part, and cut the bridges that the weights show.
 
     Returns:
-        The parts without webs, their weights, checks and numbers.
+        The parts without bridges, their weights, checks and numbers.
     """
     parts: dict[str, Part] = {}
     weights: dict[str, SkinWeights] = {}
@@ -56,7 +56,7 @@ def transfer_to_parts(
     numbers: dict[str, Any] = {}
     for name, part in cleaned.items():
         settings = transfer_config(LABELS[part.label].name, body, config)
-        mesh, source, found = _without_webs(part.mesh, fit, body, settings, config.webs)
+        mesh, source, found = _without_bridges(part.mesh, fit, body, settings, config.bridges)
         parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
         weights[name] = found
         report = weight_report(found)
@@ -81,13 +81,13 @@ def transfer_config(label: str, body: BodyModel, config: BuildConfig) -> Transfe
     return replace(base, joint_names=body.joint_names, max_influences=config.max_influences)
 
 
-def _without_webs(
-    part: TriangleMesh, fit: PosedFit, body: BodyModel, settings: TransferConfig, config: WebConfig
+def _without_bridges(
+    part: TriangleMesh, fit: PosedFit, body: BodyModel, settings: TransferConfig, config: BridgeConfig
 ) -> tuple[TriangleMesh, np.ndarray, SkinWeights]:
-    """A part without its webs, the vertex of `part` that each of its vertices is, and its skin weights.
+    """Return a part without its bridges, the vertex of `part` for each of its vertices, and its skin weights.
 
-    Weights are smoothed along the surface. Where that bridges two limbs they mix far outside the web too. They are
-    therefore computed again once it is cut, which shows what remains of a web.
+    Weights are smoothed along the surface. A bridge between two limbs mixes their weights far outside of it too. They
+    are therefore computed again after each cut, which reveals the remains of a bridge.
     """
     source = np.arange(part.vertex_count)
     weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
@@ -95,10 +95,10 @@ def _without_webs(
         # The limits of the inversion are lifted here: the next stage checks them on the part that is left.
         limits = UnposeConfig(warn_below=0.0, fail_below=1e-9)
         rest = unpose(part.vertices, weights, fit.posed_from_rest, config=limits)
-        web = find_webs(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
-        if not web.any():
+        bridge = find_bridges(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
+        if not bridge.any():
             break
-        part, kept = cut_webs(part, web, config=config)
+        part, kept = cut_bridges(part, bridge, config=config)
         source = source[kept]
         weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
     return part, source, weights

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,12 +14,7 @@ from smplxpp.build.observe import Observed
 from smplxpp.core.checks import Check, StageOutput
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.register import BodyFit
-from smplxpp.register import RegisterConfig
-from smplxpp.register import register
-from smplxpp.register import follow, lost_frames
-from smplxpp.register import LandmarkModel
-from smplxpp.register import Observations
+from smplxpp.register import BodyFit, LandmarkModel, Observations, RegisterConfig, follow, lost_frames, register
 
 CONFIDENT = 0.5
 """Mean confidence of the body's joints from which a frame counts as observed, not filled in by the priors."""

@@ -78,7 +78,7 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -
     if AUTO in (units, up):
         vertices, faces = (raw.vertices, raw.faces) if not raw.is_cloud else _rough_surface(raw)
         frame = find_scan_frame(vertices, faces, units=units, up=up)
-        units, up, note = frame.units, frame.up, frame.said
+        units, up, note = frame.units, frame.up, frame.note
     vertices = convert_points(raw.vertices, units=units, up=up)
     try:
         clean = _of_cloud(path, raw, units, up) if raw.is_cloud else sanitize(vertices, raw.faces)
@@ -142,7 +142,7 @@ def _of_cloud(path: Path | None, raw: RawMesh, units: str, up: str) -> Sanitized
         state = path.stat()
         surface = _surface(_Cloud(path, state.st_mtime_ns, state.st_size, units, up, raw))
     name = "scan in memory" if path is None else path.name
-    warnings.warn(f"{name}: {surface.said}", GeometryWarning, stacklevel=3)
+    warnings.warn(f"{name}: {surface.note}", GeometryWarning, stacklevel=3)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)  # defects of our own reconstruction are not the user's
         clean = sanitize(surface.mesh.vertices, surface.mesh.faces)

@@ -193,9 +193,7 @@ class _Build:
             cameras = usable_cameras(capture, asked.hold_out)
             (frame,) = usable_frames(capture, asked.frames)
             check_masks(capture, cameras, (frame,))
-            surface, numbers = reconstruct_frame(
-                capture, cameras, frame, surface_maker(asked), ignore_progress
-            )
+            surface, numbers = reconstruct_frame(capture, cameras, frame, surface_maker(asked), ignore_progress)
             assert self.request.surface is not None
             write_surface(self.request.surface, surface)
             step.output = reconstruction_output({frame: numbers}, {}, cameras)

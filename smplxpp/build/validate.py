@@ -68,7 +68,7 @@ def validate_template(
         params: of the scan's pose.
         scan: prepared.
         face_labels: (M,) of the scan.
-        parts: the cleaned parts in the scan's pose, without webs.
+        parts: the cleaned parts in the scan's pose, without bridges.
         motion: frames of the capture; None: there are none.
         inputs: they name photographs, which tell a mirrored scan.
         config: choices of the build.

@@ -1,4 +1,4 @@
-"""Specks, pinholes and openings of a part."""
+"""Remove small components of a part, close its pinholes, and measure its openings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from smplxpp.core.topology import border_loops, face_components
 
 
 def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> Bool[np.ndarray, " M"]:
-    """The faces of components with at least `area_fraction` of the mesh's area (the largest always)."""
+    """Return the faces of components with at least `area_fraction` of the mesh's area; the largest is always kept."""
     component = face_components(mesh.faces)
     area = np.bincount(component, mesh.face_areas)
     kept = area >= area_fraction * area.sum()
@@ -19,7 +19,7 @@ def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> Bool[np.n
 
 
 def loop_lengths(mesh: TriangleMesh, loops: list[Int[np.ndarray, " _"]]) -> Float64[np.ndarray, " L"]:
-    """The perimeter of each closed loop of vertex indices, metres."""
+    """Return the perimeter of each closed loop of vertex indices, metres."""
     positions = [mesh.vertices[loop] for loop in loops]
     return np.array([np.linalg.norm(p - np.roll(p, -1, axis=0), axis=1).sum() for p in positions])
 
@@ -27,11 +27,16 @@ def loop_lengths(mesh: TriangleMesh, loops: list[Int[np.ndarray, " _"]]) -> Floa
 def fill_pinholes(mesh: TriangleMesh, *, max_length: float = 0.04) -> tuple[TriangleMesh, Int64[np.ndarray, " n"]]:
     """Close border loops shorter than `max_length` metres; longer ones are openings (hem, cuffs, neck) and stay.
 
-    A loop of three edges takes one triangle, a longer one a fan about its mean. The border of a component that is
-    itself no larger than the hole is not a hole. `mesh` must be manifold; the result is.
+    A loop of three edges is closed by one triangle, a longer one by a fan around its mean. The border of a component
+    that is itself no larger than the hole is not a hole.
 
-    Returns the mesh, new vertices and faces at the end, and (n,) for every vertex the vertex of `mesh` it is, or for a
-    fan's centre the loop vertex nearest to it.
+    Args:
+        mesh: manifold.
+        max_length: perimeter from which a loop is an opening.
+
+    Returns:
+        The manifold mesh, with new vertices and faces at the end, and for every vertex the vertex of `mesh` that it is,
+        or for a fan's centre the loop vertex nearest to it.
     """
     loops = border_loops(mesh.faces)
     if not loops:
@@ -44,10 +49,11 @@ def fill_pinholes(mesh: TriangleMesh, *, max_length: float = 0.04) -> tuple[Tria
     vertices, faces, source = [mesh.vertices], [mesh.faces], [np.arange(mesh.vertex_count)]
     next_vertex = mesh.vertex_count
     for loop, length in zip(loops, lengths, strict=True):
-        # A disc of this perimeter has at most length^2 / (4 pi) of area.
+        # A hole with this perimeter has an area of at most length^2 / (4 pi); a component below length^2 is a speck
+        # with an outer border.
         if length > max_length or area[component_of_vertex[loop[0]]] < length**2:
             continue
-        # The hole's faces run against the border's direction.
+        # The closing faces traverse the border in the opposite direction.
         if len(loop) == 3:
             faces.append(loop[::-1][None])
             continue

@@ -1,4 +1,4 @@
-"""Loose parts of a labelled scan: cut out, without specks and pinholes, brought within a budget."""
+"""Cut a labelled scan into loose parts, remove their specks and pinholes, and reduce them to a face budget."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from smplxpp.core.validation import require_choice
 
 @dataclass(frozen=True)
 class PartsConfig:
-    """Options of `clean_parts`.
+    """Options of cleaning parts with `clean_parts`.
 
     Attributes:
-        face_budgets: faces of a part by label name; `Label.face_budget` where a name is missing.
-        speck_area: components below this fraction of the part's area go.
-        pinhole_length: border loops with a perimeter below this many metres are closed.
-        method: what the faces are made by: "quadric" (`simplify`) or "isotropic" (`remesh`).
+        face_budgets: faces of a part by label name; `Label.face_budget` for missing names.
+        speck_area: area fraction of the part below which components are removed.
+        pinhole_length: perimeter, metres, below which border loops are closed.
+        method: "quadric" edge collapse (`simplify`) or "isotropic" remeshing (`remesh`).
     """
 
     face_budgets: Mapping[str, int] = field(default_factory=dict)
@@ -44,9 +44,20 @@ class PartsConfig:
 
 @dataclass(frozen=True)
 class PartReport:
-    """What cleaning did to a part; distances in metres from the part's faces before simplification to it.
+    """Counts and distances of the cleaning of a part.
 
-    `opening_lengths` are the perimeters that remain, longest first.
+    Attributes:
+        faces_before: faces of the part in the scan.
+        faces_after: faces of the cleaned part.
+        speck_faces: faces removed as specks.
+        filled_pinholes: border loops closed.
+        components: connected components.
+        opening_lengths: perimeters of the remaining openings, metres, longest first.
+        non_manifold_edges: edges with more than two faces.
+        flipped_faces: faces opposed to the nearest source face.
+        restored_faces: source faces restored by `simplify`.
+        distance_mean: mean distance, metres, of the part's vertices before simplification to its faces after.
+        distance_p95: its 95th percentile.
     """
 
     faces_before: int
@@ -90,11 +101,14 @@ def clean_parts(
 ) -> dict[str, CleanedPart]:
     """Cut a labelled scan into its loose parts and clean each.
 
-    Skin makes no part (the body model takes its place), nor does the background (-1). A part may have several
-    components (two shoes). Any per-vertex attribute of the scan goes along as `attribute[part.source_vertex]`.
+    Skin is no part, because the body model replaces it, nor is the background (-1). A part may have several components
+    (two shoes). A vertex attribute of the scan is transferred as `attribute[part.source_vertex]`.
 
     Args:
-        mesh: the scan, sanitized. face_labels: (M,) label ids. vertex_colors: (N, 3) uint8.
+        mesh: the scan, sanitized.
+        face_labels: (M,) label ids.
+        config: options.
+        vertex_colors: (N, 3) uint8 colours of the scan.
 
     Raises:
         InputError: labels of another length or unknown, or no loose part at all.
@@ -108,6 +122,7 @@ def clean_parts(
         raise InputError("face labels", expected=f"shape ({mesh.face_count},)", received=f"shape {face_labels.shape}")
     if vertex_colors is not None and len(vertex_colors) != mesh.vertex_count:
         raise InputError("vertex colours", expected=f"{mesh.vertex_count} rows", received=f"{len(vertex_colors)}")
+    # Labels must be known; -1 is the background.
     unknown = np.setdiff1d(face_labels, [-1] + [label.id for label in LABELS])
     if len(unknown):
         raise InputError("face labels", expected="label ids -1 to 5", received=f"{unknown.tolist()}")
@@ -116,6 +131,7 @@ def clean_parts(
         selected = face_labels == label.id
         if label is SKIN or not selected.any():
             continue
+        # Clean the part; its vertices keep the colours of the scan's vertices that they stand for.
         budget = config.face_budgets.get(label.name, label.face_budget)
         part, source, report = _clean_part(mesh, selected, budget=budget, config=config)
         colors = None if vertex_colors is None else np.asarray(vertex_colors)[source]
@@ -133,12 +149,15 @@ def clean_parts(
 def _clean_part(
     scan: TriangleMesh, selected: np.ndarray, *, budget: int, config: PartsConfig
 ) -> tuple[TriangleMesh, np.ndarray, PartReport]:
+    """Return the cleaned part of the selected faces, the scan's vertex for each of its vertices, and the report."""
+    # Cut the part out, drop specks, and cut non-manifold vertices apart.
     part, source = scan.submesh(selected)
     kept = drop_specks(part, area_fraction=config.speck_area)
     part, of_part = part.submesh(kept)
     faces, of_kept = manifold_corners(part.faces)
     part = TriangleMesh(part.vertices[of_kept], faces)
     source = source[of_part][of_kept]
+    # Close pinholes, reduce to the budget, and measure how far the surface moved.
     loops = len(border_loops(part.faces))
     part, of_cut = fill_pinholes(part, max_length=config.pinhole_length)
     source = source[of_cut]

@@ -1,6 +1,7 @@
-"""A surface through a cloud of points: Poisson reconstruction (Kazhdan and Hoppe 2013), by open3d.
+"""Reconstruct a surface from a point cloud by screened Poisson reconstruction (Kazhdan and Hoppe 2013), with open3d.
 
-Where there are no points Poisson's surface goes on as a bubble; what lies far from every point is cut away again.
+Where there are no points the Poisson surface continues as a bubble; faces far from every point are therefore cut away.
+Normals come from principal component analysis of neighbourhoods, oriented by visibility from outside.
 """
 
 from __future__ import annotations
@@ -10,24 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
+from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from smplxpp.clean.components import drop_specks
-from smplxpp.clean.point_normals import NEIGHBOURS, estimate_normals
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
 from smplxpp.core.validation import require_at_least
 
 FEWEST_POINTS = 500
-"""Fewer points show no person."""
-# The cube in which it is solved is this much larger than the cloud, and is halved at most so often: 2 mm on an adult.
+"""Least number of points; fewer cannot show a person."""
+NEIGHBOURS = 16
+"""Points in the neighbourhood of a normal."""
+# The octree: its cube relative to the cloud, and the range of its depth. Depth 10 is 2 mm on an adult.
 _CUBE, _DEEPEST, _SHALLOWEST = 1.1, 10, 5
-# Of points spread at random over a surface the mean distance of neighbours is about this many median nearest ones.
-_MEAN_SPACING = 2.1
-# A point this many times farther from its neighbours than most is no part of the surface.
-_STRAY = 10.0
-# Normals of a file are taken where at least this share agrees with those that are seen from outside.
-_AGREE = 0.8
 
 
 @dataclass(frozen=True)
@@ -35,9 +32,9 @@ class PoissonConfig:
     """Options of `surface_from_points`.
 
     Attributes:
-        reach: surface farther from every point than this many median nearest distances is cut away.
-        depth: how often the cube about the cloud is halved; None: until a cell is as wide as points lie apart.
-        speck_area: components below this fraction of the area go.
+        reach: distance to the nearest point, in median point spacings, above which the surface is cut away.
+        depth: depth of the octree; None chooses cells as wide as the mean distance of the points.
+        speck_area: area fraction below which components are removed.
     """
 
     reach: float = 4.0
@@ -52,17 +49,17 @@ class PoissonConfig:
 
 @dataclass(frozen=True, eq=False)
 class PointSurface:
-    """A surface through points.
+    """A surface reconstructed from a point cloud.
 
     Attributes:
-        mesh: in the points' unit, outward; with holes where there are no points.
-        source_point: (n,) the point nearest to each vertex: labels and colours of points go along by it.
-        said: what was done, in words.
+        mesh: in the points' unit, oriented outward, with holes where there are no points.
+        source_point: (n,) index of the point nearest to each vertex, which gives it labels and colours.
+        note: summary of the reconstruction for logs.
     """
 
     mesh: TriangleMesh
     source_point: Int64[np.ndarray, " n"]
-    said: str
+    note: str
 
 
 def surface_from_points(
@@ -71,20 +68,21 @@ def surface_from_points(
     *,
     config: PoissonConfig | None = None,
 ) -> PointSurface:
-    """The surface of a person of whom points are known; the same points give the same bits. Warns with what was done.
+    """Reconstruct the surface of a person from points; the same points give the same bits.
 
-    Points that are not finite, that repeat another or lie apart from all are left out. Normals that are given are used
-    as they are, turned over, or not at all: whichever agrees with what is seen from outside (`estimate_normals`).
+    Points that are not finite, duplicates and outliers are left out. Given normals are used as they are, flipped, or
+    not at all, depending on their agreement with estimated ones (`estimate_normals`). A warning summarises the result.
 
     Args:
-        points: of the surface, sampled about evenly; may hold NaN.
-        normals: of any length, outward or inward; zero or NaN where unknown.
+        points: points of the surface, sampled about evenly; may hold NaN.
+        normals: normals of any length, outward or inward; zero or NaN where unknown.
         config: options.
 
     Raises:
         MissingExtraError: open3d is not installed, or lacks libraries of the system.
         InputError: too few points.
     """
+    # Select usable points, orient their normals, choose the octree's depth.
     config = config or PoissonConfig()
     open3d = _open3d()
     points = np.asarray(points, np.float64)
@@ -95,26 +93,27 @@ def surface_from_points(
     depth = config.depth or _depth(points[kept], spacing)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points[kept]))
     cloud.normals = open3d.utility.Vector3dVector(np.ascontiguousarray(outward))
-    # Several threads add in another order each time.
+    # One thread, because the order of summation varies between runs of several threads.
     made, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, scale=_CUBE, n_threads=1)
     whole = TriangleMesh(np.asarray(made.vertices), np.asarray(made.triangles).astype(np.int64))
+    # Cut away what is far from every point, and specks.
     distance, _ = tree.query(whole.vertices)
     near = (distance <= config.reach * spacing)[whole.faces].all(axis=1)
     if not near.any():
         raise InputError("point cloud", expected="points of a surface", received="points that no surface goes through")
     cut, _ = whole.submesh(near)
     mesh, _ = cut.submesh(drop_specks(cut, area_fraction=config.speck_area))
-    said = (
+    note = (
         f"point cloud of {len(points)} points, {spacing:.2g} apart: surface of {mesh.face_count} faces by Poisson "
         f"reconstruction (depth {depth}), {about_normals}; {len(points) - len(kept)} points left out, "
         f"{1 - mesh.face_areas.sum() / whole.face_areas.sum():.0%} of the surface cut away, where no points are"
     )
-    warnings.warn(said, GeometryWarning, stacklevel=2)
-    return PointSurface(mesh, kept[tree.query(mesh.vertices)[1]], said)
+    warnings.warn(note, GeometryWarning, stacklevel=2)
+    return PointSurface(mesh, kept[tree.query(mesh.vertices)[1]], note)
 
 
 def _open3d():
-    """The package.
+    """Import open3d when it is first needed.
 
     Raises:
         MissingExtraError: it is not installed, or does not start.
@@ -133,12 +132,15 @@ def _open3d():
 
 
 def _usable(points: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " n"]:
-    """The points that are finite, no repetitions, and not apart from all others."""
+    """Return the indices of points that are finite, no duplicates, and no outliers.
+
+    An outlier is ten times farther from its eight nearest points than the median point.
+    """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     kept = finite[np.sort(np.unique(points[finite], axis=0, return_index=True)[1])]
     if len(kept) >= FEWEST_POINTS:
         apart = cKDTree(points[kept]).query(points[kept], k=NEIGHBOURS // 2)[0].mean(axis=1)
-        kept = kept[apart <= _STRAY * np.median(apart)]
+        kept = kept[apart <= 10.0 * np.median(apart)]
     if len(kept) < FEWEST_POINTS:
         raise InputError(
             "point cloud",
@@ -152,16 +154,20 @@ def _usable(points: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " n"]:
 def _normals(
     points: Float[np.ndarray, "n 3"], given: Float[np.ndarray, "n 3"] | None
 ) -> tuple[Float64[np.ndarray, "n 3"], str]:
-    """Outward normals, and where they are from."""
+    """Return outward normals, and a description of their source.
+
+    Given normals are used if at least 80 % agree with the estimated ones, and flipped if at most 20 % do.
+    """
+    agreement = 0.8
     estimated = estimate_normals(points)
     if given is None:
         return estimated, "normals estimated"
     known = np.isfinite(given).all(axis=1) & (row_lengths(np.nan_to_num(given)) > 0)
     own = normalize_rows(np.where(known[:, None], np.nan_to_num(given), 0.0))
     share = float(_agrees(own[known], estimated[known]).mean()) if known.any() else 0.5
-    if share >= _AGREE:
+    if share >= agreement:
         return np.where(known[:, None], own, estimated), "normals of the file"
-    if share <= 1 - _AGREE:
+    if share <= 1 - agreement:
         return np.where(known[:, None], -own, estimated), "normals of the file turned over: they point inward"
     return estimated, f"normals estimated: of those of the file {share:.0%} point outward"
 
@@ -171,5 +177,82 @@ def _agrees(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Bool[np
 
 
 def _depth(points: Float[np.ndarray, "n 3"], spacing: float) -> int:
-    cells = _CUBE * np.ptp(points, axis=0).max() / (_MEAN_SPACING * spacing)
+    """Return the octree's depth at which a cell is as wide as the mean distance of neighbouring points.
+
+    For random points on a surface that is about 2.1 times `spacing`, the median distance to the nearest point.
+    """
+    cells = _CUBE * np.ptp(points, axis=0).max() / (2.1 * spacing)
     return int(np.clip(np.rint(np.log2(cells)), _SHALLOWEST, _DEEPEST))
+
+
+def point_spacing(points: Float[np.ndarray, "N 3"]) -> float:
+    """Return the median distance of a point to its nearest neighbour, metres."""
+    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+
+
+def estimate_normals(points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """Estimate outward unit normals of a point cloud of a body's surface.
+
+    A normal is that of the plane through the nearest neighbours. Its sign comes from visibility: a point that a view
+    from outside sees faces it. Propagating signs along a minimum spanning tree would fail where sleeve and trunk touch.
+    Points that no view sees take their neighbours' sign.
+
+    Args:
+        points: points without duplicates, of a surface that is sampled about evenly.
+    """
+    # Normals in batches, which bound the memory.
+    tree = cKDTree(points)
+    near, neighbours = tree.query(points, k=min(NEIGHBOURS, len(points)))
+    normals = np.concatenate(
+        [_plane_normals(points[rows]) for rows in np.array_split(neighbours, len(neighbours) // (1 << 17) + 1)]
+    )
+    # Average the votes of neighbours eight times, weighted by the squared cosine of the normals, with its sign: a
+    # neighbour with a parallel normal counts in full, one across an edge little.
+    votes = _votes_of_views(points, normals, spacing=float(np.median(near[:, 1])))
+    for _ in range(8):
+        alike = np.einsum("ij,ikj->ik", normals, normals[neighbours])
+        votes = np.einsum("ik,ik->i", alike * np.abs(alike), votes[neighbours]) / neighbours.shape[1]
+    return np.where(votes[:, None] < 0, -normals, normals)
+
+
+def _plane_normals(neighbourhoods: Float[np.ndarray, "n k 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Return the directions of least variance of neighbourhoods."""
+    centred = neighbourhoods - neighbourhoods.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
+
+
+def _votes_of_views(
+    points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"], *, spacing: float
+) -> Float64[np.ndarray, " N"]:
+    """Return the mean cosine of each point's normal with the directions of the views that see it, over 96 views.
+
+    A view is an orthographic depth buffer with cells of two point spacings, so that a surface that faces the view
+    leaves few cells empty. A point is visible if it lies at most 1.5 cells behind the foremost one around it.
+    """
+    views, cell = 96, 2.0 * spacing
+    votes = np.zeros(len(points))
+    for direction in _directions(views):
+        across = np.linalg.svd(direction[None])[2][1:]  # two axes of the image
+        column = np.floor((points @ across.T) / cell).astype(np.int64)
+        column -= column.min(axis=0)
+        seen = _foremost(column, points @ direction, depth=1.5 * cell)
+        votes += np.where(seen, normals @ direction, 0.0)
+    return votes / views
+
+
+def _foremost(cells: Int64[np.ndarray, "N 2"], height: Float[np.ndarray, " N"], *, depth: float) -> np.ndarray:
+    """Return (N,) whether each point lies within `depth` of the highest one in its cell and the eight around it."""
+    shape = cells.max(axis=0) + 1
+    top = np.full(int(shape.prod()), -np.inf)
+    index = cells[:, 0] * shape[1] + cells[:, 1]
+    np.maximum.at(top, index, height)
+    top = maximum_filter(top.reshape(shape), size=3, mode="constant", cval=-np.inf).ravel()
+    return height >= top[index] - depth
+
+
+def _directions(count: int) -> Float64[np.ndarray, "count 3"]:
+    """Return unit vectors spread evenly over the sphere (a Fibonacci spiral)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z * z)
+    return normalize_rows(np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1))

@@ -1,4 +1,4 @@
-"""Raw arrays of a scan to a mesh that the next stages can trust; every change is counted."""
+"""Repair the raw arrays of a scan to a manifold mesh that the next stages can rely on; every change is counted."""
 
 from __future__ import annotations
 
@@ -15,31 +15,18 @@ from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels, half_edges, manifold_corners, paired_half_edges
 
-# A face is without area below this fraction of the squared bounding-box diagonal (2 um x 2 um on an adult).
-_ZERO_AREA = 1e-12
-# A vertex farther from the middle than this many times the median distance belongs to nothing (a person: 300 m).
-_STRAY = 1e3
-# Of more strays than these, and than this share of the vertices, nobody can tell which are the mesh.
-_FEW_STRAYS = 3
-_MOST_STRAYS = 0.01
-# Squares of larger coordinates are infinite.
-_LARGEST = 1e100
-# Near pairs a vertex: more is no surface but a heap, whose pairs would fill the memory.
-_CROWD = 100
-# An open sheet is turned over only when it is clearly inside out: flux below this fraction of area x radius.
-_INSIDE_OUT = 0.05
-
 
 @dataclass(frozen=True)
 class CleanReport:
-    """How many elements each repair touched.
+    """Number of elements that each repair changed.
 
     Attributes:
         nonfinite_vertices: vertices with NaN or infinity, dropped with their faces.
-        stray_vertices: vertices immensely far from all others, dropped with their faces.
+        stray_vertices: outliers far from all other vertices, dropped with their faces.
         welded_vertices: vertices merged into another one.
-        zero_area_faces, duplicate_faces: faces dropped.
-        flipped_faces: faces turned over for consistent, outward winding.
+        zero_area_faces: dropped faces without area.
+        duplicate_faces: dropped faces that repeat another one.
+        flipped_faces: faces flipped for consistent, outward winding.
         split_vertices: vertices added where the surface was not manifold.
         unreferenced_vertices: vertices dropped because no face uses them.
     """
@@ -55,7 +42,7 @@ class CleanReport:
 
     @property
     def is_clean(self) -> bool:
-        """Nothing had to be changed."""
+        """Return whether no repair was necessary."""
         return not any(getattr(self, f.name) for f in fields(self))
 
     def __str__(self) -> str:
@@ -65,12 +52,13 @@ class CleanReport:
 
 @dataclass(frozen=True, eq=False)
 class Sanitized:
-    """A repaired mesh and where its elements came from.
+    """A repaired mesh and the raw elements that it came from.
 
     Attributes:
         mesh: two-manifold (with borders), every vertex referenced, winding consistent in each component.
-        source_vertex: (n,) index into the raw vertices. source_face: (m,) index into the raw faces.
-        report: the changes.
+        source_vertex: (n,) index into the raw vertices.
+        source_face: (m,) index into the raw faces.
+        report: counts of the changes.
         merged_into: (N,) for every raw vertex the one that it was welded to; its own index for most.
     """
 
@@ -81,7 +69,7 @@ class Sanitized:
     merged_into: Int64[np.ndarray, " N"]
 
     def mean_colors(self, colors: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "n 3"]:
-        """Colours of the raw vertices as the mesh's: each the mean of the vertices that were welded to one.
+        """Return the colours of the mesh's vertices, each the mean over the raw vertices that were welded to it.
 
         Files split vertices along the seams of their textures; the two sides' colours differ a little.
         """
@@ -97,28 +85,35 @@ class Sanitized:
 def sanitize(
     vertices: Num[np.ndarray, "N 3"], faces: Integer[np.ndarray, "M 3"], *, weld_tolerance: float | None = None
 ) -> Sanitized:
-    """Repair raw arrays: NaN, duplicates, faces without area, winding, non-manifold places.
+    """Repair raw arrays: NaN, duplicates, faces without area, winding, and non-manifold edges and vertices.
 
-    In this order: vertices that are not finite go with their faces, as do those more than 1000 times farther from the
-    middle than the median vertex, if they are few; vertices closer than `weld_tolerance` merge into
-    the one of lowest index (the default is 1e-6 of the bounding box's diagonal); faces without area and repeated faces
-    go; winding is made consistent in each component, and outward; the surface is cut at edges with more than two faces
-    and at vertices where fans meet; unreferenced vertices go. Sanitising the result again changes nothing but the same
-    cuts. Warns when something was changed.
+    The repairs are done in this order:
+
+    1. drop vertices that are not finite, and few outliers more than 1000 times farther from the median than the median
+       vertex, with their faces;
+    2. merge vertices closer than `weld_tolerance` into the one of lowest index;
+    3. drop faces without area and duplicate faces;
+    4. make winding consistent in each component, and outward;
+    5. cut the surface at edges with more than two faces and at vertices where fans meet;
+    6. drop unreferenced vertices.
+
+    Sanitising the result again changes nothing but the same cuts. A warning lists the changes.
 
     Args:
-        vertices: (N, 3). faces: (M, 3) integers.
+        vertices: (N, 3) positions.
+        faces: (M, 3) integer vertex indices.
+        weld_tolerance: distance below which vertices merge; None is 1e-6 of the bounding box's diagonal.
 
     Raises:
-        InputError: wrong shapes, indices out of range, nothing left, or vertices in heaps that are no surface.
+        InputError: wrong shapes, indices out of range, nothing left, or many vertices in one place.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise InputError("mesh vertices", expected="shape (N, 3)", received=f"shape {vertices.shape}")
+    # 1. Vertices that are not finite, and outliers. `TriangleMesh` checks shapes and indices.
     finite = np.isfinite(vertices).all(axis=1)
-    # The checks of shapes and indices are the mesh's own.
     faces = TriangleMesh(np.where(finite[:, None], vertices, 0.0), faces).faces
-    near = finite & ~_strays(vertices, np.unique(faces[finite[faces].all(axis=1)]))
+    near = finite & ~_outliers(vertices, np.unique(faces[finite[faces].all(axis=1)]))
     kept = np.flatnonzero(near[faces].all(axis=1))
     faces = faces[kept]
     referenced = np.unique(faces)
@@ -128,13 +123,15 @@ def sanitize(
             expected="faces with finite corners",
             received=f"{int(finite.sum())} finite vertices and no such face",
         )
+    # 2. Weld.
     diagonal = float(np.linalg.norm(np.ptp(vertices[referenced], axis=0)))
     tolerance = 1e-6 * diagonal if weld_tolerance is None else weld_tolerance
     target = _weld(vertices, referenced, tolerance)
     faces = target[faces]
 
+    # 3. Faces below 1e-12 of the squared diagonal have no area (2 um x 2 um on an adult).
     edge = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
-    solid = 0.5 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) > _ZERO_AREA * diagonal**2
+    solid = 0.5 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) > 1e-12 * diagonal**2
     faces, kept = faces[solid], kept[solid]
     if not len(faces):
         raise InputError(
@@ -144,6 +141,7 @@ def sanitize(
     duplicates = len(faces) - len(unique)
     faces, kept = faces[unique], kept[unique]
 
+    # 4. Winding; 5. and 6. cuts, which renumber the vertices that are used.
     flipped = _inconsistent_faces(vertices, faces)
     faces = np.where(flipped[:, None], faces[:, ::-1], faces)
     new_faces, source_vertex = manifold_corners(faces)
@@ -164,29 +162,31 @@ def sanitize(
     return Sanitized(TriangleMesh(vertices[source_vertex], new_faces), source_vertex, kept, report, target)
 
 
-def _strays(vertices: np.ndarray, referenced: np.ndarray) -> np.ndarray:
-    """(N,) those of the referenced vertices that lie immensely far from where most lie.
+def _outliers(vertices: np.ndarray, referenced: np.ndarray) -> np.ndarray:
+    """Return (N,) the referenced vertices more than 1000 times farther from the median than the median vertex.
 
     Raises:
-        InputError: so many that they may be the mesh, or numbers that are no places.
+        InputError: more outliers than can be told from the mesh, or coordinates whose squares overflow.
     """
+    factor, largest = 1e3, 1e100
     stray = np.zeros(len(vertices), dtype=bool)
     if not len(referenced):
         return stray
-    # Halves, so that differences of the largest numbers stay finite.
+    # Halved coordinates, so that differences of the largest numbers stay finite.
     half = 0.5 * vertices[referenced]
     distance = np.abs(half - np.median(half, axis=0)).max(axis=1)
     usual = float(np.median(distance))
-    if usual > _LARGEST:
-        raise InputError("mesh vertices", expected="coordinates of a surface", received=f"most beyond {_LARGEST:g}")
-    far = distance > _STRAY * usual
-    if usual == 0 or not far.any():  # what lies in heaps is told when it is welded
+    if usual > largest:
+        raise InputError("mesh vertices", expected="coordinates of a surface", received=f"most above {largest:g}")
+    far = distance > factor * usual
+    if usual == 0 or not far.any():  # `_weld` reports vertices in one place
         return stray
-    if far.sum() > max(_FEW_STRAYS, _MOST_STRAYS * len(referenced)):
+    # More than three outliers and 1 % of the vertices may be the mesh itself.
+    if far.sum() > max(3, 0.01 * len(referenced)):
         raise InputError(
             "mesh vertices",
             expected="a surface",
-            received=f"{int(far.sum())} of {len(referenced)} vertices more than {_STRAY:g} times farther from the "
+            received=f"{int(far.sum())} of {len(referenced)} vertices more than {factor:g} times farther from the "
             "middle than most",
             remedy="remove what lies far from the person",
         )
@@ -195,18 +195,19 @@ def _strays(vertices: np.ndarray, referenced: np.ndarray) -> np.ndarray:
 
 
 def _weld(vertices: np.ndarray, referenced: np.ndarray, tolerance: float) -> np.ndarray:
-    """(N,) for every vertex the one of lowest index that it merges into (chains of near vertices merge whole).
+    """Return (N,) for every vertex the one of lowest index that it merges into; chains of near vertices merge as one.
 
     Raises:
-        InputError: vertices in heaps.
+        InputError: more than a hundred vertices in the same place on average, whose pairs would fill the memory.
     """
+    most = 100
     target = np.arange(len(vertices))
     tree = cKDTree(vertices[referenced])
-    if tree.count_neighbors(tree, tolerance) > 2 * _CROWD * len(referenced):
+    if tree.count_neighbors(tree, tolerance) > 2 * most * len(referenced):
         raise InputError(
             "mesh vertices",
             expected="a surface",
-            received=f"vertices in heaps, each with more than {_CROWD} others in the same place",
+            received=f"vertices in heaps, each with more than {most} others in the same place",
             remedy="check for vertices without a position, and for stray geometry far from the rest",
         )
     pairs = tree.query_pairs(tolerance, output_type="ndarray")
@@ -218,7 +219,7 @@ def _weld(vertices: np.ndarray, referenced: np.ndarray, tolerance: float) -> np.
 
 
 def _first_of_each(faces: np.ndarray) -> np.ndarray:
-    """Increasing indices of the first face of every set of three vertices."""
+    """Return the increasing indices of the first face for every set of three vertices."""
     low, middle, high = np.sort(faces, axis=1).T
     order = np.lexsort((high, middle, low))
     key = np.stack([low, middle, high])[:, order]
@@ -226,11 +227,12 @@ def _first_of_each(faces: np.ndarray) -> np.ndarray:
 
 
 def _inconsistent_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The faces to turn over, for consistent winding in each component and then outward.
+    """Return the faces to flip for consistent winding in each component, and then for outward orientation.
 
-    Consistency is connectivity in the double cover: every face is two nodes, as given and turned over, and each edge
-    with two faces joins the nodes that agree. A component whose two sheets join (a Moebius strip) is left as it is.
+    Consistency is connectivity in the double cover: every face is two nodes, as given and flipped, and each edge with
+    two faces joins the nodes that agree. A component whose two sheets are connected (a Moebius strip) stays as it is.
     """
+    # Connected components of the double cover.
     count = len(faces)
     pairs = paired_half_edges(faces)
     ends = half_edges(faces)
@@ -246,13 +248,14 @@ def _inconsistent_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(cross, axis=1)
 
-    # Turn over the smaller area of each component.
+    # Flip the sheet with the smaller area of each component.
     second = given > turned
     area_second = np.bincount(component, area * second)
     total = np.bincount(component, area)
     flip = orientable & np.where(area_second[component] > 0.5 * total[component], ~second, second)
 
-    # Then whole components that face inward, by the flux of (x - centroid) through them (three times the volume).
+    # Then flip whole components that face inward, by the flux of (x - centroid) through them (three times the volume).
+    # An open sheet is flipped only if the flux is below -5 % of area x radius, because its volume is not defined.
     sign = np.where(flip, -1.0, 1.0)
     center = corners.mean(axis=1)
     centroid = np.stack([np.bincount(component, area * center[:, k]) for k in range(3)], 1) / total[:, None]
@@ -260,5 +263,5 @@ def _inconsistent_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     flux = np.bincount(component, 0.5 * sign * np.einsum("ij,ij->i", cross, arm))
     radius = np.sqrt(np.bincount(component, area * np.einsum("ij,ij->i", arm, arm)) / total)
     closed = np.bincount(component, minlength=len(total)) * 3 == 2 * np.bincount(component[a], minlength=len(total))
-    inside_out = flux < np.where(closed, 0.0, -_INSIDE_OUT * total * radius)
+    inside_out = flux < np.where(closed, 0.0, -0.05 * total * radius)
     return flip ^ (inside_out[component] & orientable)

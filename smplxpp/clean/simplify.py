@@ -1,4 +1,4 @@
-"""Simplification to a face budget: borders kept, manifold, no face turned over, every vertex traced to the source."""
+"""Simplify a mesh to a face budget by quadric edge collapse; borders stay, faces do not flip, vertices are traced."""
 
 from __future__ import annotations
 
@@ -13,23 +13,19 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels, edge_groups, manifold_corners
 from smplxpp.core.validation import require_at_least
 
-# Collapses per pass: 3 keeps the quadric order well; higher is no faster at these sizes and breaks manifoldness.
-_AGGRESSIVENESS = 3
-_MAX_ROUNDS = 5
-# Edges below this share of the mean edge join vertices that went to one place (0.09 mm on a garment of 20,000 faces).
-_SAME_PLACE = 1e-2
-# A source of more than this many times the budget may be simplified half-way first.
-_FINE = 4
+# Fraction of an edge. Vertices joined by an edge below this fraction of the mean edge coincide (0.09 mm on a garment of
+# 20,000 faces); doubled vertices are separated by this fraction of their distance to their neighbours.
+_COINCIDENT = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
-    """A simplified mesh and its maps.
+    """A simplified mesh and the maps between its vertices and the source's.
 
     Attributes:
         mesh: n vertices, m faces.
         new_from_old: (N,) for every source vertex the vertex that it collapsed into; -1 for one without faces.
-        source_vertex: (n,) the source vertex, among those that collapsed into each, that lies nearest to it.
+        source_vertex: (n,) for every vertex the nearest of the source vertices that collapsed into it.
         restored_faces: source faces kept as they were because simplifying there made a bad face.
         flipped_faces: faces still opposed to the nearest source face (0 unless the source folds over itself).
     """
@@ -44,16 +40,20 @@ class Simplified:
 def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
     """Collapse edges by quadric error (Garland and Heckbert 1997) down to about `face_budget` faces.
 
-    Border vertices stay, so a mesh whose border alone needs more faces ends above the budget. Where the collapses make
-    a non-manifold edge or a face opposed to the nearest source face, the source's faces are restored and locked, and
-    the rest is simplified again; where those of a fine source would take half of the budget, it is simplified half-way
-    first (to the geometric mean of its faces and the budget). Vertices that an edge joins and that went to the same
-    place become one: on a surface much finer than its features the best place of many is the same corner. Where fans
-    meet in one vertex alone they are cut apart, and all but the first drawn back by a hundredth of their size: no two
-    vertices share a place. A mesh within its budget returns as it is.
+    - Border vertices stay, so that a mesh whose border alone needs more faces ends above the budget.
+    - Where the collapses make a non-manifold edge or a face opposed to the nearest source face, the source's faces are
+      restored and locked, and the rest is simplified again. If locked faces of a fine source would take half of the
+      budget, it is first simplified to the geometric mean of its faces and the budget.
+    - Neighbouring vertices that moved to the same position merge: on a surface much finer than its features the best
+      position of many vertices is the same corner.
+    - Fans that meet in one vertex are cut apart, and all but the first moved back by a hundredth of their size, so that
+      no two vertices share a position.
+
+    A mesh within its budget is returned as it is.
 
     Args:
         mesh: manifold, possibly open (`sanitize`, `manifold_corners`).
+        face_budget: number of faces.
 
     Raises:
         InputError: a budget below 4.
@@ -64,18 +64,19 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
         identity = np.where(used, np.cumsum(used) - 1, -1)
         kept, source = mesh.submesh(np.ones(mesh.face_count, dtype=bool))
         return Simplified(kept, identity, source, 0, 0)
+    # Up to five rounds: collapse, find bad faces, and lock the source around them.
     tree = igl.AABB()
     tree.init(mesh.vertices, mesh.faces)
     locked = np.zeros(mesh.face_count, dtype=bool)
-    for rings in range(1, _MAX_ROUNDS + 1):
+    for rings in range(1, 6):
         result, new_from_old = _collapse(mesh, locked, face_budget)
-        flipped = opposed(result, mesh, tree)
-        # Locked faces come last; the source's own faces are right by definition, even where it folds onto itself.
+        flipped = opposed_faces(result, mesh, tree)
+        # Locked faces come last; the source's own faces are correct by definition, even where it folds onto itself.
         flipped[result.face_count - int(locked.sum()) :] = False
         bad = flipped | _non_manifold(result.faces)
         if not bad.any():
             break
-        # Lock the source faces about the vertices that went into a bad face, a ring more each round.
+        # Lock the source faces around the vertices that collapsed into a bad face, one ring more in each round.
         bad_vertex = np.zeros(result.vertex_count + 1, dtype=bool)
         bad_vertex[result.faces[bad]] = True
         touched = bad_vertex[new_from_old]
@@ -83,19 +84,20 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
             ring = touched[mesh.faces].any(axis=1)
             touched[mesh.faces[ring]] = True
         if (locked | ring).sum() > face_budget // 2:
-            if mesh.face_count > _FINE * face_budget:
+            if mesh.face_count > 4 * face_budget:
                 return _in_two_steps(mesh, face_budget)
             break
         locked |= ring
+    # Cut fans apart, trace the vertices to the source, and separate the copies.
     faces, source_of_cut = manifold_corners(result.faces)
     result = TriangleMesh(result.vertices[source_of_cut], faces)
     source = _nearest_source(mesh, result, new_from_old, source_of_cut)
-    result = drawn_apart(result, source_of_cut)
+    result = separate_doubled_vertices(result, source_of_cut)
     return Simplified(result, new_from_old, source, int(locked.sum()), int(flipped.sum()))
 
 
 def _in_two_steps(mesh: TriangleMesh, face_budget: int) -> Simplified:
-    """The simplification of the mesh simplified half-way, mapped to the mesh's own vertices."""
+    """Simplify to the geometric mean of the numbers of faces first, then to the budget, and join the maps."""
     fine = simplify(mesh, round((mesh.face_count * face_budget) ** 0.5))
     if fine.mesh.face_count >= mesh.face_count:  # its borders alone need more
         return fine
@@ -111,7 +113,8 @@ def _in_two_steps(mesh: TriangleMesh, face_budget: int) -> Simplified:
 
 
 def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple[TriangleMesh, np.ndarray]:
-    """Simplify the faces that are not locked and put the locked ones back: the border between the two stays."""
+    """Simplify the faces that are not locked and append the locked ones; the border between the two stays."""
+    # Three collapses per pass keep the order of the quadrics well; more are no faster and break manifoldness.
     free, used = mesh.submesh(~locked)
     budget = max(4, face_budget - int(locked.sum()))
     faces = free.faces.astype(np.int32)
@@ -119,12 +122,13 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
         free.vertices.copy(),
         faces.copy(),
         target_count=min(budget, free.face_count),
-        agg=_AGGRESSIVENESS,
+        agg=3,
         preserve_border=True,
         return_collapses=True,
     )
     _, _, small_from_free = fast_simplification.replay_simplification(free.vertices.copy(), faces, collapses)
-    points, small_faces, small_from_free = _joined(points, small_faces, small_from_free)
+    points, small_faces, small_from_free = _merge_coincident(points, small_faces, small_from_free)
+    # Map the source's vertices, and append vertices that only locked faces use.
     new_from_old = np.full(mesh.vertex_count, -1, dtype=np.int64)
     new_from_old[used] = small_from_free
     if not locked.any():
@@ -135,26 +139,29 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
     return TriangleMesh(vertices, np.concatenate([small_faces, new_from_old[mesh.faces[locked]]])), new_from_old
 
 
-def opposed(result: TriangleMesh, source: TriangleMesh, tree: igl.AABB) -> np.ndarray:
-    """(m,) the faces whose normal opposes the source face nearest to their middle, or that have no area."""
+def opposed_faces(result: TriangleMesh, source: TriangleMesh, tree: igl.AABB) -> np.ndarray:
+    """Return (m,) whether each face has no area, or a normal opposed to the source face nearest to its centre."""
     _, nearest, _ = tree.squared_distance(source.vertices, source.faces, result.triangles.mean(axis=1))
     cosine = np.einsum("ij,ij->i", result.face_normals, source.face_normals[nearest])
     return (cosine < 0) | (result.face_areas <= 0)
 
 
-def _joined(
+def _merge_coincident(
     points: np.ndarray, faces: np.ndarray, point_of_free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The collapsed mesh with vertices made one that an edge without length joins: points, faces, the map to them.
+    """Merge vertices that an edge of no length joins, into the one of lowest index.
 
-    The vertex of lowest index stays. Faces that lose an edge go, and so do both of two faces that come to lie on each
-    other: a flap without a volume.
+    Faces that lose an edge are dropped, and so are both of two faces that coincide then, a flap without volume.
+
+    Returns:
+        The points, the faces, and the map from the free vertices to the points.
     """
     edges = TriangleMesh(points, faces).edges
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    short = edges[length < _SAME_PLACE * length.mean()]
+    short = edges[length < _COINCIDENT * length.mean()]
     if not len(short):
         return points, faces, point_of_free
+    # Each group of coincident vertices becomes its first vertex; then unused vertices are dropped.
     group = component_labels(short, len(points))
     first = np.unique(group, return_index=True)[1][np.unique(group, return_inverse=True)[1]]
     faces = first[faces]
@@ -169,15 +176,15 @@ def _joined(
 
 
 def _non_manifold(faces: np.ndarray) -> np.ndarray:
-    """The faces at an edge with more than two faces."""
+    """Return the faces at edges with more than two faces."""
     order, _, count = edge_groups(faces)
     bad = np.zeros(len(faces), dtype=bool)
     bad[order[np.repeat(count > 2, count)] // 3] = True
     return bad
 
 
-def drawn_apart(result: TriangleMesh, source_of_cut: np.ndarray) -> TriangleMesh:
-    """The mesh with vertices that a cut (`manifold_corners`) doubled moved towards the middle of their own fans."""
+def separate_doubled_vertices(result: TriangleMesh, source_of_cut: np.ndarray) -> TriangleMesh:
+    """Move copies of vertices that a cut (`manifold_corners`) doubled, but for the first, towards their one-ring."""
     doubled = np.bincount(source_of_cut)[source_of_cut] > 1
     doubled[np.unique(source_of_cut, return_index=True)[1]] = False
     if not doubled.any():
@@ -185,14 +192,15 @@ def drawn_apart(result: TriangleMesh, source_of_cut: np.ndarray) -> TriangleMesh
     vertices = result.vertices.copy()
     for k in np.flatnonzero(doubled):
         ring = np.setdiff1d(result.faces[(result.faces == k).any(axis=1)], [k])
-        vertices[k] += _SAME_PLACE * (result.vertices[ring].mean(axis=0) - vertices[k])
+        vertices[k] += _COINCIDENT * (result.vertices[ring].mean(axis=0) - vertices[k])
     return result.with_vertices(vertices)
 
 
 def _nearest_source(
     mesh: TriangleMesh, result: TriangleMesh, new_from_old: np.ndarray, source_of_cut: np.ndarray
 ) -> np.ndarray:
-    """The source vertex of every vertex of `result`; vertices that a cut doubled share theirs."""
+    """Return the source vertex of every vertex of `result`; vertices that a cut doubled share theirs."""
+    # Of the source vertices that collapsed into a vertex the nearest, then the one of lowest index.
     old = np.flatnonzero(new_from_old >= 0)
     new = new_from_old[old]
     position = np.empty((int(source_of_cut.max()) + 1, 3))

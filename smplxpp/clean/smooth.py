@@ -1,4 +1,4 @@
-"""Noise of a scan's vertices: how rough it makes the surface, and smoothing where it is too rough to build from."""
+"""Measure the noise of a scan's vertices, and smooth scans that are too rough to build from."""
 
 from __future__ import annotations
 
@@ -12,23 +12,18 @@ from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 
 ROUGH = 0.3
-"""Roughness from which a scan is smoothed: its noise turns faces over. Scans at hand have 0.04 to 0.09."""
-_SMOOTH = 0.05
-_MAX_STEPS = 40
-# Taubin's pair (SIGGRAPH 1995): the second step gives back what the first one shrinks.
-_SHRINK, _GROW = 0.5, -0.53
-# Median of |x| over the standard deviation of normally distributed x.
-_MEDIAN_OVER_SIGMA = 0.6745
+"""Roughness (`roughness`) from which a scan is smoothed: more noise flips faces. Available scans have 0.04 to 0.09."""
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A scan without its noise.
+    """A scan after smoothing, if it needed any.
 
     Attributes:
-        mesh: the same faces; the scan itself where it was smooth enough.
-        roughness: of the scan as it came. steps: of smoothing; 0: none was needed.
-        moved: root mean square of the vertices' way, metres.
+        mesh: the smoothed scan with the same faces, or the scan itself if it was smooth enough.
+        roughness: roughness before smoothing.
+        steps: number of smoothing steps; 0 if none was needed.
+        moved: root mean square of the vertices' displacements, metres.
     """
 
     mesh: TriangleMesh
@@ -38,35 +33,38 @@ class Smoothed:
 
 
 def roughness(mesh: TriangleMesh) -> float:
-    """How far vertices stand off their neighbours' smooth surface, as a share of the median edge.
+    """Return the noise of vertices along their normals, as a fraction of the median edge length.
 
-    A vertex's height is its way along the normal to the mean of its neighbours; what counts is the height less the mean
-    of the neighbours' heights, so that curvature, which neighbours share, does not. The median over the vertices,
-    scaled to a standard deviation: hair and folds, the smaller part of a person, do not disturb it.
+    A vertex's height h is its normal distance to the mean of its neighbours. With the mean W over neighbours the noise
+    is h - W h, in which curvature, which neighbours share, cancels. Its standard deviation is estimated from the median
+    of |h - W h|, which hair and folds, the smaller part of a person, do not disturb.
     """
     mean = _mean_of_neighbours(mesh)
     height = np.einsum("ij,ij->i", mean @ mesh.vertices - mesh.vertices, mesh.vertex_normals)
     i, j = mesh.edges.T
     edge = float(np.median(row_lengths(mesh.vertices[j] - mesh.vertices[i])))
-    return float(np.median(np.abs(height - mean @ height))) / _MEDIAN_OVER_SIGMA / edge
+    # The median of |x| is 0.6745 standard deviations of a normally distributed x.
+    return float(np.median(np.abs(height - mean @ height))) / 0.6745 / edge
 
 
 def smooth_if_rough(mesh: TriangleMesh, *, rough: float = ROUGH) -> Smoothed:
-    """Smooth a scan whose roughness is above `rough`; leave any other as it is.
+    """Smooth a scan whose roughness is above `rough`; return any other unchanged.
 
-    Taubin's filter with equal weights, which does not shrink, until the surface is as smooth as a good scan. Borders
-    are smoothed along themselves. Warns when it smooths.
+    Taubin's filter (SIGGRAPH 1995) with equal weights, which does not shrink the surface, is applied until the surface
+    is as smooth as a good scan. Borders are smoothed along themselves. A warning states the smoothing.
 
     Args:
         mesh: manifold, every vertex referenced (`sanitize`).
+        rough: roughness above which it is smoothed.
     """
     found = roughness(mesh)
     if found <= rough:
         return Smoothed(mesh, found, 0, 0.0)
     mean, smooth, steps = _mean_of_neighbours(mesh), mesh, 0
-    while steps < _MAX_STEPS and roughness(smooth) > _SMOOTH:
+    # Each step shrinks by 0.5 and inflates by 0.53 of the Laplacian; at most 40 steps, until the roughness is 0.05.
+    while steps < 40 and roughness(smooth) > 0.05:
         vertices = smooth.vertices
-        for weight in (_SHRINK, _GROW):
+        for weight in (0.5, -0.53):
             vertices = vertices + weight * (mean @ vertices - vertices)
         smooth, steps = mesh.with_vertices(vertices), steps + 1
     moved = float(np.sqrt(np.mean(np.sum((smooth.vertices - mesh.vertices) ** 2, axis=1))))
@@ -80,7 +78,7 @@ def smooth_if_rough(mesh: TriangleMesh, *, rough: float = ROUGH) -> Smoothed:
 
 
 def _mean_of_neighbours(mesh: TriangleMesh) -> csr_matrix:
-    """(N, N) rows that average a vertex's neighbours; those of a border vertex are its neighbours along the border."""
+    """Return (N, N) rows that average a vertex's neighbours; a border vertex has only neighbours along the border."""
     on_border = np.zeros(mesh.vertex_count, dtype=bool)
     on_border[mesh.border_edges] = True
     ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])

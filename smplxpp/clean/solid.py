@@ -1,4 +1,4 @@
-"""Body and clothes as one solid: sheets take a thickness, and the union of all is one closed surface (manifold3d)."""
+"""Unite body and clothes to one solid: sheets are given a thickness, and manifold3d computes the union of all."""
 
 from __future__ import annotations
 
@@ -12,39 +12,29 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from smplxpp.clean.slab import slab_behind
+from smplxpp.clean.thicken import slab_behind, thickened
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.solids import closed_mesh, mesh_of_solid, solid_of_mesh
-from smplxpp.core.topology import border_loops, component_labels, face_components
+from smplxpp.core.topology import component_labels, face_components
 from smplxpp.core.validation import require_at_least, require_positive
 
-# Rounds of smoothing of how deep the inner side lies: it changes by leaps where cloth leaves the body.
-_SMOOTHING = 20
-# A part that hangs free of the body is joined to it where it comes nearer than this many gaps.
-_WIDER = (1.0, 2.0, 4.0, 8.0)
-# Pieces that stay apart and are below this share of a part's cloth are crumbs and go.
-_CRUMB = 0.05
-# Edges shorter than this share of the size are nothing: 17 um on an adult, 2 um on a figure of 180 mm.
+# Edges shorter than this fraction of the size are collapsed: 17 um on an adult, 2 um on a figure of 180 mm.
 _SHORT = 1e-5
-# Cloth of at least so many cells, of at most so many along the body, is a level set; thinner cloth hardly cuts itself.
-_CELLS_THROUGH, _MOST_CELLS = 2.5, 900
-# Its steps of the grid are smoothed away within this share of a cell.
-_STEPS = 0.1
-# Rays that measure the walls.
-_RAYS = 4000
+# Separate pieces below this fraction of a part's volume are crumbs, which are removed.
+_CRUMB = 0.05
 
 
 @dataclass(frozen=True)
 class SolidConfig:
-    """Options of `solid_of_parts`; metres.
+    """Options of `solid_of_parts`, with lengths in metres.
 
     Attributes:
-        thickness: of the cloth; its outer side stays where it is.
-        gap: cloth nearer to the body than this is filled down to it.
-        cells: of thick cloth's grid along the body's largest side, at least.
-        seed: of the places where walls are measured.
+        thickness: thickness of the cloth; its outer side keeps its place.
+        gap: distance to the body below which cloth is filled down to it.
+        cells: least number of grid cells along the body's largest side, for thick cloth.
+        seed: seed of the points where walls are measured.
     """
 
     thickness: float = 0.002
@@ -60,18 +50,22 @@ class SolidConfig:
 
 @dataclass(frozen=True)
 class SolidReport:
-    """What a solid is, by measurement.
+    """Measurements of a solid.
 
     Attributes:
-        faces, vertices: of its surface.
-        components: pieces of it; 1, or an error was raised.
-        genus: handles of the surface, such as an arm akimbo or a strap.
-        volume_cm3, area_cm2: of the solid.
-        size_mm: along x, y and z.
-        wall_mm_p1, wall_mm_p5, wall_mm_median: percentiles, over the area, of the way inward to the next wall.
-        thin_share: share of the area where that way is shorter than nine tenths of the thickness asked for.
+        faces: number of faces of its surface.
+        vertices: number of vertices.
+        components: number of pieces; 1, otherwise an error was raised.
+        genus: number of handles of the surface, such as an arm akimbo or a strap.
+        volume_cm3: volume.
+        area_cm2: area of the surface.
+        size_mm: extents along x, y and z.
+        wall_mm_p1: first percentile of the wall thickness over the area (`wall_thickness`).
+        wall_mm_p5: fifth percentile.
+        wall_mm_median: median.
+        thin_share: share of the area where the wall is thinner than 90 % of `SolidConfig.thickness`.
         dropped_pieces: crumbs outside, shells inside, and hollows that were filled.
-        gap_mm: within which each part was filled down to the body, by name.
+        gap_mm: by part, the distance to the body below which it was filled.
     """
 
     faces: int
@@ -89,108 +83,75 @@ class SolidReport:
     gap_mm: dict[str, float]
 
     def as_dict(self) -> dict:
-        """Plain numbers, for JSON."""
+        """Return the measurements as plain numbers, for JSON."""
         return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One closed, manifold surface of one piece, metres, and what it measures."""
+    """A closed manifold surface of one piece, metres, with its measurements."""
 
     mesh: TriangleMesh
     report: SolidReport
 
 
-def thickened(
-    sheet: TriangleMesh,
-    *,
-    inward: float | Float[np.ndarray, " V"],
-    outward: float | Float[np.ndarray, " V"] = 0.0,
-) -> TriangleMesh:
-    """A closed mesh between a sheet moved outward and inward along its vertices' normals; its borders become rims.
-
-    In folds narrower than the thickness it cuts itself. Pieces that are closed already stay as they are.
-
-    Args:
-        sheet: manifold, every vertex used.
-        inward, outward: metres, for all vertices or each.
-    """
-    component = face_components(sheet.faces)
-    is_open = np.zeros(int(component.max()) + 1, dtype=bool)
-    of_vertex = np.zeros(sheet.vertex_count, dtype=np.int64)
-    of_vertex[sheet.faces] = component[:, None]
-    loops = border_loops(sheet.faces)
-    is_open[[of_vertex[loop[0]] for loop in loops]] = True
-    moved = is_open[of_vertex]
-    normals, count = np.where(moved[:, None], sheet.vertex_normals, 0.0), sheet.vertex_count
-    outer = sheet.vertices + normals * np.broadcast_to(outward, count)[:, None]
-    inner = sheet.vertices - normals * np.broadcast_to(inward, count)[:, None]
-    faces = [sheet.faces, sheet.faces[is_open[component]][:, ::-1] + count]
-    for loop in loops:
-        following = np.roll(loop, -1)
-        faces += [
-            np.stack([following, loop, loop + count], axis=1),
-            np.stack([following, loop + count, following + count], axis=1),
-        ]
-    whole = TriangleMesh(np.concatenate([outer, inner]), np.concatenate(faces))
-    return whole.submesh(np.ones(whole.face_count, dtype=bool))[0]
-
-
 def solid_of_parts(
     body: TriangleMesh, parts: Mapping[str, TriangleMesh], *, config: SolidConfig | None = None
 ) -> Solid:
-    """One closed surface of body and parts, as a printer takes it.
+    """Return one closed surface of body and parts, as a 3D printer needs it.
 
-    The body's openings are closed, each part becomes cloth of the thickness asked for, inward from where it is (thin
-    cloth by `thickened`, cloth thicker than a 360th of the body by `slab_behind`); where the body lies within the gap
-    below, the cloth is filled down to it. A part of which nothing touches the rest is filled from farther off, up to
-    eight gaps. Hollows without an opening are filled, crumbs go.
+    The body's openings are closed. Each part is thickened inward (thin cloth by `thickened`, cloth thicker than a 360th
+    of the body by `slab_behind`), and filled down to the body where that lies within the gap. A part that then does not
+    touch the rest is filled from farther away, up to eight gaps. Hollows without an opening are filled, crumbs are
+    removed.
 
     Args:
-        body: manifold, outward; metres.
-        parts: manifold sheets by name, outward.
+        body: manifold, oriented outward, metres.
+        parts: manifold sheets by name, oriented outward.
         config: options.
 
     Raises:
-        InputError: a body of several pieces, or parts that stay apart from it.
+        InputError: a body of several pieces, or parts that stay separate from it.
     """
     config = config or SolidConfig()
     pieces = [_body_solid(body)]
-    if len(_apart(pieces[0], least=_CRUMB * pieces[0].volume())) > 1:
+    if len(_separate_pieces(pieces[0], least=_CRUMB * pieces[0].volume())) > 1:
         raise InputError("body", expected="a body of one piece", received="pieces that do not touch")
+    # Add part after part; the gap is doubled until the union is one piece.
     gaps = {}
+    multiples = (1.0, 2.0, 4.0, 8.0)
     for name, part in parts.items():
-        for wider in _WIDER:
+        for wider in multiples:
             made = _cloth(part, body, config, wider * config.gap)
             union = manifold3d.Manifold.batch_boolean([*pieces, made], manifold3d.OpType.Add)
-            apart = len(_apart(union, least=_CRUMB * made.volume()))
+            apart = len(_separate_pieces(union, least=_CRUMB * made.volume()))
             if apart == 1:
                 break
         else:
             raise InputError(
                 f"part {name}",
-                expected=f"a part that comes within {_WIDER[-1] * config.gap * 1e3:g} mm of the body in each piece",
+                expected=f"a part that comes within {multiples[-1] * config.gap * 1e3:g} mm of the body in each piece",
                 received=f"{apart} pieces",
                 remedy="give a wider --gap-mm, or build again without the piece",
             )
         gaps[name] = wider * config.gap * 1e3
         pieces = [union]
     whole = pieces[0]
-    # Files of printers have single precision: edges shorter than it tells apart go.
+    # Files of printers have single precision: edges that it cannot resolve are collapsed.
     largest = _largest(_largest(whole).simplify(_SHORT * _size(whole)))
     others = len(whole.decompose()) - 1
     if others:
         warnings.warn(
             f"solid: {others} crumbs of the union and shells inside it are left out", GeometryWarning, stacklevel=2
         )
-    return Solid(touching_apart(mesh_of_solid(largest)), _measured(largest, config, others, gaps))
+    return Solid(separate_touching_vertices(mesh_of_solid(largest)), _measured(largest, config, others, gaps))
 
 
-def touching_apart(mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh with vertices that lie together drawn inward, each to its own side.
+def separate_touching_vertices(mesh: TriangleMesh) -> TriangleMesh:
+    """Move coincident vertices inward along their normals, so that no two share a position.
 
-    A solid may touch itself in a vertex or an edge; a file of triangles alone, as STL is, would join it there. Those
-    that look the same way stay together then, and are drawn to the middles of their own fans.
+    A solid may touch itself in a vertex or an edge; a file of unconnected triangles, as STL is, would join it there.
+    Vertices with equal normals still coincide then; they are moved to the centres of their one-rings.
     """
     size = _SHORT * float(np.ptp(mesh.vertices, axis=0).max())
     pairs = cKDTree(mesh.vertices).query_pairs(size, output_type="ndarray")
@@ -198,13 +159,13 @@ def touching_apart(mesh: TriangleMesh) -> TriangleMesh:
     vertices[moved] -= 2 * size * mesh.vertex_normals[moved]
     still = pairs[np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1) < size]
     for k in np.unique(still):
-        way = mesh.vertices[np.unique(mesh.faces[(mesh.faces == k).any(axis=1)])].mean(axis=0) - mesh.vertices[k]
-        vertices[k] += 2 * size * way / max(float(np.linalg.norm(way)), 1e-12)
+        inward = mesh.vertices[np.unique(mesh.faces[(mesh.faces == k).any(axis=1)])].mean(axis=0) - mesh.vertices[k]
+        vertices[k] += 2 * size * inward / max(float(np.linalg.norm(inward)), 1e-12)
     return mesh.with_vertices(vertices)
 
 
 def _body_solid(body: TriangleMesh) -> manifold3d.Manifold:
-    """The union of the body's pieces, openings closed; those that are inside out or enclose nothing are left out."""
+    """Return the union of the body's pieces with openings closed, without pieces that are inside out or empty."""
     component = face_components(body.faces)
     solids = []
     for k in range(int(component.max()) + 1):
@@ -215,35 +176,39 @@ def _body_solid(body: TriangleMesh) -> manifold3d.Manifold:
 
 
 def _cloth(part: TriangleMesh, body: TriangleMesh, config: SolidConfig, gap: float) -> manifold3d.Manifold:
-    """A part as cloth, filled down to the body where that is near."""
+    """Return a part as cloth with a thickness, filled down to the body where that is near."""
+    # Depth of the inner side: the thickness, or more where the body is near. It jumps where cloth leaves the body, so
+    # that 20 rounds of averaging smooth it; it never becomes less than it was.
     above = SignedDistanceField(body, solid=True).query(part.vertices).distance
     depth = np.where(above < gap, np.maximum(above, 0.0) + config.thickness, config.thickness)
     edges = part.edges
     both = np.concatenate([edges, edges[:, ::-1]])
     neighbours = np.maximum(np.bincount(both[:, 0], minlength=part.vertex_count), 1)
     smooth = depth
-    for _ in range(_SMOOTHING):
+    for _ in range(20):
         mean = np.bincount(both[:, 0], smooth[both[:, 1]], minlength=part.vertex_count) / neighbours
         smooth = np.maximum(0.5 * (smooth + mean), depth)
+    # Cloth of at least 2.5 cells, at 900 cells along the body at most, is a level set; thinner cloth hardly intersects
+    # itself. A part filled down over a wide gap is mostly within the body, where self-intersections do not show.
     size = float(np.ptp(body.vertices, axis=0).max())
-    cell = min(config.thickness / _CELLS_THROUGH, size / config.cells)
-    # A part filled down over a wide gap is mostly within the body: nobody sees that it cuts itself there.
-    thick = config.thickness / _CELLS_THROUGH >= size / _MOST_CELLS and np.ptp(smooth) <= 2 * config.thickness
+    cells_through, most_cells = 2.5, 900
+    cell = min(config.thickness / cells_through, size / config.cells)
+    thick = config.thickness / cells_through >= size / most_cells and np.ptp(smooth) <= 2 * config.thickness
     component, solids = face_components(part.faces), []
     for k in range(int(component.max()) + 1):
         sheet, source = part.submesh(component == k)
         if thick and len(sheet.border_edges):
             slab = solid_of_mesh(slab_behind(sheet, smooth[source], cell=cell), subject="cloth")
-            solids.append(slab.simplify(_STEPS * cell))
+            solids.append(slab.simplify(0.1 * cell))  # flattens the steps of the grid
         else:
             solids.append(solid_of_mesh(thickened(sheet, inward=smooth[source]), subject="cloth"))
     return manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
 
 
-def _apart(solid: manifold3d.Manifold, *, least: float) -> list[manifold3d.Manifold]:
-    """The pieces of at least a volume that lie outside the largest, which comes first.
+def _separate_pieces(solid: manifold3d.Manifold, *, least: float) -> list[manifold3d.Manifold]:
+    """Return the largest piece, and the pieces of at least the volume `least` that lie outside of it.
 
-    Cloth that cuts itself leaves shells inside the solid, which enclose what is full already.
+    Pieces inside are shells of cloth that intersects itself; the volume in them is filled already.
     """
     largest, *others = sorted(solid.decompose(), key=lambda piece: -piece.volume())
     large = [piece for piece in others if piece.volume() > least]
@@ -260,7 +225,7 @@ def _largest(solid: manifold3d.Manifold) -> manifold3d.Manifold:
 
 
 def _size(solid: manifold3d.Manifold) -> float:
-    """The longest side of the bounding box."""
+    """Return the longest side of the bounding box."""
     box = solid.bounding_box()
     return max(high - low for low, high in zip(box[:3], box[3:], strict=True))
 
@@ -290,22 +255,26 @@ def _measured(solid: manifold3d.Manifold, config: SolidConfig, dropped: int, gap
 def wall_thickness(
     mesh: TriangleMesh, *, solid: manifold3d.Manifold | None = None, seed: int = 0
 ) -> Float[np.ndarray, " n"]:
-    """The way from places on a closed surface, drawn by area, straight inward to the outside; metres.
+    """Return the wall thickness at 4,000 random points of a closed surface, metres.
 
-    Walls within the solid, where it cuts itself, do not count: a slicer does not see them.
+    It is the distance along the inward normal until the ray leaves the solid. Walls inside the solid, where it
+    intersects itself, do not count, because a slicer does not see them.
     """
     solid = solid_of_mesh(mesh) if solid is None else solid
+    rays = 4000
     rng = np.random.default_rng(seed)
-    face = rng.choice(mesh.face_count, _RAYS, p=mesh.face_areas / mesh.face_areas.sum())
-    weights = rng.dirichlet((1.0, 1.0, 1.0), _RAYS)
+    face = rng.choice(mesh.face_count, rays, p=mesh.face_areas / mesh.face_areas.sum())
+    weights = rng.dirichlet((1.0, 1.0, 1.0), rays)
     points = np.einsum("nk,nkd->nd", weights, mesh.triangles[face])
+    # A ray starts slightly below its surface point, in order not to hit the surface there.
     reach = mesh.bbox_diagonal
-    begin = 1e-7 * reach  # off the surface
+    begin = 1e-7 * reach
     starts = points - begin * mesh.face_normals[face]
     ends = points - reach * mesh.face_normals[face]
-    out = np.zeros(_RAYS)
+    # Count the surfaces that the ray is within; at 0 it has left the solid.
+    out = np.zeros(rays)
     for k, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        depth = 1  # surfaces that the ray is within
+        depth = 1
         for hit in solid.ray_cast(start, end):
             depth += -1 if np.dot(hit.normal, end - start) > 0 else 1
             if depth == 0:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.clean.point_normals import estimate_normals, point_spacing
+from smplxpp.clean.poisson import estimate_normals, point_spacing
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec

@@ -71,7 +71,7 @@ def test_damaged_repeated_and_stray_points_are_left_out_and_vertices_keep_their_
     samples = sample_surface(ball(), 8000, seed=0)
     points = np.concatenate([[[np.nan, 0, 0], [3.0, 0, 0], [3.0, 0, 0.001]], samples.points, samples.points[:100]])
     surface = quiet(points)
-    assert "103 points left out" in surface.said
+    assert "103 points left out" in surface.note
     assert np.abs(surface.mesh.vertices).max() < 0.6
     distance = np.linalg.norm(points[surface.source_point] - surface.mesh.vertices, axis=1)
     assert distance.max() < 0.05 and (surface.source_point > 2).all()

@@ -7,8 +7,7 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import standing_poses
-from smplxpp.clean.scan_frame import find_scan_frame
-from smplxpp.clean.units import METRES_PER_UNIT, convert_points
+from smplxpp.clean.scan_frame import METRES_PER_UNIT, convert_points, find_scan_frame
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -33,15 +32,15 @@ def test_units_and_axis_are_found_back(person, units, up):
     filed = person.vertices @ axes.T / METRES_PER_UNIT[units]
     assert np.allclose(convert_points(filed, units=units, up=up), person.vertices)
     found = find_scan_frame(filed, person.faces)
-    assert (found.units, found.up, found.sure) == (units, up, True)
-    assert units in found.said
-    assert up in found.said
+    assert (found.units, found.up, found.unambiguous) == (units, up, True)
+    assert units in found.note
+    assert up in found.note
 
 
 def test_what_is_stated_is_kept(person):
     found = find_scan_frame(person.vertices, person.faces, units="cm", up="-z")
     assert (found.units, found.up) == ("cm", "-z")
-    assert "stated units cm" in found.said
+    assert "stated units cm" in found.note
 
 
 def test_stray_points_and_faces_that_point_inward_change_nothing(person):

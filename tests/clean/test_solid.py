@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.clean.slab import slab_behind
-from smplxpp.clean.solid import SolidConfig, solid_of_parts, thickened, touching_apart, wall_thickness
+from smplxpp.clean.solid import SolidConfig, separate_touching_vertices, solid_of_parts, thickened, wall_thickness
+from smplxpp.clean.thicken import slab_behind
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.solids import closed_mesh, mesh_of_solid, solid_of_mesh
@@ -127,7 +127,7 @@ def test_vertices_in_one_place_part_even_where_they_look_the_same_way():
     corner = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 1]])
     flat = TriangleMesh(np.concatenate([corner, -corner]), np.array([[0, 1, 2], [3, 4, 5]]))
     np.testing.assert_allclose(flat.vertex_normals[0], flat.vertex_normals[3])
-    apart = touching_apart(flat)
+    apart = separate_touching_vertices(flat)
     between = np.linalg.norm(apart.vertices[0] - apart.vertices[3])
     assert 1e-5 < between < 1e-4 and len(np.unique(apart.vertices.astype(np.float32), axis=0)) == 6
     np.testing.assert_array_equal(apart.vertices[[1, 2, 4, 5]], flat.vertices[[1, 2, 4, 5]])

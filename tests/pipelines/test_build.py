@@ -21,10 +21,10 @@ from pipelines.runs.layout import TEMPLATE_STAGES
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
-from smplxpp.assemble import DarnConfig
+from smplxpp.assemble import FillHolesConfig
 from smplxpp.body import load_params
 from smplxpp.body.named_poses import stress_poses
-from smplxpp.clean import WebConfig, simplify
+from smplxpp.clean import BridgeConfig, simplify
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.labels import CLOTH_LABELS, HAIR
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh
@@ -170,22 +170,26 @@ def test_corrections_of_another_run_are_copied(small, capsys):
     assert b"hair" in (run / "labels_corrections.json").read_bytes()
 
 
-def test_webs_stay_where_the_user_wants_them(small):
-    kept = small.build("run", small.inputs(), last="40_transfer", webs=WebConfig(rounds=0))
+def test_bridges_stay_where_the_user_wants_them(small):
+    kept = small.build("run", small.inputs(), last="40_transfer", bridges=BridgeConfig(rounds=0))
     cut = small.build("run", small.inputs(), last="40_transfer")
     assert kept["40_transfer"].ran and cut["40_transfer"].ran and not cut["30_clean"].ran
     faces = [record["40_transfer"].manifest["numbers"]["upper"]["web_faces"] for record in (kept, cut)]
     assert faces[0] == 0 < faces[1]
-    assert load_build(small.folder / "run")[1].webs == WebConfig()
-    assert Build(run_folder=small.folder, keep_webs=True).config().webs.rounds == 0
+    assert load_build(small.folder / "run")[1].bridges == BridgeConfig()
+    # Builds of earlier versions are read by the names that they have written.
+    file = small.folder / "run" / "build.json"
+    file.write_text(file.read_text().replace('"bridges"', '"webs"').replace('"fill_holes"', '"darning"'))
+    assert '"webs"' in file.read_text() and load_build(small.folder / "run")[1].bridges == BridgeConfig()
+    assert Build(run_folder=small.folder, keep_bridges=True).config().bridges.rounds == 0
 
 
 def test_holes_stay_where_the_user_wants_them(small):
-    record = small.build("run", small.inputs(), last="60_assemble", darning=DarnConfig(width=0.0))["60_assemble"]
+    record = small.build("run", small.inputs(), last="60_assemble", fill_holes=FillHolesConfig(width=0.0))["60_assemble"]
     numbers = record.manifest["numbers"]["darned"]["upper"]
     assert numbers["holes"] > 0 == numbers["closed"]
-    assert load_build(small.folder / "run")[1].darning == DarnConfig(width=0.0)
-    assert Build(run_folder=small.folder, keep_holes=True).config().darning == DarnConfig(width=0.0)
+    assert load_build(small.folder / "run")[1].fill_holes == FillHolesConfig(width=0.0)
+    assert Build(run_folder=small.folder, keep_holes=True).config().fill_holes == FillHolesConfig(width=0.0)
 
 
 def test_metrics_json_and_manifests_state_what_was_done(person_run):

@@ -163,15 +163,15 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
         title="Skin weights",
         text=(
             "Weights of the body reach into the space around it; cloth takes them where it lies close and faces alike, "
-            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches. Webs, where the "
-            "scan bridges two limbs, are cut.",
+            "and a smooth blend where it hangs free. Orange: cloth that no point of the body matches. Bridges "
+            "between limbs are cut.",
         ),
         pictures=(
             Picture("joints mixed by weight", _sheet(mesh, cameras, vertex_colors=colors)),
             Picture("matched (green) and free (orange)", _sheet(mesh, cameras, vertex_colors=tint)),
         ),
         tables=(
-            Table(("part", "matched share", "pieces", "policies", "web faces cut", "of its area, %"), rows, "transfer"),
+            Table(("part", "matched share", "pieces", "policies", "bridge faces", "of its area, %"), rows, "transfer"),
         ),
         checks=checks,
     )
@@ -179,7 +179,7 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
 
 def template_section(record: StageRecord, template: Template, checks: tuple[CheckRow, ...]) -> Section:
     """Show the template in the T-pose."""
-    # Runs from before there was any darning have none.
+    # Runs of earlier versions did not fill holes.
     darned = record.manifest["numbers"].get("darned", {})
     rows = tuple((name, one["holes"], one["closed"], 1e4 * one["area"]) for name, one in darned.items() if one["holes"])
     cameras = body_cameras(template.mesh, views=("front", "back"), height=POSE_HEIGHT)
@@ -187,7 +187,7 @@ def template_section(record: StageRecord, template: Template, checks: tuple[Chec
         title="Template in the T-pose",
         text=(
             "The parts taken back by the inverse of the skinning that drives them, on the naked body, layers apart. "
-            "Holes that the cut of webs has left are closed by the least surface over them: nobody saw that cloth.",
+            "Holes of cut bridges are closed by the surface of least area over them, as the scan lacks that cloth.",
         ),
         pictures=(
             Picture("colours of the scan", _sheet(template.mesh, cameras, vertex_colors=template.vertex_colors)),

@@ -1,4 +1,4 @@
-"""The template of the embedded person: holes of cut webs are closed, and counted where a user looks."""
+"""The template of the embedded person: holes of cut bridges are closed, and counted where a user looks."""
 
 from __future__ import annotations
 

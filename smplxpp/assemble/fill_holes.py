@@ -1,4 +1,4 @@
-"""Darning: what was cut out of a part because it bridged two limbs is closed again where the T-pose has room for it."""
+"""Fill the holes that cut bridges (`smplxpp.clean.bridges`) left in a part, in the T-pose, where sides are apart."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)
-class DarnConfig:
-    """Which holes are closed.
+class FillHolesConfig:
+    """Options of filling holes with `fill_holes`.
 
     Attributes:
-        width: metres; a patch whose mean width, twice its area by its border's length, is more stays open: between a
-            long sleeve and the side it would be a sail. 0 closes nothing.
+        width: largest mean width of a patch, metres: twice its area divided by its perimeter. A wider one, such as a
+            sail between a long sleeve and the side, is not made. 0 fills nothing.
     """
 
     width: float = 0.08
 
     def __post_init__(self) -> None:
-        require_at_least("darning: width", self.width, 0.0)
+        require_at_least("fill_holes: width", self.width, 0.0)
 
 
 @dataclass(frozen=True)
-class Darning:
-    """What was closed in one part.
+class FilledHoles:
+    """Counts of the holes that were filled in one part.
 
     Attributes:
-        holes: that cuts left. closed: of these. faces: added. area: of these, square metres.
+        holes: number of holes that cuts left.
+        closed: number of these that were filled.
+        faces: number of added faces.
+        area: area of the added faces, square metres.
     """
 
     holes: int = 0
@@ -46,7 +49,7 @@ class Darning:
     area: float = 0.0
 
     def as_dict(self) -> dict[str, float]:
-        """Plain numbers, for JSON."""
+        """Return the counts as plain numbers, for JSON."""
         return asdict(self)
 
 
@@ -56,28 +59,33 @@ def cut_holes(
     after: TriangleMesh,
     after_index: Int[np.ndarray, " M"],
 ) -> list[Int[np.ndarray, " _"]]:
-    """The border loops of `after` without a vertex that lay on a border of `before`.
+    """Return the border loops of `after` without a vertex that lay on a border of `before`.
 
     Loops that a cut has joined with an opening (a cuff, a hem) are openings.
 
     Args:
-        before_index, after_index: the scan's vertex of each, which tells which are the same.
+        before: the part before the cut.
+        before_index: the scan's vertex of each of its vertices.
+        after: the part after the cut.
+        after_index: the scan's vertex of each of its vertices, which identifies vertices of both.
     """
     openings = border_loops(before.faces)
     at_openings = before_index[np.concatenate(openings)] if openings else np.zeros(0, dtype=np.int64)
     return [loop for loop in border_loops(after.faces) if not np.isin(after_index[loop], at_openings).any()]
 
 
-def darn(
-    part: CanonicalPart, holes: list[Int[np.ndarray, " _"]], *, config: DarnConfig | None = None
-) -> tuple[CanonicalPart, Darning]:
-    """Close holes of a part in the T-pose, where the sides of a cut have drawn apart.
+def fill_holes(
+    part: CanonicalPart, holes: list[Int[np.ndarray, " _"]], *, config: FillHolesConfig | None = None
+) -> tuple[CanonicalPart, FilledHoles]:
+    """Fill holes of a part in the T-pose, where the sides of a cut have moved apart.
 
-    Nobody saw that cloth: a patch is the least surface over its border (`smplxpp.assemble.patch`), weights and colours
-    are harmonic between those of the border. Vertices and faces of the part keep their numbers, new ones follow, with
-    -1 for the scan's vertex. Borders that cannot be closed (`patch_loop`) stay open.
+    The scan does not show that cloth. A patch is therefore the surface of least area over its border
+    (`smplxpp.assemble.patch`); its weights and colours are harmonic functions of the border's. Vertices and faces of
+    the part keep their indices; new ones follow, with -1 for the scan's vertex. Borders that `patch_loop` cannot close
+    stay
+    open.
     """
-    config = config or DarnConfig()
+    config = config or FillHolesConfig()
     patches = []
     for loop in holes:
         with suppress(InputError):
@@ -85,13 +93,14 @@ def darn(
             if patch.width(part.mesh.vertices[loop]) <= config.width:
                 patches.append((loop, patch))
     area = sum(patch.area(part.mesh.vertices[loop]) for loop, patch in patches)
-    said = Darning(len(holes), len(patches), sum(len(patch.faces) for _, patch in patches), area)
+    report = FilledHoles(len(holes), len(patches), sum(len(patch.faces) for _, patch in patches), area)
     for loop, patch in patches:
         part = _with_patch(part, loop, patch)
-    return part, said
+    return part, report
 
 
 def _with_patch(part: CanonicalPart, loop: Int[np.ndarray, " L"], patch: Patch) -> CanonicalPart:
+    # The patch's vertices are the loop's, then new ones, whose attributes are linear in the loop's.
     count, new = part.mesh.vertex_count, len(patch.from_rim)
     at = np.concatenate([loop, np.arange(count, count + new)])
     colors = patch.from_rim @ part.vertex_colors[loop]
@@ -110,7 +119,7 @@ def _with_patch(part: CanonicalPart, loop: Int[np.ndarray, " L"], patch: Patch) 
 
 
 def _with_rows(weights: SkinWeights, rows: np.ndarray, component: int) -> SkinWeights:
-    """Skin weights with as many influences, and rows behind those that are there."""
+    """Append rows to skin weights, with as many influences as before."""
     count = len(rows)
     if not count:
         return weights

@@ -1,4 +1,4 @@
-"""Webs: faces of a part that stand for no cloth, because the scan has no depth in a narrow gap.
+"""Find and cut bridges: faces of a part that stand for no cloth, because the scan has no depth in a narrow gap.
 
 A scan is one outer surface. Where a sleeve touches the side under an arm, no camera sees the gap, and the surface runs
 straight from one to the other. Skin weights that are smoothed along the surface then mix arm and side far into both,
@@ -19,28 +19,22 @@ from smplxpp.core.mesh import TriangleMesh, row_lengths
 from smplxpp.core.topology import manifold_corners
 from smplxpp.core.validation import require_at_least
 
-REACH = 2.0
-"""How wide the sides of a fold are, in distances from the body."""
-
-_WIDENINGS = 4
-"""Rings by which a cut is widened at most where it touches itself; sides part as two vertices after that."""
-
 
 @dataclass(frozen=True)
-class WebConfig:
-    """When an edge of a part is taken for a bridge; all must hold, so that cloth that only hangs over a gap stays.
+class BridgeConfig:
+    """Thresholds of `find_bridges`; all must hold, so that cloth that only hangs over a gap stays.
 
-    That the body's two surfaces face each other in the scan's pose is not a matter of degree and has no option.
+    That the body's two surfaces face each other in the scan's pose is a condition without a threshold.
 
     Attributes:
-        valley: the part itself faces itself across the edge, as the bottom of a fold does: how far the normals of its
-            two sides lean towards each other, 0 where cloth runs straight across and 1 where its sides touch.
-        jump: the points of the body that are nearest to the edge's ends lie, at rest, at least this many times the
-            edge's length apart. Along cloth that follows the body the two are about the same.
-        stretch: unposing makes the edge at least this many times as long. Loose cloth, whose weights change slowly,
-            stretches less, however far apart the limbs under it are.
-        speck_area: pieces that the cut leaves with less than this fraction of the part's area go with it.
-        rounds: cuts at most; after each the weights are found anew without what was cut.
+        valley: how far the normals of the edge's two sides lean towards each other, as at the bottom of a fold: 0 where
+            cloth runs straight across, 1 where its sides touch.
+        jump: distance in the rest pose between the body points nearest to the edge's ends, as a multiple of the edge's
+            length. It is about 1 along cloth that follows the body.
+        stretch: factor of the edge's length in the T-pose. Loose cloth, whose weights change slowly, stretches less,
+            however far apart the limbs under it are.
+        speck_area: area fraction of the part below which pieces that the cut leaves are removed, too.
+        rounds: largest number of cuts; after each the weights are computed again without the cut faces. 0 cuts nothing.
     """
 
     valley: float = 0.1
@@ -51,53 +45,63 @@ class WebConfig:
 
     def __post_init__(self) -> None:
         for name, least in (("valley", 0.0), ("jump", 1.0), ("stretch", 1.0), ("speck_area", 0.0), ("rounds", 0)):
-            require_at_least(f"webs: {name}", getattr(self, name), least)
+            require_at_least(f"bridges: {name}", getattr(self, name), least)
 
 
-def find_webs(
+def find_bridges(
     posed: TriangleMesh,
     rest: TriangleMesh,
     body: TriangleMesh,
     body_rest: TriangleMesh,
     *,
-    config: WebConfig | None = None,
+    config: BridgeConfig | None = None,
 ) -> Bool[np.ndarray, " M"]:
-    """Find the faces of a part with an edge that bridges two surfaces of the body; see `WebConfig`.
+    """Find the faces of a part with an edge that bridges two surfaces of the body; see `BridgeConfig`.
 
     Args:
-        posed: the part as scanned. rest: unposed.
-        body: in the pose of the scan. body_rest: in the T-pose. All in metres.
+        posed: the part as scanned, metres.
+        rest: the part in the T-pose.
+        body: the body in the pose of the scan.
+        body_rest: the body in the T-pose.
+        config: thresholds.
     """
-    config = config or WebConfig()
+    config = config or BridgeConfig()
+    # For each edge: its lengths posed and in the T-pose, and the distance at rest of the body points nearest to its
+    # ends.
     ends = posed.edges
-    foot, place, normal = _feet(posed.vertices, body, body_rest)
+    nearest, place, normal = _nearest_on_body(posed.vertices, body, body_rest)
     length, at_rest, apart = (
         row_lengths(points[ends[:, 1]] - points[ends[:, 0]]) for points in (posed.vertices, rest.vertices, place)
     )
-    across = foot[ends[:, 1]] - foot[ends[:, 0]]
+    # The body's surfaces face each other if each normal points towards the other surface.
+    across = nearest[ends[:, 1]] - nearest[ends[:, 0]]
     facing = (np.einsum("ij,ij->i", across, normal[ends[:, 0]]) > 0) & (
         np.einsum("ij,ij->i", across, normal[ends[:, 1]]) < 0
     )
     bridge = np.flatnonzero(facing & (apart > config.jump * length) & (at_rest > config.stretch * length))
-    away = row_lengths(posed.vertices - foot)[ends].mean(axis=1)
-    reach = np.maximum(REACH * away, REACH * length)
-    bridge = bridge[_valleys(posed, ends[bridge], across[bridge], reach[bridge]) > config.valley]
+    # The sides of a fold are two distances from the body wide, and at least two edges.
+    away = row_lengths(posed.vertices - nearest)[ends].mean(axis=1)
+    reach = np.maximum(2.0 * away, 2.0 * length)
+    bridge = bridge[_fold_depth(posed, ends[bridge], across[bridge], reach[bridge]) > config.valley]
     return _faces_with(posed.faces, ends[bridge], posed.vertex_count)
 
 
-def cut_webs(
-    part: TriangleMesh, web: Bool[np.ndarray, " M"], *, config: WebConfig | None = None
+def cut_bridges(
+    part: TriangleMesh, bridge: Bool[np.ndarray, " M"], *, config: BridgeConfig | None = None
 ) -> tuple[TriangleMesh, Int[np.ndarray, " N"]]:
-    """Leave out faces and the specks that this leaves; the borders are openings like a hem.
+    """Remove the faces of bridges, and the specks that this leaves; the new borders are openings like a hem.
 
-    Where cuts meet in a vertex, the smaller of its sides goes too: as two vertices at one place of the scan they would
-    leave a border that touches itself, and what closes it (`smplxpp.assemble.darn`) would have faces without area.
+    Where cuts meet in a vertex, the smaller of its sides is removed, too. Otherwise the vertex would be doubled at one
+    place of the scan, the border would touch itself, and the patch that closes it (`smplxpp.assemble.fill_holes`) would
+    have faces without area.
 
-    Returns the rest, manifold, and for each of its vertices the vertex of `part` that it is.
+    Returns:
+        The rest, manifold, and for each of its vertices the vertex of `part` that it is.
     """
-    config = config or WebConfig()
-    left, source = part.submesh(~web)
-    for _ in range(_WIDENINGS):
+    config = config or BridgeConfig()
+    left, source = part.submesh(~bridge)
+    # Widen the cut ring by ring where it touches itself. After four rings the sides part as two vertices.
+    for _ in range(4):
         faces, of_kept = manifold_corners(left.faces)
         narrow = _smaller_sides(faces, of_kept)
         if not narrow.any():
@@ -110,7 +114,12 @@ def cut_webs(
 
 
 def _smaller_sides(faces: Int[np.ndarray, "M 3"], old: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " M"]:
-    """Faces about every old vertex that has become several, but those about the one of them with the most faces."""
+    """Return the faces around all copies of a doubled vertex but the copy with the most faces.
+
+    Args:
+        faces: faces after vertices were doubled (`manifold_corners`).
+        old: the old vertex of each vertex.
+    """
     count = np.bincount(faces.ravel(), minlength=len(old))
     by_size = np.lexsort((np.arange(len(old)), -count, old))
     smaller = np.zeros(len(old), dtype=bool)
@@ -118,16 +127,21 @@ def _smaller_sides(faces: Int[np.ndarray, "M 3"], old: Int[np.ndarray, " N"]) ->
     return np.asarray(smaller[faces].any(axis=1))
 
 
-def _valleys(
+def _fold_depth(
     part: TriangleMesh,
     edges: Int[np.ndarray, "E 2"],
     across: Float[np.ndarray, "E 3"],
     reach: Float[np.ndarray, " E"],
 ) -> Float[np.ndarray, " E"]:
-    """How far the part's normals on both sides of an edge lean towards each other, in [-1, 1]; below 0 on a ridge.
+    """Return how far the normals on both sides of an edge lean towards each other, in [-1, 1]; below 0 on a ridge.
+
+    With the mean normals n1, n2 of the two sides and the unit direction d across the edge it is (n1 - n2) d / 2.
 
     Args:
-        across: directions from one side to the other. reach: distance up to which faces count as a side's, metres.
+        part: the part.
+        edges: vertices of the edges.
+        across: directions from one side to the other.
+        reach: distance up to which faces belong to a side, metres.
     """
     tree = cKDTree(part.face_centers)
     out = np.zeros(len(edges))
@@ -142,10 +156,10 @@ def _valleys(
     return out
 
 
-def _feet(
+def _nearest_on_body(
     points: Float[np.ndarray, "N 3"], body: TriangleMesh, body_rest: TriangleMesh
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
-    """The nearest point of the body, where it is at rest, and the body's normal there in the pose."""
+    """Return the nearest point of the body, its place in the rest pose, and the body's normal there in the pose."""
     _, face, nearest = igl.point_mesh_squared_distance(points, body.vertices, body.faces)
     corners = body.triangles[face]
     weights = igl.barycentric_coordinates(nearest, *(np.ascontiguousarray(corners[:, k]) for k in range(3)))
@@ -153,7 +167,7 @@ def _feet(
 
 
 def _faces_with(faces: Int[np.ndarray, "M 3"], edges: Int[np.ndarray, "E 2"], count: int) -> Bool[np.ndarray, " M"]:
-    """Whether a face has one of the edges; `count` vertices there are."""
+    """Return whether each face has one of the edges; `count` is the number of vertices."""
 
     def keys(pairs: np.ndarray) -> np.ndarray:
         return pairs.min(axis=-1) * count + pairs.max(axis=-1)

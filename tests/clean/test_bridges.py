@@ -1,11 +1,11 @@
-"""Webs of a scan: bridges between facing limbs are cut, real cloth over gaps, on shoulders and in folds is not."""
+"""Bridges of a scan between facing limbs are cut, real cloth over gaps, on shoulders and in folds is not."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from smplxpp.clean import WebConfig, cut_webs, find_webs
+from smplxpp.clean import BridgeConfig, cut_bridges, find_bridges
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups
@@ -85,12 +85,12 @@ def torn(cloth: TriangleMesh, width: float = 0.0) -> TriangleMesh:
 
 def test_the_bridge_between_two_limbs_is_found_and_nothing_else(body):
     cloth = inside_the_gap()
-    web = find_webs(cloth, torn(cloth), *body)
+    bridge = find_bridges(cloth, torn(cloth), *body)
     x = cloth.triangles[:, :, 0]
     over_the_middle = (x.min(axis=1) < TRUNK + GAP / 2) & (x.max(axis=1) > TRUNK + GAP / 2)
-    assert web.any() and not (web & ~over_the_middle).any()
+    assert bridge.any() and not (bridge & ~over_the_middle).any()
     # From the lower end to the upper one: what is cut is two pieces afterwards.
-    rows = np.unique(cloth.face_centers[web, 1].round(2))
+    rows = np.unique(cloth.face_centers[bridge, 1].round(2))
     np.testing.assert_allclose(rows[[0, -1]], [0.1, 0.3], atol=0.011)
 
 
@@ -101,30 +101,30 @@ def test_units_and_place_do_not_matter(body):
     def moved(mesh: TriangleMesh) -> TriangleMesh:
         return mesh.with_vertices(100.0 * mesh.vertices @ turn.T + np.array([3.0, 5.0, -7.0]))
 
-    expected = find_webs(cloth, torn(cloth), *body)
-    found = find_webs(moved(cloth), moved(torn(cloth)), *map(moved, body))
+    expected = find_bridges(cloth, torn(cloth), *body)
+    found = find_bridges(moved(cloth), moved(torn(cloth)), *map(moved, body))
     np.testing.assert_array_equal(found, expected)
 
 
 def test_cloth_that_is_not_torn_stays(body):
     cloth = inside_the_gap()
-    assert not find_webs(cloth, cloth, *body).any()
+    assert not find_bridges(cloth, cloth, *body).any()
 
 
 def test_loose_cloth_between_two_limbs_stays(body):
     """A skirt or a wide sleeve: it hangs from trunk to arm in front of both, and its weights change slowly."""
     x = np.linspace(0.0, AXIS, 80)
     front = sheet(np.stack([x, np.full(80, TRUNK + 0.01)], axis=1))
-    assert not find_webs(front, torn(front, width=AXIS), *body).any()
-    # Not even where the weights jump: it is flat, while a web is the bottom of a fold.
-    assert not find_webs(front, torn(front), *body).any()
+    assert not find_bridges(front, torn(front, width=AXIS), *body).any()
+    # Not even where the weights jump: it is flat, while a bridge is the bottom of a fold.
+    assert not find_bridges(front, torn(front), *body).any()
 
 
 def test_a_cape_over_the_shoulder_stays(body):
     """It goes round trunk and arm from outside."""
     angle = np.linspace(1.5, -1.5, 120)
     cape = sheet(np.stack([0.05 + 0.3 * np.cos(angle), 0.2 * np.sin(angle)], axis=1))
-    assert not find_webs(cape, torn(cape), *body).any()
+    assert not find_bridges(cape, torn(cape), *body).any()
 
 
 def test_cloth_that_follows_one_limb_through_the_gap_stays(body):
@@ -133,14 +133,14 @@ def test_cloth_that_follows_one_limb_through_the_gap_stays(body):
     trunk = np.linspace(1.2, -1.2, 160)
     along = (TRUNK + off) * np.stack([np.cos(trunk), np.sin(trunk)], axis=1)
     cloth = sheet(along)
-    assert not find_webs(cloth, torn(cloth, width=1.0), *body).any()
+    assert not find_bridges(cloth, torn(cloth, width=1.0), *body).any()
 
 
 def test_a_cut_leaves_manifold_openings_and_names_its_vertices(body):
     cloth = inside_the_gap()
-    web = find_webs(cloth, torn(cloth), *body)
-    left, source = cut_webs(cloth, web)
-    assert left.face_count == int((~web).sum())
+    bridge = find_bridges(cloth, torn(cloth), *body)
+    left, source = cut_bridges(cloth, bridge)
+    assert left.face_count == int((~bridge).sum())
     np.testing.assert_array_equal(left.vertices, cloth.vertices[source])
     assert edge_groups(left.faces)[2].max() == 2
     assert len(border_loops(cloth.faces)) == 1 and len(border_loops(left.faces)) == 2
@@ -154,12 +154,12 @@ def test_cuts_that_meet_in_a_vertex_are_one(mirrored):
     low, high = y.min(), y.max()
     middle = 0.01 * round(50 * (low + high))
     y = low + high - y if mirrored else y
-    web = np.zeros(plane.face_count, dtype=bool)
+    bridge = np.zeros(plane.face_count, dtype=bool)
     for left_x, top in ((0.15, middle), (0.20, middle + 0.05)):
-        web |= (x > left_x) & (x < left_x + 0.05) & (y > top - 0.05) & (y < top)
-    left, source = cut_webs(plane, web)
+        bridge |= (x > left_x) & (x < left_x + 0.05) & (y > top - 0.05) & (y < top)
+    left, source = cut_bridges(plane, bridge)
     assert len(np.unique(source)) == len(source)
-    assert 0 < (~web).sum() - left.face_count <= 5
+    assert 0 < (~bridge).sum() - left.face_count <= 5
     assert len(border_loops(plane.faces)) == 1 and len(border_loops(left.faces)) == 2
     np.testing.assert_array_equal(left.vertices, plane.vertices[source])
 
@@ -168,11 +168,11 @@ def test_specks_that_a_cut_leaves_go_with_it():
     plane = sheet(np.stack([np.linspace(0, 0.4, 41), np.zeros(41)], axis=1))
     ring = np.abs(np.linalg.norm(plane.face_centers - [0.2, 0.2, 0.0], axis=1) - 0.03) < 0.012
     assert len(border_loops(plane.submesh(~ring)[0].faces)) == 3
-    left, _ = cut_webs(plane, ring, config=WebConfig(speck_area=0.05))
+    left, _ = cut_bridges(plane, ring, config=BridgeConfig(speck_area=0.05))
     assert len(border_loops(left.faces)) == 2
 
 
 @pytest.mark.parametrize("change", [{"jump": 0.5}, {"stretch": 0.0}, {"speck_area": -1.0}, {"rounds": -1}])
 def test_settings_without_meaning_are_refused(change):
-    with pytest.raises(InputError, match=f"webs: {next(iter(change))}"):
-        WebConfig(**change)
+    with pytest.raises(InputError, match=f"bridges: {next(iter(change))}"):
+        BridgeConfig(**change)

@@ -1,4 +1,4 @@
-"""Darning: holes of a cut are closed in the T-pose with harmonic weights and colours; openings and sails are not."""
+"""Holes of a cut are filled in the T-pose with harmonic weights and colours; openings and sails are not."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.assemble import CanonicalPart, DarnConfig, cut_holes, darn
+from smplxpp.assemble import CanonicalPart, FillHolesConfig, cut_holes, fill_holes
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import UPPER
 from smplxpp.core.mesh import TriangleMesh
@@ -55,37 +55,37 @@ def holes_of(part: CanonicalPart, before: CanonicalPart) -> list[np.ndarray]:
 def test_a_hole_is_closed_and_what_was_there_keeps_its_numbers(tube):
     part = without(tube, ((8, 13), (3, 8)))
     holes = holes_of(part, tube)
-    darned, said = darn(part, holes)
+    filled, report = fill_holes(part, holes)
     count = part.mesh.vertex_count
-    assert said.holes == said.closed == 1 and said.faces == darned.mesh.face_count - part.mesh.face_count
-    assert said.area == pytest.approx(25 * CELL**2, rel=0.2)
-    assert len(border_loops(part.mesh.faces)) == 3 and len(border_loops(darned.mesh.faces)) == 2
-    np.testing.assert_array_equal(darned.mesh.vertices[:count], part.mesh.vertices)
-    np.testing.assert_array_equal(darned.mesh.faces[: part.mesh.face_count], part.mesh.faces)
-    assert (darned.scan_index[count:] == -1).all() and (darned.scan_index[:count] == part.scan_index).all()
+    assert report.holes == report.closed == 1 and report.faces == filled.mesh.face_count - part.mesh.face_count
+    assert report.area == pytest.approx(25 * CELL**2, rel=0.2)
+    assert len(border_loops(part.mesh.faces)) == 3 and len(border_loops(filled.mesh.faces)) == 2
+    np.testing.assert_array_equal(filled.mesh.vertices[:count], part.mesh.vertices)
+    np.testing.assert_array_equal(filled.mesh.faces[: part.mesh.face_count], part.mesh.faces)
+    assert (filled.scan_index[count:] == -1).all() and (filled.scan_index[:count] == part.scan_index).all()
     # Weights and colours are linear along the tube; so are harmonic ones between them.
-    height = darned.mesh.vertices[count:, 1] / (CELL * (ROWS - 1))
-    np.testing.assert_allclose(darned.weights.dense()[count:, 0], height, atol=0.03)
-    np.testing.assert_allclose(darned.vertex_colors[count:, 0], 255 * height, atol=8)
-    np.testing.assert_allclose(darned.weights.dense().sum(axis=1), 1.0, atol=1e-12)
-    assert not darned.weights.matched[count:].any() and np.isnan(darned.weights.distance[count:]).all()
+    height = filled.mesh.vertices[count:, 1] / (CELL * (ROWS - 1))
+    np.testing.assert_allclose(filled.weights.dense()[count:, 0], height, atol=0.03)
+    np.testing.assert_allclose(filled.vertex_colors[count:, 0], 255 * height, atol=8)
+    np.testing.assert_allclose(filled.weights.dense().sum(axis=1), 1.0, atol=1e-12)
+    assert not filled.weights.matched[count:].any() and np.isnan(filled.weights.distance[count:]).all()
 
 
 def test_a_cut_that_reaches_an_opening_is_part_of_it(tube):
     part = without(tube, ((16, 20), (3, 8)))
     assert holes_of(part, tube) == []
-    darned, said = darn(part, [])
-    assert darned is part and said.holes == 0
+    filled, report = fill_holes(part, [])
+    assert filled is part and report.holes == 0
 
 
 def test_two_holes_and_the_wide_one_stays(tube):
     part = without(tube, ((8, 12), (3, 7)), ((3, 17), (20, 36)))
     holes = holes_of(part, tube)
-    darned, said = darn(part, holes, config=DarnConfig(width=0.04))
-    assert (said.holes, said.closed) == (2, 1) and len(border_loops(darned.mesh.faces)) == 3
-    assert darn(part, holes, config=DarnConfig(width=1.0))[1].closed == 2
-    same, said = darn(part, holes, config=DarnConfig(width=0.0))
-    assert same is part and (said.holes, said.closed) == (2, 0)
+    filled, report = fill_holes(part, holes, config=FillHolesConfig(width=0.04))
+    assert (report.holes, report.closed) == (2, 1) and len(border_loops(filled.mesh.faces)) == 3
+    assert fill_holes(part, holes, config=FillHolesConfig(width=1.0))[1].closed == 2
+    same, report = fill_holes(part, holes, config=FillHolesConfig(width=0.0))
+    assert same is part and (report.holes, report.closed) == (2, 0)
 
 
 def test_a_hole_that_cannot_be_closed_stays(tube):
@@ -98,11 +98,11 @@ def test_a_hole_that_cannot_be_closed_stays(tube):
         part,
         mesh=TriangleMesh(np.concatenate([part.mesh.vertices, apart]), np.concatenate([part.mesh.faces, across])),
     )
-    darned, said = darn(crossed, [hole])
-    assert darned is crossed and (said.holes, said.closed) == (1, 0)
+    filled, report = fill_holes(crossed, [hole])
+    assert filled is crossed and (report.holes, report.closed) == (1, 0)
 
 
 @pytest.mark.parametrize("width", [-1.0, np.nan, np.inf])
 def test_no_width_is_refused(width):
     with pytest.raises(InputError, match="width"):
-        DarnConfig(width=width)
+        FillHolesConfig(width=width)
