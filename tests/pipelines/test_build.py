@@ -185,7 +185,9 @@ def test_bridges_stay_where_the_user_wants_them(small):
 
 
 def test_holes_stay_where_the_user_wants_them(small):
-    record = small.build("run", small.inputs(), last="60_assemble", fill_holes=FillHolesConfig(width=0.0))["60_assemble"]
+    record = small.build("run", small.inputs(), last="60_assemble", fill_holes=FillHolesConfig(width=0.0))[
+        "60_assemble"
+    ]
     numbers = record.manifest["numbers"]["darned"]["upper"]
     assert numbers["holes"] > 0 == numbers["closed"]
     assert load_build(small.folder / "run")[1].fill_holes == FillHolesConfig(width=0.0)

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body import BodyModel, load_body
+from smplxpp.clean.scan_frame import METRES_PER_UNIT, convert_points
 from smplxpp.clean.simplify import simplify
-from smplxpp.clean.units import METRES_PER_UNIT, convert_points
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
