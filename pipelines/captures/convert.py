@@ -103,10 +103,12 @@ def convert_capture(
         OSError: the system refused a file, as on a full disk; its notes tell how many views are written.
     """
     config = config or ConvertConfig()
+    # Check the request and claim the folder before anything is written.
     cameras, frames = _chosen(capture, config)
     out = Path(out).absolute()
     _claim(capture, out, config)
     source = capture if config.scale == 1.0 else capture.resized(config.scale)
+    # Views come first, then everything else, so that an interruption can be continued.
     views = source.views(cameras, frames)
     outcomes: list[ViewOutcome] = []
     try:
@@ -156,6 +158,7 @@ def _write_rest(
         splits = source.splits.restricted(cameras, frames)
         write_description(out / "capture.json", source.recording, splits, frames)
     else:
+        # ActorsHQ's layout has a calibration table and no description.
         rig = [RigCamera(source.cameras[c], "body", False) for c in cameras]
         write_calibration_csv(_root(out, config) / "calibration.csv", rig)
     return left_out
@@ -172,6 +175,7 @@ def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[in
         ("--cameras", config.cameras, tuple(capture.cameras)),
         ("--frames", config.frames, capture.frames),
     ):
+        # Name what is unknown, and the first twelve of what there is.
         unknown = [one for one in wanted or () if one not in have]
         if unknown or wanted == () or not have:
             raise InputError(
@@ -186,11 +190,13 @@ def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[in
 
 def _claim(capture: Capture, out: Path, config: ConvertConfig) -> None:
     """Refuse a folder of anything but this conversion, and record the conversion in it."""
+    # Neither folder may lie in the other.
     root = capture.root.resolve()
     if out.resolve() == root or root in out.resolve().parents or out.resolve() in root.parents:
         raise InputError("--out", expected="a folder apart from the capture's", received=str(out))
     record = jsonable({"source": str(root), "format": capture.format, **asdict(config)})
     path = out / _RECORD
+    # A record of the same conversion continues it; any other file is refused.
     if path.is_file():
         recorded = as_object(
             read_json(path, subject="record of a conversion"), subject=f"record of a conversion {path}"
@@ -224,6 +230,7 @@ def _write_params(capture: Capture, out: Path, frames: Sequence[int], config: Co
         return left_out
     if config.layout == "actorshq":
         save_params_by_row(out / "smpl_params.npz", params)
+    # One stacked file if frames are numbered from 0 without gaps.
     elif list(params) == list(range(len(params))):
         BodyParams.concatenate(list(params.values())).save(out / "params" / "params.npz")
     else:  # a row for each number would leave gaps
@@ -250,6 +257,7 @@ def _write_keypoints(capture: Capture, out: Path, cameras: Sequence[str], frames
 def _write_geometry(capture: Capture, out: Path, frames: Sequence[int]) -> None:
     """Write true surfaces, and the scans that a template is built from."""
     meshes = capture.recording.meshes
+    # True surfaces of one topology are copied; other meshes become scans.
     if isinstance(meshes, PosedTopology):
         atomic_write_bytes(out / "geometry" / "topology.npz", read_bytes(meshes.topology))
         for frame in frames:
@@ -262,6 +270,7 @@ def _write_geometry(capture: Capture, out: Path, frames: Sequence[int]) -> None:
             if mesh is not None:
                 with atomic_path(out / "scans" / f"scan_{frame:06d}.ply") as temporary:
                     write_ply(temporary, mesh)
+    # Scans of our own layout come with labels and other files, which are copied too.
     if capture.format == "simple":
         for frame in frames:
             for path in sorted((capture.root / "scans").glob(f"scan_{frame:06d}*")):

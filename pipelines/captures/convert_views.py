@@ -77,6 +77,7 @@ class ViewWriter:
 
     def _targets(self, camera: str, frame: int) -> dict[str, tuple[Path, Path | None]]:
         """Return for each kind of file its path, and the source's file if its bytes can be copied."""
+        # Bytes can be copied only where neither lens nor size changes.
         capture = self.capture
         unchanged = camera not in capture.recording.distortions and capture.windows[camera] == Window.full(
             capture.recording.cameras[camera]
@@ -97,6 +98,7 @@ class ViewWriter:
                 "image": target("image", ".jpg", image if same else None),
                 "mask": target("mask", ".png", mask_source),
             }
+        # Other images keep their format if it can be written, lossless ones as PNG.
         kept = suffix if unchanged or suffix in JPEG_SUFFIXES else (".png" if suffix in _LOSSLESS else ".jpg")
         targets = {"image": target("image", kept, image if unchanged else None)}
         if mask is not None:

@@ -132,12 +132,14 @@ def detection_sheet(
     """
     import PIL.Image
 
+    # The frame that most cameras have.
     frames = np.concatenate([one.keypoints.frames for one in found.values()])
     numbers, counts = np.unique(frames, return_counts=True)
     frame = int(numbers[counts.argmax()])
     pictures: list[np.ndarray] = []
     captions: list[str] = []
     for name, one in found.items():
+        # Cameras without that frame are left out.
         (rows,) = np.nonzero(one.keypoints.frames == frame)
         if not len(rows) or len(pictures) == most:
             continue
@@ -202,6 +204,7 @@ class _CameraWork:
 
     def _keypoints(self) -> Keypoints2D:
         frames = sorted(self.rows)
+        # Frames without a person have confidence 0.
         table = np.zeros((len(frames), len(self.detector.names), 3))
         for row, frame in enumerate(frames):
             person = self.rows[frame].person
@@ -212,7 +215,7 @@ class _CameraWork:
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """The detection of one frame.
+    """The detection of one frame, as a file records it.
 
     Attributes:
         key: SHA-256 of its image and mask.
@@ -236,6 +239,7 @@ def kept_rows(path: Path, detector: Detector) -> dict[int, _Row]:
     arrays = read_arrays(path, subject="keypoints")
     keys, people = (np.ravel(arrays.get(name, ())) for name in ("image_digest", "people"))
     who = np.ravel(arrays.get("detector", ()))
+    # A file without records of images, people and detector has another origin.
     stands = read_keypoints(path)
     if not len(keys) == len(people) == len(stands.frames) or people.dtype.kind not in "iu" or len(who) != 1:
         raise InputError(
@@ -244,6 +248,7 @@ def kept_rows(path: Path, detector: Detector) -> dict[int, _Row]:
             received="another",
             remedy="name another folder",
         )
+    # Detections of another detector are made again.
     if str(who[0]) != detector.identity or stands.names != detector.names:
         return {}
     rows = zip(stands.frames.tolist(), keys, people, stands.points, stands.confidence, strict=True)

@@ -49,6 +49,7 @@ class Plates:
                 expected=f"an image or a folder of images for each camera, such as {without[0]}.png",
                 received=f"none for {', '.join(without[:8])}",
             )
+        # Settings and plates identify the masks that they give.
         digest = hashlib.sha256(repr(self.config).encode())
         for camera, files in self.files.items():
             for path in files:
@@ -94,6 +95,7 @@ def write_masks(
 
 def _own_folder(folder: Path, identity: str) -> None:
     """Refuse a folder with masks of another origin, and record the origin of a new one."""
+    # Masks of two origins in one folder could not be told apart.
     record = folder / _RECORD
     if record.is_file():
         present = as_object(read_json(record), subject=f"file {record}").get("identity")
@@ -110,6 +112,7 @@ def _own_folder(folder: Path, identity: str) -> None:
 
 
 def _plates_of(folder: Path, camera: str) -> list[Path]:
+    # A folder of plates for the camera, or images that begin with its name and no further digit.
     if camera in subfolders(folder):
         found = sorted((folder / camera).iterdir())
     else:

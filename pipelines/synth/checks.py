@@ -19,6 +19,7 @@ _GARMENTS = ("upper", "lower")
 def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, float]:
     """Return figures of a take: distances from skinning, strain of free edges, depth in the body, tracker's error."""
     count = person.body.vertex_count
+    # The body of the take has to equal the posed model.
     posed = person.body.forward(take.params).vertices
     moved = row_lengths((take.vertices - take.skinned).reshape(-1, 3)).reshape(take.vertices.shape[:2])
     tracked = person.body.forward(noisy).vertices
@@ -32,6 +33,7 @@ def take_checks(person: Person, take: Take, noisy: BodyParams) -> dict[str, floa
     # Depth costs a distance query a frame, so that about 100 frames at even steps stand for all.
     depth = _depths(person, take.vertices[:: -(-len(take.vertices) // 100)])
     for name in _GARMENTS:
+        # Garments that are attached all over have no free edges.
         strain = free_edge_strain(person, take, name)
         out |= {
             f"{name}_depth_max_mm": _MM * float(depth[name].max()),
@@ -62,6 +64,7 @@ def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarr
     """Return the strain of edges between two free vertices, relative to the skinned layer of frame 0."""
     mesh, used = person.tpose.submesh(person.face_part == PART_NAMES.index(garment))
     edges = used[mesh.edges]
+    # Attached vertices follow skinning, whose strain is not the simulation's.
     edges = edges[(take.attachment[edges] < 1.0).all(axis=1)]
 
     def lengths(vertices: Float[np.ndarray, "*T V 3"]) -> Float[np.ndarray, "*T E"]:

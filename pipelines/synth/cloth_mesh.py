@@ -52,6 +52,7 @@ def submesh(cloth: ClothMesh, face_mask: Bool[np.ndarray, " M"]) -> ClothMesh:
 
 def loop_subdivide(cloth: ClothMesh, times: int = 1) -> ClothMesh:
     """Subdivide positions and weights alike (Loop 1987); borders follow their own curve."""
+    # Weights are subdivided as further coordinates of the vertices.
     stacked = np.ascontiguousarray(np.hstack([cloth.vertices, cloth.weights]))
     values, faces = igl.loop(stacked, np.ascontiguousarray(cloth.faces, dtype=np.int64), times)
     return ClothMesh(values[:, :3], faces, values[:, 3:])
@@ -119,6 +120,7 @@ def smooth(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, steps: int) 
 
 def diffuse(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, radius: float) -> Float[np.ndarray, "N D"]:
     """Return vertex values diffused implicitly over about `radius` metres: `(M + radius^2 L) x = M x0`."""
+    # One implicit Euler step of the heat equation, with the cotangent Laplacian.
     laplacian = -igl.cotmatrix(mesh.vertices, mesh.faces)
     mass = igl.massmatrix(mesh.vertices, mesh.faces, igl.MASSMATRIX_TYPE_BARYCENTRIC)
     mass = mass + 1e-12 * identity(mesh.vertex_count)
@@ -142,12 +144,14 @@ def push_out(
     """
     field = SignedDistanceField(inner, solid=solid)
     vertices = mesh.vertices
+    # Early rounds move wide areas at once, the last one exactly the vertices that lack clearance.
     for smoothing in (4, 4, 4, 2, 1, 0):
         where = field.query(vertices)
         known = (solid | ~where.on_border) & (where.distance > -reach)
         missing = np.where(known, np.clip(clearance - where.distance, 0.0, None), 0.0)[:, None]
         if not missing.any():
             break
+        # Each vertex moves at least as far as it has to, along a smoothed gradient of the distance.
         widened = np.maximum(smooth(mesh, missing, steps=smoothing), missing)
         vertices = vertices + widened * normalize_rows(smooth(mesh, where.gradient, steps=smoothing))
     return vertices

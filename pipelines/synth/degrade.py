@@ -104,6 +104,7 @@ def degrade_capture(
         _write_params(root / "params", params, config.seed)
         if config.rig:
             _write_rig(root / "cameras.json", body, params, config)
+            # Open the new folder, which has the ring's cameras.
             shown = open_capture(root, cache_bytes=0)
         else:
             shown = capture
@@ -156,6 +157,7 @@ def _link(source: Path, root: Path, *, copy: bool) -> None:
     """Link or copy every file except those that are written new; links of the source are followed."""
     for folder, folders, files in os.walk(source, followlinks=True):
         place = Path(folder).relative_to(source)
+        # Keypoints, labels and description of the source are replaced.
         if place == Path():
             folders[:] = [name for name in folders if name not in (tracked.KEYPOINTS, tracked.ESTIMATED_LABELS)]
             files = [name for name in files if name not in _DESCRIPTIONS]
@@ -184,6 +186,7 @@ def _write_rig(path: Path, body: BodyModel, params: dict[int, BodyParams], confi
     # Boxes of 16 cm to each side of the joints hold the flesh around them.
     joints = body.forward(BodyParams.concatenate(list(params.values()))).joints
     around = 0.16 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    # Close-ups hold head and neck.
     head = joints[:, [body.joint_names.index(name) for name in ("neck", "head", "jaw") if name in body.joint_names]]
 
     def boxes(points: np.ndarray) -> np.ndarray:

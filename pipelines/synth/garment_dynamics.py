@@ -79,6 +79,7 @@ class GarmentDynamics:
         self._used = [np.unique(block.faces) for block in touches]
         self._solver = ClothSolver(model, _collider(touches, self._used), config.fabric, config.solver)
         self._rest, self._state = rest, ClothState.at_rest(rest.vertices)
+        # A garment without free vertices needs no solver.
         self._moves = bool((model.inverse_mass > 0).any())
         self.position = rest.vertices
 
@@ -96,6 +97,7 @@ class GarmentDynamics:
             return
         if damped:
             self._state.velocity *= np.float32(0.7)
+        # Only the vertices that faces of the surfaces use take part.
         skin = [
             np.concatenate([ends[k][used] for ends, used in zip(surfaces, self._used, strict=True)]) for k in (0, 1)
         ]

@@ -84,6 +84,7 @@ def make_capture(
         write_calibration_csv(images / "calibration.csv", rig)
         take.params.save(params)
         noisy.save(params.with_stem(f"{params.stem}_noisy"))
+        # Skin under clothes is left out of images, and painted no cells in the atlas.
         hidden = hidden_faces(person, take.vertices[0])
         painted = (person, _atlas(person, hidden, config.texel, progress))
         if config.layout == "simple":
@@ -157,6 +158,7 @@ def _write_geometry(
 ) -> None:
     arrays = layers | {"face_hidden": hidden, "pin": take.attachment.astype(np.float32)}
     save_compact(folder / "topology.npz", arrays)
+    # The topology is the same in all frames; only vertices change.
     for frame in range(0, config.frames, config.truth_step):
         arrays = {"verts": take.vertices[frame].astype(np.float32)}
         save_compact(folder / f"frame_{frame:06d}.npz", arrays)
@@ -164,6 +166,7 @@ def _write_geometry(
 
 def _write_scan(folder: Path, person: Person, take: Take, config: SynthConfig) -> dict[str, float]:
     reference = TriangleMesh(take.vertices[0], person.tpose.faces)
+    # Every part but the body is an open sheet.
     sheets = [person.face_part == part for part in range(1, len(PART_NAMES))]
     scan = simulate_scan(reference, sheets, ScanConfig(faces=config.scan_faces, seed=config.seed + 3))
     part, label, colors = _scan_attributes(person, scan)
@@ -208,7 +211,7 @@ def _write_views(
     """Render every frame through every camera and write the files."""
     person, atlas = painted
     for frame, lit in enumerate(lit_frames):
-
+        # Cameras of a frame are rendered in parallel; the next frame is lit after them.
         def one(item: RigCamera, lit: LitFrame = lit, frame: int = frame) -> None:
             view = render_view(person, lit, item.camera, supersampling=config.supersampling, atlas=atlas)
             _write_view(root, item.camera.name, frame, view, config)
@@ -232,6 +235,7 @@ def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig, environment:
     train, novel = split_frames(config.frames)
     everything, normals = list(range(config.frames)), list(range(0, config.frames, config.normals_step))
     names = [item.camera.name for item in rig]
+    # Held-out frames follow the training frames; short captures have none.
     splits = {"train_frames": [0, train - 1]} | ({"novel_pose_frames": [train, config.frames - 1]} if novel else {})
     light = {}
     if environment is not None:
@@ -288,6 +292,7 @@ def _readme(manifest: dict, config: SynthConfig) -> str:
     split += f", {novel[0]} to {novel[1]} are held out as new poses." if novel else ", none is held out."
 
     def listed(frames: list[int]) -> str:
+        # Frames are at an even step: all, the first three of them, or one.
         step = frames[1] - frames[0] if len(frames) > 1 else 0
         return "all" if step == 1 else f"{', '.join(map(str, frames[:3]))} ..." if step else str(frames[0])
 

@@ -217,6 +217,7 @@ class Performance:
         values = np.zeros((len(times), len(self.expression_names)))
         look: dict[str, float] = {}
         for k in range(1, len(times)):
+            # The look changes with every third mouth shape; one in eight comes with a blink.
             if k % 3 == 1:
                 look = _LOOKS[rng.integers(len(_LOOKS))]
             closed = {"eyeBlinkLeft": 0.95, "eyeBlinkRight": 0.95} if rng.uniform() < 0.12 else {}
@@ -232,6 +233,7 @@ class Performance:
         sizes = {"spine2": 0.6, "neck": 1.2, "head": 1.8, "left_wrist": 3.0, "right_wrist": 3.0}
         for name, degrees in sizes.items():
             out[:, SMPLX_JOINTS.index(name)] = np.radians(degrees) * wander(t, rng, hertz=1.1)
+        # Both eyes turn together, without roll.
         gaze = np.radians(2.5) * wander(t, rng, hertz=1.6)
         gaze[:, 2] = 0.0
         for name in ("left_eye_smplhf", "right_eye_smplhf"):
@@ -255,6 +257,7 @@ def _pose(degrees: _Angles, fingers: tuple[float, float]) -> Float[np.ndarray, "
     """Return an axis-angle pose in radians; `fingers` are the bends of the left and right hand in degrees."""
     pose = np.zeros((sum(joints for _, joints in POSE_BLOCKS), 3))
     for j, name in enumerate(SMPLX_JOINTS):
+        # Fingers bend about z, mirrored between the hands.
         if name[-1].isdigit() and not name.startswith("spine") and "thumb" not in name:
             pose[j, 2] = -fingers[0] if name.startswith("left") else fingers[1]
     for name, angles in degrees.items():

@@ -59,6 +59,7 @@ class Person:
     def posed(self, params: BodyParams) -> tuple[Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
         """Pose every layer by linear blend skinning; return its vertices and the joints' transforms from rest."""
         posed = self.body.forward(params)
+        # Expressions change the body's rest shape, not that of clothes.
         rest = np.repeat(self.tpose.vertices[None], len(params), axis=0)
         rest[:, : self.body.vertex_count] = posed.rest_vertices
         return skin(rest, self.weights, posed.posed_from_rest), posed.posed_from_rest

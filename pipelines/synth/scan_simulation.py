@@ -105,8 +105,10 @@ def _inner_side(layers: TriangleMesh, mask: Bool[np.ndarray, " M"], thickness: f
     sheet = layers.submesh(mask)[0]
     n = sheet.vertex_count
     back = sheet.vertices - thickness * sheet.vertex_normals
+    # Border edges in the direction of their faces.
     directed = np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]])
     border = directed[np.isin(np.sort(directed, axis=1) @ [n, 1], sheet.border_edges @ [n, 1])]
+    # Two triangles for each border edge, wound as the sheet.
     a, b = border.T
     rim = np.concatenate([np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)])
     return TriangleMesh(np.concatenate([sheet.vertices, back]), np.concatenate([sheet.faces[:, ::-1] + n, rim]))
@@ -187,6 +189,7 @@ def _near_vertices(mesh: TriangleMesh, grid: Float[np.ndarray, "G 3"], cell: flo
     hit = np.zeros(size[::-1], dtype=bool)
     samples = np.concatenate([mesh.vertices, mesh.triangles.mean(axis=1)])
     index = np.round((samples - low) / cell).astype(int)
+    # Mark the cells of the samples, then grow them by three cells along each axis.
     hit[index[:, 2], index[:, 1], index[:, 0]] = True
     for axis in range(3):
         grown = hit.copy()
@@ -198,6 +201,7 @@ def _near_vertices(mesh: TriangleMesh, grid: Float[np.ndarray, "G 3"], cell: flo
 
 def _outer_component(mesh: TriangleMesh) -> TriangleMesh:
     """Return the connected component with the largest area, oriented outwards."""
+    # Marching cubes extracts inner cavities too; the outer surface is the largest.
     component = face_components(mesh.faces)
     areas = np.bincount(component, mesh.face_areas)
     kept = mesh.submesh(component == np.argmax(areas))[0]
@@ -226,6 +230,7 @@ def _shown_points(
     layers: TriangleMesh, seen: Bool[np.ndarray, " M"], points: Float[np.ndarray, "N 3"]
 ) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
     """Return the closest seen face of the layers and the barycentric coordinates of the closest point on it."""
+    # Hidden layers are not shown, however near they are.
     candidates = np.flatnonzero(seen)
     _, face, closest = igl.point_mesh_squared_distance(points, layers.vertices, layers.faces[candidates])
     face = candidates[face]
@@ -240,6 +245,7 @@ def merge_islands(mesh: TriangleMesh, part: UInt8[np.ndarray, " N"], *, smallest
     part, edges = part.copy(), mesh.edges
     piece = component_labels(edges[part[edges[:, 0]] == part[edges[:, 1]]], mesh.vertex_count)
     for small in np.flatnonzero(np.bincount(piece) < smallest):
+        # Edges from the small component to its surroundings; the most frequent part there wins.
         inside = piece[edges] == small
         crossing = inside[:, 0] != inside[:, 1]
         around = part[edges[crossing][~inside[crossing]]]

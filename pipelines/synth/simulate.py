@@ -148,6 +148,7 @@ class HairLag:
 
     def advance(self, head: Float[np.ndarray, "3 3"], seconds: float) -> None:
         """Follow the head to `head` within `seconds`."""
+        # Angular velocity of the head in this tick; the spring sees its change.
         spin = rotvec_from_matrix(head @ self._head.T) / seconds
         push = self.GAIN * (spin - self._spin)
         self._rate += -push - seconds * (self.STIFFNESS * self._angle + self.DAMPING * self._rate)
@@ -191,11 +192,13 @@ class _Stage:
         """Return parameters with the lowest vertex at y = 0, all layers skinned, the joints' transforms."""
         params = self.performance.at(times)
         layers, posed_from_rest = self.person.posed(params)
+        # Put the lowest vertex of every frame on the floor.
         up = np.round(-layers[..., 1].min(axis=1), 5)
         layers[..., 1] += up[:, None]
         transforms = posed_from_rest.copy()
         transforms[:, :, 1, 3] += up[:, None]
         transl = np.stack([0 * up, up, 0 * up], axis=1)
+        # Feet that stay: shift the body so that the ankles keep their place.
         if self.performance.feet_stay:
             aside = self._aside(transforms)
             transl += aside
@@ -221,6 +224,7 @@ class _Stage:
             seconds: length of the tick.
             damped: whether to damp all velocities first.
         """
+        # The body moves first; clothes see where it starts and ends.
         _, layers, transforms = self.standing(np.array([time]))
         before, after = self._layers, layers[0]
         skin, skirt = (before, after), self._skirt_vertices

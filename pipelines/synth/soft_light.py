@@ -86,6 +86,7 @@ def vertex_light(mesh: TriangleMesh, config: LightConfig) -> Float64[np.ndarray,
 def stage_light() -> Irradiance:
     """Return the unshadowed irradiance of the stage as spherical harmonics."""
     coefficients = np.zeros((9, 3))
+    # A linear gradient in y has two coefficients: the constant and the first-order one of y.
     coefficients[0] = 0.5 * (_SKY + _GROUND) * np.sqrt(4.0 * np.pi)
     coefficients[1] = 0.5 * (_SKY - _GROUND) * np.sqrt(4.0 * np.pi / 3.0)
     return Irradiance(coefficients)
@@ -112,6 +113,7 @@ def environment_light(
     total = np.zeros((config.directions, 3))
     np.add.at(total, nearest, solid[:, None] * panorama.reshape(-1, 3))
     share = np.bincount(nearest, solid, minlength=config.directions)
+    # Mean radiance of each direction, weighted by its share of the sphere.
     mean = total / np.maximum(share, 1e-12)[:, None] * (share / share.mean())[:, None]
     brightness = {tuple(d): c for d, c in zip(view_directions(config.directions).tolist(), mean, strict=True)}
     return _gathered(mesh, config, lambda direction: brightness[tuple(direction.tolist())])
@@ -171,6 +173,7 @@ def _visible(
     flat, width = depth.ravel(), camera.width
     index = row * width + column
     front = z - slack
+    # Bilinear weights of four depth tests.
     upper = (1 - fx) * (flat.take(index) > front) + fx * (flat.take(index + 1) > front)
     lower = (1 - fx) * (flat.take(index + width) > front) + fx * (flat.take(index + width + 1) > front)
     return (1 - fy) * upper + fy * lower

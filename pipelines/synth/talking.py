@@ -136,6 +136,7 @@ class Talking:
     @cached_property
     def _order(self) -> list[int]:
         rng = np.random.default_rng([self.seed, 0])
+        # As many gestures as fit if all were the fastest.
         shortest = _TEMPO.move[0] + _TEMPO.hold[0]
         return rounds(rng, len(GESTURES), int(self.seconds / shortest) + 2)
 
@@ -187,6 +188,7 @@ class Talking:
         while time < self.seconds:
             start = time + rng.uniform(*hold)
             time = start + rng.uniform(*move)
+            # Normal deviates, clipped so that none exceeds the largest value.
             keys.append(np.asarray(largest) * np.clip(0.55 * rng.normal(size=3), -1, 1))
             moves.append((start, time))
         return _Track(np.stack(keys), tuple(moves))
@@ -199,6 +201,7 @@ class Talking:
         out = np.zeros((len(t), len(SMPLX_JOINTS), 3))
         for name, degrees in sway.items():
             out[:, SMPLX_JOINTS.index(name)] = np.radians(degrees) * wander(t, rng, hertz=0.5) / np.sqrt(2.0)
+        # Elbows mark speech with beats of 3 degrees.
         beat = np.radians(3.0) * wander(t, rng, hertz=0.9)[:, 0] / np.sqrt(2.0)
         out[:, SMPLX_JOINTS.index("left_elbow"), 1] = -beat
         out[:, SMPLX_JOINTS.index("right_elbow"), 1] = beat
@@ -243,6 +246,7 @@ class Talking:
     def _blinks(self, t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T E"]:
         # Seconds from the blink, and how far the lids are closed.
         seconds, closed = np.array(((-0.09, 0.0), (0.0, 1.0), (0.05, 1.0), (0.20, 0.0))).T
+        # Blinks add up; the sum is clipped with the other expressions.
         shut = sum((np.interp(t - blink, seconds, closed) for blink in self.blink_times), np.zeros(len(t)))
         return shut[:, None] * self._expression({"eyeBlinkLeft": 0.97, "eyeBlinkRight": 0.97}, 1.0)
 
@@ -269,6 +273,7 @@ class _Track:
 
     def __call__(self, t: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T *values"]:
         start, end = np.array(self.moves).T
+        # The move that has started last; u runs from 0 to 1 within it.
         k = np.clip(np.searchsorted(start, t, side="right") - 1, 0, len(start) - 1)
         u = np.clip((t - start[k]) / (end[k] - start[k]), 0.0, 1.0)
         s = (u**3 * (10.0 - 15.0 * u + 6.0 * u**2)).reshape(-1, *[1] * (self.keys.ndim - 1))

@@ -142,6 +142,7 @@ def _visible(
         with np.errstate(invalid="ignore"):
             inside = (screen[:, 2] > 0) & (screen[:, :2] >= 0).all(axis=1)
             inside &= (screen[:, 0] < camera.width) & (screen[:, 1] < camera.height)
+        # Compare the depth image at the joint with the joint's own depth.
         x, y = screen[inside, :2].astype(np.int64).T
         out[row, inside] = depth[y, x] > screen[inside, 2] - 0.15
     return out

@@ -62,8 +62,10 @@ def tracker_noise(
     """
     rng = np.random.default_rng(seed)
     count = len(params)
+    # Random rotations on top of every joint's own.
     turns = matrix_from_rotvec(rng.normal(0, np.radians(degrees), (count, len(SMPLX_JOINTS), 3)))
     pose = rotvec_from_matrix(turns @ matrix_from_rotvec(params.full_pose))
+    # One period of a sine over the sequence, and white noise, of equal variance.
     phase = rng.uniform(0, 2 * np.pi, 3) + 2 * np.pi * np.arange(count)[:, None] / max(count, 2)
     slow, white = np.sin(phase) * np.sqrt(2), rng.normal(size=(count, 3))
     tracked = BodyParams.from_full_pose(

@@ -89,6 +89,7 @@ def hidden_faces(person: Person, vertices: Float[np.ndarray, "V 3"]) -> Bool[np.
         cloth = layers.submesh(person.face_part == PART_NAMES.index(name))[0]
         # Skin counts as covered where it is behind the nearest cloth, away from the border and not too deep.
         squared, face, closest = igl.point_mesh_squared_distance(vertices[:count], cloth.vertices, cloth.faces)
+        # Behind the cloth: against the normal of its nearest face.
         inside = np.einsum("vi,vi->v", vertices[:count] - closest, cloth.face_normals[face]) < 0
         border = cloth.vertices[np.unique(cloth.border_edges)]
         away = np.sqrt(igl.point_mesh_squared_distance(closest, border, np.arange(len(border))[:, None])[0]) > margin
@@ -109,6 +110,7 @@ def render_view(
     """
     # Rasterize at s times the resolution.
     s = supersampling
+    # Intrinsics scale with the resolution.
     K = camera.K.copy()
     K[:2] *= s
     fine = replace(camera, K=K, width=camera.width * s, height=camera.height * s)
@@ -137,6 +139,7 @@ def label_map(person: Person, frame: LitFrame, camera: Camera) -> UInt8[np.ndarr
 def normal_map(frame: LitFrame, camera: Camera) -> Float64[np.ndarray, "H W 3"]:
     """Return smooth unit normals in the world, facing the camera, at pixel centres; zero on background."""
     maps = rasterize_mesh(frame.mesh, camera)
+    # Interpolate vertex normals, normalise them, and turn those of back faces.
     normal = maps.interpolate(frame.mesh.faces, frame.mesh.vertex_normals)
     hit = maps.mask
     flat = normal[hit]
@@ -258,6 +261,7 @@ def paint_atlas(person: Person, *, cell: float, face_cell: float, shown: Int[np.
 def _cell_centers(place: Int[np.ndarray, " P"], n: Int[np.ndarray, " P"]) -> Float[np.ndarray, "P 3"]:
     """Return the barycentric centres of cells by their index among the n^2 of their face."""
     # Row i starts at i (2 n - i): solve that for i, with a margin for rounding.
+    # Cells in a row alternate between upright and inverted triangles.
     row = np.floor(n - np.sqrt(np.maximum(n.astype(np.float64) ** 2 - place, 0.0)) + 1e-9).astype(np.int64)
     inside = place - row * (2 * n - row)
     column, inverted = inside // 2, inside % 2

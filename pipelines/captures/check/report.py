@@ -133,6 +133,7 @@ def _report(check: CaptureCheck, pictures: tuple[Picture, ...]) -> Report:
     capture = check.capture
     fits = check.cameras()
     numbers = [KeyNumber("cameras", str(len(capture.cameras))), KeyNumber("frames", f"{len(capture.frames):,}")]
+    # The key number is the median over cameras of the body's share outside the mask.
     if fits:
         outside = float(np.median([fit.outside for fit in fits.values()]))
         numbers.append(KeyNumber("body outside the masks", f"{outside:.1%}", "median of the cameras"))
@@ -173,6 +174,7 @@ def _findings_section(check: CaptureCheck, most: int = 12) -> Section:
 def _silhouette_section(check: CaptureCheck, pictures: tuple[Picture, ...]) -> Section:
     fits = check.cameras()
     rows = []
+    # One row a camera, also without a fit.
     for name in check.capture.cameras:
         fit = fits.get(name)
         figures = (None,) * 4 if fit is None else (100 * fit.outside, 100 * fit.worst, fit.iou, fit.bad)
@@ -198,6 +200,7 @@ def _frame_section(check: CaptureCheck) -> Section:
         for frame, fit in spread(list(fits.items()), 200)
     )
     header = ("frame", "views", "outside, median %", "outside, worst %", "overlap", "bad views", "verdict")
+    # A curve needs two frames.
     curves: tuple[Curve, ...] = ()
     if len(fits) > 1:
         numbers = np.array(list(fits))

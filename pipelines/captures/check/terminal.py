@@ -26,9 +26,11 @@ def print_check(check: CaptureCheck, console: Console) -> None:
     if frames.row_count:
         console.print()
         console.print(frames)
+    # Findings of one kind are printed together, with one remedy.
     for group in grouped(check.findings):
         console.print()
         _print_group(group, console)
+    # End with the number of failures and warnings.
     counts = [sum(finding.status == status for finding in check.findings) for status in ("fail", "warn")]
     console.print()
     if not any(counts):
@@ -47,6 +49,7 @@ def _print_head(check: CaptureCheck, content: dict[str, Any], console: Console) 
         f"{content['frames']} frames{rate}",
         highlight=False,
     )
+    # What training sees and what is held out.
     splits = check.capture.splits
     cameras, frames = ", ".join(splits.novel_view_cameras), in_ranges(np.array(splits.novel_pose_frames, dtype=int))
     held = " and ".join(f"{what} {names}" for what, names in (("cameras", cameras), ("frames", frames)) if names)

@@ -72,6 +72,7 @@ def grid_faces(rows: int, columns: int, *, closed: bool) -> Int[np.ndarray, "M 3
 
     Seen from the front side rows go down and columns to the left: outward for rows downwards and azimuths that grow.
     """
+    # Two triangles for each cell of the grid.
     across = columns if closed else columns - 1
     i, j = np.meshgrid(np.arange(rows - 1), np.arange(across), indexing="ij")
     a, b = (i * columns + j).ravel(), (i * columns + (j + 1) % columns).ravel()
@@ -163,6 +164,7 @@ def joined(*pieces: ClothMesh) -> ClothMesh:
 
 def tube_along(curve: Float[np.ndarray, "R 3"], radii: Float[np.ndarray, " R"], *, sides: int = 24) -> tuple:
     """Return points and faces of a tube about a curve, normals outward, ends open."""
+    # A frame across the curve, from a fixed vector that no curve here is parallel to.
     tangent = np.gradient(curve, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     first = np.cross(tangent, [0.31, 0.12, 0.94])
@@ -176,5 +178,6 @@ def tube_along(curve: Float[np.ndarray, "R 3"], radii: Float[np.ndarray, " R"], 
 
 def facing_out(cloth: ClothMesh, inner: Float[np.ndarray, "N 3"]) -> ClothMesh:
     """Return the sheet wound so that its normals point away from the inner point of each vertex."""
+    # The mean over all vertices decides, so that folds do not matter.
     outward = np.einsum("ij,ij->i", cloth.mesh.vertex_normals, cloth.vertices - inner).mean()
     return cloth if outward > 0 else ClothMesh(cloth.vertices, cloth.faces[:, ::-1], cloth.weights)

@@ -30,6 +30,7 @@ def fitted_garments(mannequin: Mannequin) -> list[Garment]:
     def overalls(p: np.ndarray) -> np.ndarray:
         trousers = legs(top=waist + 0.02, hem=ankle[1] + 0.02)(p)
         x, y, z = p.T
+        # A bib of 23 cm and two straps of 5 cm, joined to the trousers at the waist.
         bib = np.minimum(0.115 - np.abs(x), np.minimum(z - mannequin.axis[1], j["spine3"][1] + 0.09 - y))
         strap = np.minimum(0.024 - np.abs(np.abs(x) - 0.088), j["neck"][1] + 0.03 - y)
         return np.maximum(trousers, np.minimum(np.maximum(bib, strap), y - waist))
@@ -64,6 +65,7 @@ def tops(mannequin: Mannequin) -> list[Garment]:
     long, half = j["left_wrist"][0] - 0.015, 0.5 * (shoulder[0] + elbow[0])
 
     def vest(p: np.ndarray) -> np.ndarray:
+        # Armholes of 10 cm radius around the shoulder joints.
         holes = np.hypot(p[:, 1] - shoulder[1] + 0.02, p[:, 2] - shoulder[2]) - 0.105
         holes = np.where(np.abs(p[:, 0]) > shoulder[0] - 0.025, holes, 1.0)
         return np.minimum(shirt(cuff=shoulder[0] + 0.01, hem=crotch + 0.07, neck=0.1, deep=0.17)(p), holes)
@@ -96,6 +98,7 @@ def bottoms(mannequin: Mannequin) -> list[Garment]:
     (waist, crotch), knee, ankle = _trunk_heights(mannequin), j["left_knee"], j["left_ankle"]
     grown, legs = partial(_grown, mannequin), partial(_legs, mannequin)
 
+    # Trousers stand off the skin more from crotch to knee, and again to the hem.
     def wide(at_knee: float, at_hem: float) -> Ease:
         def ease(p: np.ndarray) -> np.ndarray:
             down = ramp(p[:, 1], crotch, knee[1])
@@ -103,6 +106,7 @@ def bottoms(mannequin: Mannequin) -> list[Garment]:
 
         return ease
 
+    # Soles are 12 mm thicker than the shoe, over the lowest 3 cm.
     def sole(ease: float) -> Ease:
         floor = mannequin.skin.vertices[:, 1].min()
         return lambda p: ease + 0.012 * ramp(p[:, 1], floor + 0.03, floor)
@@ -158,6 +162,7 @@ def _shirt(
 
     def level(p: np.ndarray) -> np.ndarray:
         x, y, z = p.T
+        # A round neckline, cuffs, hem and shoulders; the smallest distance decides.
         open_at = np.hypot(x, z - joint[2] - 0.018) - neck
         open_at = np.where(y > joint[1] - deep, open_at, 1.0)
         inside = np.minimum(np.minimum(open_at, cuff - np.abs(x)), np.minimum(y - hem, joint[1] + 0.03 - y))
@@ -176,8 +181,10 @@ def _hood_up(mannequin: Mannequin) -> ClothMesh:
         face = np.where(z > j["head"][2] + 0.01, face, 1.0)
         return np.minimum(face, np.minimum(y - j["spine3"][1] - 0.09, j["left_shoulder"][0] + 0.02 - np.abs(x)))
 
+    # The hood widens upwards, and is smoothed until no face shows in it.
     cloth = layer(mannequin, level, ease=lambda p: 0.012 + 0.018 * ramp(p[:, 1], 0.6, 0.75), fairing=30)
     chin, base = j["jaw"][1] - 0.02, j["neck"][1] - 0.01
+    # Weights pass from the shoulders at the neck's base to the head at the chin.
     head = ramp(cloth.vertices[:, 1], base, chin)[:, None]
     weights = head * mannequin.rigid("head", len(cloth.vertices)) + (1 - head) * mannequin.below(cloth.vertices)
     return ClothMesh(cloth.vertices, cloth.faces, weights)
@@ -192,6 +199,7 @@ def _hood_down(mannequin: Mannequin, shirt: ClothMesh) -> ClothMesh:
     points, faces = tube_along(curve, 0.016 + 0.026 * np.cos(t / 1.5) ** 2)
     roll = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 24, axis=0))
     vertices = push_out(roll.mesh, mannequin.skin.mesh, clearance=0.012, solid=True)
+    # The roll follows the upper spine, its sides half the collar bone of their side.
     collar = ramp(np.abs(vertices[:, 0]), 0.03, 0.16)[:, None]
     left = (vertices[:, 0] > 0)[:, None]
     side = np.where(left, mannequin.rigid("left_collar", len(points)), mannequin.rigid("right_collar", len(points)))
@@ -211,6 +219,7 @@ def _scarf(mannequin: Mannequin) -> ClothMesh:
     points, faces = tube_along(curve, np.full(61, 0.03))
     ring = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 24, axis=0))
     vertices = push_out(ring.mesh, mannequin.skin.mesh, clearance=0.006, solid=True)
+    # Weights pass from the upper spine to the neck over the height of the roll.
     up = ramp(vertices[:, 1], height - 0.05, height + 0.05)[:, None]
     count = len(vertices)
     weights = mannequin.rigid("neck", count) * (0.4 + 0.4 * up) + mannequin.rigid("spine3", count) * (0.6 - 0.4 * up)

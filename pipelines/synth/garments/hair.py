@@ -52,6 +52,7 @@ def tied_and_short_hair(mannequin: Mannequin) -> list[Garment]:
 
     def ball(centre: tuple[float, float, float], radius: float) -> ClothMesh:
         t = np.linspace(0.02, np.pi - 0.02, 24)
+        # A sphere is a tube along its axis whose radius is that of its circles.
         curve = np.asarray(centre) + radius * np.column_stack([0 * t, np.cos(t), 0 * t])
         points, faces = tube_along(curve, radius * np.sin(t), sides=32)
         cloth = ClothMesh(points, faces, mannequin.rigid("head", len(points)))
@@ -87,6 +88,7 @@ def skull_cap(mannequin: Mannequin, *, ease: float = 0.017) -> ClothMesh:
     j = mannequin.joints
 
     def level(p: np.ndarray) -> np.ndarray:
+        # The hairline rises steeply towards the face.
         hairline = j["head"][1] + 0.02 + 1.25 * np.clip(p[:, 2] - j["head"][2] + 0.02, 0, None)
         return p[:, 1] - hairline
 
@@ -100,6 +102,7 @@ def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float 
     top = j["head"][1] + 0.055
     heights, azimuths = np.linspace(top, bottom, 60), np.linspace(1.5 * np.pi - half, 1.5 * np.pi + half, 70)
     down = ((top - heights) / (top - bottom))[:, None]
+    # The radius grows quadratically from the head down; ellipses are 15 % deeper than wide.
     radius = np.broadcast_to(0.096 + spread * down**2, (60, 70))
     centre = j["head"][2] + 0.005
     points = np.stack(
@@ -111,6 +114,7 @@ def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float 
     cloth = mannequin.unweighted(points, grid_faces(60, 70, closed=False))
     inside = np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + centre])
     cloth = facing_out(cloth, inside)
+    # Push it off the skin, smooth it, and push out what smoothing brought too near.
     pushed = push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.009, solid=True, reach=0.12)
     pushed = smooth(cloth.mesh, pushed, steps=4)
     return cloth.with_vertices(
@@ -156,6 +160,7 @@ def _braid(mannequin: Mannequin) -> ClothMesh:
     points, faces = tube_along(curve, 0.02 + 0.003 * np.sin(40 * t) - 0.008 * t)
     cloth = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 24, axis=0))
     cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.003, solid=True, reach=0.08))
+    # Weights follow from the centre line, so that a ring of the braid moves rigidly.
     middle = np.repeat(curve, 24, axis=0)
     line = ClothMesh(middle, cloth.faces, cloth.weights)
     weights = _handed_over(mannequin, line, mannequin.trunk_weights(middle), keeps=0.0, over=0.14).weights

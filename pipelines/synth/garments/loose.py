@@ -27,6 +27,7 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
     chest = j["spine3"][1] + 0.085
 
     def skirt(name: str, hem: float, *, label: str = "lower", top: float = waist, legs: float, shins: float, **cut):
+        # `cut` holds the options of `hang`: flare, pleats and distance.
         make = partial(_hung, mannequin, top, hem, legs=legs, shins=shins, **cut)
         return Garment(name, label, make, _SKIRT.format(legs=legs, shins=shins), loose=True, beside_hands=True)
 
@@ -51,6 +52,7 @@ def _hung(
     heights = np.linspace(top, hem, int((top - hem) / 0.014) + 2)  # rows 14 mm apart
     azimuths = around(100) if not gap else np.linspace(np.pi / 2 + gap, 2.5 * np.pi - gap, 100)
     points, faces = hang(mannequin, heights, azimuths, closed=not gap, **cut)
+    # Weights follow from the points before they are pushed off the skin.
     cloth = facing_out(mannequin.unweighted(points, faces), mannequin.inner_points(points))
     cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.004, solid=True))
     return ClothMesh(cloth.vertices, cloth.faces, skirt_weights(mannequin, points, legs=legs, shins=shins))
@@ -63,12 +65,14 @@ def _coat(mannequin: Mannequin) -> ClothMesh:
 
     def level(p: np.ndarray) -> np.ndarray:
         x, y, z = p.T
+        # Open in front by 9 cm, with a round neckline, cut off at hips and wrists.
         front = np.where(z > mannequin.axis[1], np.abs(x) - 0.045, 1.0)
         neck = np.where(y > j["neck"][1] - 0.13, np.hypot(x, z - j["neck"][2] - 0.018) - 0.075, 1.0)
         below = np.minimum(y - hip - 0.06, j["neck"][1] + 0.03 - y)
         return np.minimum(np.minimum(front, neck), np.minimum(below, j["left_wrist"][0] - 0.02 - np.abs(x)))
 
     top = layer(mannequin, level, ease=0.018, fairing=10)
+    # The panels overlap the upper part by 1.5 cm.
     panels = _hung(mannequin, hip + 0.075, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.022)
     return joined(top, panels)
 
@@ -107,6 +111,7 @@ def _kimono(mannequin: Mannequin) -> ClothMesh:
     # Sleeves are tubes along the arms, wider downwards than upwards.
     along = np.linspace(shoulder[0] + 0.10, wrist[0] - 0.03, 40)
     angle = around(48)
+    # Sleeves hang 7 cm below the arm at the shoulder, 26 cm at the wrist.
     hangs = 0.07 + 0.19 * ((along - along[0]) / (along[-1] - along[0])) ** 0.8
     drop = np.where(np.sin(angle)[None, :] < 0, hangs[:, None], 0.062)
     for sign in (1.0, -1.0):

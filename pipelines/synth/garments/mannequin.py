@@ -54,6 +54,7 @@ class Mannequin:
     @staticmethod
     def cut_on(body: BodyModel, params: BodyParams, skin: ClothMesh, joints: dict[str, np.ndarray]) -> Mannequin:
         """Return the mannequin of a skin and its joints, of any size."""
+        # Arms and head would widen the outlines.
         torso = shares(body, skin.weights, (*ARM_JOINTS, *_HEAD_JOINTS)) < 0.5
         low, outlines = _outlines(skin.vertices[torso], joints["pelvis"][2])
         return Mannequin(body, params, skin, joints, outlines, low)
@@ -70,6 +71,7 @@ class Mannequin:
         r, c = np.broadcast_arrays(row, column)
         i, j = r.astype(int), c.astype(int) % _DIRECTIONS
         u, v = r - i, c - np.floor(c)
+        # Columns wrap around; rows do not.
         o, k = self.outlines, (j + 1) % _DIRECTIONS
         return (1 - u) * ((1 - v) * o[i, j] + v * o[i, k]) + u * ((1 - v) * o[i + 1, j] + v * o[i + 1, k])
 
@@ -98,6 +100,7 @@ class Mannequin:
         The trunk is the skin that follows pelvis, spine, collars, hips and neck. How far a point stands off the skin
         does not matter.
         """
+        # Restrict the skin to vertices of the trunk, and their weights to its joints.
         names = ("pelvis", "spine", "collar", "hip", "neck")
         kept = shares(self.body, self.skin.weights, names) > 0.9
         own = self.skin.weights[kept] * named(self.body, names)
@@ -108,6 +111,7 @@ class Mannequin:
         """Return the mean weights around the arm at the same place along it; hands count as the wrist."""
         weights = self.skin.weights.copy()
         for side in ("left", "right"):
+            # Weights of the fingers are added to the wrist.
             fingers = [i for i, n in enumerate(self.body.joint_names) if n.startswith(side) and n[-1].isdigit()]
             fingers = [i for i in fingers if "spine" not in self.body.joint_names[i]]
             weights[:, self.body.joint_names.index(f"{side}_wrist")] += weights[:, fingers].sum(axis=1)
@@ -118,6 +122,7 @@ class Mannequin:
 
     def below(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N J"]:
         """Return the weights of the skin straight below points that rest on the shoulders."""
+        # Skin that faces up, above the chest, but not of the head.
         up = (self.skin.mesh.vertex_normals[:, 1] > 0.2) & (shares(self.body, self.skin.weights, _HEAD_JOINTS) < 0.5)
         up &= self.skin.vertices[:, 1] > self.joints["spine3"][1]
         return _mean_of_nearest(self.skin.vertices[up][:, [0, 2]], self.skin.weights[up], points[:, [0, 2]])

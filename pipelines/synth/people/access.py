@@ -71,7 +71,13 @@ def _body() -> BodyModel:
 def _code() -> bytes:
     """Return a digest of the sources that people follow from; the cast enters the key of each member."""
     synth = Path(__file__).parents[1]
-    names = ("scan_simulation.py", "textures.py", *(f"people/{name}.py" for name in ("bodies", "making", "paint")))
+    names = (
+        "cloth_mesh.py",
+        "patterns.py",
+        "scan_simulation.py",
+        "textures.py",
+        *(f"people/{name}.py" for name in ("bodies", "making", "paint")),
+    )
     files = [*(synth / name for name in names), *sorted((synth / "garments").glob("*.py"))]
     return hashlib.sha256(b"".join(read_bytes(path) for path in files)).digest()
 

@@ -87,6 +87,7 @@ def skin_paint(
         seed: seed of the skin's mottling.
     """
     colors = textures.skin_colors(points, face_marks(face_landmarks(betas)), seed=seed)
+    # Scale the fixture's skin to the tone, then paint the eyeballs over it.
     colors *= np.asarray(SKIN_TONES[tone]) / np.asarray(textures.SKIN, dtype=float)
     nearer = np.argmin(np.linalg.norm(points[eyeball][:, None] - eyes, axis=2), axis=1)
     colors[eyeball] = textures.eye_colors(points[eyeball] - eyes[nearer])
@@ -95,6 +96,7 @@ def skin_paint(
 
 def hair_paint(points: Float[np.ndarray, "P 3"], color: str, *, seed: int) -> Float[np.ndarray, "P 3"]:
     """Return colours of hair: strands along its fall, lighter and darker."""
+    # Locks of 8 mm and strands of 2 mm, long in the direction of the fall.
     locks = smooth_noise(points, scale=(0.008, 0.3, 0.008), seed=seed)
     strands = smooth_noise(points, scale=(0.002, 0.12, 0.002), seed=seed + 1)
     return np.asarray(HAIR_COLORS[color]) * (1.0 + 0.16 * locks + 0.12 * strands)[:, None]
