@@ -3,9 +3,8 @@
 from smplxpp.assemble.body_colors import body_colors_from_scan
 from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
 from smplxpp.assemble.fill_holes import FilledHoles, FillHolesConfig, cut_holes, fill_holes
-from smplxpp.assemble.layers import Obstacle, Penetration, measure_penetration
-from smplxpp.assemble.left_inside import LeftInside
-from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
+from smplxpp.assemble.layers import Obstacle, Penetration, RemainingPenetration, measure_penetration
+from smplxpp.assemble.push_out import PushConfig, flipped_faces, push_out, stand_off
 
 __all__ = [
     "AssemblyConfig",
@@ -14,16 +13,16 @@ __all__ = [
     "FillHolesConfig",
     "FilledHoles",
     "LayerReport",
-    "LeftInside",
     "Obstacle",
     "Penetration",
     "PushConfig",
+    "RemainingPenetration",
     "assemble_template",
     "body_colors_from_scan",
     "cut_holes",
     "fill_holes",
+    "flipped_faces",
     "measure_penetration",
     "push_out",
     "stand_off",
-    "turned_faces",
 ]

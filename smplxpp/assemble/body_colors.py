@@ -1,4 +1,4 @@
-"""Colours of the body's skin from the scan."""
+"""Transfer the colours of bare skin from the scan to the body."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ def body_colors_from_scan(
     *,
     max_distance: float = 0.015,
 ) -> tuple[UInt8[np.ndarray, "V 3"], Int64[np.ndarray, " V"]]:
-    """Colour every body vertex that the scan shows bare; the others take the median of the skin seen.
+    """Colour every body vertex that the scan shows bare; the others get the median colour of the visible skin.
 
-    A vertex is shown where its closest point on the scan's skin is near and faces the same way.
+    A vertex is shown if its closest point on the scan's skin is near and the normals agree in direction.
 
     Args:
-        posed_body: the body in the scan's pose. scan_colors: (N, 3) uint8 of the scan's vertices.
-        skin_faces: (M,) bool, faces of the scan that are skin.
-        max_distance: metres.
+        posed_body: the body in the scan's pose.
+        scan: the scan.
+        scan_colors: (N, 3) uint8 of the scan's vertices.
+        skin_faces: (M,) whether a face of the scan is skin.
+        max_distance: largest distance to the scan, metres.
 
     Returns:
         colors: (V, 3) uint8.
@@ -40,10 +42,12 @@ def body_colors_from_scan(
             expected=f"({scan.vertex_count}, 3) and ({scan.face_count},)",
             received=f"{np.shape(scan_colors)} and {np.shape(skin_faces)}",
         )
+    # Without any skin the body is grey.
     colors = np.full((posed_body.vertex_count, 3), 180, dtype=np.uint8)
     scan_index = np.full(posed_body.vertex_count, -1, dtype=np.int64)
     if not skin_faces.any():
         return colors, scan_index
+    # Closest points on the scan's skin; a vertex takes the colour of the nearest corner there.
     skin, used = scan.submesh(skin_faces)
     tree = igl.AABB()
     tree.init(skin.vertices, skin.faces)

@@ -1,4 +1,4 @@
-"""Assembly: the naked body and the parts in the T-pose become one Template."""
+"""Assemble the naked body and the parts in the T-pose to one template, outer layers pushed out of inner ones."""
 
 from __future__ import annotations
 
@@ -11,9 +11,15 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
-from smplxpp.assemble.layers import Obstacle, Penetration, measure_penetration
-from smplxpp.assemble.left_inside import LeftInside, find_left_inside, joints_near
-from smplxpp.assemble.penetration import PushConfig, push_out, stand_off, turned_faces
+from smplxpp.assemble.layers import (
+    Obstacle,
+    Penetration,
+    RemainingPenetration,
+    joints_near,
+    measure_penetration,
+    remaining_penetration,
+)
+from smplxpp.assemble.push_out import PushConfig, flipped_faces, push_out, stand_off
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.labels import LAYER_ORDER, SKIN
@@ -29,10 +35,10 @@ class CanonicalPart:
 
     Attributes:
         mesh: N vertices, metres.
-        weights: of the N vertices.
-        label: id of `smplxpp.core.labels`.
+        weights: skin weights of the N vertices.
+        label: label id (`smplxpp.core.labels`).
         vertex_colors: (N, 3) uint8 sRGB.
-        scan_index: the scan's vertex that each comes from, -1 for none; `assemble_template` checks that S = N.
+        scan_index: the scan's vertex of each vertex, -1 for none; `assemble_template` checks that S = N.
     """
 
     mesh: TriangleMesh
@@ -44,11 +50,11 @@ class CanonicalPart:
 
 @dataclass(frozen=True)
 class AssemblyConfig:
-    """Settings of `assemble_template`.
+    """Options of assembling a template with `assemble_template`.
 
     Attributes:
-        clearance: metres between layers after the repair.
-        push: the other settings of the repair.
+        clearance: distance between layers after the repair, metres.
+        push: the other options of the repair.
         layer_order: label ids from the skin outwards.
         skin_color: sRGB of the body's vertices.
     """
@@ -61,15 +67,18 @@ class AssemblyConfig:
 
 @dataclass(frozen=True)
 class LayerReport:
-    """What the repair found and did on one part.
+    """Penetrations of one part before and after the repair, and its displacements.
 
     Attributes:
-        before, after: penetration into each inner layer.
-        moved: vertices moved at all. max_push, mean_push: metres, the mean over those moved.
-        turned_faces: faces turned over by the repair.
-        max_push_near: the joint that the longest push is nearest to; empty where nothing moved.
-        push_limit: metres that no vertex was pushed beyond: the part's stand-off and the clearance.
-        left: what would have needed more.
+        before: penetration into each inner layer before the repair.
+        after: penetration into each inner layer after it.
+        moved: number of vertices moved.
+        max_push: largest displacement, metres.
+        mean_push: mean displacement of the moved vertices, metres.
+        flipped_faces: faces flipped by the repair.
+        max_push_near: joint nearest to the largest displacement; empty if nothing moved.
+        push_limit: largest displacement allowed, metres: the part's stand-off and the clearance.
+        remaining: vertices that would have needed more.
     """
 
     before: tuple[Penetration, ...]
@@ -77,51 +86,52 @@ class LayerReport:
     moved: int
     max_push: float
     mean_push: float
-    turned_faces: int
+    flipped_faces: int
     max_push_near: str
     push_limit: float
-    left: LeftInside
+    remaining: RemainingPenetration
 
 
 @dataclass(frozen=True)
 class AssemblyReport:
-    """Repairs by part, in the order in which they were made."""
+    """Reports of the repair by part, in the order of the repairs."""
 
     parts: dict[str, LayerReport]
 
     @property
     def penetrating_before(self) -> int:
-        """Vertices inside an inner layer before the repair, counted once an inner layer."""
+        """Return the number of vertices inside an inner layer before the repair, counted once for each inner layer."""
         return sum(p.vertices for part in self.parts.values() for p in part.before)
 
     @property
     def penetrating_after(self) -> int:
-        """Vertices inside an inner layer after it."""
+        """Return the number of vertices inside an inner layer after the repair."""
         return sum(p.vertices for part in self.parts.values() for p in part.after)
 
     @property
     def max_push(self) -> float:
-        """The longest way a vertex was pushed, metres."""
+        """Return the largest displacement of a vertex, metres."""
         return max((part.max_push for part in self.parts.values()), default=0.0)
 
     @property
     def max_push_where(self) -> str:
-        """The part that was pushed the longest way, and near which joint; empty where nothing moved."""
+        """Return the part and the joint of the largest displacement as text; empty if nothing moved."""
         name, part = max(self.parts.items(), key=lambda item: item[1].max_push, default=("", None))
         return f"{name}, near {part.max_push_near.replace('_', ' ')}" if part and part.max_push_near else ""
 
     @property
-    def left_depth(self) -> float:
-        """How deep inside an inner layer the repair has left a vertex, metres; 0 for none."""
-        return max((part.left.depth for part in self.parts.values()), default=0.0)
+    def remaining_depth(self) -> float:
+        """Return the largest depth, metres, of a vertex that stays inside an inner layer; 0 for none."""
+        return max((part.remaining.depth for part in self.parts.values()), default=0.0)
 
     @property
-    def left_where(self) -> str:
-        """What was left, part by part, in words; empty for nothing."""
-        return "; ".join(f"{name}: {part.left.words}" for name, part in self.parts.items() if part.left.vertices)
+    def remaining_where(self) -> str:
+        """Return a summary, part by part, of vertices that stay inside; empty for none."""
+        parts = self.parts.items()
+        return "; ".join(f"{name}: {part.remaining.summary}" for name, part in parts if part.remaining.vertices)
 
     def as_dict(self) -> dict:
-        """Plain numbers, for JSON; lengths in metres."""
+        """Return the report as plain numbers, for JSON; lengths in metres."""
         totals = ("penetrating_before", "penetrating_after", "max_push")
         return {name: getattr(self, name) for name in totals} | asdict(self)
 
@@ -135,13 +145,13 @@ def assemble_template(
 ) -> tuple[Template, AssemblyReport]:
     """Put the shaped body and its parts together, outer layers pushed out of inner ones.
 
-    Parts are taken from the skin outwards (`config.layer_order`); each is pushed out of the body and of every part
-    further in, as that one lies after its own repair. Vertices that already keep the clearance stay where they are,
-    but for those around a push. No part is pushed farther than it stands off the body (`stand_off`): where that is not
-    enough the body does not fit the scan, and the report says where.
+    Parts are processed from the skin outwards (`config.layer_order`); each is pushed out of the body and of every part
+    inside it, which were repaired before. Vertices that keep the clearance stay, but for those around a push. No part
+    is pushed farther than it stands off the body (`stand_off`). If that is not enough, the body does not fit the scan,
+    and the report names the place.
 
     Args:
-        body: the model; its betas are baked in, its bases stay.
+        body: the body model; its betas are baked in, its bases stay.
         params: one frame; only the betas are used.
         parts: by name, in the T-pose of `body` with these betas.
         config: clearance and order.
@@ -153,7 +163,7 @@ def assemble_template(
         InputError: more than one frame, a part named "body", unknown label, arrays that do not fit.
 
     Warns:
-        GeometryWarning: vertices left inside an inner layer, or faces turned over.
+        GeometryWarning: vertices that stay inside an inner layer, or flipped faces.
     """
     config = config or AssemblyConfig()
     if len(params) != 1:
@@ -161,7 +171,7 @@ def assemble_template(
     for name, part in parts.items():
         _check_part(name, part, body, config)
     neutral = BodyParams.rest(betas=params.betas[0], expressions=0, v_shape=params.v_shape)
-    # Without the mean hand: its pose correctives are none of the T-pose's.
+    # Without the mean hand, because its pose correctives are not part of the T-pose.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
     body_mesh = body.mesh(rest)
     meshes, report = _separate(body, body_mesh, parts, config)
@@ -188,10 +198,11 @@ def _check_part(name: str, part: CanonicalPart, body: BodyModel, config: Assembl
 def _separate(
     body: BodyModel, body_mesh: TriangleMesh, parts: Mapping[str, CanonicalPart], config: AssemblyConfig
 ) -> tuple[dict[str, TriangleMesh], AssemblyReport]:
+    """Push every part out of the body and of the layers inside it; return the meshes by name, and the report."""
     push = replace(config.push, clearance=config.clearance)
     obstacles = [Obstacle(BODY_PART, body_mesh, solid=True, max_depth=push.max_depth)]
     meshes, reports = {}, {}
-    # Parts of one label lie side by side, in the order they came.
+    # Parts of one label lie side by side and are no obstacles to each other.
     for label in config.layer_order:
         layer = [name for name, part in parts.items() if part.label == label]
         for name in layer:
@@ -205,33 +216,34 @@ def _separate(
 def _separate_part(
     mesh: TriangleMesh, obstacles: list[Obstacle], push: PushConfig, shaped: tuple[BodyModel, TriangleMesh]
 ) -> tuple[TriangleMesh, LayerReport]:
+    # Push the part out, up to its stand-off, and compare its penetrations before and after.
     before = tuple(measure_penetration(mesh, obstacle) for obstacle in obstacles)
     limit = stand_off(mesh, obstacles[0], push) + push.clearance
     moved = mesh.with_vertices(push_out(mesh, obstacles, push, limit=limit))
     after = tuple(measure_penetration(moved, obstacle) for obstacle in obstacles)
-    way = np.linalg.norm(moved.vertices - mesh.vertices, axis=1)
-    # A smoothed displacement never ends: less than a micrometre is none.
-    edited = way[way > 1e-6]
+    length = np.linalg.norm(moved.vertices - mesh.vertices, axis=1)
+    # A smoothed displacement decays without end; less than a micrometre does not count.
+    edited = length[length > 1e-6]
     report = LayerReport(
         before=before,
         after=after,
         moved=len(edited),
-        max_push=float(way.max(initial=0.0)),
+        max_push=float(length.max(initial=0.0)),
         mean_push=float(edited.mean()) if len(edited) else 0.0,
-        turned_faces=int(turned_faces(mesh, moved.vertices).sum()),
-        max_push_near=next(iter(joints_near(moved.vertices[[way.argmax()]], *shaped))) if len(edited) else "",
+        flipped_faces=int(flipped_faces(mesh, moved.vertices).sum()),
+        max_push_near=next(iter(joints_near(moved.vertices[[length.argmax()]], *shaped))) if len(edited) else "",
         push_limit=limit,
-        left=find_left_inside(moved, obstacles, *shaped),
+        remaining=remaining_penetration(moved, obstacles, *shaped),
     )
     return moved, report
 
 
 def _warn_of_rest(name: str, report: LayerReport) -> None:
-    if report.left.vertices or report.turned_faces:
-        where = f" ({report.left.words})" if report.left.vertices else ""
+    if report.remaining.vertices or report.flipped_faces:
+        where = f" ({report.remaining.summary})" if report.remaining.vertices else ""
         warnings.warn(
-            f"part {name!r}: {report.left.vertices} vertices stay inside an inner layer{where}, {report.turned_faces} "
-            "faces turned over; the fit or the skin weights are far off there",
+            f"part {name!r}: {report.remaining.vertices} vertices stay inside an inner layer{where}, "
+            f"{report.flipped_faces} faces turned over; the fit or the skin weights are far off there",
             GeometryWarning,
             stacklevel=4,
         )
@@ -244,6 +256,7 @@ def _template(
     parts: Mapping[str, CanonicalPart],
     config: AssemblyConfig,
 ) -> Template:
+    # Concatenate the arrays of body and parts; a part's vertex refers to the nearest vertex of the body.
     whole, count = concatenate_meshes(meshes), body.vertex_count
     sizes = [mesh.vertex_count for mesh in meshes]
     labels = [SKIN.id, *(part.label for part in parts.values())]
@@ -267,7 +280,7 @@ def _template(
 
 
 def _stack(weights: list[SkinWeights]) -> SkinWeights:
-    """All vertices in one; slots padded with joint 0 at weight 0, components numbered on."""
+    """Concatenate skin weights; slots are padded with joint 0 at weight 0, components are numbered consecutively."""
     width = max(w.joint_indices.shape[1] for w in weights)
 
     def padded(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Layers of a clothed person: who lies outside whom, and where an outer layer cuts into an inner one."""
+"""Measure where an outer layer of a clothed person penetrates an inner one, by the inner layer's signed distance."""
 
 from __future__ import annotations
 
@@ -6,26 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.spatial import cKDTree
 
+from smplxpp.body.model import BodyModel
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 
-# Metres; two parts of one scan touch at their seam to within rounding.
 TOUCHING = 1e-6
-# Cloth comes through cloth where both run alike. Where one part's web stands across the other (a scan bridges the gap
-# under a hem) the points behind the web are beside it, not through it: normals' cosine above which layers run alike.
-_PARALLEL = 0.5
+"""Depth, metres, up to which a point only touches. Two parts of one scan touch at their seam to within rounding."""
 
 
 class Obstacle:
-    """An inner layer that outer ones must stay out of.
+    """An inner layer that outer layers must not penetrate.
 
     Args:
-        name: of the part.
-        mesh: its surface, outward.
-        solid: a body, with an inside; otherwise a garment, an open surface with a back.
-        max_depth: metres behind a garment up to which a point counts as having come through it; further away it
-            belongs somewhere else (the other leg, the far side of the torso).
+        name: name of the part.
+        mesh: its surface, oriented outward.
+        solid: whether it is a body, with an inside; otherwise it is a garment, an open surface with a back.
+        max_depth: distance behind a garment, metres, up to which a point has penetrated it; farther away it belongs to
+            another place (the other leg, the far side of the torso).
     """
 
     def __init__(self, name: str, mesh: TriangleMesh, *, solid: bool, max_depth: float) -> None:
@@ -38,25 +37,28 @@ class Obstacle:
     def distance(
         self, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"]
     ) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
-        """Signed distance (N,) of (N, 3) points with (N, 3) outward unit normals, and its (N, 3) gradient.
+        """Return the signed distance (N,) of points with outward unit normals, and its (N, 3) gradient.
 
-        The answer is infinite further than `max_depth` from the bounding box, and where the question has none: beside
-        a garment's border, further behind it than `max_depth`, and where the two surfaces do not run alike.
+        The distance is infinite farther than `max_depth` from the bounding box, and where a garment's sign means
+        nothing: beside its border, farther behind it than `max_depth`, and where the surfaces are not parallel. Cloth
+        penetrates parallel cloth; where a part crosses the other (a scan bridges the gap under a hem), points behind it
+        are beside it. Surfaces are parallel if the cosine of their normals is above 0.5.
         """
         near = self._box_distance(points) <= self._max_depth
         found = self._field.query(points[near])
         distance, gradient = np.full(len(points), np.inf), np.zeros_like(points)
         if not self._solid:
-            facing = np.einsum("ij,ij->i", found.normal, normals[near]) > _PARALLEL
+            facing = np.einsum("ij,ij->i", found.normal, normals[near]) > 0.5
             meaningful = facing & ~found.on_border & (found.distance > -self._max_depth)
             found.distance[~meaningful] = np.inf
         distance[near], gradient[near] = found.distance, found.gradient
         return distance, gradient
 
     def lower_bound(self, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-        """The way, in metres, that each point above zero can go without coming inside; infinite far behind a garment.
+        """Return a lower bound of each point's distance, metres; infinite far behind a garment.
 
-        Unlike `distance` it answers beside borders too, where a small move may give the question an answer.
+        A point with a positive bound can move so far without penetrating. Unlike `distance` it is finite beside borders
+        too, where a small move may lead in front of the surface.
         """
         bound = self._box_distance(points)
         near = bound <= self._max_depth
@@ -64,7 +66,7 @@ class Obstacle:
         return bound if self._solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
 
     def _box_distance(self, points: np.ndarray) -> np.ndarray:
-        """Metres to the bounding box, 0 inside: far points need no search."""
+        """Return the distance to the bounding box, metres, 0 inside, because far points need no search."""
         squared = np.zeros(len(points))
         for axis in range(3):
             x = points[:, axis]
@@ -74,9 +76,10 @@ class Obstacle:
     def clearance(
         self, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"], wanted: float
     ) -> Float64[np.ndarray, " N"]:
-        """The metres that each point must keep: `wanted`, but no more than it has from a garment it did not cut into.
+        """Return the clearance of each point, metres: `wanted`, but at most its distance to a garment that it is
+        outside.
 
-        Parts cut from one scan share a seam; a gap there would have to tear the cloth.
+        Parts cut from one scan share a seam; a gap there would tear the cloth.
         """
         if self._solid:
             return np.full(len(points), wanted)
@@ -91,8 +94,10 @@ class Penetration:
 
     Attributes:
         inner: name of the inner layer.
-        vertices: vertices inside by more than `TOUCHING`. face_centers: centres of faces inside by more.
-        depth_mean, depth_max: of those vertices, metres; 0 if none.
+        vertices: number of vertices deeper inside than `TOUCHING`.
+        face_centers: number of face centres deeper inside.
+        depth_mean: mean depth of those vertices, metres; 0 if none.
+        depth_max: largest depth, metres; 0 if none.
     """
 
     inner: str
@@ -103,7 +108,7 @@ class Penetration:
 
 
 def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
-    """Count and depth of an outer layer's vertices and face centres inside an inner layer."""
+    """Count an outer layer's vertices and face centres inside an inner layer, and measure their depth."""
     distance, _ = obstacle.distance(mesh.vertices, mesh.vertex_normals)
     centers, _ = obstacle.distance(face_centers(mesh, mesh.vertices), mesh.face_normals)
     depth = -distance[distance < -TOUCHING]
@@ -117,6 +122,57 @@ def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
 
 
 def face_centers(mesh: TriangleMesh, values: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"]:
-    """The mean over each face's corners of values at the vertices."""
+    """Return the mean over each face's corners of values at the vertices."""
     a, b, c = mesh.faces.T
     return (values[a] + values[b] + values[c]) / 3.0
+
+
+@dataclass(frozen=True)
+class RemainingPenetration:
+    """Vertices of a part that stay inside an inner layer after the repair, because the body does not fit the scan
+    there.
+
+    Attributes:
+        vertices: number of vertices.
+        depth: depth of the deepest, metres; 0 for none.
+        where: number of vertices by the joint with the largest weight in the nearest skin, largest first.
+    """
+
+    vertices: int
+    depth: float
+    where: dict[str, int]
+
+    @property
+    def summary(self) -> str:
+        """Return number, depth and the first three joints as text."""
+        places = ", ".join(joint.replace("_", " ") for joint in list(self.where)[:3])
+        more = " and others" if len(self.where) > 3 else ""
+        return f"{self.vertices} vertices, up to {1e3 * self.depth:.1f} mm deep, near {places}{more}"
+
+
+def remaining_penetration(
+    mesh: TriangleMesh, obstacles: list[Obstacle], body: BodyModel, body_mesh: TriangleMesh
+) -> RemainingPenetration:
+    """Find the vertices of a repaired part that lie inside any inner layer.
+
+    Args:
+        mesh: the part.
+        obstacles: its inner layers.
+        body: the body model, which names the places.
+        body_mesh: its surface in the part's pose.
+    """
+    depth = np.zeros(mesh.vertex_count)
+    for obstacle in obstacles:
+        depth = np.maximum(depth, -obstacle.distance(mesh.vertices, mesh.vertex_normals)[0])
+    inside = np.flatnonzero(depth > TOUCHING)
+    if not len(inside):
+        return RemainingPenetration(0, 0.0, {})
+    return RemainingPenetration(len(inside), float(depth.max()), joints_near(mesh.vertices[inside], body, body_mesh))
+
+
+def joints_near(points: Float[np.ndarray, "N 3"], body: BodyModel, body_mesh: TriangleMesh) -> dict[str, int]:
+    """Count points by the joint with the largest weight at the nearest skin vertex; the largest count comes first."""
+    nearest = cKDTree(body_mesh.vertices).query(points)[1]
+    counts = np.bincount(body.weights[nearest].argmax(axis=1), minlength=body.joint_count)
+    order = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
+    return {body.joint_names[k]: int(counts[k]) for k in order}

@@ -1,4 +1,4 @@
-"""A hole's patch: the least surface over a border loop, with faces as small as those around it (Liepa 2003)."""
+"""Triangulate a hole with the least area, and refine the patch to the density of the mesh around it (Liepa 2003)."""
 
 from __future__ import annotations
 
@@ -11,70 +11,71 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 from smplxpp.core.topology import edge_groups, half_edges
 
-LONGEST = 400
-"""Vertices of a border at most: time grows with their cube."""
-_ROUNDS = 12
-_MOST = 1000  # new vertices, about
-_SPACING = 2.0**0.5  # Liepa's density factor
+MAX_LOOP = 400
+"""Largest number of vertices of a border; time grows with their cube."""
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """What closes a border loop of L vertices.
+    """A triangulation that closes a border loop of L vertices.
 
     Attributes:
-        faces: (F, 3), turned as the mesh around; 0 to L - 1 are the loop's vertices in order, K new ones follow.
-        from_rim: (K, L) float64, rows sum to 1: a new vertex's place, colour or weights from those of the loop's. The
-            mean of its neighbours' (discrete harmonic), so that nothing goes beyond what the rim has.
+        faces: (F, 3), wound as the mesh around; 0 to L - 1 are the loop's vertices in order, K new ones follow.
+        from_rim: (K, L) float64 coefficients of the new vertices' positions, colours or weights in those of the loop;
+            rows sum to 1. Each new vertex is the mean of its neighbours (discrete harmonic), so that no value leaves
+            the range of the rim's.
     """
 
     faces: Int64[np.ndarray, "F 3"]
     from_rim: Float64[np.ndarray, "K L"]
 
     def places(self, rim: Float[np.ndarray, "L 3"]) -> Float64[np.ndarray, "N 3"]:
-        """The loop's vertices, then the new ones."""
+        """Return the positions of the loop's vertices, then of the new ones."""
         return np.concatenate([rim, self.from_rim @ rim])
 
     def area(self, rim: Float[np.ndarray, "L 3"]) -> float:
-        """Square metres."""
+        """Return the area of the patch, square metres."""
         return float(TriangleMesh(self.places(rim), self.faces).face_areas.sum())
 
     def width(self, rim: Float[np.ndarray, "L 3"]) -> float:
-        """Twice the area by the border's length, metres: how wide a long slit is in the mean, a disc's radius."""
+        """Return twice the area divided by the perimeter, metres: a long slit's mean width, or a disc's radius."""
         return 2.0 * self.area(rim) / float(row_lengths(np.roll(rim, -1, axis=0) - rim).sum())
 
 
 def patch_loop(mesh: TriangleMesh, loop: Int[np.ndarray, " L"]) -> Patch:
     """Close a border loop of a manifold mesh (`smplxpp.core.topology.border_loops`).
 
-    The loop is triangulated with the least area (Barequet and Sharir 1995); triangles larger than the rim's edges are
-    split, edges turned until they are Delaunay's (Liepa, *Filling holes in meshes*, SGP 2003), and new vertices go to
-    the mean of their neighbours. Two vertices of the loop with an edge outside get none within.
+    The loop is triangulated with the least area (Barequet and Sharir 1995). Triangles larger than the rim's edges are
+    split and edges flipped until they are Delaunay (Liepa, *Filling holes in meshes*, SGP 2003). New vertices are
+    placed at the mean of their neighbours. Two vertices of the loop that share an edge outside get none inside.
 
     Raises:
-        InputError: fewer than 3 or more than `LONGEST` vertices, or a loop that only an edge which exists could close.
+        InputError: fewer than 3 or more than `MAX_LOOP` vertices, or a loop that only an existing edge could close.
     """
     count = len(loop)
-    if not 3 <= count <= LONGEST:
-        raise InputError("hole", expected=f"a border of 3 to {LONGEST} vertices", received=str(count))
+    if not 3 <= count <= MAX_LOOP:
+        raise InputError("hole", expected=f"a border of 3 to {MAX_LOOP} vertices", received=str(count))
+    # 1. Triangulate with the least area, without edges that exist already.
     rim = mesh.vertices[loop]
     taken = _chords(mesh.faces, loop)
     faces = _least_area(rim, taken)
+    # 2. Refine to the edge lengths at the rim, but to no more than about 1000 new vertices, which bounds a border of
+    # many tiny edges.
     around = row_lengths(np.roll(rim, -1, axis=0) - rim)
-    # A border of many tiny edges does not ask for as tiny faces all over.
-    least = (sum(_area(*rim[list(face)]) for face in faces) / _MOST) ** 0.5
+    least = (sum(_area(*rim[list(face)]) for face in faces) / 1000) ** 0.5
     spacing = list(np.maximum(0.5 * (around + np.roll(around, 1)), least))
     places = list(rim)
-    for _ in range(_ROUNDS):
+    for _ in range(12):
         if not _split(faces, places, spacing):
             break
-        _turn(faces, np.array(places), taken)
+        _flip_to_delaunay(faces, np.array(places), taken)
+    # 3. Harmonic coefficients of the new vertices.
     triangles = np.array(faces, dtype=np.int64)
     return Patch(triangles, _harmonic(triangles, count, len(places)))
 
 
 def _chords(faces: Int[np.ndarray, "M 3"], loop: Int[np.ndarray, " L"]) -> set[tuple[int, int]]:
-    """Pairs of places in the loop, lower first, between which the mesh has an edge."""
+    """Return the pairs of positions in the loop, lower first, between which the mesh has an edge."""
     at = np.full(int(faces.max()) + 1, -1)
     at[loop] = np.arange(len(loop))
     ends = np.sort(at[half_edges(faces)], axis=1)
@@ -82,7 +83,10 @@ def _chords(faces: Int[np.ndarray, "M 3"], loop: Int[np.ndarray, " L"]) -> set[t
 
 
 def _least_area(rim: Float[np.ndarray, "L 3"], taken: set[tuple[int, int]]) -> list[tuple[int, int, int]]:
-    """The triangulation of a loop with the least area, by dynamic programming over its diagonals."""
+    """Return the triangulation of a loop with the least area, by dynamic programming over its diagonals.
+
+    cost[i, j] is the least area over the vertices i to j: min over k of cost[i, k] + cost[k, j] + area(i, k, j).
+    """
     count = len(rim)
     cost, middle = np.full((count, count), np.inf), np.zeros((count, count), dtype=np.int64)
     cost[np.arange(count - 1), np.arange(1, count)] = 0.0
@@ -98,25 +102,29 @@ def _least_area(rim: Float[np.ndarray, "L 3"], taken: set[tuple[int, int]]) -> l
             cost[i, j], middle[i, j] = total[best], k[best]
     if not np.isfinite(cost[0, count - 1]):
         raise InputError("hole", expected="a border that faces can close", received="one with edges across it")
+    # Trace the best diagonals back; faces run against the border's direction.
     faces: list[tuple[int, int, int]] = []
     sides = [(0, count - 1)]
     while sides:
         low, high = sides.pop()
         if high - low >= 2:
             between = int(middle[low, high])
-            faces.append((high, between, low))  # against the border's direction
+            faces.append((high, between, low))
             sides += [(low, between), (between, high)]
     return faces
 
 
 def _split(faces: list[tuple[int, int, int]], places: list[np.ndarray], spacing: list[float]) -> bool:
-    """Put a vertex into the middle of each face that is wider than the edges around; whether there was one."""
+    """Insert a vertex at the centroid of each face that is larger than the edges around; return whether there was one.
+
+    Liepa's criterion: sqrt(2) times the distance from centroid to every corner exceeds the spacing at both.
+    """
     before = len(faces)
     for index in range(before):
         corners = faces[index]
         middle = np.mean([places[c] for c in corners], axis=0)
         wanted = float(np.mean([spacing[c] for c in corners]))
-        reach = [_SPACING * float(np.linalg.norm(middle - places[c])) for c in corners]
+        reach = [2.0**0.5 * float(np.linalg.norm(middle - places[c])) for c in corners]
         if any(r <= max(wanted, spacing[c]) for r, c in zip(reach, corners, strict=True)):
             continue
         new = len(places)
@@ -128,9 +136,12 @@ def _split(faces: list[tuple[int, int, int]], places: list[np.ndarray], spacing:
     return len(faces) > before
 
 
-def _turn(faces: list[tuple[int, int, int]], places: Float[np.ndarray, "N 3"], taken: set[tuple[int, int]]) -> None:
-    """Turn inner edges whose two opposite angles are together more than a straight one, until there is none."""
-    beside: dict[tuple[int, int], int] = {}  # the face with the directed edge
+def _flip_to_delaunay(
+    faces: list[tuple[int, int, int]], places: Float[np.ndarray, "N 3"], taken: set[tuple[int, int]]
+) -> None:
+    """Flip inner edges with opposite angles that sum to more than pi, until there is none."""
+    # The face of each directed edge; a queue of inner edges; a budget, because flips may cycle on a curved patch.
+    beside: dict[tuple[int, int], int] = {}
     for index, face in enumerate(faces):
         beside.update({(face[k], face[(k + 1) % 3]): index for k in range(3)})
     todo = [edge for edge in beside if edge[0] < edge[1] and edge[::-1] in beside]
@@ -147,6 +158,7 @@ def _turn(faces: list[tuple[int, int, int]], places: Float[np.ndarray, "N 3"], t
             continue
         if _angle(places[c], places[a], places[b]) + _angle(places[d], places[a], places[b]) <= np.pi + 1e-9:
             continue
+        # Replace the faces (a, b, c) and (b, a, d) by those of the other diagonal, and check their outer edges again.
         del beside[a, b], beside[b, a]
         faces[first], faces[second] = (a, d, c), (d, b, c)
         beside.update({(a, d): first, (d, c): first, (c, a): first, (d, b): second, (b, c): second, (c, d): second})
@@ -163,7 +175,7 @@ def _angle(corner: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _harmonic(faces: Int64[np.ndarray, "F 3"], rim: int, count: int) -> Float64[np.ndarray, "K L"]:
-    """Weights of the rim in every new vertex, of which each is the mean of its neighbours."""
+    """Return the coefficients of the rim in every new vertex, each of which is the mean of its neighbours."""
     if count == rim:
         return np.zeros((0, rim))
     order, first, _ = edge_groups(faces)

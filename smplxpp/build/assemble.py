@@ -77,12 +77,12 @@ def assemble_parts(
         ),
         Check(
             "depth of what the repair leaves inside",
-            report.left_depth * MM,
+            report.remaining_depth * MM,
             "mm",
             0.0,
             5.0,
-            explanation=f"the body does not fit the scan here: register first. {report.left_where}"
-            if report.left_where
+            explanation=f"the body does not fit the scan here: register first. {report.remaining_where}"
+            if report.remaining_where
             else "nothing needs a push beyond what its part stands off the body",
         ),
         Check(

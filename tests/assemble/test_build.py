@@ -68,7 +68,7 @@ def test_a_part_within_the_body_comes_out(body):
     assert report.penetrating_after == 0
     assert 0.004 < report.max_push < 0.02
     assert report.as_dict()["parts"]["tunic"]["after"][0]["vertices"] == 0
-    assert report.parts["tunic"].turned_faces == 0
+    assert report.parts["tunic"].flipped_faces == 0
     assert np.array_equal(template.vertices[: body.vertex_count], body.forward(params()).rest_vertices[0])
 
 
@@ -81,13 +81,13 @@ def test_a_body_that_does_not_fit_is_named_and_not_pushed_through(body):
         _, report = assemble_template(body, params(), parts)
     tunic = report.parts["tunic"]
     assert 0.010 <= tunic.push_limit <= 0.031 and tunic.max_push == pytest.approx(tunic.push_limit, rel=1e-6)
-    assert tunic.left.vertices == tunic.after[0].vertices > 50
-    assert tunic.left.depth == tunic.after[0].depth_max > 0.005
-    assert sum(tunic.left.where.values()) == tunic.left.vertices
-    assert set(tunic.left.where) <= {"pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip", "neck"}
-    assert report.left_where.startswith("tunic: ") and "cap" not in report.left_where
+    assert tunic.remaining.vertices == tunic.after[0].vertices > 50
+    assert tunic.remaining.depth == tunic.after[0].depth_max > 0.005
+    assert sum(tunic.remaining.where.values()) == tunic.remaining.vertices
+    assert set(tunic.remaining.where) <= {"pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip", "neck"}
+    assert report.remaining_where.startswith("tunic: ") and "cap" not in report.remaining_where
     assert report.max_push_where.startswith("tunic, near ")
-    assert report.parts["cap"].left.vertices == 0 and report.parts["cap"].left.where == {}
+    assert report.parts["cap"].remaining.vertices == 0 and report.parts["cap"].remaining.where == {}
 
 
 def test_the_mean_hand_leaves_no_correctives_in_the_t_pose(body):
@@ -167,5 +167,5 @@ def test_true_layers_of_the_captures(captures, body, subject):
         template, report = assemble_template(body, BodyParams.rest(betas=d["betas"]), parts)
     assert report.penetrating_before > 0
     assert report.penetrating_after == 0
-    assert all(report.parts[name].turned_faces == 0 for name in parts if name != "hair")
+    assert all(report.parts[name].flipped_faces == 0 for name in parts if name != "hair")
     assert np.abs(template.vertices[: body.vertex_count] - d["v_tpose"][: body.vertex_count]).max() < 2e-5

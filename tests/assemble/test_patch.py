@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from smplxpp.assemble.patch import LONGEST, patch_loop
+from smplxpp.assemble.patch import MAX_LOOP, patch_loop
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups
@@ -106,8 +106,8 @@ def test_a_border_of_tiny_edges_gets_no_myriad_of_faces():
 def test_borders_that_are_none_are_refused():
     with pytest.raises(InputError, match="3 to"):
         patch_loop(ring(8), np.arange(2))
-    with pytest.raises(InputError, match=str(LONGEST)):
-        patch_loop(ring(LONGEST + 1), np.arange(LONGEST + 1))
+    with pytest.raises(InputError, match=str(MAX_LOOP)):
+        patch_loop(ring(MAX_LOOP + 1), np.arange(MAX_LOOP + 1))
     mesh = ring(4)
     crossed = TriangleMesh(
         np.concatenate([mesh.vertices, [[0.0, 0.0, 0.1], [0.0, 0.0, -0.1]]]),

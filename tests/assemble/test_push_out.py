@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from smplxpp.assemble import Obstacle, PushConfig, measure_penetration, push_out, stand_off, turned_faces
+from smplxpp.assemble import Obstacle, PushConfig, flipped_faces, measure_penetration, push_out, stand_off
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 
@@ -37,7 +37,7 @@ def test_a_dent_is_pushed_out_to_the_clearance():
     after = measure_penetration(moved, solid(inner))
     assert (after.vertices, after.face_centers) == (0, 0)
     assert np.linalg.norm(moved.vertices, axis=1).min() > 0.1
-    assert not turned_faces(outer, moved.vertices).any()
+    assert not flipped_faces(outer, moved.vertices).any()
     way = np.linalg.norm(moved.vertices - outer.vertices, axis=1)
     assert way.max() < 0.0095
     # No spike: neighbours' ways differ by less than half the longest.
@@ -122,7 +122,7 @@ def test_nothing_is_pushed_beyond_the_limit_and_the_surface_stays_smooth():
     # No cliff where the limit begins to hold, and nothing turns over.
     steps = [np.abs(np.diff(lengths[moved.edges], axis=1)).max() for lengths in (way, np.linalg.norm(far, axis=1))]
     assert steps[0] <= steps[1]
-    assert not turned_faces(outer, moved.vertices).any()
+    assert not flipped_faces(outer, moved.vertices).any()
 
 
 def test_a_limit_that_nothing_reaches_changes_no_bit():
