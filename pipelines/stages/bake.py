@@ -1,4 +1,4 @@
-"""Stage 85: what the teacher does in maps becomes motion of the student's mesh."""
+"""Stage 85: distil the teacher's maps into a deformation field of the student's mesh."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ class BakeStage(ModelStage):
     """A student before its blend shapes: field and attributes from a teacher, or from photographs.
 
     Attributes:
-        cloth: the loose clothes, which poses that count as new are shown simulated; None: nothing is.
-        source: a teacher, whose Gaussians it starts from too; or a fit, to learn from photographs alone.
+        source: stage of a teacher, whose Gaussians are the start; or of a fit, to learn from photographs alone.
+        cloth: stage of the loose clothes, which are simulated in poses that count as new; None simulates none.
+        student: architecture of the student.
+        config: configuration of the training.
     """
 
     file = "student.safetensors"

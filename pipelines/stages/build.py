@@ -158,15 +158,16 @@ def build(
 
     Args:
         run: folder of the run.
-        inputs: what is read, and which stages make the rest.
-        config: choices.
-        registration: what the body is registered to, where the inputs register.
-        reconstruction: what the scan is made of, where the inputs reconstruct.
-        by_hand: the user's files of landmarks and corrections by their names in a run, which replace those there.
+        inputs: files to read; they decide which stages make the rest.
+        config: choices of the stages.
+        registration: inputs of the registration, if the build registers the body.
+        reconstruction: inputs of the reconstruction, if the build reconstructs the scan.
+        by_hand: the user's landmarks and corrections by their names in a run; they replace the files there.
         first: stage to begin with.
         last: stage to end with.
         progress: called with a stage's name before (False) and after (True) it.
-        report: writes the page of the run when all stages stand; it lies above this room, so that it is handed in.
+        report: function that writes the page of the run after the last stage. The package of reports imports this one,
+            so that the caller passes the function in.
 
     Returns:
         The record of every stage up to `last`.
@@ -174,9 +175,10 @@ def build(
     Raises:
         InputError: unusable input; every finished stage is kept.
     """
-    # What a user made by hand lies in the run whatever becomes of the build.
+    # Keep the user's files in the run first, so that they remain there if the build fails.
     for name, source in (by_hand or {}).items():
         take_file(run, name, source, read=_READERS[name])
+    # Check the range of stages and the inputs before the run folder is touched.
     for name in (first, last):
         require_choice("stage", name, BUILD_STAGES)
     if BUILD_STAGES.index(first) > BUILD_STAGES.index(last):
@@ -185,8 +187,11 @@ def build(
     assert inputs.reconstructs == (reconstruction is not None), "what to reconstruct from"
     config = resolved(config, inputs)
     check_inputs(inputs)
+    # The lock keeps a second process from writing into the run while stages change. `build.json` is written first,
+    # because stages and the report of an interrupted build read it.
     with own_run_folder(run, (*BUILD_STAGES, "build", "metrics", "report")):
         save_build(run, inputs, config)
+        # These two stages do their own bookkeeping, since commands of their own run them as well.
         makers = {}
         if reconstruction is not None:
             makers[RECONSTRUCT_STAGE] = partial(reconstruct_capture, run, reconstruction)
@@ -194,6 +199,7 @@ def build(
             makers[REGISTER_STAGE] = partial(register_capture, run, registration)
         records = _run_stages(BuildContext(run, inputs, config), makers, first, last, progress)
         write_metrics(run, inputs, records)
+    # The page needs all stages; a partial build leaves the previous page in place.
     if report is not None and last == BUILD_STAGES[-1]:
         progress("report", False)
         report(run, inputs, config, records)
@@ -208,12 +214,14 @@ def _run_stages(
     last: str,
     progress: Progress,
 ) -> dict[str, StageRecord]:
-    """Run stages one after the other; those of `makers` have commands of their own."""
+    """Run the stages up to `last` in order; `makers` run those that have commands of their own."""
     records: dict[str, StageRecord] = {}
     wanted = stages_of(context.inputs)
     for name in BUILD_STAGES[: BUILD_STAGES.index(last) + 1]:
+        # A stage for something that the user has given does not exist in this build.
         if name not in wanted:
             continue
+        # Stages before the first one are only read; a missing one ends the build here.
         if BUILD_STAGES.index(name) < BUILD_STAGES.index(first):
             records[name] = require_stage(context.run, name)
             continue
@@ -222,15 +230,18 @@ def _run_stages(
             records[name] = makers[name]()
         else:
             work = partial(PARTS[name].work, build=context)
+            # `_stage` needs the records so far, because the digests of earlier outputs are part of the key.
             records[name] = run_stage(context.run, _stage(name, context, records), work)
         progress(name, True)
     return records
 
 
 def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) -> Stage:
-    """What decides a stage of the build."""
+    """Return the identity of a stage: its configuration, digests of its inputs, its code and seed."""
     part, inputs, config = PARTS[name], context.inputs, context.config
     digests: dict[str, str] = {}
+    # Digest all that the stage reads: input files, files placed by hand, and outputs of earlier stages. Any change in
+    # them changes the key and makes the stage run again.
     for key in part.files:
         digests |= _file_digests(key, getattr(inputs, key))
     if "detector" in part.settings and config.detector is not None:

@@ -1,4 +1,4 @@
-"""Records in a run of what its build, its registration and its reconstruction were made from."""
+"""Read and write the records of the inputs and choices of a run's build, registration and reconstruction."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _RECONSTRUCT_PATHS = ("capture", "masks", "mesh")
 
 @dataclass(frozen=True)
 class BuildContext:
-    """What the stages of a build work on.
+    """Run folder, inputs and choices that the stages of a build share.
 
     Attributes:
-        run: folder of the run, in which the stages before stand.
-        inputs: what is read.
-        config: choices.
+        run: folder of the run, which holds the earlier stages.
+        inputs: files to read.
+        config: choices of the stages.
     """
 
     run: Path
@@ -45,7 +45,7 @@ class BuildContext:
 
 
 def stages_of(inputs: BuildInputs) -> tuple[str, ...]:
-    """Return the stages of a build in their order, with those that make what is not given."""
+    """Return the stages of a build in order, including those that make inputs the user has not given."""
     return tuple(stage for stage in BUILD_STAGES if stage.partition("_")[2] in inputs.steps)
 
 
@@ -58,15 +58,15 @@ def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
 
 
 def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
-    """Read what `save_build` wrote; None where there is none, or none that this version can read, which is logged.
+    """Read what `save_build` wrote; None without a record, or (with a warning) for one that cannot be read.
 
-    Optional inputs that are gone are left out.
+    Optional inputs whose files are missing are left out.
     """
 
     def parsed(content: Mapping[str, Any]) -> tuple[BuildInputs, BuildConfig]:
         return _build_inputs(content["inputs"]), _build_config(content["config"])
 
-    return _load(run / BUILD_FILE, parsed, "%s counts as a run that does not say what it was built from: %s")
+    return _load(run / BUILD_FILE, parsed, "%s is treated as a run without a record of its inputs: %s")
 
 
 def save_register(run: Path, inputs: RegisterInputs) -> None:
@@ -81,8 +81,8 @@ def load_register(run: Path) -> RegisterInputs | None:
         require_plain_fields(RegisterInputs, values, subject=REGISTER_FILE)
         return RegisterInputs(**{**values, **_paths(values, _REGISTER_PATHS), **_frames_and_cameras(values)})
 
-    words = "%s counts as a run without a registration by `smplxpp register`: %s"
-    return _load(run / REGISTER_FILE, parsed, words)
+    warning = "%s is treated as a run without a registration by `smplxpp register`: %s"
+    return _load(run / REGISTER_FILE, parsed, warning)
 
 
 def save_reconstruct(run: Path, inputs: ReconstructInputs) -> None:
@@ -97,11 +97,11 @@ def load_reconstruct(run: Path) -> ReconstructInputs | None:
         require_plain_fields(ReconstructInputs, values, subject=RECONSTRUCT_FILE)
         return ReconstructInputs(**{**values, **_paths(values, _RECONSTRUCT_PATHS), **_frames_and_cameras(values)})
 
-    return _load(run / RECONSTRUCT_FILE, parsed, "%s counts as a run without a reconstruction: %s")
+    return _load(run / RECONSTRUCT_FILE, parsed, "%s is treated as a run without a reconstruction: %s")
 
 
-def _load(path: Path, parsed: Callable[[dict[str, Any]], _T], words: str) -> _T | None:
-    """What a record holds; None where there is none, or none that can be read, which is logged in these words."""
+def _load(path: Path, parsed: Callable[[dict[str, Any]], _T], warning: str) -> _T | None:
+    """Parse a record; None without one, or for one that cannot be read, with this warning in the log."""
     if not path.exists():
         return None
     try:
@@ -109,23 +109,25 @@ def _load(path: Path, parsed: Callable[[dict[str, Any]], _T], words: str) -> _T 
         with values_of(path):
             return parsed(values)
     except InputError as error:
-        log.warning(words, path.parent, error)
+        # An unreadable record must not block the run, whose stages can be made again without it.
+        log.warning(warning, path.parent, error)
         return None
 
 
 def _plain(value: Any) -> Any:
-    """A value with its paths as absolute texts."""
+    """Return a value whose paths are replaced by absolute paths as text."""
     if isinstance(value, Path):
         return str(absolute(value))
     return {k: _plain(v) for k, v in value.items()} if isinstance(value, dict) else value
 
 
 def _paths(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Path]:
+    """Return the fields among `names` that are given, as paths."""
     return {name: Path(values[name]) for name in names if values.get(name) is not None}
 
 
 def _frames_and_cameras(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers of frames, None for all, and names of held-out cameras."""
+    """Parse the numbers of frames (None for all) and the names of held-out cameras."""
     frames = values["frames"]
     if frames is not None:
         frames = tuple(as_integer(frame, subject="frames") for frame in as_list(frames, subject="frames"))
@@ -159,6 +161,7 @@ def _build_inputs(written: Mapping[str, Any]) -> BuildInputs:
     require_plain_fields(BuildInputs, values, subject=BUILD_FILE)
     found: dict[str, Any] = {f.name: values[f.name] for f in fields(BuildInputs)}
     found |= {name: Path(values[name]) for name in _BUILD_PATHS if values[name] is not None}
+    # Later stages can do without these files. A run that was moved without them stays readable.
     for name in ("labels", "cameras", "motion"):
         if found[name] is not None and not found[name].exists():
             found[name] = None

@@ -1,4 +1,4 @@
-"""Stage 83: which clothes are loose, cut for simulation and fitted to the surface that the teacher followed."""
+"""Stage 83: find loose clothes, cut them for simulation and calibrate them on the surface that the teacher tracked."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class ClothStage(ModelStage):
     """Garments of the template's loose parts.
 
     Attributes:
-        teacher: stage of the teacher, to whose followed surface they are fitted.
-        config: which parts are looked at, and how.
+        teacher: stage of the teacher, on whose tracked surface the garments are calibrated.
+        config: parts to examine, and settings of the calibration.
     """
 
     file = Path(GARMENTS).name
@@ -59,8 +59,11 @@ class ClothStage(ModelStage):
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
         begin = time.monotonic()
         teacher = trainer.model(self.teacher)
+        # Without a teacher that tracked the cloth there is no surface to calibrate the simulation on.
         track = teacher.track if isinstance(teacher, TeacherAvatar) else None
         reference = None
+        # Loose parts are found from the reference pose, without the shape offsets that the template already contains.
+        # Parts named by the user need that pose, so that reading it may fail here with its own message.
         if (trainer.run / PARAMS).is_file() or self.config.parts is not None:
             reference = load_params_of_run(trainer.run).frame(0).without_shape()
         found = find_garments(
@@ -71,6 +74,7 @@ class ClothStage(ModelStage):
             report=lambda done, total: session.report(Progress(done, total, 0.0, 0.0)),
         )
         save_garments(folder / self.file, found.garments)
+        # The keys about iterations are those of every training stage, so that progress and resuming read them alike.
         numbers = {
             "loose": [garment.part for garment in found.garments],
             "particles": {garment.part: len(garment.particles) for garment in found.garments},
@@ -89,7 +93,7 @@ class ClothStage(ModelStage):
 
 
 def clothed_sequence(trainer: Trainer, ground: str, cloth: ModelStage | None) -> AvatarSequence:
-    """Return the capture, with the garments of a finished stage simulated in poses that are new or count as new."""
+    """Return the capture; garments of a finished stage are simulated in poses that are new or count as new."""
     return with_simulated(trainer.sequence(ground), [] if cloth is None else trainer.model(cloth))
 
 
@@ -121,6 +125,7 @@ def _checks(found: LooseClothes) -> list[Check]:
     return [
         Check(
             f"{part}: wrong outline with it simulated",
+            # 1e-9 keeps a perfect outline under skinning from dividing by zero.
             value=outlines.simulated / max(outlines.skinned, 1e-9),
             unit="of skinning's",
             warn=1.0,

@@ -1,4 +1,4 @@
-"""Stage 90: blend shapes for what the field leaves, and the compact file for players."""
+"""Stage 90: train blend shapes for the residual of the field, and write the compact file for players."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ class CompensateStage(ModelStage):
     """A baked student with trained blend shapes.
 
     Attributes:
-        student: the bake. teacher: whose followed surface the blend shapes start from; None: from zero.
-        cloth: the loose clothes, which poses that count as new are shown simulated; None: nothing is.
-        shapes: as many as the expressions of the body are driven, whatever it says itself.
-        max_bytes: of the compact file, which has to leave out blend shapes for it; None: it has all.
+        student: stage of the baked student.
+        teacher: stage of the teacher whose tracked surface initialises the blend shapes; None starts from zero.
+        cloth: stage of the loose clothes, which are simulated in poses that count as new; None simulates none.
+        shapes: blend shapes; their number of expression inputs is replaced by that of the body.
+        config: configuration of the training.
+        max_bytes: largest size of the compact file, which leaves out blend shapes to meet it; None keeps all.
     """
 
     file = "student.safetensors"

@@ -58,12 +58,13 @@ from smplxpp.metrics.distance import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
 from smplxpp.template.template import Template
 
-SEEN_OF_A_PIXEL = 0.05
-"""How finely photographs place a surface, pixels; points of a clear pattern are found to 0.05 to 0.1.
+MATCHING_ERROR_PIXELS = 0.05
+"""Error in pixels with which photographs locate a surface; points of a clear pattern are located to 0.05 to 0.1.
 
-Where skinning alone is already right to a fraction of a pixel, a surface that photographs moved cannot be held to the
-same: at 256x320 a pixel is 6 mm of the person, and skinning has a tight shirt at 1.7 mm. With many pixels nothing of it
-is left.
+The gate of P2S against skinning is relaxed by this error where skinning alone is within a pixel of the truth. At
+256x320 a pixel covers 6 mm of the person, while skinning places a tight shirt to 1.7 mm. At high resolution the
+relaxation
+vanishes.
 """
 
 
@@ -85,28 +86,33 @@ def evaluate(
         models: names among `MODEL_FILES`; empty: `MEASURED`, as far as there are files.
         cloth: what moves loose clothes of students in held-out poses, where the run has found some.
         refined: measure held-out poses that the run refined on training cameras too, where it has any.
-        force: measure anew even if the stage stands.
+        force: measure again even if the stage is up to date.
         progress: called with the share of the frames that are measured.
 
     Raises:
         InputError: no template, no trained model, a model of another template; a capture of another body, or one that
             lacks views, masks or parameters.
     """
+    # Open and check everything first: measuring takes long, and wrong inputs must end it at once.
     files = model_files(run, models)
     scene = open_scene(run, inputs, measures=True)
-    with_people(scene.capture, view_sets(scene.capture, config.protocol))  # a bad file ends it before work starts
+    with_people(scene.capture, view_sets(scene.capture, config.protocol))
     known = input_protocol(run, scene.capture)
     body = load_body(inputs.body)
     exact = exact_params(scene.capture, inputs.body, body)
+    # Held-out poses refined on training cameras are measured in a second pass, reported apart.
     again = refined_poses(run, scene.capture) if refined else None
     clothes = _Clothes(run, scene.template, cloth)
     sequence = clothes.sequence(scene.capture, device=device)
     loaded = {name: load_model(name, path, sequence.rig) for name, path in files.items()}
+    # Figures on views that a model was trained on would not be novel-view figures.
     refuse_seen(
         run,
         {path.relative_to(run).parts[0] for path in files.values()},
         measured_splits(scene.capture, config.protocol),
     )
+    # The key covers models, capture, true surfaces, garments and refined poses. Evaluation is repeated if any of them
+    # changes.
     stage = Stage(
         name=EVALUATE_STAGE,
         config={"evaluation": config, "inputs": known, "scale": inputs.scale, "device": device, "cloth": clothes.mode},
@@ -131,10 +137,14 @@ def evaluate(
         return evaluate_models(loaded, there, held_out, progress=progress).report.models
 
     def work(folder: Path) -> StageOutput:
+        # First pass: all view sets with the poses that the capture gives.
         found = evaluate_models(loaded, sequence, config, files=files, progress=progress)
         report = replace(found.report, inputs=known)
+        # Second pass: the same models in refined held-out poses, which separates errors of the pose from errors of the
+        # model.
         if again is not None:
             report = replace(report, refined_poses=_of_refined(again))
+        # A synthetic capture knows the exact poses. Their errors are listed beside the figures.
         if exact is not None:
             captures = {"": scene.capture} | ({} if again is None else {", refined on training cameras": again})
             report = replace(
@@ -154,7 +164,7 @@ def evaluate(
 
 
 class _Clothes:
-    """The loose clothes of a run, as an evaluation moves them."""
+    """Loose clothes of a run, with the method that moves them in held-out frames."""
 
     def __init__(self, run: Path, template: Template, mode: ClothMode) -> None:
         self.template = template
@@ -163,10 +173,10 @@ class _Clothes:
         self.digests = {GARMENTS: sha256_file(run / GARMENTS)} if self.garments else {}
 
     def sequence(self, capture: Capture, *, device: str) -> AvatarSequence:
-        """Open a capture whose held-out frames have their clothes moved so."""
+        """Open a capture and move the loose clothes of its held-out frames."""
         motions = None
         if self.garments:
-            # On skinning nothing swings: how long a frame lasts is not asked for.
+            # Skinned clothes have no dynamics, so that the frame rate does not matter.
             fps = 1.0 if self.mode == "skin" else capture.fps
             if fps is None:
                 raise InputError(
@@ -195,6 +205,7 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
     Raises:
         InputError: an unknown name, a model that is asked for and not trained, no teacher and no student.
     """
+    # Look for every known model file, then compare with the names that the user asked for.
     there = {name: run / file for name, file in MODEL_FILES.items() if (run / file).is_file()}
     asked = list(names)
     require_known("models", asked, MODEL_FILES)
@@ -206,9 +217,10 @@ def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
             f"run {run}",
             expected=", ".join(MODEL_FILES[name] for name in missing) if missing else "a trained teacher or student",
             received=f"only {', '.join(there)}" if there else "no model",
-            remedy=f"`smplxpp {'fit' if fit_alone else 'train'}` makes it; a training under way is measured "
+            remedy=f"`smplxpp {'fit' if fit_alone else 'train'}` makes it; a training in progress is measured "
             "when its stage is finished",
         )
+    # Without a student, the baked one (before its blend shapes) is the newest.
     wanted = asked or (*MEASURED, *(() if "student" in there else ("baked",)))
     return {name: there[name] for name in MODEL_FILES if name in wanted and name in there}
 
@@ -225,17 +237,22 @@ def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
 
 
 def _write(folder: Path, found: Evaluation, *, overlap: float, pixel: float) -> StageOutput:
-    """Write figures, tables and pictures of an evaluation; return what the manifest and the report say of it.
+    """Write figures, tables and pictures of an evaluation; return the checks and numbers of the manifest.
 
     Args:
-        overlap: of the template and the masks. pixel: metres that one covers at the person.
+        folder: folder of the stage.
+        found: figures, rendered views and posed surfaces.
+        overlap: IoU of the template's silhouettes and the masks.
+        pixel: size of a pixel at the person, metres.
     """
     report = found.report
     report.save(folder / REPORT_FILE)
+    # Write every table as plain text, CSV and LaTeX.
     tables = evaluation_tables(report)
     for name, table in tables.items():
         for ending, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label=f"tab:{name}"))):
             atomic_write_text(folder / "tables" / f"{name}.{ending}", text)
+    # Write the pictures: truth beside the rendering of every model, for typical and worst views.
     views, surfaces = [], []
     for view in found.views:
         worst = view.chosen == "worst"
@@ -252,12 +269,15 @@ def _write(folder: Path, found: Evaluation, *, overlap: float, pixel: float) -> 
                 "head": view.head,
             }
         )
+    # Colour the posed mesh by its distance to the true surface.
     for surface in found.surfaces:
         file = f"pictures/surface_{surface.set}_{surface.frame:06d}.png"
         atomic_write_bytes(folder / file, encode_png(surface_picture(surface.truth, surface.posed)))
         title = f"{SURFACE_SETS[surface.set]}, frame {surface.frame}: distance to the true surface"
         surfaces.append({"file": file, "title": title})
+    # All models are measured on the same views, so that the counts of the first hold for all.
     best = next(iter(report.models.values()))
+    # The manifest carries all that the run's page shows, so that the page needs no other file.
     numbers = {
         "models": {name: summary_figures(model) for name, model in report.models.items()},
         "conventions": report.conventions,
@@ -272,10 +292,12 @@ def _write(folder: Path, found: Evaluation, *, overlap: float, pixel: float) -> 
 
 
 def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> list[Check]:
-    """What the best model of an evaluation is held against: floors, simpler models, skinning alone.
+    """Check the best model of an evaluation against floors, simpler models and skinning alone.
 
     Args:
-        overlap: of the template and the masks. pixel: metres that one covers at the person.
+        report: figures of all models.
+        overlap: IoU of the template's silhouettes and the masks.
+        pixel: size of a pixel at the person, metres.
     """
     checks = [
         gates.SILHOUETTE.check(
@@ -284,10 +306,12 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
             explanation="skinning alone; low: another person, another pose, or other cameras",
         )
     ]
+    # The gates apply to the model that the training was for, which is the last one made.
     name = next((name for name in BEST_FIRST if name in report.models), None)
     if name is None:
         return checks
     best = report.models[name]
+    # Appearance: an absolute floor of PSNR, the gain over the fit, and the loss against the teacher.
     for part, floor in gates.PSNR.items():
         if part in best.views:
             psnr = best.mean(part)["psnr"]
@@ -303,6 +327,8 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
             if name != "teacher" and "teacher" in report.models:
                 gain = psnr - report.models["teacher"].mean(part)["psnr"]
                 checks.append(gates.AGAINST_TEACHER.check(f"{name} against its teacher, {SETS[part]}", gain))
+    # Geometry: the point-to-surface distance (P2S) of each garment, against that of plain skinning. The gate is for the
+    # mesh that a student's field deforms, so that the teacher is left out.
     for part, title in SURFACE_SETS.items():
         if part not in best.surfaces or name == "teacher":
             continue
@@ -311,18 +337,18 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
             ours, skinned = (found[label.name].p2s if label.name in found else None for found in (own, alone))
             if ours and skinned:
                 pixel_mm = pixel * MM
-                # Where skinning is already right to a fraction of a pixel, photographs are no finer.
-                left = SEEN_OF_A_PIXEL * pixel_mm / skinned if skinned < pixel_mm else 0.0
+                # Relax the gate where skinning is within a pixel of the truth, see `MATCHING_ERROR_PIXELS`.
+                slack = MATCHING_ERROR_PIXELS * pixel_mm / skinned if skinned < pixel_mm else 0.0
                 gate = gates.AGAINST_SKINNING
-                gate = replace(gate, warn=gate.warn + left, fail=max(gate.fail, gate.warn + left))
+                gate = replace(gate, warn=gate.warn + slack, fail=max(gate.fail, gate.warn + slack))
                 checks.append(
                     gate.check(
                         f"P2S of {label.name} against skinning alone, {title}",
                         ours / skinned,
                         explanation="below 1: the mesh that the field moves is nearer to the truth"
                         + (
-                            f"; within a pixel {SEEN_OF_A_PIXEL:g} of it are left, photographs are no finer"
-                            if left
+                            f"; the gate allows {MATCHING_ERROR_PIXELS:g} pixel more, the error of photographs"
+                            if slack
                             else ""
                         ),
                     )
@@ -331,7 +357,7 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
 
 
 def surface_digest(capture: Capture, protocol: ProtocolConfig) -> str:
-    """SHA-256 of the true surfaces that are measured."""
+    """Return the SHA-256 of the true surfaces that are measured."""
     digest = hashlib.sha256()
     for frame in chain(*truth_frames(capture, protocol, view_sets(capture, protocol)).values()):
         mesh = capture.truth_mesh(frame)

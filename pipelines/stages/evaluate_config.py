@@ -16,7 +16,7 @@ MODEL_FILES: Mapping[str, str] = {
 }
 """Models of a run by the name that an evaluation gives them. `baked` is the student before its blend shapes."""
 MEASURED = ("fit", "teacher", "student")
-"""Those that are measured where nothing else is asked for, as far as a run has them."""
+"""Models that are measured by default, as far as a run has them."""
 BEST_FIRST = ("student", "compact", "baked", "teacher")
-"""What an evaluation is about: the first of these that was measured."""
+"""Preference for the model that the gates apply to: the first of these that was measured."""
 HELD_OUT_VIEWS = ("novel_view", "novel_pose")

@@ -1,4 +1,4 @@
-"""What is known of the inputs behind an evaluation: said by the capture, by the build and by the trainings."""
+"""Collect what capture, build and trainings state about the inputs of an evaluation: exact, tracked or estimated."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ from smplxpp.core.files.json_file import as_integer, as_text
 
 
 def input_protocol(run: Path, capture: Capture) -> InputProtocol:
-    """Collect what capture, build and trainings say of the inputs; "not known" for whatever none of them says.
+    """Collect what capture, build and trainings state about the inputs; "not known" where none of them does.
 
-    A capture speaks for its own files alone: for the parameters that lie in it, and for the labels of a template that
-    was built from it. It says what a file is by the file's name under "inputs", or by naming it in a protocol that is
-    called exact or tracked. Parameters that the run made are tracked, if what they began with was.
+    A capture's statement holds for its own files only: for parameters that lie in it, and for labels of a template that
+    was built from it. It lists a file under "inputs", or in a protocol with the name exact or tracked. Parameters that
+    the run made are tracked if they started from tracked ones.
 
     Raises:
-        InputError: a capture that says it in other words than docs/captures.md.
+        InputError: a statement that docs/captures.md does not define.
     """
     declared = DeclaredInputs.of(capture)
     build = load_build(run)
     parameters, stage = parameters_in_run(declared, run, path_of_params(capture.recording.params))
+    # The template may have been built with other parameters than those the views are read with. Figures then depend on
+    # both, and the protocol is mixed.
     of_template = parameters
     if build is not None:
         given = build[0].params if isinstance(build[0].params, Path) else run / REGISTERED_PARAMS
         of_template = parameters_in_run(declared, run, given)[0]
     if of_template != parameters:
         parameters = NOT_KNOWN if NOT_KNOWN in (parameters, of_template) else MIXED
+    # Normals estimated from the tracked surface are an estimate even where the capture has normal maps.
     used, frames, cameras = _trained(run)
     there, all_views = normal_maps(capture)
     if used == "surface":
@@ -54,11 +57,12 @@ def input_protocol(run: Path, capture: Capture) -> InputProtocol:
 
 
 def _trained(run: Path) -> tuple[str | None, int | None, int | None]:
-    """Source of the normals, and frames and cameras, of the last training that is in the run."""
+    """Return the source of the normals and the numbers of frames and cameras of the last training in the run."""
     for stage in reversed(TRAIN_STAGES):
         numbers = (read_manifest(run / stage) or {}).get("numbers", {})
         if "training_frames" in numbers and "training_cameras" in numbers:
             subject = f"file {run / stage / MANIFEST}"
+            # Read strictly: the numbers are printed as facts in the tables.
             frames, cameras = (
                 as_integer(numbers[name], subject=f"{subject}: {name}", least=0)
                 for name in ("training_frames", "training_cameras")

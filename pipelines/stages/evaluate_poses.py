@@ -28,13 +28,13 @@ from smplxpp.template.template import Template
 
 log = logging.getLogger(__name__)
 COMPARED = 100
-"""Frames of either kind whose poses are compared, evenly spread; all where there are no more."""
+"""Largest number of frames of a kind (training, held-out) whose poses are compared; they are evenly spread."""
 BEHIND = 5e-4
-"""Metres behind a surface from which a vertex counts as covered: parts keep a millimetre from the body."""
+"""Depth in metres behind the outer surface from which a vertex counts as covered; parts keep 1 mm from the body."""
 
 
 def exact_params(capture: Capture, body: Path | None, model: BodyModel) -> ParamSource | None:
-    """The exact parameters of a capture that has a protocol of that name; for measuring alone, never for training."""
+    """Return the exact parameters of a capture with a protocol of that name; they serve measuring, never training."""
     if EXACT not in capture.recording.protocols or capture.protocol == EXACT:
         return None
     try:
@@ -45,19 +45,23 @@ def exact_params(capture: Capture, body: Path | None, model: BodyModel) -> Param
 
 
 def pose_errors(captures: Mapping[str, Capture], exact: ParamSource, template: Template) -> dict[str, PoseError]:
-    """Errors of the poses in use, of training frames and of held-out ones.
+    """Measure the errors of the poses in use, for training and for held-out frames.
 
-    What is in use is the template's body, which has one shape, in the poses of the frames; the exact body has its own.
+    The poses in use move the template's body, which has one shape; the exact body has a shape of its own.
 
     Args:
-        captures: "" with the poses in use; others, whose held-out poses alone count, by what is said of these.
+        captures: captures by a suffix of the kind's name. "" has the poses in use; of others only held-out poses count.
+        exact: the true parameters.
+        template: template of the run.
     """
     covered, known = covered_vertices(template), set(exact.frames().tolist())
     found: dict[str, PoseError] = {}
     for title, capture in captures.items():
         splits = capture.splits
+        # Refinement of held-out poses leaves the training poses alone, so that those are compared once, under "".
         kinds = {"training frames": () if title else splits.train_frames, "held-out frames": splits.novel_pose_frames}
         for kind, frames in kinds.items():
+            # Compare only frames for which both sources have parameters.
             there = [frame for frame in frames if frame in known and capture.params(frame) is not None]
             errors = [
                 pose_error(
@@ -74,23 +78,25 @@ def pose_errors(captures: Mapping[str, Capture], exact: ParamSource, template: T
 
 
 def _from_template(params: BodyParams, template: Template) -> BodyParams:
-    """Parameters for the template's body, whose mean shape is the template's."""
+    """Return parameters for the template's body, whose mean shape is the template's."""
     size = template.body.num_betas
     betas = np.zeros((len(params), size))
+    # The template's mean shape already contains its own betas; subtract them from the exact ones.
     betas[:, : params.betas.shape[1]] += params.betas[:, :size]
     betas[:, : len(template.betas)] -= template.betas[:size]
     return replace(params, betas=betas, v_shape=None)
 
 
 def covered_vertices(template: Template) -> Bool[np.ndarray, " V"]:
-    """The vertices of the body that some view from outside would show, if no part covered them in the T-pose."""
+    """Return which vertices of the body are hidden by parts in the T-pose, and visible from outside without parts."""
     body = template.part_mesh(template.part_names[0])
+    # A vertex is covered if it is visible with the body alone and hidden with all parts.
     seen = [outer_visible_points(mesh, body.vertices, tolerance=BEHIND) for mesh in (body, template.mesh)]
     return seen[0] & ~seen[1]
 
 
 def refined_poses(run: Path, capture: Capture) -> Capture | None:
-    """The capture with held-out poses that the run refined on the training cameras; None where it has not."""
+    """Return the capture with held-out poses that the run refined on the training cameras; None without any."""
     path = run / REFINED_HELD_OUT_PARAMS
     own = capture.recording.params
     if own is None or not path.is_file() or not capture.splits.novel_pose_frames:
@@ -100,12 +106,12 @@ def refined_poses(run: Path, capture: Capture) -> Capture | None:
 
 
 def refined_digest(run: Path, refined: Capture | None) -> dict[str, str]:
-    """What `refined_poses` was read from, as an input of a stage."""
+    """Return the digest of the file behind `refined_poses`, as an input of a stage."""
     return {} if refined is None else {REFINED_HELD_OUT_PARAMS: sha256_file(run / REFINED_HELD_OUT_PARAMS)}
 
 
 def of_held_out_poses(config: EvaluationConfig, capture: Capture) -> EvaluationConfig | None:
-    """The part of an evaluation that hangs on held-out poses, without speed and pictures; None where there is none."""
+    """Restrict an evaluation to the view sets of held-out poses, without speed and pictures; None without such sets."""
     sets = tuple(name for name in view_sets(capture, config.protocol) if name.startswith("novel_pose"))
     if not sets:
         return None
@@ -114,7 +120,7 @@ def of_held_out_poses(config: EvaluationConfig, capture: Capture) -> EvaluationC
 
 @dataclass(frozen=True, eq=False)
 class _HeldOutFrom:
-    """Parameters whose held-out frames come from another source, as far as it has them."""
+    """Parameters whose held-out frames come from a second source, where that source has them."""
 
     own: ParamSource
     other: ParamSource

@@ -1,4 +1,4 @@
-"""Stage 70: views of the reference frame turn the template into Gaussians bound to its triangles."""
+"""Stage 70: fit Gaussians that are bound to the template's triangles to the views of one frame."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ class FitStage(ModelStage):
     """Gaussians fitted to one frame's photographs.
 
     Attributes:
-        config: of the fit. by_hand: made by `smplxpp fit`; a training takes such a fit as it stands.
+        config: configuration of the fit.
+        by_hand: whether `smplxpp fit` makes it; a training takes such a fit as it is.
     """
 
     file = "gaussians.safetensors"
@@ -63,7 +64,7 @@ class FitStage(ModelStage):
         }
 
     def inputs(self, trainer: Trainer) -> Mapping[str, str]:
-        """Digests of the template and of everything that is read of the capture, contents included."""
+        """Return digests of the template and of everything that the fit reads from the capture, by content."""
         scene, capture = trainer.scene, trainer.scene.capture
 
         def of(*arrays: np.ndarray) -> str:
@@ -73,6 +74,8 @@ class FitStage(ModelStage):
             return digest.hexdigest()
 
         out = {TEMPLATE: scene.digests[TEMPLATE], "capture/pose": of(_posed(trainer))}
+        # A fit reads one frame only, so that the content of each file can be hashed (a training hashes names and
+        # sizes).
         for name in (*capture.splits.train_cameras, *capture.splits.novel_view_cameras):
             camera = capture.cameras[name]
             out[f"capture/{name} camera"] = of(camera.K, camera.cam_from_world)
@@ -85,6 +88,7 @@ class FitStage(ModelStage):
         return out
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        # The overlap of silhouettes is measured before the fit, which would hide a wrong pose.
         scene = fit_scene(trainer.scene, GROUNDS[self.ground](trainer.scene.template))
         overlap = silhouette_overlap(scene.template.mesh.with_vertices(scene.vertices), list(scene.train))
         views = {view.name: view for view in (*scene.held_out, *scene.train)}
@@ -92,6 +96,7 @@ class FitStage(ModelStage):
         def preview(images: Mapping[str, np.ndarray]) -> None:
             _write_strips(session.folder, images, views, scene.background)
 
+        # The fit keeps checkpoints and previews in the session's folder, where an interrupted one continues.
         result = fit_gaussians(
             scene,
             self.config,
@@ -102,13 +107,16 @@ class FitStage(ModelStage):
             report=session.report,
             preview=preview,
         )
+        # Keep the bound Gaussians for later stages, a plain splat file for viewers, and the log.
         save_bound(result.gaussians, folder / self.file)
         write_splat_ply(folder / "splats.ply", result.splats)
         shutil.copyfile(session.folder / METRICS_FILE, folder / METRICS_FILE)
+        # Show all held-out views and a few training views.
         held_out = [view.name for view in scene.held_out]
         train = [view.name for view in scene.train]
         shown = (*held_out, *spread(train, PREVIEWED_TRAINING_VIEWS))
         _write_strips(folder, {name: result.images[name] for name in shown}, views, scene.background)
+        # The first evaluation, before any step, is the reference for the gain of PSNR.
         start = next(line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation")
         output = _output(result, held_out, train, overlap=overlap, start=start["mean"]["psnr"])
         output.numbers["by_hand"] = self.by_hand
@@ -119,7 +127,7 @@ class FitStage(ModelStage):
 
 
 def _posed(trainer: Trainer) -> np.ndarray:
-    """(V, 3) vertices of the person's template in the frame's pose, metres."""
+    """Return the (V, 3) vertices of the person's template in the frame's pose, metres."""
     return trainer.scene.template.pose(trainer.scene.reference_params())[0]
 
 
@@ -132,12 +140,17 @@ def _write_strips(
 
 
 def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap: float, start: float) -> StageOutput:
-    """Make numbers and checks.
+    """Make numbers and checks of a fit.
 
     Args:
-        overlap: of the template and the masks. start: PSNR of the same views before the first step, dB.
+        result: Gaussians, images and qualities.
+        held_out: names of the held-out views.
+        train: names of the training views.
+        overlap: IoU of the template's silhouettes and the masks.
+        start: PSNR of the same views before the first step, dB.
     """
     done = result.progress
+    # Judge on held-out cameras where there are any; otherwise only training views remain.
     shown = held_out or train
     mean = {
         name: mean_quality({v: result.quality[v] for v in names})
@@ -146,6 +159,7 @@ def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap
     }
     figures = mean["held_out" if held_out else "train"]
     which = "held-out" if held_out else "training"
+    # Check the inputs (silhouettes), the quality reached, the gain over the start, and the steps done.
     checks = [
         gates.SILHOUETTE.check(
             "template's silhouette on the masks",
@@ -169,6 +183,7 @@ def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap
             explanation="below 1: the limit of time ended it; the same command continues",
         ),
     ]
+    # These figures go to the manifest; the report and the command print them.
     numbers = {
         "gaussians": len(result.gaussians),
         "iterations": done.iterations,

@@ -1,4 +1,4 @@
-"""What models have seen, by the record of the stages that made them, against what is held out."""
+"""Compare the cameras and frames that models were trained on, as their stages record, with the held-out ones."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text
 
 log = logging.getLogger(__name__)
 NAMED = 8
-"""Cameras and frames that a refusal names."""
-TRAIN_ANEW = "train without them (smplxpp train --force; the capture's split says which frames are held out)"
+"""Largest number of cameras or frames that an error message lists."""
+TRAIN_AGAIN = "train without them (smplxpp train --force; the capture's split says which frames are held out)"
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Cameras and frames that a model learned from, by itself or through what it was made from."""
+    """Cameras and frames that a model learned from, directly or through the models it was made from."""
 
     cameras: frozenset[str]
     frames: frozenset[int]
 
 
 def seen_of(record: StageRecord) -> Seen | None:
-    """What the model of a stage has seen, by the stage's manifest; None where it does not say.
+    """Return the cameras and frames that the model of a stage has seen; None where its manifest has no record.
 
     Raises:
-        InputError: a manifest that says it in other kinds of values.
+        InputError: a manifest with values of another type.
     """
     subject = f"file {record.folder / MANIFEST}: seen"
     value = record.manifest["numbers"].get("seen")
@@ -47,7 +47,7 @@ def seen_of(record: StageRecord) -> Seen | None:
 
 
 def _seen_by(run: Path, stage: str) -> Seen:
-    """What the model of a stage has seen; a model without a record of it is logged."""
+    """Return what the model of a stage has seen; log a warning for a model without a record."""
     manifest = read_manifest(run / stage)
     seen = None if manifest is None else seen_of(StageRecord(run / stage, manifest, ran=False))
     if seen is None:
@@ -56,23 +56,30 @@ def _seen_by(run: Path, stage: str) -> Seen:
     return seen
 
 
-def refuse_seen(run: Path, stages: Iterable[str], splits: Splits, *, anew: str = TRAIN_ANEW) -> None:
-    """Refuse models that have seen cameras or frames which count as held out; `anew` says how to make others.
+def refuse_seen(run: Path, stages: Iterable[str], splits: Splits, *, remedy: str = TRAIN_AGAIN) -> None:
+    """Refuse models that have seen cameras or frames which count as held out.
+
+    Args:
+        run: folder of the run.
+        stages: names of the stages that made the models.
+        splits: the cameras and frames that count as held out.
+        remedy: how to make models that have not seen them.
 
     Raises:
         InputError: names the stages and what they saw.
     """
+    # Intersect what is held out now with what each model has learned from.
     each = {name: _seen_by(run, name) for name in sorted(stages)}
     cameras = [camera for camera in splits.novel_view_cameras if any(camera in one.cameras for one in each.values())]
     frames = [frame for frame in splits.novel_pose_frames if any(frame in one.frames for one in each.values())]
     if not cameras and not frames:
         return
+    # Suggest cameras that no model has seen: holding out those needs no further training.
     known = sorted({*splits.train_cameras, *splits.novel_view_cameras})
     never = [camera for camera in known if all(camera not in one.cameras for one in each.values())]
     names = [name for name, one in each.items() if one.cameras.intersection(cameras) or one.frames.intersection(frames)]
-    remedy = anew
     if cameras and never:
-        remedy = f"hold out what they did not see (--hold-out {' '.join(never[:NAMED])}), or {anew}"
+        remedy = f"hold out what they did not see (--hold-out {' '.join(never[:NAMED])}), or {remedy}"
     what = [f"{kind} {_named(values)}" for kind, values in (("cameras", cameras), ("frames", frames)) if values]
     raise InputError(
         f"held-out views of run {run}",

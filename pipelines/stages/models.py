@@ -47,7 +47,7 @@ GROUNDS: Mapping[str, Callable[[Template], Template]] = {
 }
 """Templates that models are trained on, made from the person's."""
 ONE_STEP = 1e-9
-"""Seconds: a training that is begun takes a step."""
+"""Least time in seconds of a training that begins, so that it takes at least one step."""
 Bar = Callable[[str, int], AbstractContextManager[Callable[[Progress], None]]]
 
 
@@ -56,8 +56,8 @@ class TrainOptions:
     """How training runs; nothing in it changes what comes out.
 
     Attributes:
-        max_seconds: stop after as long with a checkpoint and what there is.
-        force: train anew even what stands.
+        max_seconds: time after which training stops, with a checkpoint and the model reached so far.
+        force: train again even what is up to date.
         tensorboard: log for TensorBoard into the folders of the stages.
         bar: called with a stage's name and iterations; shows its progress.
     """
@@ -69,7 +69,7 @@ class TrainOptions:
 
 
 class StageConfig(Protocol):
-    """What the configuration of every stage says."""
+    """Fields that the configuration of every stage has."""
 
     @property
     def seed(self) -> int:
@@ -85,16 +85,17 @@ class ModelStage(ABC):
     """A model that is trained once. Its settings and the files that it needs decide what comes out.
 
     Attributes:
-        name: its folder in the run. config: of the training.
-        ground: among `GROUNDS`, the template that it is trained on.
-        elsewhere: other folders of the run in which the same stage may stand already.
+        name: name of its folder in the run.
+        config: configuration of the training.
+        ground: key of `GROUNDS`, the template that it is trained on.
+        elsewhere: other folders of the run that may hold the same model already.
     """
 
     file: ClassVar[str]
     """The model in the stage's folder."""
     resumable: ClassVar[bool] = True
     alone: ClassVar[bool] = False
-    """Of several processes the first trains it; the others wait."""
+    """Whether rank 0 trains it alone, while the other processes wait."""
 
     name: str
     config: StageConfig
@@ -148,8 +149,12 @@ class Trainer:
     """Makes the model stages of a run on one scene.
 
     Args:
-        run: folder of the run. scale: of the images, part of every stage's key.
-        perceptual: for the perceptual term of losses that have one, None leaves it out.
+        run: folder of the run.
+        scene: template and capture.
+        options: limits and display.
+        together: processes that train together.
+        scale: scale of the images, part of every stage's key.
+        perceptual: metric of the perceptual loss term; None leaves the term out.
     """
 
     def __init__(
@@ -175,26 +180,26 @@ class Trainer:
         return self.together.device.split(":")[0]
 
     def perceptual_name(self, config: PhotometricConfig) -> str | None:
-        """The metric of the perceptual term of a training that has one."""
+        """Return the name of the metric of a training's perceptual term; None without the term."""
         return None if self.perceptual is None or not config.weights.perceptual else self.perceptual.name
 
     def seconds_left(self) -> float:
-        """What is left of the time, the same on every process; 0 when it is over."""
+        """Return the seconds until the time limit, the same on every process; 0 after it."""
         return self.together.run_on_rank0(lambda: max(0.0, self._deadline - time.monotonic()))
 
     def sequence(self, ground: str) -> AvatarSequence:
-        """The capture seen with one of the templates of `GROUNDS`; they share its images."""
+        """Return the capture with one of the templates of `GROUNDS`; all of them share its images."""
         if ground not in self._sequences:
             template = GROUNDS[ground](self.scene.template)
             self._sequences[ground] = AvatarSequence(self.scene.capture, template, device=self.together.device)
         return self._sequences[ground]
 
     def model(self, stage: ModelStage) -> Any:
-        """The finished model of a stage."""
+        """Load the finished model of a stage."""
         return stage.read_by(self, self.path(stage))
 
     def path(self, stage: ModelStage) -> Path:
-        """The file of a finished stage.
+        """Return the model file of a finished stage.
 
         Raises:
             InputError: it is missing or unfinished.
@@ -210,7 +215,7 @@ class Trainer:
         return found.folder / stage.file
 
     def _instead(self, stage: ModelStage, found: StageRecord | None) -> str:
-        """What there is of a stage that is not finished, in words."""
+        """Describe the state of an unfinished stage for an error message."""
         if found is not None:
             numbers = found.manifest["numbers"]
             return f"{numbers.get('iterations_done')} of {numbers.get('iterations')} iterations of it"
@@ -221,12 +226,15 @@ class Trainer:
         return f"one that was made otherwise: {differences(manifest, self.identity(stage))}"
 
     def found(self, stage: ModelStage) -> StageRecord | None:
-        """The stage where it stands, in its own folder or elsewhere in the run; None where it does not."""
+        """Return the record of an up-to-date stage, in its own folder or elsewhere in the run; None without one."""
+        # Keys of finished stages are not computed again: their digests cover large files.
         if stage.name in self._finished:
             return self._finished[stage.name]
+        # A stage whose sources are missing or unfinished has no key and therefore cannot be up to date.
         if any((need := self.found(one)) is None or not need.finished for one in stage.needs.values()):
             return None
         identity = self.identity(stage)
+        # An unfinished training counts only in its own folder, where it can be resumed.
         for name in (stage.name, *stage.elsewhere):
             record = standing(self.run / name, identity)
             if record is not None and (record.finished or name == stage.name):
@@ -236,17 +244,19 @@ class Trainer:
         return None
 
     def take(self, stage: ModelStage, record: StageRecord) -> None:
-        """Let a record that lies in the run count as a stage, whatever its key."""
+        """Accept a record of the run as a finished stage, whatever its key."""
         self._finished[stage.name] = record
 
     def identity(self, stage: ModelStage) -> Stage:
-        """What decides a stage whose needs are finished."""
+        """Return the identity (name, configuration, digests, code) of a stage whose sources are finished."""
+        # The key contains the digest of every source model, so that a source trained again invalidates this one.
         digests, sources = dict(stage.inputs(self)), {}
         for part, needed in stage.needs.items():
             path = self.path(needed)
             with values_of(self._finished[needed.name]):
                 digests[part] = self._finished[needed.name].manifest["files"][needed.file]
             sources[part] = path.relative_to(self.run).as_posix()
+        # Only a template other than the person's own enters the key.
         ground = {} if stage.ground == CLOTHED else {"ground": stage.ground}
         return Stage(
             name=stage.name,
@@ -262,33 +272,40 @@ class Trainer:
     def make(self, stage: ModelStage, *, force: bool | None = None) -> StageRecord:
         """Train a stage unless it stands; what it needs has to stand.
 
-        A training that was interrupted, or that the limit of time ended, goes on where it was. The first process
-        writes, the others train with it.
+        A training that was interrupted, or that reached its time limit, resumes from its checkpoint. Rank 0 writes,
+        the other processes train with it.
 
         Args:
-            force: train anew even if it stands; None: as the options say.
+            stage: the stage to train.
+            force: train again even if it is up to date; None takes the options' choice.
 
         Raises:
             InputError: something it needs is missing or unfinished, its state is of another training, memory or disk
                 ran out, or training diverged; checkpoints and finished stages stay.
         """
         force = self.options.force if force is None else force
+        # Forget the record, or `found` would return the old model for the rest of this command.
         if force:
             self._finished.pop(stage.name, None)
+        # Only rank 0 trains; the other processes wait for its record.
         if stage.alone:
             return self.together.run_on_rank0(lambda: self._make(stage, force=force))
         return self._make(stage, force=force)
 
     def _make(self, stage: ModelStage, *, force: bool) -> StageRecord:
         together, shared = self.together, not stage.alone
-        if shared:  # what is missing is said before the folder is touched
+        if shared:
+            # A missing source raises here on every rank, before the folder is touched.
             together.run_on_rank0(lambda: [str(self.path(needed)) for needed in stage.needs.values()])
+        # Every collective call below has its partner in `_first`, in the same order. An unequal number of calls would
+        # block all processes.
         if not together.first:
             identity, runs = together.run_on_rank0(_nothing)
             if runs:
                 stage.work(self, self._session(stage, identity), self.run / stage.name)
             record = together.run_on_rank0(_nothing)
         else:
+            # Only rank 0 holds the lock and writes.
             with own_run_folder((self.run / stage.name).parent, (Path(stage.name).name, "report")):
                 record = self._first(stage, shared=shared, force=force)
             record = together.run_on_rank0(lambda: record) if shared else record
@@ -297,18 +314,20 @@ class Trainer:
         return record
 
     def _first(self, stage: ModelStage, *, shared: bool, force: bool) -> StageRecord:
-        """What the first process does: decide, tell the others, train and write."""
+        """Decide on rank 0 whether to train, broadcast the decision, train and write."""
         together = self.together
 
         def decided() -> tuple[Stage, bool]:
             identity = self.identity(stage)
             return identity, decide(self.run, identity, force=force) != "skip"
 
+        # The other ranks learn from this call whether there is anything to train.
         identity, _ = together.run_on_rank0(decided) if shared else decided()
 
         def work(folder: Path) -> StageOutput:
             with explain_resource_errors(self.run), self.options.bar(stage.name, stage.iterations) as report:
                 output = stage.work(self, replace(self._session(stage, identity), report=report), folder)
+            # Recorded for later commands, which refuse to call a seen view novel.
             output.numbers["seen"] = self._seen(stage)
             output.numbers["protocol"] = self.scene.capture.protocol
             return output
@@ -317,6 +336,7 @@ class Trainer:
 
     def _session(self, stage: ModelStage, identity: Stage) -> Session:
         folder = self.run / identity.work_name
+        # A stage trained by rank 0 alone must not call a collective.
         left = self._deadline - time.monotonic() if stage.alone else self.seconds_left()
         return Session(
             folder,
@@ -329,20 +349,23 @@ class Trainer:
         )
 
     def _seen(self, stage: ModelStage) -> dict[str, list[Any]]:
-        """Cameras and frames that the model learned from, by itself or through what it was made from."""
+        """Return the cameras and frames that the model learned from, directly or through its source models."""
         splits, scene = self.scene.capture.splits, self.scene
+        # Stages for one process read the reference frame; the others read all training frames.
         frames = {scene.frame} if stage.alone else set(splits.train_frames)
         cameras = set(splits.train_cameras)
+        # What a source model has seen, this one has seen through it.
         for needed in stage.needs.values():
             seen = seen_of(self._finished[needed.name])
             if seen is not None:
                 cameras |= seen.cameras
                 frames |= seen.frames
+        # The template's shape comes from that frame's scan.
         if scene.template_frame is not None:
             frames.add(scene.template_frame)
         return {"cameras": sorted(cameras), "frames": sorted(frames)}
 
 
 def _nothing() -> Any:
-    """For the processes that only hear what the first one says."""
+    """Stand in for the work of rank 0 on processes that only receive its result."""
     raise AssertionError

@@ -1,4 +1,4 @@
-"""Surfaces by a neural signed distance over the hull, for machines with a CUDA device."""
+"""Reconstruct surfaces as a neural signed distance field within the hull, on machines with a CUDA device."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from smplxpp.reconstruct import PhotoView, ReconstructConfig, Reconstruction, ad
 
 
 def neural_method(config: ReconstructConfig, surface: SurfaceConfig, device: str) -> Method:
-    """The method for `reconstruct_capture`.
+    """Return the neural method for `reconstruct_capture`.
 
     Raises:
         InputError: no CUDA device, and the CPU was not asked for.
@@ -42,16 +42,19 @@ def _neural_surface(
     device: str,
     progress: ProgressCallback,
 ) -> Reconstruction:
-    """The hull, then the neural surface within it; colours and confidence as of the sweep's surface."""
+    """Fit the neural surface within the hull; colours and confidence are computed as for the sweep's surface."""
+    # The visual hull bounds the search. Views that it rejected are left out of the neural fit too.
     start = reconstruct(views, replace(config, refine=False), progress=progress)
     kept = [view for view in views if view.name in start.numbers["views"]]
     fit = fit_surface(kept, start.hull, surface, device=device, progress=progress)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GeometryWarning)  # the hull's masks were warned of
+        warnings.simplefilter("ignore", GeometryWarning)  # the hull has warned of the same masks already
         found = adopt_surface(fit.mesh, kept, config)
+    # Counts of the final mesh replace those of the hull.
     numbers = {
         **start.numbers,
         **{name: found.numbers[name] for name in ("status", "genus", "vertices", "faces", "unseen", "unsure", "gains")},
+        # The mean over the last 100 steps smooths the noise of single batches.
         "loss": float(np.mean(fit.losses[-100:])),
     }
     return replace(found, hull=start.hull, numbers=numbers, notes=start.notes)

@@ -1,4 +1,4 @@
-"""The stage that reconstructs frames of a capture; the work is done by `smplxpp.build.reconstruct`."""
+"""The stage that reconstructs frames of a capture; `smplxpp.build.reconstruct` does the work."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ from smplxpp.core.files.atomic import atomic_folder
 from smplxpp.core.files.json_file import as_object, jsonable, read_json
 
 _SHARES = {"masks": 0.0, "hull": 0.1, "photographs": 0.2, "colours": 0.9}
-"""Share of a frame's work that is done when a step of it begins."""
+"""Progress within a frame, from 0 to 1, at which each step begins."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """Another way to a surface than the sweep.
+    """A method of surface reconstruction that replaces the plane sweep.
 
     Attributes:
-        make: reconstructs the surface of a moment.
-        code: modules that do its work.
-        choices: what it depends on.
+        make: function that reconstructs the surface of one frame.
+        code: modules that implement it, part of the stage's key.
+        choices: its settings, part of the stage's key.
     """
 
     make: Maker
@@ -63,21 +63,22 @@ def reconstruct_capture(
     force: bool = False,
     progress: ProgressCallback = ignore_progress,
 ) -> StageRecord:
-    """Reconstruct the frames, unless the stage stands, and keep it in a run that the caller owns.
+    """Reconstruct the frames, unless the stage is up to date, in a run whose lock the caller holds.
 
-    Frames that were finished before a kill are not made again. One of several frames that cannot be reconstructed is
-    skipped and named in `reconstruction.json`.
+    Frames that were finished before an interruption are kept. A frame that fails is skipped and listed in
+    `reconstruction.json`, unless it is the only one.
 
     Args:
         run: folder of the run.
-        inputs: what is reconstructed.
-        method: makes the surfaces in the place of the sweep.
-        force: reconstruct again even if the stage stands.
-        progress: called with what is being done, and the share of it that is done.
+        inputs: capture, frames and settings.
+        method: method that replaces the plane sweep.
+        force: reconstruct again even if the stage is up to date.
+        progress: called with the name of the current step and its share done.
 
     Raises:
-        InputError: unusable inputs, or not a single frame that could be reconstructed.
+        InputError: unusable inputs, or no frame that could be reconstructed.
     """
+    # Check all inputs first: a missing mask must not end a sequence after hours.
     capture = open_photographs(inputs)
     cameras = usable_cameras(capture, inputs.hold_out)
     frames = usable_frames(capture, inputs.frames)
@@ -101,7 +102,9 @@ def reconstruct_capture(
         code=(__name__, *(() if method is None else method.code)),
         resumable=True,
     )
+    # The record is written before the work, so that an interrupted run knows its inputs.
     save_reconstruct(run, inputs)
+    # Finished frames lie in the work folder, whose name contains the key. A changed setting therefore starts from none.
     state = run / stage.work_name
     make = surface_maker(inputs) if method is None else method.make
     work = partial(_work, state=state, capture=capture, cameras=cameras, frames=frames, make=make, progress=progress)
@@ -121,18 +124,21 @@ def _work(
     """Write `scan_FFFFFF.ply`, `scan_FFFFFF.npz` of every frame, and `reconstruction.json`."""
     found: dict[int, dict[str, Any]] = {}
     notes: dict[int, str] = {}
-    # One folder a frame keeps what is finished; a frame that fails is noted and the next one goes on.
+    # One folder for each frame keeps finished work. A frame that fails is noted and the loop continues.
     for k, frame in enumerate(frames):
 
         def report(what: str, share: float, k: int = k, frame: int = frame) -> None:
+            # Photographs are the only step that reports its own progress; they fill 0.2 to 0.9.
             done = _SHARES.get(what, 0.0) + (0.7 * share if what == "photographs" else 0.0)
             progress(f"{frame}: {what}", (k + done) / len(frames))
 
         made = state / f"frame_{frame:06d}"
+        # The folder appears at once when its frame is complete, so that its existence means finished.
         if not made.is_dir():
             try:
                 _keep_frame(made, capture, cameras, frame, make, report)
             except InputError as error:
+                # A single frame that fails has no result at all.
                 if len(frames) == 1:
                     raise
                 notes[frame] = str(error)
@@ -145,6 +151,7 @@ def _work(
             expected="a surface of at least one frame",
             received=f"none of {len(frames)}: {next(iter(notes.values()))}",
         )
+    # Copy instead of moving: an interruption during the copy must not lose frames.
     for frame in found:
         for name in ("scan.ply", "scan.npz"):
             path = state / f"frame_{frame:06d}" / name
@@ -162,8 +169,9 @@ def _work(
 def _keep_frame(
     made: Path, capture: Capture, cameras: tuple[str, ...], frame: int, make: Maker, progress: ProgressCallback
 ) -> None:
-    """Reconstruct a frame and keep it in a folder: a scan, what is known of its vertices, its numbers."""
+    """Reconstruct a frame and keep it in a folder: the scan, arrays for each vertex, and numbers."""
     result, numbers = reconstruct_frame(capture, cameras, frame, make, progress)
+    # Write into a temporary folder and rename it, see `_work`.
     with atomic_folder(made) as temporary:
         write_surface(temporary / "scan.ply", result)
         np.savez_compressed(
@@ -181,6 +189,7 @@ def photograph_digests(capture: Capture, cameras: tuple[str, ...], frames: tuple
     rig, files = hashlib.sha256(), hashlib.sha256()
     for name in cameras:
         camera = capture.cameras[name]
+        # Intrinsics and poses are hashed by content, because a calibration may change under the same name.
         rig.update(f"{name} {camera.width} {camera.height}".encode())
         rig.update(camera.K.tobytes() + camera.cam_from_world.tobytes())
     for frame in frames:

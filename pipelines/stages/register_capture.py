@@ -1,4 +1,4 @@
-"""The stage that registers the body to a capture or a scan; the work is done by `smplxpp.build.register`."""
+"""The stage that registers the body to a capture or a scan; `smplxpp.build.register` does the work."""
 
 from __future__ import annotations
 
@@ -34,19 +34,20 @@ def register_capture(
     force: bool = False,
     progress: ProgressCallback = ignore_progress,
 ) -> StageRecord:
-    """Register the body, unless the stage stands, and keep the stage in a run that the caller owns.
+    """Register the body, unless the stage is up to date, in a run whose lock the caller holds.
 
-    Landmarks that lie in the run, placed by hand on the reference frame's scan, are observations too.
+    Landmarks in the run, placed by hand on the reference frame's scan, are observations too.
 
     Args:
         run: folder of the run.
-        inputs: what the body is registered to.
-        force: register again even if the stage stands.
-        progress: called with what is being done, and the share of it that is done.
+        inputs: observations to register the body to.
+        force: register again even if the stage is up to date.
+        progress: called with the name of the current step and its share done.
 
     Raises:
-        InputError: inputs that nothing can be registered to, or not a single frame that was.
+        InputError: inputs without observations, or no frame that could be registered.
     """
+    # Collect the observations: keypoints, masks, scans, landmarks and, where a scan was located, its pose.
     config = RegisterConfig(seed=inputs.seed)
     body = load_body(inputs.body)
     placed, located = run / LANDMARKS_FILE, run / LOCATE_STAGE
@@ -56,10 +57,12 @@ def register_capture(
         landmarks=placed if placed.exists() else None,
         located=partial(load_located, located) if (located / MANIFEST).exists() else None,
     )
+    # The key covers contents of small files, and names and sizes of the many large ones.
     digests = observed_digests(observed, inputs, landmarks=placed if observed.placed else None)
     if observed.found is not None:
         digests |= {f"{LOCATE_STAGE}/{file}": sha256_file(located / file) for file in LOCATED_FILES}
     observations = observed.observations
+    # Frames are part of the key: a registration of other frames is another result.
     choices = {
         "register": config,
         "frames": observations.frames,
@@ -69,6 +72,7 @@ def register_capture(
         "scans": {"units": inputs.units, "up": inputs.up, "label_set": inputs.label_set},
     }
     stage = Stage(name=REGISTER_STAGE, config=choices, inputs=digests, code=(__name__,))
+    # The record is written before the work, so that an interrupted run knows its inputs.
     save_register(run, inputs)
     work = partial(_work, observed=observed, inputs=inputs, body=body, config=config, progress=progress)
     return run_stage(run, stage, work, force=force)
@@ -84,6 +88,7 @@ def _work(
     progress: ProgressCallback,
 ) -> StageOutput:
     """Write `params.npz`, `initial.npz`, `confidence.npz` and `registration.json`."""
+    # Save the fit, the initial parameters it started from (for the report), and the confidence of each joint.
     registration, output = register_observed(observed, body, at=inputs.frame, config=config, progress=progress)
     fit, observations = registration.fit, registration.observations
     _save(folder / "params.npz", stacked_rows(fit.frames, fit.params))
@@ -126,6 +131,7 @@ def _files(scans: Mapping[int, Any]) -> dict[int, Path]:
 def _seen_digests(observations: Observations, capture: Capture | None) -> dict[str, str]:
     """SHA-256 of cameras, keypoints and the fit to start from, and of the names and sizes of masks and label maps."""
     cameras, points, start, files = (hashlib.sha256() for _ in range(4))
+    # Hash cameras, keypoints and initial parameters by content: all of them are small.
     for name, camera in observations.cameras.items():
         cameras.update(f"{name} {camera.width} {camera.height}".encode())
         cameras.update(camera.K.tobytes() + camera.cam_from_world.tobytes())
@@ -136,6 +142,7 @@ def _seen_digests(observations: Observations, capture: Capture | None) -> dict[s
     if observations.initial is not None:
         for key in ARRAY_NAMES:
             start.update(np.ascontiguousarray(getattr(observations.initial, key)).tobytes())
+    # Masks and label maps are large: hash their names and sizes.
     if capture is not None:
         for name in observations.cameras:
             for frame in observations.frames:

@@ -31,24 +31,27 @@ _WHITE = (1.0, 1.0, 1.0)
 
 
 def relight(run: Path, name: str, lights: Mapping[str, Relighting], *, force: bool = False) -> StageRecord:
-    """Draw a run's student from the front, as it was trained and in other lights; skipped while it stands.
+    """Draw a run's student from the front, in the captured light and in others, unless the pictures are up to date.
 
     Args:
-        name: of the light. lights: by what is said of each picture: the same light, turned.
-        force: draw anew even if the stage stands.
+        run: folder of the run.
+        name: name of the light.
+        lights: lights by the caption of their picture, for instance one light in several directions.
+        force: draw again even if the stage is up to date.
 
     Raises:
         InputError: no template or no student, or a student of another template.
     """
     known = [PARAMS] if (run / PARAMS).is_file() else []
+    # The key holds the coefficients of the lights, because a light's name says nothing of its content.
     stage = Stage(
         name=RELIGHT_STAGE,
         config={
             "light": name,
             "height": HEIGHT,
             "lights": {
-                said: [one.light.coefficients.tolist(), one.captured.coefficients.tolist()]
-                for said, one in lights.items()
+                caption: [one.light.coefficients.tolist(), one.captured.coefficients.tolist()]
+                for caption, one in lights.items()
             },
         },
         inputs={file: sha256_file(run / file) for file in (TEMPLATE, STUDENT, *known)},
@@ -57,16 +60,19 @@ def relight(run: Path, name: str, lights: Mapping[str, Relighting], *, force: bo
     )
 
     def work(folder: Path) -> StageOutput:
+        # Draw through the bundle and the player, so that the pictures show what a viewer will show.
         player = _player(run, Path(folder))
         params = load_params_of_run(run).frame(0).without_shape() if known else BodyParams.rest(betas=0)
         points = player.pose(params).means.astype(np.float64)
         camera = fit_cameras(points, directions=[VIEWS["front"]], height=HEIGHT)[0]
         files: dict[str, str] = {}
-        for k, (said, relighting) in enumerate([("as captured", None), *lights.items()]):
+        # The first picture has the captured light and is the reference for all others.
+        for k, (caption, relighting) in enumerate([("as captured", None), *lights.items()]):
             image, _ = player.draw(camera, background=_WHITE, relighting=relighting)
-            files[said] = BEFORE if relighting is None else f"relit_{k}.png"
+            files[caption] = BEFORE if relighting is None else f"relit_{k}.png"
+            # Round to 8 bits.
             picture = (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-            atomic_write_bytes(folder / files[said], encode_png(picture))
+            atomic_write_bytes(folder / files[caption], encode_png(picture))
         return StageOutput(numbers={"light": name, "pictures": files})
 
     with own_run_folder(run, (RELIGHT_STAGE, "report")):
@@ -74,6 +80,7 @@ def relight(run: Path, name: str, lights: Mapping[str, Relighting], *, force: bo
 
 
 def _player(run: Path, folder: Path) -> AvatarPlayer:
+    """Load the student of a run into a player, through a temporary bundle beside `folder`."""
     student = load_avatar(run / STUDENT, Rig(Template.load(run / TEMPLATE)))
     if not isinstance(student, Student):
         raise InputError(f"model {run / STUDENT}", expected="a student", received="a teacher")

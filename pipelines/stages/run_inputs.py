@@ -1,4 +1,4 @@
-"""Which parameters, motion and protocol a run uses, and what is known of them: exact or tracked."""
+"""Choose the parameters, motion and protocol of a run, and determine whether they are exact or tracked."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from smplxpp.core.params import BodyParams
 
 log = logging.getLogger(__name__)
 MADE_BY = {REGISTERED_PARAMS: "registered", REFINED_PARAMS: "refined"}
-"""Parameters that a run makes, and by what."""
+"""Parameter files that a run makes, with the participle that the tables print for them."""
 
 
 def params_in_use(run: Path, given: Path | None) -> Path | None:
-    """Return the run's refined parameters if they began with these; else `params_to_begin_with`."""
+    """Return the run's refined parameters if they started from the given ones; else `params_to_begin_with`."""
+    # Refined parameters hold for one template and one start. With another template or other given parameters they are
+    # stale.
     manifest = read_manifest(run / REFINE_STAGE)
     if manifest is not None and is_finished(manifest) and (run / REFINED_PARAMS).is_file():
         of_template = (run / TEMPLATE).is_file() and manifest["inputs"].get(TEMPLATE) == sha256_file(run / TEMPLATE)
@@ -45,14 +47,14 @@ def params_to_begin_with(run: Path, given: Path | None) -> Path | None:
 
 
 def record_of_given(given: Path | None) -> str | None:
-    """Return how a record names parameters that a user gave: content and name of a file, or a folder's name."""
+    """Return the identifier of given parameters in a record: name and digest of a file, or a folder's name."""
     if given is None:
         return None
     return f"{given.name} {sha256_file(given)}" if given.is_file() else given.name
 
 
 def motion_of_build(run: Path, inputs: BuildInputs) -> BodyParams | None:
-    """Read the capture's motion: the one that the build names, or the frames that its run has registered."""
+    """Read the capture's motion: the one given to the build, or the frames that the run has registered."""
     given = None if inputs.motion is None else given_motion(inputs, load_body(inputs.body))
     if given is not None:
         return given
@@ -60,21 +62,21 @@ def motion_of_build(run: Path, inputs: BuildInputs) -> BodyParams | None:
 
 
 def run_protocol(run: Path) -> str | None:
-    """Return the protocol that the template of a run was built by; None without one, or where it is not known."""
+    """Return the protocol of the build of a run's template; None without one, or without a record."""
     build = load_build(run)
     return None if build is None else build[0].protocol
 
 
 def chosen_protocol(run: Path, asked: str | None, *, own_params: bool, measures: bool = False) -> str | None:
-    """Choose the protocol that a command reads a capture by: the one that is asked for, else the run's.
+    """Choose the protocol for reading a capture: the user's choice, else the run's.
 
-    A template built by one protocol and models trained by another would follow no protocol at all.
+    The template and the models must use the same protocol, or the run follows none.
 
     Args:
         run: folder of the run.
-        asked: the protocol that the user names, None without one.
-        own_params: whether the user names parameters too, and so knows that they are not the template's.
-        measures: whether the command trains nothing; then another protocol is logged and not refused.
+        asked: the user's choice, None without one.
+        own_params: whether the user gives parameters too, and so knows that they differ from the template's.
+        measures: whether the command only measures; then another protocol is logged instead of refused.
 
     Raises:
         InputError: another protocol than the run's, for a training.
@@ -98,7 +100,7 @@ def chosen_protocol(run: Path, asked: str | None, *, own_params: bool, measures:
 
 
 def parameters_in_run(declared: DeclaredInputs, run: Path, path: Path | None) -> tuple[str, str]:
-    """Return the word for parameters in a file or folder ("exact", "tracked", ...), and what the run made them by."""
+    """Return the kind of parameters in a file or folder ("exact", "tracked", ...), and the run's stage behind them."""
     for file, stage in MADE_BY.items():
         if path is not None and same_place(path, run / file):
             return _made_from(declared, run), stage
@@ -106,7 +108,9 @@ def parameters_in_run(declared: DeclaredInputs, run: Path, path: Path | None) ->
 
 
 def labels_of_build(declared: DeclaredInputs, build: BuildInputs) -> str:
-    """Return the word for the labels that a template was built with; labels by the body are an estimate."""
+    """Return the kind of the labels that a template was built with; labels by the body are an estimate."""
+    # Labels projected by the body are estimated whatever lies in the capture. The capture can only declare what its own
+    # files are.
     views = list(build.label_maps.values())
     files = views or [one for one in (build.labels or build.scan,) if isinstance(one, Path)]
     if (build.reconstructs or all(path.exists() for path in files)) and _by_body(build):
@@ -117,8 +121,10 @@ def labels_of_build(declared: DeclaredInputs, build: BuildInputs) -> str:
 
 
 def _made_from(declared: DeclaredInputs, run: Path) -> str:
-    """The word for parameters that a run made, by what they began with: keypoints alone, or a fit."""
+    """Return the kind of parameters that a run made, which depends on their start: keypoints alone, or a fit."""
     began = declared.own_parameters()
+    # Registered parameters began with a fit or with keypoints alone; refined ones with the parameters that their record
+    # names.
     registration = load_register(run)
     if registration is not None:
         named = registration.params if isinstance(registration.params, Path) else None
@@ -126,6 +132,7 @@ def _made_from(declared: DeclaredInputs, run: Path) -> str:
     else:
         given = (read_manifest(run / REFINE_STAGE) or {}).get("numbers", {}).get("given")
         began = began if given is None else declared.root / "params" / str(given).partition(" ")[0]
+    # Keypoints alone are tracked. A start from exact parameters makes the result mixed.
     if began is None:
         return TRACKED
     word = declared.given_parameters(began)
@@ -133,7 +140,7 @@ def _made_from(declared: DeclaredInputs, run: Path) -> str:
 
 
 def _by_body(build: BuildInputs) -> bool:
-    """Whether the body in the scan decided its labels; False for a scan that can no longer be read."""
+    """Return whether the labels come from the body in the scan; False for a scan that cannot be read any more."""
     try:
         return label_source(build) == "body"
     except InputError:

@@ -20,14 +20,14 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import lies_in
 from smplxpp.template.template import Template
 
-REGISTER_ANEW = "register without them (smplxpp register --hold-out, or the capture's split)"
-RECONSTRUCT_ANEW = "reconstruct without them (smplxpp reconstruct --hold-out, or the capture's split) and build again"
-REFINE_ANEW = "refine the poses without them (smplxpp train --refine-poses on)"
+REGISTER_AGAIN = "register without them (smplxpp register --hold-out, or the capture's split)"
+RECONSTRUCT_AGAIN = "reconstruct without them (smplxpp reconstruct --hold-out, or the capture's split) and build again"
+REFINE_AGAIN = "refine the poses without them (smplxpp train --refine-poses on)"
 
 
 @dataclass(frozen=True)
 class TrainInputs:
-    """What a training reads its views from.
+    """Sources from which a training reads its views.
 
     Attributes:
         capture: folder of any known layout.
@@ -74,12 +74,14 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
         InputError: no template; a capture that lacks images, masks, cameras or parameters of the frame; a template
             that does not stand in the images.
     """
+    # Choose protocol and parameters as `open_scene` does, so that fit and training see the same poses and cameras.
     template = open_template(run)
     inputs = of_protocol(run, inputs)
     inputs = replace(inputs, params=params_in_use(run, inputs.params))
     capture = open_views(inputs)
     if inputs.params == run / REFINED_PARAMS:
         capture = _corrected(run, capture)
+    # Check the frame before any image is read.
     if frame not in capture.frames:
         raise InputError(
             f"capture {capture.name}",
@@ -96,6 +98,7 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
             "`smplxpp register`",
         )
+    # Reduce the training frames to this one; held-out cameras remain for measuring.
     splits = capture.splits
     capture = replace(capture, splits=Splits(splits.train_cameras, splits.novel_view_cameras, (frame,), ()))
     overlap = silhouette_overlap(
@@ -106,23 +109,27 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
 
 
 def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures: bool = False) -> TrainScene:
-    """Open the template of a run and a capture, and look at both.
+    """Open the template of a run and a capture, and check that they fit together.
 
     Training frames and views that lack parameters or a mask are left out with a warning, if others remain.
 
     Args:
-        refined: with the run's refined parameters, if it has any that began with these.
-        measures: nothing is trained; then another protocol than the run's is logged and not refused.
+        run: folder of the run.
+        inputs: capture, parameters, held-out cameras and scale.
+        refined: whether to read the run's refined parameters, if it has any that started from these.
+        measures: whether the caller only measures; then another protocol than the run's is logged instead of refused.
 
     Raises:
         InputError: no template; another protocol than the template's; no training camera, image, mask or parameters;
-            images of another size than their camera; nobody in the masks; a template that does not stand in the images,
-            or parameters of another body.
+            images of another size than their camera; empty masks; a template that does not stand in the images, or
+            parameters of another body.
     """
+    # Choose the protocol first: it decides which parameters and splits the capture has.
     template = open_template(run)
     inputs = of_protocol(run, inputs, measures=measures)
     inputs = replace(inputs, params=(params_in_use if refined else params_to_begin_with)(run, inputs.params))
     capture = open_views(inputs)
+    # Refined parameters were optimised together with camera corrections, so that both are read or neither.
     made: dict[str, str] = {}
     if inputs.params == run / REFINED_PARAMS:
         made = {name: sha256_file(run / name) for name in (REFINED_PARAMS, REFINED_CAMERAS) if (run / name).is_file()}
@@ -132,12 +139,13 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
     # What the run made from photographs must not have seen those that are held out now.
     splits = scene.capture.splits
     if inputs.params == run / layout.REGISTERED_PARAMS:
-        refuse_seen(run, (layout.REGISTER_STAGE,), splits, anew=REGISTER_ANEW)
+        refuse_seen(run, (layout.REGISTER_STAGE,), splits, remedy=REGISTER_AGAIN)
     if inputs.params == run / REFINED_PARAMS:
-        refuse_seen(run, (REFINE_STAGE,), splits, anew=REFINE_ANEW)
+        refuse_seen(run, (REFINE_STAGE,), splits, remedy=REFINE_AGAIN)
     if built is not None and lies_in(built[0].scan_file, run / layout.RECONSTRUCT_STAGE):
-        refuse_seen(run, (layout.RECONSTRUCT_STAGE,), splits, anew=RECONSTRUCT_ANEW)
+        refuse_seen(run, (layout.RECONSTRUCT_STAGE,), splits, remedy=RECONSTRUCT_AGAIN)
     template_frame = _template_frame(run, inputs)
+    # The same holds for the template: its shape was scanned in one frame.
     if template_frame in splits.novel_pose_frames:
         raise InputError(
             f"held-out frames of capture {capture.name}",
@@ -151,14 +159,14 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
 
 
 def of_protocol(run: Path, inputs: TrainInputs, *, measures: bool = False) -> TrainInputs:
-    """The inputs with the protocol that is read."""
+    """Return the inputs with the protocol for reading the capture filled in."""
     own_params = inputs.params is not None
     protocol = chosen_protocol(run, inputs.protocol, own_params=own_params, measures=measures)
     return replace(inputs, protocol=protocol)
 
 
 def _corrected(run: Path, capture: Capture) -> Capture:
-    """The capture with the training cameras that the run has corrected, if it has."""
+    """Return the capture with the camera corrections of the run, unchanged without any."""
     file = run / REFINED_CAMERAS
     if not file.is_file():
         return capture
@@ -166,7 +174,7 @@ def _corrected(run: Path, capture: Capture) -> Capture:
 
 
 def _template_frame(run: Path, inputs: TrainInputs) -> int | None:
-    """The frame of the capture whose scan the template was built from."""
+    """Return the frame whose scan the template was built from; None for a scan from outside the capture."""
     built = load_build(run)
     if built is None or not lies_in(built[0].scan_file, inputs.capture):
         return None

@@ -1,4 +1,4 @@
-"""Stage 80: the surface is followed, the networks are pretrained on it, the teacher learns from the photographs."""
+"""Stage 80: track the surface, pretrain the networks on it, train the teacher on the photographs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ class TeacherStage(ModelStage):
     """A teacher on fitted Gaussians.
 
     Attributes:
-        gaussians: the stage that fits them.
+        gaussians: stage of the fit.
+        networks: architecture of the teacher.
+        config: configuration of tracking, pretraining and training.
     """
 
     file = "teacher.safetensors"
@@ -41,6 +43,7 @@ class TeacherStage(ModelStage):
         }
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        # The configuration depends on the frame that the template was built from, where tracking starts.
         sequence = trainer.sequence(self.ground)
         gaussians = self.gaussians.read(trainer.path(self.gaussians), sequence.rig)
         model, done = fit_teacher(

@@ -98,6 +98,7 @@ def segment(folder: Path, build: BuildContext) -> StageOutput:
         load_params_of_run(build.run),
         corrections=Corrections.load(path) if path.exists() else None,
     )
+    # Keep the labels before corrections too: the report shows what was changed by hand.
     result, before = labelled.result, labelled.before
     assert result.corrected is not None
     np.savez(
@@ -109,6 +110,7 @@ def segment(folder: Path, build: BuildContext) -> StageOutput:
         labels_before_hand=before.face_labels,
         confidence_before_hand=before.confidence,
     )
+    # A coloured mesh for mesh viewers, with labels as face properties.
     write_ply(
         folder / "labels.ply",
         scan.mesh,
@@ -138,6 +140,7 @@ def transfer(folder: Path, build: BuildContext) -> StageOutput:
     save_weights(folder, weights)
     save_parts(folder, parts)
     for name, part in parts.items():
+        # Each vertex shows the blend of its joints' colours, so that a wrong weight stands out.
         write_ply(
             folder / f"{name}_weights.ply",
             part.mesh,
@@ -159,6 +162,7 @@ def unpose(folder: Path, build: BuildContext) -> StageOutput:
 def assemble(folder: Path, build: BuildContext) -> StageOutput:
     """Write body and parts as one `Template`, layers apart: npz, GLB and OBJ."""
     body, scan, posed = load_body(build.inputs.body), load_prepared_scan(build.run), load_parts(build.run)
+    # Weights and rest vertices are stored per part and matched by the part's name.
     at_rest, weights = load_canonical(build.run, posed), load_weights(build.run, posed)
     template, output = assemble_parts(
         body,
@@ -179,6 +183,7 @@ def assemble(folder: Path, build: BuildContext) -> StageOutput:
 def validate(folder: Path, build: BuildContext) -> StageOutput:
     """Write distances to the scan in the reference pose; measure flips, and stretch under hard poses and the motion."""
     scan = load_prepared_scan(build.run)
+    # Distances are kept per vertex for the report's histograms and error maps.
     found, output = validate_template(
         Template.load(build.run / TEMPLATE),
         load_params_of_run(build.run),

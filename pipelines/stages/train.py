@@ -32,13 +32,15 @@ log = logging.getLogger(__name__)
 
 
 def model_stages(config: Recipe) -> dict[str, ModelStage]:
-    """The stages of a training by their steps."""
+    """Return the model stages of a training, by the name of their step."""
     preset = config.preset
+    # Stages refer to the stages that they read, which makes a graph: fit -> teacher -> cloth -> bake -> compensate.
     fit = FitStage(name=layout.FIT_STAGE, config=preset.fit)
     teacher = TeacherStage(
         name=layout.TEACHER_STAGE, gaussians=fit, networks=preset.networks.teacher, config=preset.teacher
     )
     cloth = None
+    # Garments are calibrated on the cloth that the teacher tracked; without a teacher there are none.
     if config.teacher and config.cloth is not None:
         cloth = ClothStage(name=layout.CLOTH_STAGE, teacher=teacher, config=config.cloth)
     bake = BakeStage(
@@ -48,6 +50,7 @@ def model_stages(config: Recipe) -> dict[str, ModelStage]:
         student=preset.student(),
         config=preset.bake,
     )
+    # Blend shapes start from the teacher's tracked surface, if the preset asks for it.
     compensate = CompensateStage(
         name=layout.COMPENSATE_STAGE,
         student=bake,
@@ -75,13 +78,18 @@ def train(
     *,
     steps: tuple[str, ...] = STEPS,
 ) -> dict[str, StageRecord]:
-    """Train what is missing of a run, in the order of the steps; every stage that stands is skipped.
+    """Train the missing stages of a run, in the order of the steps, and skip those that are up to date.
 
-    A training that was interrupted, or that the limit of time ended, goes on where it was.
+    A training that was interrupted, or that reached its time limit, resumes from its checkpoint.
 
     Args:
-        scene: opened with the parameters that stand; opened anew where poses are refined first.
-        steps: of `STEPS`, in this order; the stages of those before the first must stand.
+        run: folder of the run.
+        inputs: sources of the views.
+        scene: the opened scene; it is opened again after a refinement of the poses.
+        config: configuration of all stages.
+        options: limits and display.
+        together: processes that train together.
+        steps: a subsequence of `STEPS`; stages before the first one must be finished.
 
     Returns:
         Records by step, up to the first that is not finished.
@@ -90,27 +98,33 @@ def train(
         InputError: an earlier stage is missing or unfinished or saw what is held out, a checkpoint is of another
             training, memory or disk ran out, or training diverged; checkpoints and finished stages stay.
     """
+    # Refuse a training that cannot succeed before anything is written.
     check_training(scene, config, steps, pose_known=(run / PARAMS).is_file())
     if "cloth" in steps and config.cloth is not None and config.cloth.parts:
         load_params_of_run(run)  # parts that the user named are simulated, so their pose has to be readable
     records: dict[str, StageRecord] = {}
     how = config.refine
+    # Refinement changes poses and cameras, so that the scene is opened again. Its time counts against the limit, which
+    # rank 0 measures for all.
     if "refine" in steps and how is not None:
         begin = time.monotonic()
         records["refine"] = together.run_on_rank0(lambda: _refined(run, inputs, how, options))
         scene = together.run_on_rank0(lambda: open_scene(run, inputs))
         left = options.max_seconds - (time.monotonic() - begin)
         options = replace(options, max_seconds=together.run_on_rank0(lambda: max(0.0, left)))
+    # Models of one run share the trainer: its scene, metric and deadline.
     note_missing_normals(scene.capture, config, steps)
     metric = load_metric(config.perceptual, device=together.device)
     trainer = Trainer(run, scene, options, together, scale=inputs.scale, perceptual=metric)
     stages = model_stages(config)
+    # A fit made by `smplxpp fit` has another key than the preset's, but takes its place.
     by_hand = together.run_on_rank0(lambda: _fit_by_hand(run, scene, stages["fit"]))
     if by_hand is not None:
         trainer.take(stages["fit"], by_hand)
     for step in steps:
         if step not in stages:
             continue
+        # Out of time: stop between stages, but never before the first.
         if records and not trainer.seconds_left():
             break
         records[step] = by_hand if step == "fit" and by_hand is not None else trainer.make(stages[step])
@@ -130,20 +144,21 @@ def _refined(run: Path, inputs: TrainInputs, config: RefineConfig, options: Trai
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:
-    """The fit of this template that the user made, which is never replaced.
+    """Return the record of a fit that the user made for this template; it is never replaced. None without one.
 
     Raises:
         InputError: it saw a camera or a frame that this training holds out.
     """
+    # A fit of another template has Gaussians bound to other triangles.
     manifest = read_manifest(run / fit.name)
     if manifest is None or manifest["inputs"].get(TEMPLATE) != scene.digests[TEMPLATE]:
         return None
     numbers = manifest["numbers"]
     if not (numbers.get("by_hand") and is_finished(manifest)):
         return None
-    anew = f"fit without them (smplxpp fit), or delete {run / fit.name}"
-    refuse_seen(run, (fit.name,), scene.capture.splits, anew=anew)
-    record = require_stage(run, fit.name, remedy=f"fit it anew (smplxpp fit), or delete {run / fit.name}")
+    remedy = f"fit without them (smplxpp fit), or delete {run / fit.name}"
+    refuse_seen(run, (fit.name,), scene.capture.splits, remedy=remedy)
+    record = require_stage(run, fit.name, remedy=f"fit again (smplxpp fit), or delete {run / fit.name}")
     log.info(
         "%s: taken as it stands, %s Gaussians, %s iterations; delete it to have the preset's",
         fit.name,

@@ -1,4 +1,4 @@
-"""What a training leaves in its stage: models, previews, figures, checks."""
+"""Write the results of a training into its stage: models, previews, figures, checks."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from pipelines.stages.models import CLOTHED, Trainer
 from smplxpp.core.checks import Check
 
 KINDS = {"novel_view": "held-out views", "novel_pose": "held-out poses"}
-"""Kinds of views that a training measures, by the words for them."""
-WAY_BACK = f"{TRACK}/{BACK}"
-BEFORE = {TRACK: "track_metrics.jsonl", WAY_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
-"""Logs of what comes before a training, by its folder."""
+"""Titles of the kinds of views that a training measures."""
+TRACK_BACK = f"{TRACK}/{BACK}"
+BEFORE = {TRACK: "track_metrics.jsonl", TRACK_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
+"""Log files of tracking and pretraining, by their folder within the session's."""
 
 
 def kind_name(kind: str, *, held_out: bool) -> str:
@@ -36,7 +36,7 @@ def kind_name(kind: str, *, held_out: bool) -> str:
 
 
 def keep_logs(work: Path, folder: Path) -> None:
-    """Copy what a training has logged and shown into its stage; what came before it has metrics of its own."""
+    """Copy logs and previews of a training into its stage; tracking and pretraining keep logs of their own."""
     for name in ("previews", TENSORBOARD_FOLDER):
         if (work / name).is_dir():
             shutil.copytree(work / name, folder / name)
@@ -47,7 +47,7 @@ def keep_logs(work: Path, folder: Path) -> None:
 
 
 def write_model(path: Path, model: TeacherAvatar | Student) -> dict[str, Any]:
-    """Write a model; the number of its bytes."""
+    """Write a model and return the size of its file in bytes."""
     return {"bytes": {path.name: save_avatar(path, model)}}
 
 
@@ -59,10 +59,15 @@ def training_output(
     done: Progress,
     write: Callable[[], Mapping[str, Any]],
 ) -> StageOutput:
-    """Write what a training leaves in its stage: logs, the model, numbers, checks; nothing but on the first process.
+    """Write the results of a training into its stage: logs, the model, numbers, checks. Only rank 0 writes.
 
     Args:
-        write: writes the models and gives numbers on them.
+        trainer: the trainer of the run.
+        session: the session whose logs are kept.
+        folder: folder of the stage.
+        model: the trained model.
+        done: the progress at which training ended.
+        write: function that writes the model files and returns numbers on them.
     """
     if not trainer.together.first:
         return StageOutput()
@@ -80,19 +85,27 @@ def _output(
     *,
     overlap: float,
 ) -> StageOutput:
-    """Numbers and checks of a stage whose logs are in `folder`.
+    """Collect numbers and checks of a stage whose logs are in `folder`.
 
     Args:
-        done: where training ended. numbers: of the files that were written.
-        overlap: of the template and the masks.
+        folder: folder of the stage.
+        model: the trained model.
+        done: the progress at which training ended.
+        sequence: the capture with the person's template.
+        numbers: numbers on the written files.
+        overlap: IoU of the template's silhouettes and the masks.
     """
+    # First and last evaluation of the log: the start and the result.
     evaluations = [line for line in read_metrics(folder / METRICS_FILE) if line["kind"] == "evaluation"]
     # None while tracking or pretraining: nothing of the training itself has been measured.
     start, end = (evaluations[0], evaluations[-1]) if evaluations else ({}, {})
+    # Tracking and pretraining have logs of their own, whose times are reported apart.
     before = {part: read_metrics(folder / name) for part, name in BEFORE.items()}
     seconds = {part: lines[-1]["seconds"] if lines else 0.0 for part, lines in before.items()}
+    # Without held-out cameras the "novel" views are training views, and are named so.
     held_out = bool(sequence.capture.splits.novel_view_cameras)
     found = {kind: end[kind] for kind in KINDS if kind in end}
+    # Figures for the manifest: the model's size, the course of the training, and its quality per kind of views.
     everything = {
         **numbers,
         "gaussians": len(model.gaussians),
@@ -108,7 +121,7 @@ def _output(
         "held_out_cameras": held_out,
         "normals": _normals(sequence, folder),
         "convention": CONVENTION,
-        "seconds_of_tracking": seconds[TRACK] + seconds[WAY_BACK],
+        "seconds_of_tracking": seconds[TRACK] + seconds[TRACK_BACK],
         **_followed(model),
         "seconds_of_pretraining": seconds[PRETRAIN],
         "iterations_before": sum(lines[-1]["iteration"] for lines in before.values() if lines),
@@ -120,7 +133,7 @@ def _output(
 
 
 def _followed(model: TeacherAvatar | Student | Baseline) -> dict[str, Any]:
-    """How far off a teacher's followed clothes are expected to be, and the drift of a way back, mm."""
+    """Return the expected error of a teacher's tracked clothes and the drift of tracking there and back, mm."""
     track = model.track if isinstance(model, TeacherAvatar) else None
     if track is None or track.sigma is None:
         return {}
@@ -128,13 +141,15 @@ def _followed(model: TeacherAvatar | Student | Baseline) -> dict[str, Any]:
 
 
 def _normals(sequence: AvatarSequence, folder: Path) -> str:
-    """Where the normals of the loss came from: "maps" of the capture, the followed "surface", or "none"."""
+    """Return the source of the loss's normals: "maps" of the capture, the tracked "surface", or "none"."""
     if sequence.normal_maps:
         return "maps"
     return "surface" if any("normal" in line for line in read_metrics(folder / METRICS_FILE)) else "none"
 
 
 def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
+    """Check the figures of a training against their gates."""
+    # The silhouettes tell wrong inputs from a failed training.
     checks = [
         gates.SILHOUETTE.check(
             "template's silhouette on the masks",
@@ -142,8 +157,10 @@ def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
             explanation="mean over some training views; low: another pose, or other cameras",
         ),
     ]
+    # Tracking forwards and back must return to the start; the distance is the drift.
     if "drift_mm" in numbers.get("followed", {}):
         checks.append(gates.DRIFT.check("clothes followed back to the first frame", numbers["followed"]["drift_mm"]))
+    # Check each measured kind of views: quality, gain since the start, loss by compression.
     for kind, gate in gates.PSNR.items():
         if kind not in numbers:
             continue
