@@ -76,10 +76,10 @@ class Obstacle:
     def clearance(
         self, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"], wanted: float
     ) -> Float64[np.ndarray, " N"]:
-        """Return the clearance of each point, metres: `wanted`, but at most its distance to a garment that it is
-        outside.
+        """Return the clearance that each point must keep, metres.
 
-        Parts cut from one scan share a seam; a gap there would tear the cloth.
+        It is `wanted`, but outside of a garment at most the distance that the point has already. Parts cut from one
+        scan share a seam; a gap there would tear the cloth.
         """
         if self._solid:
             return np.full(len(points), wanted)

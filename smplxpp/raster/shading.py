@@ -19,25 +19,22 @@ from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh
 # In camera axes (x right, y down, z forward): from the surface to the light, above and left of the camera.
 _KEY_DIRECTION = np.array([-0.42076, -0.62112, -0.66119], dtype=np.float32)
 _HALF_DIRECTION = np.array([-0.23084, -0.34076, -0.91137], dtype=np.float32)  # between the key and the viewer
-_KEY, _SKY, _GROUND = 0.62, 0.46, 0.24
-_RIM, _GLOSS = 0.16, 0.05
-_BLOCK = 1 << 15  # pixels shaded at a time
 _BACK_SIDE = np.array([0.42, 0.46, 0.54], dtype=np.float32)  # inside of open surfaces: darker and cooler
 
 
 @dataclass(frozen=True)
 class ShadeStyle:
-    """How surfaces are drawn.
+    """Options of drawing surfaces with `render_shaded`.
 
     Attributes:
         base_color: sRGB of surfaces without colours of their own.
-        background: sRGB.
-        supersampling: samples a pixel along each axis.
-        relief: 1 = full light and shadow, 0 = flat colours; lower where colours must be read exactly.
+        background: sRGB of the background.
+        supersampling: number of samples of a pixel along each axis.
+        relief: 1 for full light and shadow, 0 for flat colours; lower values keep colours readable.
         occlusion: strength of the ambient occlusion, 0 to 1.
-        occlusion_radius: metres.
-        smooth: interpolate vertex normals (else one normal a face).
-        wireframe: draw the faces' edges.
+        occlusion_radius: radius of the ambient occlusion, metres.
+        smooth: whether vertex normals are interpolated; otherwise each face has one normal.
+        wireframe: whether the faces' edges are drawn.
     """
 
     base_color: tuple[int, int, int] = (206, 200, 192)
@@ -52,12 +49,13 @@ class ShadeStyle:
 
 @dataclass(frozen=True)
 class Layer:
-    """A shaded surface before it is put on a background, at the supersampled size.
+    """A shaded surface before compositing on a background, at the supersampled size.
 
     Attributes:
-        color: linear light, 0 where nothing is hit. mask: where something is.
-        depth: metres, inf where nothing is hit.
-        facing: |cos| between normal and view, 1 where nothing is hit.
+        color: linear light, 0 on the background.
+        mask: pixels of the surface.
+        depth: metres, inf on the background.
+        facing: |cos| between normal and view, 1 on the background.
     """
 
     color: Float32[np.ndarray, "H W 3"]
@@ -77,8 +75,11 @@ def render_shaded(
     """Draw a lit picture of a mesh.
 
     Args:
-        vertex_colors: sRGB, interpolated in linear light. face_colors: sRGB, one a face.
-        style: see `ShadeStyle`.
+        mesh: the mesh.
+        camera: the camera.
+        vertex_colors: sRGB, interpolated in linear light.
+        face_colors: sRGB, one for each face.
+        style: options.
     """
     style = style or ShadeStyle()
     layer = shade_layer(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors, style=style)
@@ -93,7 +94,8 @@ def shade_layer(
     face_colors: UInt8[np.ndarray, "M 3"] | None = None,
     style: ShadeStyle,
 ) -> Layer:
-    """Rasterise and shade a mesh; colours are one a vertex or one a face."""
+    """Rasterise and shade a mesh, with colours of either vertices or faces."""
+    # Colours are bytes of one kind.
     for name, colors, count in (
         ("vertex colours", vertex_colors, mesh.vertex_count),
         ("face colours", face_colors, mesh.face_count),
@@ -106,6 +108,7 @@ def shade_layer(
             )
     if vertex_colors is not None and face_colors is not None:
         raise InputError("colours", expected="a vertex or a face", received="both")
+    # Rasterise at the supersampled size, and gather what shading needs.
     s = style.supersampling
     K = camera.K.copy()
     K[:2] *= s
@@ -124,16 +127,18 @@ def shade_layer(
         edge_heights=_edge_heights(mesh, fine) if style.wireframe else None,
         style=style,
     )
+    # Shade the covered pixels in blocks of 32,768, which fit the processor's cache, on up to four threads.
+    block = 1 << 15
     open_sky = unoccluded(maps, fine, surface.normals_at, style=style)
     color = np.zeros((fine.height * fine.width, 3), np.float32)
     facing = np.ones(fine.height * fine.width, np.float32)
 
     def work(begin: int) -> None:
-        pixels = hit[begin : begin + _BLOCK]
+        pixels = hit[begin : begin + block]
         color[pixels], facing[pixels] = surface.shade(pixels, open_sky)
 
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        list(pool.map(work, range(0, len(hit), _BLOCK)))
+        list(pool.map(work, range(0, len(hit), block)))
     shape = (fine.height, fine.width)
     return Layer(color.reshape(*shape, 3), maps.face_id >= 0, maps.depth, facing.reshape(shape))
 
@@ -156,12 +161,18 @@ def resolve(
 
 @dataclass(frozen=True)
 class _Surface:
-    """What every pixel's shading reads; `shade` works on blocks that fit the processor's cache.
+    """Inputs of the shading of all pixels.
 
     Attributes:
-        back: faces that turn their inner side to the camera. normals: of vertices or faces, in camera axes.
-        vertex_albedo, face_albedo: linear light; a single face's stands for all.
-        edge_heights: pixels.
+        mesh: the mesh.
+        camera: the supersampled camera.
+        maps: maps of the mesh.
+        back: faces whose back is visible.
+        normals: normals of vertices or faces, in camera axes.
+        vertex_albedo: linear colours of vertices.
+        face_albedo: linear colours of faces, or one for all.
+        edge_heights: heights of the faces over their edges, pixels.
+        style: options.
     """
 
     mesh: TriangleMesh
@@ -183,6 +194,7 @@ class _Surface:
         self, pixels: Int[np.ndarray, " P"], open_sky: Float32[np.ndarray, "H W"]
     ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, " P"]]:
         """Return linear colour and |cos| to the view at flat pixel indices."""
+        # Albedo from vertices, one colour, or faces.
         face, bary, corners = self._gather(pixels)
         normal = self._normals(face, bary, corners)
         if self.vertex_albedo is not None:
@@ -191,13 +203,14 @@ class _Surface:
             color = np.repeat(self.face_albedo, len(pixels), axis=0)
         else:
             color = self.face_albedo.take(face, axis=0)
+        # Light, a rim at grazing angles, a darker back side, and lines within a pixel of an edge.
         row, col = np.divmod(pixels, self.camera.width)
         s = self.style.supersampling
         sky = open_sky[row // s, col // s]
         facing = np.clip(-np.einsum("pd,pd->p", normal, _view_directions(self.camera, row, col)), 0.0, 1.0)
         relief = np.float32(self.style.relief)
         color *= _light(normal, facing, sky, relief)[:, None]
-        color += (relief * np.float32(_RIM) * (1.0 - facing) ** 4 * sky)[:, None]
+        color += (relief * np.float32(0.16) * (1.0 - facing) ** 4 * sky)[:, None]
         color *= np.where(self.back.take(face)[:, None], _BACK_SIDE, np.float32(1.0))
         if self.edge_heights is not None:
             pixels_from_edge = (bary * self.edge_heights.take(face, axis=0)).min(axis=1)
@@ -226,7 +239,7 @@ def _interpolate(values: np.ndarray, corners: np.ndarray, bary: np.ndarray) -> n
 
 
 def _view_directions(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.ndarray:
-    """(P, 3) float32 unit vectors from the camera to pixel centres, in camera axes."""
+    """Return (P, 3) float32 unit vectors from the camera to pixel centres, in camera axes."""
     view = np.empty((len(row), 3), np.float32)
     view[:, 2] = 1.0
     if camera.orthographic:
@@ -238,7 +251,7 @@ def _view_directions(camera: Camera, row: np.ndarray, col: np.ndarray) -> np.nda
 
 
 def _back_faces(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
-    """(M,) bool: faces that turn their inner side to the camera."""
+    """Return (M,) whether the camera sees each face from behind."""
     if camera.orthographic:
         return mesh.face_cross @ camera.forward > 0.0
     # The sign of n . (p - eye), with p any corner; n . p is fixed by the mesh.
@@ -252,30 +265,27 @@ def _camera_normals(mesh: TriangleMesh, camera: Camera, *, smooth: bool) -> np.n
 
 
 def _light(normal: np.ndarray, facing: np.ndarray, open_sky: np.ndarray, relief: np.float32) -> np.ndarray:
-    """(P,) factor on the surface's colour."""
-    # Wrapped diffuse light: the terminator of a bare Lambert term hides half of the form.
+    """Return the (P,) factor of light on the surface's colour; its weights were chosen by eye."""
+    key_light, sky_light, ground_light, gloss_light = 0.62, 0.46, 0.24, 0.05
+    # Wrapped diffuse light, because the terminator of a plain Lambert term hides half of the form.
     key = np.clip((normal @ _KEY_DIRECTION + 0.30) / 1.30, 0.0, None)
     sky = 0.5 * (1.0 - normal[:, 1])  # y points down
     gloss = np.clip(normal @ _HALF_DIRECTION, 0.0, None) ** 24
-    ambient = _GROUND + (_SKY - _GROUND) * sky + 0.18 * facing
-    lit = _KEY * key * (0.45 + 0.55 * open_sky) + ambient * open_sky + _GLOSS * gloss
+    ambient = ground_light + (sky_light - ground_light) * sky + 0.18 * facing
+    lit = key_light * key * (0.45 + 0.55 * open_sky) + ambient * open_sky + gloss_light * gloss
     return (1.0 - relief) + relief * lit
 
 
 def _edge_heights(mesh: TriangleMesh, camera: Camera) -> np.ndarray:
-    """(M, 3) float32: height over the opposite edge of each corner, in pixels; barycentrics times it are distances."""
+    """Return (M, 3) float32 heights of each corner over its opposite edge, in pixels.
+
+    Barycentric coordinates times these heights are distances to the edges.
+    """
     t = camera.screen_from_world(mesh.vertices)[:, :2][mesh.faces]
     u, v = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
     twice_area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     opposite = np.stack([np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3)], axis=1)
     return (twice_area[:, None] / np.maximum(opposite, 1e-9)).astype(np.float32)
-
-
-_SAMPLES = 16  # neighbours of a pixel
-_BIAS = np.float32(0.002)  # metres: below it lie the depth map's own steps
-_GAIN = 3.0  # contrast of the occlusion, chosen by eye
-_FAR = np.float32(1e6)  # metres: depth of the background
-_GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)
 
 
 def unoccluded(
@@ -290,6 +300,11 @@ def unoccluded(
     neighbours: the obscurance of McGuire et al., "The Alchemy Screen-Space Ambient Obscurance Algorithm" (2011),
     with a smooth falloff.
     """
+    # 16 neighbours of a pixel; a contrast chosen by eye; a bias of 2 mm, below which lie the depth map's own steps; a
+    # background 1e6 m away.
+    neighbours, gain = 16, 3.0
+    bias, far = np.float32(0.002), np.float32(1e6)
+    golden_angle = np.pi * (3.0 - 5.0**0.5)
     s = style.supersampling
     face = maps.face_id[::s, ::s]
     seen = np.ones(face.shape, np.float32)
@@ -298,12 +313,13 @@ def unoccluded(
         return seen
     row, col = np.divmod(pixels, face.shape[1])
     normal = normals_at(row * s * camera.width + col * s)
-    depth = np.where(face >= 0, maps.depth[::s, ::s], _FAR)
+    # Depth padded by the radius in pixels, so that neighbours need no bounds.
+    depth = np.where(face >= 0, maps.depth[::s, ::s], far)
     z = depth.ravel()[pixels]
     focal = camera.K[0, 0] / s
     reach = style.occlusion_radius * focal / (1.0 if camera.orthographic else float(np.median(z)))
     pad = int(np.ceil(reach))
-    padded = np.pad(depth, pad, constant_values=_FAR)
+    padded = np.pad(depth, pad, constant_values=far)
     center = (row + pad) * padded.shape[1] + col + pad
     flat = padded.ravel()
     x = ((col + 0.5 - camera.K[0, 2] / s) / focal).astype(np.float32)
@@ -312,8 +328,8 @@ def unoccluded(
     inverse_r2 = np.float32(1.0 / style.occlusion_radius**2)
     total = np.zeros(len(pixels), np.float32)
     # Sum the obscurance over a spiral of neighbours of even density, the same for every pixel.
-    for k in range(_SAMPLES):
-        radius, angle = reach * np.sqrt((k + 0.5) / _SAMPLES), _GOLDEN_ANGLE * k
+    for k in range(neighbours):
+        radius, angle = reach * np.sqrt((k + 0.5) / neighbours), golden_angle * k
         dx, dy = round(radius * np.cos(angle)), round(radius * np.sin(angle))
         step_x, step_y = np.float32(dx / focal), np.float32(dy / focal)
         zk = flat.take(center + (dy * padded.shape[1] + dx))
@@ -323,7 +339,7 @@ def unoccluded(
         else:
             vx, vy = x * vz + step_x * zk, y * vz + step_y * zk
         v2 = vx * vx + vy * vy + vz * vz
-        along = np.maximum(vx * nx + vy * ny + vz * nz - _BIAS, 0.0)
+        along = np.maximum(vx * nx + vy * ny + vz * nz - bias, 0.0)
         total += along * np.maximum(1.0 - v2 * inverse_r2, 0.0) / np.sqrt(v2 + np.float32(1e-6))
-    seen.ravel()[pixels] = np.clip(1.0 - style.occlusion * _GAIN / _SAMPLES * total, 0.0, 1.0)
+    seen.ravel()[pixels] = np.clip(1.0 - style.occlusion * gain / neighbours * total, 0.0, 1.0)
     return seen

@@ -1,4 +1,4 @@
-"""Cameras that frame a body: one scale for all views of a row, so that the pictures can be compared."""
+"""Make cameras that frame a body, with one scale for all views of a row, so that pictures can be compared."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.validation import require_known
 
-# From the body to the camera. The body stands along +y and faces +z; its left is +x.
+# Directions from the body to the camera. The body stands along +y and faces +z; its left is +x.
 VIEWS: dict[str, tuple[float, float, float]] = {
     "front": (0.0, 0.05, 1.0),
     "back": (0.0, 0.05, -1.0),
@@ -23,7 +23,8 @@ VIEWS: dict[str, tuple[float, float, float]] = {
     "three-quarter-back": (-0.62, 0.12, -0.78),
     "above": (0.0, 1.0, 0.35),
 }
-FIELD_OF_VIEW_DEG = 22.0  # long lens: little perspective, still a sense of depth
+FIELD_OF_VIEW_DEG = 22.0
+"""Vertical field of view: a long lens, with little perspective but still a sense of depth."""
 
 
 def body_cameras(
@@ -57,10 +58,13 @@ def fit_cameras(
     """Make perspective cameras that see all points along each of `directions`, from one common distance.
 
     Args:
+        points: points to frame.
         directions: vectors from the points to the camera.
-        height, width: pixels; without a width, each picture is as wide as its points need.
+        names: names of the cameras.
+        height: height of the pictures, pixels.
+        width: width of the pictures, pixels; None makes each as wide as its points need.
         margin: free border, as a share of the height.
-        common_width: with no `width` given, the widest picture's width for all.
+        common_width: without `width`, use the widest picture's width for all.
 
     The distance is the smallest at which |x| <= t_x (d + z) and |y| <= t_y (d + z) holds for every point in every
     view, with z the depth relative to the centre of the bounding box and t the tangents of half the field of view.
@@ -72,12 +76,14 @@ def fit_cameras(
     center = 0.5 * (low + high)
     tan_y = np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2) * (1.0 - 2.0 * margin)
     tan_x = None if width is None else tan_y * (width / height - 2.0 * margin) / (1.0 - 2.0 * margin)
+    # The smallest distance from which every view sees all points.
     bases = [_view_basis(np.asarray(d, dtype=np.float64)) for d in directions]
     local = [(points - center) @ basis.T for basis in bases]
     need = [np.max(np.abs(p[:, 1]) / tan_y - p[:, 2]) for p in local]
     if tan_x is not None:
         need += [np.max(np.abs(p[:, 0]) / tan_x - p[:, 2]) for p in local]
     distance = max(float(max(need)), 1e-3)
+    # Focal length in pixels, and the widths of the pictures.
     focal = 0.5 * height / np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2)
     if width is not None:
         widths = [width] * len(bases)
@@ -86,6 +92,7 @@ def fit_cameras(
         widths = [2 * int(np.ceil(h + margin * height)) for h in half]
         if common_width:
             widths = [max(widths)] * len(bases)
+    # All cameras look at the centre of the bounding box.
     cameras = []
     for k, (basis, w) in enumerate(zip(bases, widths, strict=True)):
         pose = np.eye(4)

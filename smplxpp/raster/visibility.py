@@ -1,4 +1,4 @@
-"""The visible outer surface: what some camera around the mesh could see."""
+"""Find the visible outer surface of a mesh: the part that some camera around it could see."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from smplxpp.raster.zbuffer import rasterize_mesh
 
 
 def view_directions(count: int) -> Float64[np.ndarray, "count 3"]:
-    """`count` unit vectors spread evenly over the sphere (Fibonacci lattice): (count, 3)."""
+    """Return `count` unit vectors spread evenly over the sphere (a Fibonacci lattice)."""
     k = np.arange(count) + 0.5
     z = 1.0 - 2.0 * k / count
     angle = np.pi * (1.0 + 5.0**0.5) * k
@@ -20,7 +20,7 @@ def view_directions(count: int) -> Float64[np.ndarray, "count 3"]:
 
 
 def outside_views(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> list[Camera]:
-    """Parallel square views of a whole mesh from directions spread over the sphere."""
+    """Return square orthographic views of a whole mesh from directions spread over the sphere."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     radius = 0.5 * float(np.linalg.norm(high - low)) * 1.01
     return [
@@ -30,7 +30,7 @@ def outside_views(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640)
 
 
 def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int = 640) -> Bool[np.ndarray, " M"]:
-    """The faces that own a pixel in some of `views` orthographic views from outside."""
+    """Return the faces that own a pixel in at least one of `views` orthographic views from outside."""
     seen = np.zeros(mesh.face_count, dtype=bool)
     for camera in outside_views(mesh, views=views, resolution=resolution):
         ids = rasterize_mesh(mesh, camera).face_id
@@ -41,7 +41,10 @@ def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int 
 def outer_visible_points(
     mesh: TriangleMesh, points: Float[np.ndarray, "P 3"], *, tolerance: float, views: int = 32, resolution: int = 640
 ) -> Bool[np.ndarray, " P"]:
-    """The points that no face of `mesh` hides by more than `tolerance` metres in some view from outside."""
+    """Return the points that are visible from outside in at least one orthographic view.
+
+    A point is visible in a view if it lies at most `tolerance` metres behind the mesh's depth at its pixel.
+    """
     points = np.asarray(points, dtype=np.float64)
     seen = np.zeros(len(points), dtype=bool)
     for camera in outside_views(mesh, views=views, resolution=resolution):
@@ -52,6 +55,6 @@ def outer_visible_points(
         inside = (col >= 0) & (col < camera.width) & (row >= 0) & (row < camera.height)
         front = np.full(len(todo), -np.inf)
         front[inside] = depth[row[inside], col[inside]]
-        # A background pixel proves nothing: it may be the rim of a face that hides the point.
+        # A background pixel is no evidence, because it may be at the rim of a face that hides the point.
         seen[todo] = (z <= front + tolerance) & np.isfinite(front)
     return seen

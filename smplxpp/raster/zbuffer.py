@@ -1,4 +1,4 @@
-"""Mesh maps: which face, where on it and how deep, at every pixel of a camera's image."""
+"""Rasterise meshes into maps of face index, barycentric coordinates and depth at every pixel of a camera's image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from smplxpp.native import address, check_size, native_library, thread_count
 
 @dataclass(frozen=True)
 class MeshMaps:
-    """What a camera sees of a mesh.
+    """Maps of the faces that a camera sees of a mesh.
 
     Attributes:
         face_id: (H, W) int32, -1 on the background.
@@ -31,13 +31,13 @@ class MeshMaps:
 
     @property
     def mask(self) -> Bool[np.ndarray, "H W"]:
-        """The pixels covered by the mesh."""
+        """Return the pixels that the mesh covers."""
         return self.face_id >= 0
 
     def interpolate(
         self, faces: Integer[np.ndarray, "M 3"], vertex_values: Num[np.ndarray, "N D"], background: float = 0.0
     ) -> Float64[np.ndarray, "H W D"]:
-        """Vertex values (N, D) at every pixel: (H, W, D) float64; `background` where nothing is hit."""
+        """Interpolate vertex values (N, D) at every pixel: (H, W, D) float64, `background` where nothing is hit."""
         values = np.asarray(vertex_values)
         out = np.full((*self.face_id.shape, values.shape[1]), background, dtype=np.float64)
         hit = self.mask
@@ -49,11 +49,11 @@ class MeshMaps:
 def rasterize_mesh(mesh: TriangleMesh, camera: Camera, *, near: float = 1e-3, threads: int | None = None) -> MeshMaps:
     """Rasterise `mesh` through `camera` with a z-buffer; both sides of every face are drawn.
 
-    A face with a corner nearer than `near` metres is skipped whole. The result is the same for any `threads` (None: up
-    to 8).
+    A face with a corner nearer than `near` metres is skipped as a whole. The result is the same for any number of
+    `threads` (None: up to 8).
 
     Raises:
-        InputError: `near` is not finite, `threads` below 1, an image beyond 65536 pixels a side.
+        InputError: `near` is not finite, `threads` below 1, an image with more than 65536 pixels a side.
     """
     return _rasterize(mesh.vertices, mesh.faces, camera, near, threads)
 
@@ -66,10 +66,10 @@ def rasterize_triangles(
     near: float = 1e-3,
     threads: int | None = None,
 ) -> MeshMaps:
-    """`rasterize_mesh` for arrays: vertices (N, 3), faces (M, 3). A face with a corner that is not finite is left out.
+    """Rasterise arrays as `rasterize_mesh` does a mesh; a face with a corner that is not finite is left out.
 
     Raises:
-        InputError: as `rasterize_mesh`; other shapes or types; faces that point beyond the vertices.
+        InputError: as `rasterize_mesh`; other shapes or types; faces with indices of no vertex.
     """
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     for name, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
@@ -89,6 +89,7 @@ def rasterize_triangles(
 
 
 def _rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera, near: float, threads: int | None) -> MeshMaps:
+    # Project to pixels in float64; the native z-buffer fills the maps.
     if not math.isfinite(near):
         raise InputError("near", expected="a finite distance in metres", received=repr(near))
     threads = thread_count(threads)

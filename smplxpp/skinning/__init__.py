@@ -1,4 +1,4 @@
-"""Skinning, forwards and back: forward kinematics, linear blends, and from the reference pose to the T-pose."""
+"""Compute forward kinematics, linear blend skinning, and the inverse of skinning from a pose to the T-pose."""
 
 from smplxpp.skinning.inverse import UnposeConfig, Unposed, UnposeReport, pose, unpose
 from smplxpp.skinning.linear_blend import blend_transforms, forward_kinematics, skin

@@ -1,4 +1,4 @@
-"""Skinning and its inverse with one and the same model: rest points to posed ones, and back."""
+"""Skin rest points to a pose, and invert exactly that map to bring posed points back to the rest pose."""
 
 from __future__ import annotations
 
@@ -12,20 +12,17 @@ from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.skinning.linear_blend import blend_transforms, skin
 
-# How many vertices an error names before it only counts them.
-_NAMED = 8
-
 
 @dataclass(frozen=True)
 class UnposeConfig:
-    """Bounds on the determinant of a blended transform (1 where one joint owns the vertex).
+    """Bounds on the determinant of a blended transform, which is 1 if one joint has all the weight.
 
-    An even blend of two joints has 0.5 at 90 degrees between them, 0.25 at 120, 0.067 at 150 and 0 at 180, where blend
-    skinning has folded the surface flat and nothing can unfold it.
+    An even blend of two joints has 0.5 at 90 degrees between them, 0.25 at 120, 0.067 at 150 and 0 at 180, where linear
+    blend skinning folds the surface flat and has no inverse.
 
     Attributes:
-        warn_below: a warning and a count.
-        fail_below: an error that names the vertices.
+        warn_below: determinant below which vertices are counted in a warning.
+        fail_below: determinant below which an error names the vertices.
     """
 
     warn_below: float = 0.25
@@ -34,11 +31,12 @@ class UnposeConfig:
 
 @dataclass(frozen=True)
 class UnposeReport:
-    """How well the pose could be undone.
+    """Conditioning and accuracy of an inversion.
 
     Attributes:
-        determinant_min, determinant_mean: over the vertices.
-        below_warning: vertices under `UnposeConfig.warn_below`.
+        determinant_min: smallest determinant over the vertices.
+        determinant_mean: mean determinant.
+        below_warning: number of vertices below `UnposeConfig.warn_below`.
         round_trip_max: largest |pose(unpose(x)) - x|, metres.
     """
 
@@ -50,11 +48,11 @@ class UnposeReport:
 
 @dataclass(frozen=True, eq=False)
 class Unposed:
-    """Result of `unpose`.
+    """Rest positions that `unpose` returns, with their conditioning.
 
     Attributes:
         vertices: (N, 3) rest positions, metres.
-        determinant: (N,) of the linear part of each vertex's blended transform.
+        determinant: (N,) determinant of the linear part of each vertex's blended transform.
         report: summary.
     """
 
@@ -70,11 +68,11 @@ def pose(
     *,
     rest_offsets: Float[np.ndarray, "N 3"] | None = None,
 ) -> Float64[np.ndarray, "N 3"]:
-    """Linear blend skinning, `x = (sum_j w_j G_j) (x_T + b)`.
+    """Pose rest points by linear blend skinning, `x = (sum_j w_j G_j) (x_T + b)`.
 
     Args:
         rest_vertices: (N, 3) x_T, metres.
-        weights: of the N vertices over J joints; dense rows sum to 1.
+        weights: skin weights of the N vertices over J joints; dense rows sum to 1.
         posed_from_rest: (J, 4, 4) G, as `BodyModel.forward` returns them for one frame.
         rest_offsets: (N, 3) b, see `unpose`.
 
@@ -102,21 +100,21 @@ def unpose(
     rest_offsets: Float[np.ndarray, "N 3"] | None = None,
     config: UnposeConfig | None = None,
 ) -> Unposed:
-    """Undo linear blend skinning, `x_T = (sum_j w_j G_j)^-1 x - b`.
+    """Invert linear blend skinning, `x_T = (sum_j w_j G_j)^-1 x - b`.
 
-    The inverse is that of the blended matrix, so that `pose` with the same weights and transforms gives the input back
-    (blending the inverses instead would not). The transforms already stand at the joints of the shaped body, so x_T
-    lies around that body's own T-pose, whose identity is not taken out.
+    The inverse is that of the blended matrix, so that `pose` with the same weights and transforms returns the input;
+    blending the inverses instead would not. The transforms refer to the joints of the shaped body, so that x_T lies
+    around that body's own T-pose; its shape is not removed.
 
-    b is what the driving model adds to the rest position before skinning, in this pose: the expression and
-    pose-corrective offset of the body at the point that the vertex corresponds to (barycentric, as its weights were
-    found). Pass it exactly when the driver will add it again; a `Template` moves its parts by skinning alone, so parts
-    that go into one are unposed without.
+    b is the offset that the driving model adds to the rest position before skinning in this pose: the body's expression
+    and pose-corrective offset at the point that the vertex corresponds to (barycentric, as its weights were found).
+    Pass it only if the driver will add it again. A `Template` moves its parts by skinning alone, so that parts of one
+    are unposed without.
 
     Args:
         posed_vertices: (N, 3) x, metres.
-        weights: of the N vertices over J joints.
-        posed_from_rest: (J, 4, 4) of the pose that x is in.
+        weights: skin weights of the N vertices over J joints.
+        posed_from_rest: (J, 4, 4) transforms of the pose that x is in.
         rest_offsets: (N, 3) b, metres; None is zero.
         config: bounds on the determinant.
 
@@ -137,45 +135,48 @@ def unpose(
     posed, dense, transforms, offsets = _checked(
         "posed vertices", posed_vertices, weights, posed_from_rest, rest_offsets
     )
+    # The blended transform of each vertex; a small determinant magnifies errors, 0 cannot be inverted.
     blended = blend_transforms(dense, transforms)
     linear, shift = blended[:, :3, :3], blended[:, :3, 3]
     determinant = np.linalg.det(linear)
     low = np.flatnonzero(determinant < config.fail_below)
     if len(low):
-        named = ", ".join(f"{v} ({determinant[v]:.3g})" for v in low[:_NAMED])
+        named = ", ".join(f"{v} ({determinant[v]:.3g})" for v in low[:8])
         raise InputError(
             "blended transforms",
             expected=f"determinants of at least {config.fail_below:g}",
-            received=f"{len(low)} vertices below: {named}{', ...' if len(low) > _NAMED else ''}",
+            received=f"{len(low)} vertices below: {named}{', ...' if len(low) > 8 else ''}",
             remedy="choose a reference frame nearer to the T-pose, or smooth the weights of these vertices",
         )
-    doubtful = int((determinant < config.warn_below).sum())
-    if doubtful:
+    weak = int((determinant < config.warn_below).sum())
+    if weak:
         warnings.warn(
-            f"{doubtful} of {len(posed)} vertices are bent so far that unposing magnifies their errors "
+            f"{weak} of {len(posed)} vertices are bent so far that unposing magnifies their errors "
             f"(determinant down to {determinant.min():.3g})",
             GeometryWarning,
             stacklevel=2,
         )
+    # Solve for the rest positions, and pose them again to measure the error.
     shaped = np.linalg.solve(linear, (posed - shift)[..., None])[..., 0]
     round_trip = np.linalg.norm(skin(shaped, dense, transforms) - posed, axis=1)
     report = UnposeReport(
         determinant_min=float(determinant.min(initial=np.inf)),
         determinant_mean=float(determinant.mean()) if len(determinant) else float("nan"),
-        below_warning=doubtful,
+        below_warning=weak,
         round_trip_max=float(round_trip.max(initial=0.0)),
     )
     return Unposed(shaped - offsets, determinant, report)
 
 
 def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):
-    """The four arrays in float64, shapes agreeing."""
+    """Return vertices, dense weights, transforms and offsets in float64 after checking shapes, sums and finiteness."""
     vertices = np.asarray(vertices, dtype=np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.isfinite(vertices).all():
         raise InputError(subject, expected="finite (N, 3), N > 0", received=_describe(vertices))
     dense = weights.dense() if isinstance(weights, SkinWeights) else np.asarray(weights, dtype=np.float64)
     if dense.ndim != 2 or len(dense) != len(vertices) or not np.isfinite(dense).all():
         raise InputError("skinning weights", expected=f"finite ({len(vertices)}, J)", received=_describe(dense))
+    # Rows of weights sum to 1, transforms are affine, offsets have the vertices' shape.
     error = np.abs(dense.sum(axis=1) - 1.0)
     if error.max() > 1e-6:
         raise InputError(

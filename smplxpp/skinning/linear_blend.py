@@ -1,6 +1,6 @@
-"""Forward kinematics and linear blend skinning, written once for numpy arrays and torch tensors.
+"""Compute forward kinematics and linear blend skinning, written once for numpy arrays and torch tensors.
 
-The kind of the result is the kind of the arguments; in torch everything is differentiable.
+The type of the result is the type of the arguments; in torch everything is differentiable.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ def forward_kinematics(
     *,
     transl: Float[Array, "... 3"] | None = None,
 ) -> tuple[Float[Array, "... J 4 4"], Float[Array, "... J 3"]]:
-    """Transforms of a skeleton whose joints turn about themselves.
+    """Compute the transforms of a skeleton's joints from their local rotations.
 
-    With `L_j = [R_j, J_j - J_parent; 0, 1]` (the root's offset being `J_root + transl`) and `G_j = G_parent L_j`,
-    the returned transform is `G_j [I, -J_j; 0, 1]`: it takes a point of the rest pose to the posed one (Loper et al.
-    2015, equations 3 and 4). The root turns about its own joint; the translation comes last.
+    With `L_j = [R_j, J_j - J_parent; 0, 1]` (the root's offset is `J_root + transl`) and `G_j = G_parent L_j`, the
+    returned transform is `G_j [I, -J_j; 0, 1]`, which maps a point of the rest pose to the posed one (Loper et al.
+    2015, equations 3 and 4). The root rotates about its own joint; the translation comes last.
 
     Args:
-        rest_joints: metres.
-        parents: -1 at the root; the order of the joints is free.
-        rotations: each relative to its parent's frame.
-        transl: metres, moves the whole body.
+        rest_joints: joints in the rest pose, metres.
+        parents: index of each joint's parent, -1 at the root; the order of the joints is free.
+        rotations: rotation of each joint relative to its parent's frame.
+        transl: translation of the whole body, metres.
 
     Returns:
-        posed_from_rest: of each joint.
-        joints: where they are in the pose, metres.
+        posed_from_rest: transform of each joint.
+        joints: positions of the joints in the pose, metres.
     """
     xp = array_namespace(rotations)
     parents = np.asarray(parents)
@@ -44,7 +44,7 @@ def forward_kinematics(
     root_position = rest_joints[..., root, :]
     if transl is not None:
         root_position = root_position + transl[..., None, :]
-    # One batched product a level of the tree; the results are put back in joint order at the end.
+    # One batched product for each level of the tree; the results are put back in joint order at the end.
     turned, moved = [rotations[..., root, :, :]], [root_position]
     for above, level in pairwise(levels):
         parent = [above.index(parents[j]) for j in level]
@@ -64,7 +64,7 @@ def forward_kinematics(
 def blend_transforms(
     weights: Float[Array, "N J"], posed_from_rest: Float[Array, "... J 4 4"]
 ) -> Float[Array, "... N 4 4"]:
-    """Each point's weighted sum of the joints' transforms."""
+    """Return each point's sum of the joints' transforms, weighted by its skin weights."""
     flat = posed_from_rest.reshape(posed_from_rest.shape[:-2] + (16,))
     return (weights @ flat).reshape(flat.shape[:-2] + (weights.shape[0], 4, 4))
 
@@ -72,11 +72,11 @@ def blend_transforms(
 def skin(
     vertices: Float[Array, "... V 3"], weights: Float[Array, "V J"], posed_from_rest: Float[Array, "... J 4 4"]
 ) -> Float[Array, "... V 3"]:
-    """Linear blend skinning, `x = sum_j w_j G_j x_rest`.
+    """Pose vertices by linear blend skinning, `x = sum_j w_j G_j x_rest`.
 
     Args:
         vertices: rest positions.
-        weights: of each vertex over the joints; rows sum to 1.
+        weights: skin weights of each vertex over the joints; rows sum to 1.
         posed_from_rest: transforms of the joints.
 
     Returns:
@@ -84,7 +84,8 @@ def skin(
     """
     xp = array_namespace(posed_from_rest)
     batch, joint_count = tuple(posed_from_rest.shape[:-3]), posed_from_rest.shape[-3]
-    # Twelve numbers a joint, blended for all frames in one product, vertices last so that the sums run along memory.
+    # The 12 numbers of each joint's transform are blended for all frames in one product, with vertices last, so that
+    # sums run along memory.
     rows = xp.moveaxis(posed_from_rest[..., :3, :], -3, -1).reshape(-1, joint_count)
     blended = (rows @ weights.T).reshape((*batch, 3, 4, weights.shape[0]))
     x, y, z = (vertices[..., axis] for axis in range(3))
@@ -93,7 +94,7 @@ def skin(
 
 
 def _levels(parents: np.ndarray) -> list[list[int]]:
-    """The joints by distance from the root."""
+    """Return the joints grouped by their depth in the tree."""
     levels = [[int(j) for j in np.flatnonzero(parents < 0)]]
     while sum(map(len, levels)) < len(parents):
         level = [int(j) for j in np.flatnonzero(np.isin(parents, levels[-1]))]
