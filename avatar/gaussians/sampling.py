@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.frames import MIN_EDGE
-from smplxpp.cloth.opening_webs import find_opening_webs
+from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 from smplxpp.core.spherical_harmonics import coefficient_count
@@ -86,7 +86,7 @@ def sample_on_mesh(
     weights = mesh.face_areas * 1.0 if config.spread_by == "area" else (mesh.face_areas > 0).astype(float)
     if density is not None:
         weights *= _positive(density, mesh.face_count)
-    weights[find_opening_webs(template)] = 0.0
+    weights[find_opening_bridges(template)] = 0.0
     head = np.zeros(mesh.face_count, dtype=bool) if config.head_share is None else head_faces(template)
     if config.hidden_density < 1.0:
         weights *= np.where(seen_faces(mesh), 1.0, config.hidden_density)

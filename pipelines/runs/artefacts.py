@@ -14,7 +14,7 @@ from pipelines.runs.layout import (
     CANONICAL,
     PARAMS,
     PARTS,
-    PARTS_WITHOUT_WEBS,
+    PARTS_WITHOUT_BRIDGES,
     POSED_BODY,
     SCAN,
     SCAN_LABELS,
@@ -177,7 +177,7 @@ def load_cleaned_parts(run: Path) -> dict[str, Part]:
 
 def load_parts(run: Path) -> dict[str, Part]:
     """Read the parts without bridges, which is what the skin weights are for."""
-    return _parts(run / PARTS_WITHOUT_WEBS)
+    return _parts(run / PARTS_WITHOUT_BRIDGES)
 
 
 def save_weights(folder: Path, weights: Mapping[str, SkinWeights]) -> None:

@@ -74,8 +74,8 @@ def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarr
 
 
 def scan_checks(reference: TriangleMesh, scan: SimulatedScan) -> dict[str, float]:
-    """Return figures of a scan: distances from the layers that it shows, share of webs, topology."""
-    # Vertices farther than 5 mm from what they show belong to webs.
+    """Return figures of a scan: distances from the layers that it shows, share of bridges, topology."""
+    # Vertices farther than 5 mm from what they show belong to bridges.
     shown = scan.shown_on(reference)
     distance = row_lengths(scan.mesh.vertices - shown) * _MM
     inside = SignedDistanceField(scan.mesh, solid=True).query(shown[distance < 5]).distance

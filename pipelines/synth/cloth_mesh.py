@@ -127,7 +127,7 @@ def diffuse(mesh: TriangleMesh, values: Float[np.ndarray, "N D"], *, radius: flo
     return splu((mass + radius**2 * laplacian).tocsc()).solve(mass @ values)
 
 
-def push_out(
+def lift_outside(
     mesh: TriangleMesh, inner: TriangleMesh, *, clearance: float, solid: bool, reach: float = 0.04
 ) -> Float[np.ndarray, "N 3"]:
     """Return the vertices moved at least `clearance` metres outside `inner`, in rounds of less and less smoothed moves.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipelines.synth import textures
-from pipelines.synth.cloth_mesh import ClothMesh, clip, loop_subdivide, outer_faces, push_out, smooth, submesh
+from pipelines.synth.cloth_mesh import ClothMesh, clip, lift_outside, loop_subdivide, outer_faces, smooth, submesh
 from pipelines.synth.patterns import skirt_colors
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core.errors import InputError
@@ -181,7 +181,7 @@ def make_trousers(body: BodyModel, skin: Float[np.ndarray, "V 3"]) -> ClothMesh:
     cloth = loop_subdivide(legs)
     vertices = smooth(cloth.mesh, cloth.vertices, steps=6)
     inner = TriangleMesh(skin, body.faces[outer])
-    return cloth.with_vertices(push_out(cloth.mesh.with_vertices(vertices), inner, clearance=0.004, solid=True))
+    return cloth.with_vertices(lift_outside(cloth.mesh.with_vertices(vertices), inner, clearance=0.004, solid=True))
 
 
 def with_trousers(arrays: dict[str, np.ndarray], body: BodyModel) -> dict[str, np.ndarray]:

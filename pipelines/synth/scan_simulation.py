@@ -1,4 +1,4 @@
-"""Simulate the scan of image-based reconstruction: one outer surface, noise, webs where no camera sees a gap."""
+"""Simulate the scan of image-based reconstruction: one outer surface, noise, bridges where no camera sees a gap."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _level_set(
     """Return the distance to the nearest surface, truncated to a band, negative where the cameras leave it solid.
 
     Near a seen surface its normal decides the side. Elsewhere a point is free if some camera sees clearly past it or if
-    it is below the floor. Points that no camera sees stay solid, which makes the webs.
+    it is below the floor. Points that no camera sees stay solid, which makes the bridges.
     """
     # Carve away the points that a camera sees past.
     solid = grid[:, 1] >= mesh.vertices[:, 1].min()

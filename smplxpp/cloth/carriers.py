@@ -28,7 +28,7 @@ def find_carriers(cloth: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray, "
     it, what is tight of the border's upper half does.
 
     Args:
-        cloth: N vertices, without webs. body: the naked body in the same pose, closed or nearly.
+        cloth: N vertices, without bridges. body: the naked body in the same pose, closed or nearly.
     """
     distance = np.full(cloth.vertex_count, np.inf)
     used = cloth.referenced

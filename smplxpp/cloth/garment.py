@@ -14,7 +14,7 @@ from smplxpp.cloth.collider import ColliderMesh, collider_of
 from smplxpp.cloth.embedding import Embedding, embed
 from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.model import ClothModel, build_model
-from smplxpp.cloth.opening_webs import find_opening_webs
+from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.params import BodyParams
@@ -132,9 +132,9 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
     if cloth.face_count and looks_inwards(cloth, body):
         warnings.warn(f"{part}: its faces look inwards; it is simulated turned over", GeometryWarning, stacklevel=2)
         cloth = turned_over(cloth)
-    kept = largest_piece(cloth, ~find_opening_webs(template)[template.part_faces(part)])
+    kept = largest_piece(cloth, ~find_opening_bridges(template)[template.part_faces(part)])
     if not cloth.face_areas[kept].sum() > 0:
-        raise InputError(f"loose part {part!r}", expected="a surface with area", received="none beside webs")
+        raise InputError(f"loose part {part!r}", expected="a surface with area", received="none beside bridges")
     sheet, of_cloth = cloth.submesh(kept)
     carriers = np.flatnonzero(find_carriers(sheet, body))
     if not len(carriers):
@@ -148,7 +148,7 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
     seeds, faces = coarsen(sheet, config.spacing)
     rest, of_seeds = TriangleMesh(sheet.vertices[seeds], faces).submesh(_held(seeds, faces, depth, config))
     seeds = seeds[of_seeds]
-    # Vertices of the web ride on the nearest triangle; how deep they hang is what the nearest particle says.
+    # Vertices of the bridge ride on the nearest triangle; how deep they hang is what the nearest particle says.
     all_depth = np.full(cloth.vertex_count, np.inf)
     all_depth[of_cloth] = depth
     if not rest.face_count:

@@ -131,7 +131,7 @@ class ClothSolver:
         )
 
 
-def push_out(
+def move_before_collider(
     points: Float32[np.ndarray, "N 3"],
     normals: Float[np.ndarray, "N 3"],
     surface: Float32[np.ndarray, "c 3"],

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int64
 
 from smplxpp.cloth.carried import CarriedVertices
 from smplxpp.cloth.garment import Garment
-from smplxpp.cloth.solver import ClothSolver, ClothState, push_out
+from smplxpp.cloth.solver import ClothSolver, ClothState, move_before_collider
 from smplxpp.core.mesh import row_lengths
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class GarmentThread:
         """Return how many particles lie inside what the garment touches."""
         coarse = self.garment.rest.with_vertices(self._state.position)
         normals, loose = coarse.vertex_normals, ~self.garment.pinned
-        out = push_out(self._state.position, normals, self._surfaces[-1], self._solver.collider, margin=0.0)
+        out = move_before_collider(self._state.position, normals, self._surfaces[-1], self._solver.collider, margin=0.0)
         return int((row_lengths(out - self._state.position)[loose] > _BURIED).sum())
 
     def laid_over(

@@ -27,15 +27,16 @@ class TransferConfig:
             point's weights whatever the distance.
         smoothing: how strongly a vertex is believed: weights are smoothed over this multiple of its distance to the
             source. None believes matched vertices wholly and the others not at all.
-        normal_doubt: how many times wider still where the normals are perpendicular (twice as many where opposite).
+        normal_widening: how many times wider still where the normals are perpendicular (twice as many where opposite).
         turned: a vertex that faces away from the nearest skin is smoothed as if it lay this fraction of the source's
             extent away, however near it lies.
-        confident: a matched vertex within this fraction of the source's extent is confident. The others listen to the
-            joints that confident ones lead to along the surface. None: no vertex is.
-        far: between these fractions of the source's extent a vertex passes from what the body nearby says to what
-            confident vertices lead to.
-        lead_length: `l` of the energy by which confident vertices lead, as a fraction of the source's extent: the
-            shorter, the more a skirt keeps of what its waist follows, where a longer one continues the trend.
+        confident: a matched vertex within this fraction of the source's extent is confident and keeps the weights of
+            its match. The others get anchor weights from them along the surface, which limit the joints that they may
+            follow. None: no vertex is confident.
+        far: fractions of the source's extent. Between these distances the anchor weights gradually replace the weights
+            of the body nearby.
+        anchor_length: `l` of the energy that inpaints the anchor weights, as a fraction of the source's extent. With a
+            short length a skirt keeps a share of what its waist follows, a longer one continues the trend.
         published: share of the published method's answer in that of cloth off the skin. The two err differently: on
             loose cloth their mean is mostly nearer to the truth than either.
         allowed_joints: names or indices of the joints that the target may follow; None allows all. They steer what is
@@ -59,11 +60,11 @@ class TransferConfig:
 
     falloff: float | None = 6.0
     smoothing: float | None = 0.4
-    normal_doubt: float = 3.5
+    normal_widening: float = 3.5
     turned: float = 0.04
     confident: float | None = 0.015
     far: tuple[float, float] = (0.045, 0.08)
-    lead_length: float = 0.06
+    anchor_length: float = 0.06
     published: float = 0.35
     allowed_joints: tuple[str | int, ...] | None = None
     unmatched: str = "extend"
@@ -76,13 +77,13 @@ class TransferConfig:
     joint_names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("max_distance", "max_angle_deg", "length_scale", "lead_length", "smoothing", "confident"):
+        for name in ("max_distance", "max_angle_deg", "length_scale", "anchor_length", "smoothing", "confident"):
             value = getattr(self, name)
             if value is not None:
                 require_positive(f"config {name}", value, finite=False)
         if self.falloff is not None and not self.falloff > 2:
             raise InputError("config falloff", expected="more than 2, or None", received=str(self.falloff))
-        for name in ("normal_doubt", "turned", "averaging_steps"):
+        for name in ("normal_widening", "turned", "averaging_steps"):
             require_at_least(f"config {name}", getattr(self, name), 0)
         require_between("config published", self.published, 0.0, 1.0)
         if len(self.far) != 2 or not 0 <= self.far[0] < self.far[1]:
@@ -110,7 +111,7 @@ class TransferConfig:
         return TransferConfig(
             falloff=None,
             smoothing=None,
-            normal_doubt=0.0,
+            normal_widening=0.0,
             turned=0.0,
             confident=None,
             published=0.0,
@@ -120,7 +121,9 @@ class TransferConfig:
     @staticmethod
     def restricted() -> TransferConfig:
         """The default of version 0.1, in which a label's joints overrule matches: for comparison."""
-        return TransferConfig(confident=None, normal_doubt=2.0, turned=0.0, published=0.0, smoothing=0.4, falloff=6.0)
+        return TransferConfig(
+            confident=None, normal_widening=2.0, turned=0.0, published=0.0, smoothing=0.4, falloff=6.0
+        )
 
     @staticmethod
     def for_label(name: str, *, base: TransferConfig | None = None) -> TransferConfig:

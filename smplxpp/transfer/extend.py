@@ -10,8 +10,8 @@ from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.transfer.anchors import LEAST_REACH, speaking
 from smplxpp.transfer.correspond import Correspondence
-from smplxpp.transfer.evidence import LEAST_REACH, speaking
 
 _SAMPLES = 1000
 _NEIGHBOURS = 32  # at a few radii of a sample the rest of the kernel is a few percent
@@ -80,7 +80,7 @@ def extend_weights(
     told = None
     if reach is not None:
         told = speaking(reach, samples.weights)
-        asked = told.max(axis=0) > _LEAST_SAY  # a limb that nothing is led to takes no neighbour's place
+        asked = told.max(axis=0) > _LEAST_SAY  # a limb without anchor weight takes no neighbour place
         if asked.any():
             told = told[:, asked]
             samples = SurfaceSamples(

@@ -9,18 +9,18 @@ from jaxtyping import Float
 
 from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.transfer.components import settle_unmatched, vertex_components
-from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.correspond import Correspondence, closest_points, face_outward, prefer_facing
-from smplxpp.transfer.evidence import (
+from smplxpp.transfer.anchors import (
+    anchor_share,
+    anchor_weights,
     components_without,
     joint_reach,
-    lead,
-    lean_on_the_lead,
     neighbouring_joints,
     smooth_step,
     turned_away,
 )
+from smplxpp.transfer.components import settle_unmatched, vertex_components
+from smplxpp.transfer.config import TransferConfig
+from smplxpp.transfer.correspond import Correspondence, closest_points, face_outward, prefer_facing
 from smplxpp.transfer.extend import extend_weights, sample_surface
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 from smplxpp.transfer.regions import restrict_source
@@ -44,8 +44,8 @@ def transfer_weights(
     distance from the body (`extend_weights`), and the whole is smoothed along the cloth over a length that grows alike
     (`fit_smoothly`): close cloth moves with the skin under it, loose cloth between two limbs blends them instead of
     tearing. Vertices that lie on the skin and face as it does are confident: they keep its weights whatever the label
-    says, and what they lead to along the cloth decides which limbs the others may follow at all (`evidence`), so that
-    a skirt does not follow the hand beside it, and far from the body it takes the place of what the body says.
+    says, and their anchor weights along the cloth decide which limbs the others may follow at all (`anchor_weights`),
+    so that a skirt does not follow the hand beside it, and far from the body it takes the place of what the body says.
     `TransferConfig.paper()` is "Robust Skin Weights Transfer via Weight Inpainting" (Abdrashitov, Raichstat,
     Monsen, Hill; SIGGRAPH Asia 2023 Technical Communications): closest points are believed where near and facing the
     same way, the rest is inpainted.
@@ -145,15 +145,15 @@ def _values(
     size: float,
     config: TransferConfig,
 ) -> np.ndarray:
-    """The weights (N, J) each vertex would take by itself, and by what confident vertices lead to."""
+    """The weights (N, J) each vertex would take by itself, blended with its anchor weights."""
     joint_count, used = weights.shape[1], np.flatnonzero(weights.any(axis=0))
     weights = weights[:, used]
     copied = at.found.interpolate(source, weights)
-    led = reach = None
+    anchors = reach = None
     alone = components_without(at.component, at.confident)
     if at.confident.any():
-        led = _lead(at, copied, config.lead_length * size, config)
-        reach = joint_reach(led, neighbouring_joints(weights), None if allowed is None else allowed[used])
+        anchors = _anchor_weights(at, copied, config.anchor_length * size, config)
+        reach = joint_reach(anchors, neighbouring_joints(weights), None if allowed is None else allowed[used])
         reach[alone] = 1.0 if allowed is None else allowed[used]
     elif allowed is not None and config.confident is not None:
         reach = np.repeat(allowed[None, used].astype(np.float64), len(copied), axis=0)
@@ -163,11 +163,11 @@ def _values(
         values, heard = extend_weights(
             at.target.vertices, at.normals, at.found, copied, samples, falloff=config.falloff, reach=reach
         )
-    if led is not None:
+    if anchors is not None:
         far = (config.far[0] * size, config.far[1] * size)
-        lean = lean_on_the_lead(at.found.distance, at.found.angle, heard, far=far)
+        lean = anchor_share(at.found.distance, at.found.angle, heard, far=far)
         lean[at.confident | alone] = 0.0
-        values = values + lean[:, None] * (led - values)
+        values = values + lean[:, None] * (anchors - values)
     if reach is not None and alone.any():
         # A little of what may not speak comes along with what may; where nothing else is near it stays.
         kept = np.where(reach > 0, values, 0.0)
@@ -184,16 +184,18 @@ def _published(
     """The published method's answer (N, J), with `at.confident` all that is matched."""
     used = np.flatnonzero(weights.any(axis=0))
     out = np.zeros((at.target.vertex_count, weights.shape[1]))
-    out[:, used] = _lead(at, at.found.interpolate(source, weights[:, used]), config.length_scale * size, config)
+    out[:, used] = _anchor_weights(
+        at, at.found.interpolate(source, weights[:, used]), config.length_scale * size, config
+    )
     return out
 
 
-def _lead(at: _Matches, copied: np.ndarray, length: float, config: TransferConfig) -> np.ndarray:
-    """What confident vertices lead to (N, J); vertices without a face and components without one keep `copied`."""
+def _anchor_weights(at: _Matches, copied: np.ndarray, length: float, config: TransferConfig) -> np.ndarray:
+    """Return the anchor weights (N, J); vertices without a face and components without one keep `copied`."""
     kept = at.confident | components_without(at.component, at.confident)
     mesh, used = at.target.submesh(np.ones(at.target.face_count, dtype=bool))
     out = copied.copy()
-    out[used] = lead(mesh, copied[used], kept[used], length=length, laplacian=config.laplacian)
+    out[used] = anchor_weights(mesh, copied[used], kept[used], length=length, laplacian=config.laplacian)
     return out
 
 
@@ -210,7 +212,7 @@ def _smooth(
     if config.smoothing is None:
         width = np.where(matched | settled, 0.0, np.inf)
     else:
-        doubt = 1.0 + config.normal_doubt * (1.0 - np.cos(np.nan_to_num(found.angle)))
+        doubt = 1.0 + config.normal_widening * (1.0 - np.cos(np.nan_to_num(found.angle)))
         doubted = np.hypot(found.distance, config.turned * size * turned_away(found.angle))
         width = np.where(settled, 0.0, config.smoothing * doubt * doubted)
     mesh, used = target.submesh(np.ones(target.face_count, dtype=bool))

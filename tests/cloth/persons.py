@@ -22,12 +22,12 @@ WAIST, HEM = 0.95, 0.45
 
 @cache
 def person(
-    *, web: bool = False, tight: bool = True, outwards: bool = True, torn: bool = False, layers: int = 1
+    *, bridge: bool = False, tight: bool = True, outwards: bool = True, torn: bool = False, layers: int = 1
 ) -> Template:
     """Hips, two legs, a head, and a skirt from the waist to the knees.
 
     Args:
-        web: a ring of faces closes the hem inwards, as a scan does.
+        bridge: a ring of faces closes the hem inwards, as a scan does.
         tight: the waistband lies on the hips; else it hangs 9 cm from them.
         outwards: the skirt's faces look out.
         torn: a slit from hem to waist, and a piece that hangs together with nothing.
@@ -35,7 +35,7 @@ def person(
     """
     hips = ball((0.16, 0.2, 0.12), 0.92, {"pelvis": 1.0}, subdivisions=4)
     legs = [_leg(name, x) for name, x in (("left_hip", 0.08), ("right_hip", -0.08))]
-    skirt = _skirt(web=web, tight=tight, outwards=outwards, torn=torn)
+    skirt = _skirt(bridge=bridge, tight=tight, outwards=outwards, torn=torn)
     skirts = {PART: skirt}
     if layers > 1:
         away = np.where(np.arange(len(skirt.vertices)) < AROUND, 0.0, 0.02)  # they share the waistband
@@ -59,7 +59,7 @@ def _leg(name: str, x: float) -> Part:
     return Part(part.vertices + [x, 0.0, 0.0], part.faces, part.joints)
 
 
-def _skirt(*, web: bool, tight: bool, outwards: bool, torn: bool) -> Part:
+def _skirt(*, bridge: bool, tight: bool, outwards: bool, torn: bool) -> Part:
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
     circle = np.stack([np.sin(angle), np.zeros(AROUND), np.cos(angle)], axis=1)
     t = np.linspace(0.0, 1.0, DOWN)
@@ -68,7 +68,7 @@ def _skirt(*, web: bool, tight: bool, outwards: bool, torn: bool) -> Part:
     rings = [
         circle * [0.158 + w, 0, 0.119 + w] + [0, (1 - s) * WAIST + s * HEM, 0] for s, w in zip(t, wide, strict=True)
     ]
-    if web:  # 3 cm inwards
+    if bridge:  # 3 cm inwards
         rings += [rings[-1] * [s, 1, s] for s in (0.95, 0.9)]
     rows = len(rings)
     a = (np.arange(rows - 1)[:, None] * AROUND + np.arange(AROUND)).ravel()

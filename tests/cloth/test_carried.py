@@ -9,7 +9,7 @@ import pytest
 
 from smplxpp.cloth.carried import CarriedVertices, SkinnedRows
 from smplxpp.cloth.embedding import embed
-from smplxpp.cloth.solver import Collider, push_out
+from smplxpp.cloth.solver import Collider, move_before_collider
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from tests.cloth.persons import person, standing
@@ -53,7 +53,7 @@ def test_what_is_carried_is_pushed_out_as_points_are():
     skin = body.vertices.astype(np.float32)
     found = carried.at(coarse.vertices.astype(np.float32), skin, margin=0.002)
     points, normals = embedding.carried_with_normals(coarse)
-    expected = push_out(points.astype(np.float32), normals, skin, solid, margin=0.002)
+    expected = move_before_collider(points.astype(np.float32), normals, skin, solid, margin=0.002)
     np.testing.assert_allclose(found, expected, atol=5e-6)
     pushed = np.linalg.norm(found - points, axis=1) > 1e-4
     assert 0.02 < pushed.mean() < 0.98

@@ -1,4 +1,4 @@
-"""Garments cut from a template: what holds them, what they carry, what they touch; webs of openings; bad garments."""
+"""Garments cut from a template: what holds them, what they carry, what they touch; opening bridges; bad garments."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
 from smplxpp.cloth.carriers import find_carriers
-from smplxpp.cloth.opening_webs import find_opening_webs
+from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.template.template import BODY_PART
@@ -82,45 +82,45 @@ def test_another_pin_depth_holds_more_without_cutting_anew():
     assert (deeper.share() <= garment.share()).all() and deeper.share().sum() < garment.share().sum()
 
 
-def test_a_web_under_a_hem_is_found_and_cut_off():
-    template = person(web=True)
-    web = find_opening_webs(template)
-    heights = template.vertices[template.faces[web]][..., 1]
-    assert web.sum() == 192 and np.ptp(heights) < 1e-9 and heights[0, 0] == pytest.approx(HEM)
-    with_web, without = cut(web=True), cut()
-    assert with_web.rest.face_areas.sum() == pytest.approx(without.rest.face_areas.sum(), rel=0.01)
+def test_a_bridge_under_a_hem_is_found_and_cut_off():
+    template = person(bridge=True)
+    bridge = find_opening_bridges(template)
+    heights = template.vertices[template.faces[bridge]][..., 1]
+    assert bridge.sum() == 192 and np.ptp(heights) < 1e-9 and heights[0, 0] == pytest.approx(HEM)
+    with_bridge, without = cut(bridge=True), cut()
+    assert with_bridge.rest.face_areas.sum() == pytest.approx(without.rest.face_areas.sum(), rel=0.01)
     # Its vertices ride along.
-    assert len(with_web.vertices) == len(without.vertices) + 96
-    assert np.isfinite(with_web.vertex_depth).all() and with_web.share()[-96:].min() == 1.0
+    assert len(with_bridge.vertices) == len(without.vertices) + 96
+    assert np.isfinite(with_bridge.vertex_depth).all() and with_bridge.share()[-96:].min() == 1.0
 
 
 @pytest.mark.parametrize("moved", [0.05, -0.05])
-def test_a_dent_in_a_web_is_the_webs(moved):
-    flat = person(web=True)
-    web = find_opening_webs(flat)
-    ring = np.unique(flat.faces[web])
+def test_a_dent_in_a_bridge_is_the_bridges(moved):
+    flat = person(bridge=True)
+    bridge = find_opening_bridges(flat)
+    ring = np.unique(flat.faces[bridge])
     # Of its inner edge: no face around such a vertex touches the skirt.
-    inside = ring[~np.isin(ring, flat.faces[~web])]
+    inside = ring[~np.isin(ring, flat.faces[~bridge])]
     edge = min(inside, key=lambda vertex: (flat.faces == vertex).any(axis=1).sum())
     vertices = flat.vertices.copy()
     vertices[edge, 1] += moved
     dented = replace(flat, vertices=vertices)
-    assert (web & (np.abs(dented.mesh.face_normals[:, 1]) < 0.5)).any()
-    np.testing.assert_array_equal(find_opening_webs(dented), web)
+    assert (bridge & (np.abs(dented.mesh.face_normals[:, 1]) < 0.5)).any()
+    np.testing.assert_array_equal(find_opening_bridges(dented), bridge)
 
 
-def test_a_skirt_without_a_web_has_none_and_nobody_takes_a_waist_for_one():
-    assert not find_opening_webs(person()).any()
-    assert not find_opening_webs(person(tight=False)).any()
+def test_a_skirt_without_a_bridge_has_none_and_nobody_takes_a_waist_for_one():
+    assert not find_opening_bridges(person()).any()
+    assert not find_opening_bridges(person(tight=False)).any()
 
 
-def test_a_body_that_is_no_solid_has_no_webs_and_carries_nothing():
-    template = person(web=True)
+def test_a_body_that_is_no_solid_has_no_bridges_and_carries_nothing():
+    template = person(bridge=True)
     faces = template.faces.copy()
     body = template.part_faces(BODY_PART)
     faces[body] = faces[body][:, ::-1]
     hollow = replace(template, faces=faces)
-    assert not find_opening_webs(hollow).any()
+    assert not find_opening_bridges(hollow).any()
     with pytest.warns(GeometryWarning, match="inwards"), pytest.raises(InputError, match="point inward"):
         cut_garment(hollow, PART, standing(), COARSE)
 

@@ -15,7 +15,7 @@ import pytest
 from smplxpp.cloth import solver as solver_module
 from smplxpp.cloth.fabric import Fabric, SolverConfig
 from smplxpp.cloth.model import build_model
-from smplxpp.cloth.solver import GRAVITY, ClothState, push_out
+from smplxpp.cloth.solver import GRAVITY, ClothState, move_before_collider
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import matrix_from_rotvec
@@ -268,7 +268,7 @@ def test_the_nearest_place_is_found_on_large_faces_beside_small_ones():
     assert (surface.face_normals[:, 1] > 0).all()
     point, up = np.array([[-0.008, 0.001, 0]], np.float32), np.array([[0.0, 1, 0]])
     vertices = surface.vertices.astype(np.float32)
-    out = push_out(point, up, vertices, collider(surface), margin=0.002)
+    out = move_before_collider(point, up, vertices, collider(surface), margin=0.002)
     np.testing.assert_allclose(out, [[-0.008, 0.002, 0]], atol=2e-4)
 
 

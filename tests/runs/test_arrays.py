@@ -21,7 +21,7 @@ from pipelines.runs.artefacts import (
     read_named,
     save_arrays,
 )
-from pipelines.runs.layout import CANONICAL, PARTS_WITHOUT_WEBS, SCAN, SCAN_LABELS, WEIGHTS
+from pipelines.runs.layout import CANONICAL, PARTS_WITHOUT_BRIDGES, SCAN, SCAN_LABELS, WEIGHTS
 from smplxpp.build.data import Part
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh
@@ -67,7 +67,7 @@ def test_artefacts_without_their_arrays(tmp_path):
     mesh = TriangleMesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     parts = {"scan": Part(mesh, 3, np.arange(3), np.zeros((3, 3), np.uint8))}
     weights = partial(load_weights, parts=parts)
-    for file, load in ((SCAN, load_scan), (PARTS_WITHOUT_WEBS, load_parts), (WEIGHTS, weights)):
+    for file, load in ((SCAN, load_scan), (PARTS_WITHOUT_BRIDGES, load_parts), (WEIGHTS, weights)):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         save_arrays(tmp_path / file, {"scan": {"faces": np.zeros((0, 3), int)}})
         with pytest.raises(InputError, match="received a file without it"):
@@ -84,7 +84,7 @@ def test_artefacts_of_other_kinds_name_their_file(tmp_path):
     parts = {"a": Part(mesh, 3, plain["source_vertex"], plain["colors"])}
     readers = {
         SCAN: ("scan", plain, load_scan),
-        PARTS_WITHOUT_WEBS: ("a", plain, load_parts),
+        PARTS_WITHOUT_BRIDGES: ("a", plain, load_parts),
         WEIGHTS: ("a", told, partial(load_weights, parts=parts)),
         CANONICAL: ("a", {"vertices": mesh.vertices}, partial(load_canonical, parts=parts)),
     }

@@ -8,7 +8,7 @@ import igl
 import numpy as np
 import pytest
 
-from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, loop_subdivide, push_out, smooth
+from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, lift_outside, loop_subdivide, smooth
 from pipelines.synth.motion import Performance
 from pipelines.synth.patterns import band
 from pipelines.synth.scan_simulation import ScanConfig, simulate_scan
@@ -86,7 +86,7 @@ def test_smoothing_keeps_a_border_on_its_own_curve(ball):
 
 def test_push_out_reaches_the_clearance():
     inner, cloth = icosphere(3, 1.0), icosphere(3, 0.99)
-    moved = push_out(cloth, inner, clearance=0.01, solid=True)
+    moved = lift_outside(cloth, inner, clearance=0.01, solid=True)
     distance = SignedDistanceField(inner, solid=True).query(moved).distance
     assert distance.min() > 0.0099
     assert distance.max() < 0.02

@@ -187,7 +187,7 @@ def test_a_confident_match_keeps_its_joints_whatever_is_allowed(body):
 
 
 def test_cloth_that_lies_on_the_skin_elsewhere_does_not_follow_the_hand_beside_it(body):
-    """A close skirt is led to the legs all over; the hand that nearly touches it faces against it."""
+    """A close skirt has anchor weights of the legs all over; the hand that nearly touches it faces against it."""
     mesh, weights = body
     angle = np.arange(48) * (2 * np.pi / 48)
     sheet = tube(0.2, 0.1, 0.95, around=48)
@@ -235,7 +235,7 @@ def test_averaging_moves_unmatched_vertices_only(body, skirt):
     smoothed = transfer_weights(
         *body,
         skirt,
-        config=TransferConfig(falloff=None, smoothing=None, unmatched="nearest", normal_doubt=0, averaging_steps=5),
+        config=TransferConfig(falloff=None, smoothing=None, unmatched="nearest", normal_widening=0, averaging_steps=5),
     )
     change = np.abs(plain.dense() - smoothed.dense()).max(axis=1)
     assert change[plain.matched].max() < 1e-12 and change[~plain.matched].max() > 1e-4

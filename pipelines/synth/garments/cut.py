@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipelines.synth.cloth_mesh import ClothMesh, clip, push_out, smooth, submesh
+from pipelines.synth.cloth_mesh import ClothMesh, clip, lift_outside, smooth, submesh
 from pipelines.synth.garments.mannequin import Mannequin
 from pipelines.synth.patterns import ramp
 from smplxpp.core.topology import face_components
@@ -61,7 +61,7 @@ def layer(
     normals = smooth(mesh, mesh.with_vertices(vertices).vertex_normals, steps=fairing)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     vertices = vertices + lift[:, None] * normals
-    lifted = cloth.with_vertices(push_out(mesh.with_vertices(vertices), whole.mesh, clearance=0.003, solid=True))
+    lifted = cloth.with_vertices(lift_outside(mesh.with_vertices(vertices), whole.mesh, clearance=0.003, solid=True))
     # Drop crumbs that the cut leaves, below 5 % of the faces.
     component = face_components(lifted.faces)
     return submesh(lifted, np.bincount(component)[component] > 0.05 * len(component))

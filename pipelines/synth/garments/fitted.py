@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from pipelines.synth.cloth_mesh import ClothMesh, push_out, smooth
+from pipelines.synth.cloth_mesh import ClothMesh, lift_outside, smooth
 from pipelines.synth.garments.cut import Garment, Level, facing_out, grid_faces, joined, layer, tube_along
 from pipelines.synth.garments.mannequin import Mannequin
 from pipelines.synth.patterns import ramp
@@ -198,7 +198,7 @@ def _hood_down(mannequin: Mannequin, shirt: ClothMesh) -> ClothMesh:
     curve = np.stack([0.115 * np.sin(t), height, j["neck"][2] - 0.02 - 0.095 * np.cos(t)], axis=1)
     points, faces = tube_along(curve, 0.016 + 0.026 * np.cos(t / 1.5) ** 2)
     roll = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 24, axis=0))
-    vertices = push_out(roll.mesh, mannequin.skin.mesh, clearance=0.012, solid=True)
+    vertices = lift_outside(roll.mesh, mannequin.skin.mesh, clearance=0.012, solid=True)
     # The roll follows the upper spine, its sides half the collar bone of their side.
     collar = ramp(np.abs(vertices[:, 0]), 0.03, 0.16)[:, None]
     left = (vertices[:, 0] > 0)[:, None]
@@ -218,7 +218,7 @@ def _scarf(mannequin: Mannequin) -> ClothMesh:
     curve = np.concatenate([curve, curve[:1]])
     points, faces = tube_along(curve, np.full(61, 0.03))
     ring = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 24, axis=0))
-    vertices = push_out(ring.mesh, mannequin.skin.mesh, clearance=0.006, solid=True)
+    vertices = lift_outside(ring.mesh, mannequin.skin.mesh, clearance=0.006, solid=True)
     # Weights pass from the upper spine to the neck over the height of the roll.
     up = ramp(vertices[:, 1], height - 0.05, height + 0.05)[:, None]
     count = len(vertices)
@@ -232,6 +232,6 @@ def _scarf(mannequin: Mannequin) -> ClothMesh:
     points = np.stack(np.broadcast_arrays(lateral[None, :], drop[:, None], deep), axis=-1).reshape(-1, 3)
     end = ClothMesh(points, grid_faces(40, 10, closed=False), mannequin.trunk_weights(points))
     end = facing_out(end, points - [0.0, 0.0, 1.0])
-    pushed = push_out(end.mesh, mannequin.skin.mesh, clearance=0.008, solid=True)
+    pushed = lift_outside(end.mesh, mannequin.skin.mesh, clearance=0.008, solid=True)
     end = end.with_vertices(smooth(end.mesh, pushed, steps=2))
     return joined(ring, end)

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from pipelines.synth.cloth_mesh import ClothMesh, push_out, smooth
+from pipelines.synth.cloth_mesh import ClothMesh, lift_outside, smooth
 from pipelines.synth.garments.cut import Garment, facing_out, grid_faces, joined, layer, tube_along
 from pipelines.synth.garments.mannequin import Mannequin
 from pipelines.synth.patterns import ramp
@@ -115,10 +115,10 @@ def _curtain(mannequin: Mannequin, bottom: float, *, spread: float, half: float 
     inside = np.column_stack([0 * points[:, 0], points[:, 1], 0 * points[:, 0] + centre])
     cloth = facing_out(cloth, inside)
     # Push it off the skin, smooth it, and push out what smoothing brought too near.
-    pushed = push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.009, solid=True, reach=0.12)
+    pushed = lift_outside(cloth.mesh, mannequin.skin.mesh, clearance=0.009, solid=True, reach=0.12)
     pushed = smooth(cloth.mesh, pushed, steps=4)
     return cloth.with_vertices(
-        push_out(cloth.mesh.with_vertices(pushed), mannequin.skin.mesh, clearance=0.007, solid=True)
+        lift_outside(cloth.mesh.with_vertices(pushed), mannequin.skin.mesh, clearance=0.007, solid=True)
     )
 
 
@@ -159,7 +159,7 @@ def _braid(mannequin: Mannequin) -> ClothMesh:
         curve[1:-1] = 0.5 * curve[1:-1] + 0.25 * (curve[:-2] + curve[2:])
     points, faces = tube_along(curve, 0.02 + 0.003 * np.sin(40 * t) - 0.008 * t)
     cloth = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 24, axis=0))
-    cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.003, solid=True, reach=0.08))
+    cloth = cloth.with_vertices(lift_outside(cloth.mesh, mannequin.skin.mesh, clearance=0.003, solid=True, reach=0.08))
     # Weights follow from the centre line, so that a ring of the braid moves rigidly.
     middle = np.repeat(curve, 24, axis=0)
     line = ClothMesh(middle, cloth.faces, cloth.weights)

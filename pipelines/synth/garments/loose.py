@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from pipelines.synth.cloth_mesh import ClothMesh, push_out
+from pipelines.synth.cloth_mesh import ClothMesh, lift_outside
 from pipelines.synth.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
 from pipelines.synth.garments.mannequin import Mannequin
 
@@ -54,7 +54,7 @@ def _hung(
     points, faces = hang(mannequin, heights, azimuths, closed=not gap, **cut)
     # Weights follow from the points before they are pushed off the skin.
     cloth = facing_out(mannequin.unweighted(points, faces), mannequin.inner_points(points))
-    cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.004, solid=True))
+    cloth = cloth.with_vertices(lift_outside(cloth.mesh, mannequin.skin.mesh, clearance=0.004, solid=True))
     return ClothMesh(cloth.vertices, cloth.faces, skirt_weights(mannequin, points, legs=legs, shins=shins))
 
 
@@ -90,7 +90,7 @@ def _cape(mannequin: Mannequin) -> ClothMesh:
     points = mannequin.at(heights[:, None], azimuths[None, :], np.maximum.accumulate(radius, axis=0)).reshape(-1, 3)
     faces = grid_faces(len(heights), len(azimuths), closed=False)
     cloth = facing_out(mannequin.unweighted(points, faces), mannequin.inner_points(points))
-    cloth = cloth.with_vertices(push_out(cloth.mesh, mannequin.skin.mesh, clearance=0.006, solid=True))
+    cloth = cloth.with_vertices(lift_outside(cloth.mesh, mannequin.skin.mesh, clearance=0.006, solid=True))
     weights = skirt_weights(mannequin, points, legs=0.4, shins=0.0)
     return ClothMesh(cloth.vertices, cloth.faces, weights)
 
@@ -124,5 +124,5 @@ def _kimono(mannequin: Mannequin) -> ClothMesh:
             np.column_stack([sign * along, 0 * along + shoulder[1], 0 * along + shoulder[2]]), 48, axis=0
         )
         sleeve = facing_out(sleeve, middle)
-        pieces.append(sleeve.with_vertices(push_out(sleeve.mesh, mannequin.skin.mesh, clearance=0.005, solid=True)))
+        pieces.append(sleeve.with_vertices(lift_outside(sleeve.mesh, mannequin.skin.mesh, clearance=0.005, solid=True)))
     return joined(*pieces)

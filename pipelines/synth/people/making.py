@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from pipelines.synth.cloth_mesh import ClothMesh, outer_faces, push_out, smooth
+from pipelines.synth.cloth_mesh import ClothMesh, lift_outside, outer_faces, smooth
 from pipelines.synth.garments.mannequin import ARM_JOINTS, HAND_JOINTS, shares
 from pipelines.synth.garments.wardrobe import all_garments
 from pipelines.synth.patterns import smooth_noise
@@ -109,7 +109,7 @@ def make_person(name: str, member: Member, body: BodyModel, *, seed: int, scan: 
         own = np.flatnonzero(merged == shown)
         albedo = albedo[own[cKDTree(taken.mesh.vertices[own]).query(taken.mesh.vertices)[1]]]
         colors = photographed(taken.mesh, albedo, rng=rng)
-    # Vertices farther than 4 mm from every layer belong to webs and filled holes.
+    # Vertices farther than 4 mm from every layer belong to bridges and filled holes.
     off = np.linalg.norm(taken.mesh.vertices - taken.shown_on(layers), axis=1)
     seen = (off < 0.004)[taken.mesh.faces].all(axis=1)
     return PersonScan.of(
@@ -144,7 +144,7 @@ def _put_on(cloth: ClothMesh, worn: list[ClothMesh], *, folds: float, seed: int)
     fine = smooth_noise(cloth.vertices, scale=(0.02, 0.02, 0.03), seed=seed + 1)
     vertices = cloth.vertices + folds * (coarse + 0.5 * fine)[:, None] * mesh.vertex_normals
     for inner in worn:
-        vertices = push_out(mesh.with_vertices(vertices), inner.mesh, clearance=_OVER_CLOTH, solid=False)
+        vertices = lift_outside(mesh.with_vertices(vertices), inner.mesh, clearance=_OVER_CLOTH, solid=False)
     return cloth.with_vertices(vertices)
 
 
@@ -155,10 +155,10 @@ def pose_layers(dressed: Dressed, params: BodyParams) -> tuple[PosedBody, list[F
     out: list[np.ndarray] = []
     for layer in dressed.layers:
         mesh = layer.cloth.mesh.with_vertices(skin(layer.cloth.vertices, layer.cloth.weights, posed.posed_from_rest[0]))
-        vertices = push_out(mesh, bare, clearance=0.0035, solid=True)
+        vertices = lift_outside(mesh, bare, clearance=0.0035, solid=True)
         for inner, points in zip(dressed.layers, out, strict=False):
             under = inner.cloth.mesh.with_vertices(points)
-            vertices = push_out(mesh.with_vertices(vertices), under, clearance=_OVER_CLOTH, solid=False, reach=0.02)
+            vertices = lift_outside(mesh.with_vertices(vertices), under, clearance=_OVER_CLOTH, solid=False, reach=0.02)
         out.append(smooth(mesh, vertices, steps=1))
     return posed, out
 

@@ -29,7 +29,7 @@ class PersonScan:
         mesh: one outer surface, in `units` and with `up` upwards (metres and "y" but for variants).
         colors: sRGB colour of each vertex; None for a scan without colours.
         face_labels: id of `smplxpp.core.labels` of the layer that each face shows.
-        seen: whether a face lies on a layer that the scanner saw; false on webs and filled holes.
+        seen: whether a face lies on a layer that the scanner saw; false on bridges and filled holes.
         params: one row that gives `body_vertices` with `load_body()`.
         body_vertices: vertices of the open body under the clothes.
         joints: its joints.

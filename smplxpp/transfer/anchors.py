@@ -9,7 +9,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.transfer.inpaint import fit_smoothly
 
 _TOGETHER = 0.1  # two joints are neighbours where a vertex follows both by at least this
-_NEIGHBOUR = 0.1  # how far a neighbour of the joint that cloth is led to may speak, against that joint
+_NEIGHBOUR = 0.1  # how far a neighbour of the joint of the anchor weights may count, against that joint
 LEAST_REACH = 1e-6  # the whole body speaks where nothing that may speak is near
 _OWN = 0.3  # a joint with this share of the confident cloth's weight is no longer what the label says about it
 _UNHEARD = (0.01, 0.001)  # share of the body nearby that may speak: from the first to the second it loses its say
@@ -18,7 +18,7 @@ _AWAY = (np.radians(35.0), np.radians(70.0))
 _DOUBTED = (np.radians(15.0), np.radians(45.0))
 
 
-def lead(
+def anchor_weights(
     mesh: TriangleMesh,
     copied: Float[np.ndarray, "N J"],
     confident: Bool[np.ndarray, " N"],
@@ -26,7 +26,7 @@ def lead(
     length: float,
     laplacian: str,
 ) -> Float64[np.ndarray, "N J"]:
-    """The weights that confident vertices lead to along the surface: they keep theirs, the others are inpainted.
+    """Inpaint the weights of confident vertices along the surface: these keep theirs, the others follow from them.
 
     Args:
         mesh: every vertex referenced. copied: weights of the closest points; components without a confident vertex
@@ -49,28 +49,29 @@ def neighbouring_joints(weights: Float[np.ndarray, "V J"]) -> Bool[np.ndarray, "
 
 
 def joint_reach(
-    led: Float[np.ndarray, "N J"], neighbours: Bool[np.ndarray, "J J"], allowed: Bool[np.ndarray, " J"] | None
+    anchors: Float[np.ndarray, "N J"], neighbours: Bool[np.ndarray, "J J"], allowed: Bool[np.ndarray, " J"] | None
 ) -> Float64[np.ndarray, "N J"]:
     """How far each joint may speak for a vertex: wholly where confident cloth leads to it, a little beside that.
 
-    A sleeve that hangs before the thigh is led to the arm, and the thigh, no neighbour of the arm, is not asked;
-    neither is the hand beside a skirt. What a label excludes (`allowed`) is not asked either, unless confident cloth
+    A sleeve that hangs before the thigh has anchor weights of the arm, and the thigh, no neighbour of the arm, is not
+    asked; neither is the hand beside a skirt. What a label excludes (`allowed`) is not asked either, unless confident
+    cloth
     follows it.
     """
     passed_on = np.where(neighbours, _NEIGHBOUR, 0.0)
     np.fill_diagonal(passed_on, 1.0)
-    reach = np.minimum(led @ passed_on, 1.0)
-    return reach if allowed is None else np.where(allowed | (led > _OWN), reach, 0.0)
+    reach = np.minimum(anchors @ passed_on, 1.0)
+    return reach if allowed is None else np.where(allowed | (anchors > _OWN), reach, 0.0)
 
 
-def lean_on_the_lead(
+def anchor_share(
     distance: Float[np.ndarray, " N"],
     angle: Float[np.ndarray, " N"],
     heard: Float[np.ndarray, " N"],
     *,
     far: tuple[float, float],
 ) -> Float64[np.ndarray, " N"]:
-    """How far the lead replaces what the body nearby says: 0 to 1.
+    """Return the share, 0 to 1, with which anchor weights replace the weights of the body nearby.
 
     Smoothly from 0 to 1 between the two distances `far` (metres); where hardly any of the body nearby may speak
     (`heard`, a share); and, for a vertex that faces away from the skin nearest to it (`angle`, radians), where less

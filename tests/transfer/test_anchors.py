@@ -7,7 +7,7 @@ import pytest
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.transfer import TransferConfig, transfer_weights
-from smplxpp.transfer.evidence import lead, lean_on_the_lead, turned_away
+from smplxpp.transfer.anchors import anchor_share, anchor_weights, turned_away
 
 FAR = (0.1, 0.2)
 UNHEARD, HEARD = 0.2, 0.9
@@ -20,14 +20,14 @@ UNHEARD, HEARD = 0.2, 0.9
         (0.25, 0, HEARD, 1.0, 1.0),
         (0.15, 0, HEARD, 0.4, 0.6),
         (0.05, 0, 0.0, 1.0, 1.0),
-        (0.05, 120, HEARD, 0.0, 0.0),  # a lining: it faces away, and what it is led to agrees
+        (0.05, 120, HEARD, 0.0, 0.0),  # a lining: it faces away, and its anchor weights agree
         (0.05, 20, UNHEARD, 0.0, 0.0),  # what it covers may contradict
         (0.05, 120, UNHEARD, 0.7, 1.0),
         (0.0, np.nan, UNHEARD, 0.0, 0.0),
     ],
 )
-def test_far_contradicted_and_unheard_vertices_lean_on_the_lead(distance, degrees, heard, least, most):
-    lean = lean_on_the_lead(np.array([distance]), np.radians([degrees]), np.array([heard]), far=FAR)
+def test_far_contradicted_and_unheard_vertices_take_the_anchor_weights(distance, degrees, heard, least, most):
+    lean = anchor_share(np.array([distance]), np.radians([degrees]), np.array([heard]), far=FAR)
     assert least <= lean[0] <= most
 
 
@@ -46,13 +46,13 @@ def _strip(length: float = 1.0, count: int = 41) -> TriangleMesh:
     return TriangleMesh(points, faces)
 
 
-def test_a_short_lead_keeps_what_the_waist_follows_where_a_long_one_continues_the_trend():
-    """Known at the top: a share that grows downwards. Both keep it there; far below only the long lead saturates."""
+def test_a_short_anchor_length_keeps_what_the_waist_follows_where_a_long_one_continues_the_trend():
+    """Known at the top: a share that grows downwards. Both keep it there; far below only the long length saturates."""
     mesh = _strip()
     known = mesh.vertices[:, 1] > -0.2
     share = np.clip(0.2 - 2.0 * mesh.vertices[:, 1], 0, 1)
     copied = np.where(known[:, None], np.stack([share, 1 - share], axis=1), [1.0, 0.0])
-    short, long = (lead(mesh, copied, known, length=length, laplacian="cotangent") for length in (0.05, 1.0))
+    short, long = (anchor_weights(mesh, copied, known, length=length, laplacian="cotangent") for length in (0.05, 1.0))
     hem = mesh.vertices[:, 1] < -0.9
     assert np.abs(short[known] - copied[known]).max() < 1e-9
     assert short[hem, 0].max() < 0.85 < long[hem, 0].min()
