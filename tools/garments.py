@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, loop_subdivide, push_out, smooth, submesh
+from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, lift_outside, loop_subdivide, smooth, submesh
 from pipelines.synth.patterns import ramp, smooth_noise
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import face_components
@@ -78,8 +78,8 @@ def make_shirt(form: DressForm, *, under: TriangleMesh, seed: int) -> ClothMesh:
     creases = smooth_noise(vertices, scale=(0.03, 0.03, 0.05), seed=seed + 1)
     folds = (0.0015 + 0.0055 * low) * (1 - on_sleeve) * drapes + (0.0012 + 0.002 * on_sleeve) * creases
     vertices = vertices + (ease + folds)[:, None] * normals
-    vertices = push_out(mesh.with_vertices(vertices), form.body, clearance=0.004, solid=True)
-    vertices = push_out(mesh.with_vertices(vertices), under, clearance=0.004, solid=False)
+    vertices = lift_outside(mesh.with_vertices(vertices), form.body, clearance=0.004, solid=True)
+    vertices = lift_outside(mesh.with_vertices(vertices), under, clearance=0.004, solid=False)
     return with_clean_weights(cloth.with_vertices(smooth(mesh, vertices, steps=2)))
 
 
@@ -108,7 +108,7 @@ def make_skirt(form: DressForm, *, seed: int) -> ClothMesh:
     reach = 0.004 + 0.055 * down + (0.001 + 0.025 * down) * folds
     vertices = vertices.copy()
     vertices[:, [0, 2]] += reach[:, None] * outward
-    vertices = push_out(mesh.with_vertices(vertices), form.body, clearance=0.005, solid=True)
+    vertices = lift_outside(mesh.with_vertices(vertices), form.body, clearance=0.005, solid=True)
     vertices = smooth(mesh, vertices, steps=3)
     weights = diffuse(mesh.with_vertices(vertices), cloth.weights, radius=0.06)
     return with_clean_weights(ClothMesh(vertices, cloth.faces, weights))
@@ -128,7 +128,7 @@ def make_shoes(form: DressForm) -> ClothMesh:
     sole = ramp(vertices[:, 1], ground + 0.035, ground + 0.004)
     normals = mesh.with_vertices(vertices).vertex_normals
     vertices = vertices + (0.005 + 0.004 * sole)[:, None] * normals
-    vertices = push_out(mesh.with_vertices(vertices), form.body, clearance=0.004, solid=True)
+    vertices = lift_outside(mesh.with_vertices(vertices), form.body, clearance=0.004, solid=True)
     # A flat sole: everything near the ground goes down to one plane, softly.
     floor = ground - 0.012
     height = vertices[:, 1] - floor
