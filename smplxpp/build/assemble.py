@@ -52,6 +52,8 @@ def assemble_parts(
     """
     canonical, filled = {}, {}
     for name, before in cleaned.items():
+        # A part's vertices at rest come from the inverse skinning of its posed mesh. The faces are the same in both
+        # poses.
         part = parts[name].posed
         made = CanonicalPart(
             mesh=part.mesh.with_vertices(parts[name].vertices),
@@ -63,9 +65,15 @@ def assemble_parts(
         # Close the holes that cut bridges left. Cuffs and hems were open before and stay open.
         holes = cut_holes(before.mesh, before.source_vertex, part.mesh, part.source_vertex)
         canonical[name], filled[name] = fill_holes(made, holes, config=config.fill_holes)
+    # The clearance is given in millimetres by the user; every length inside the package is in metres.
     settings = AssemblyConfig(clearance=config.clearance_mm / MM)
     template, report = assemble_template(body, params, canonical, config=settings)
+    # A body vertex takes the colour of the scan's skin where that is close; elsewhere the median of the skin that is
+    # seen.
     template = _with_scan_colors(template, scan, face_labels == SKIN.id, fit, body)
+    # A layer that penetrates another shows through it, so that the first check allows no such vertex (limits 0). What
+    # the repair leaves inside is zero unless the fit is wrong, since no part may be pushed farther than it stands off
+    # the body.
     checks = [
         Check(
             "outer vertices inside an inner layer at rest",
@@ -120,7 +128,9 @@ def _with_scan_colors(
     # The scan's nearest skin is that of the lips, so that the inside of the mouth would become red.
     mouth = inside_of_mouth(template)[:count]
     body_colors[mouth], body_index[mouth] = MOUTH_COLOR, -1
+    # -1 marks a vertex of the template that no vertex of the scan's file stands for.
     scan_index = np.where(body_index >= 0, scan.source_vertex[body_index], -1)
+    # The template lists the body's vertices first, `count` of them, and the parts' vertices after them.
     return replace(
         template,
         vertex_colors=np.concatenate([body_colors, template.vertex_colors[count:]]),

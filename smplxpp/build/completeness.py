@@ -59,13 +59,16 @@ def completeness_checks(
     """
     figure = template.posed_body(params).frame(0)
     body = template.body.mesh(figure.vertices)
+    # A vertex belongs to the region of the joint with its largest skin weight.
     names = np.array(body_regions(template.body.joint_names))
     region = names[template.body.weights.argmax(axis=1)]
+    # Faces without a label count as bare too, because a garment whose label is missing is to be found among them.
     bare = np.isin(face_labels, (SKIN.id, BACKGROUND))
     # What of the body has no scan near it, by region.
     checks, numbers = _body_side(body, region, scan)
     # What of the scan has no template near it; surfaces that look down are left out, because scanners miss them.
     unexplained = (scan_to_template.distance > EXPLAINED) & (scan_to_template.samples.normals[:, 1] > _LOOKS_DOWN)
+    # Samples are uniform in area, so that their mean estimates a share of the surface.
     share = float(unexplained.mean())
     checks.append(
         UNEXPLAINED.check(
@@ -76,11 +79,15 @@ def completeness_checks(
         )
     )
     # Skin that stands off the body: a garment without its label.
+    # Largest first. A patch is a connected component of bare faces that are all farther than `OFF_BODY` from the
+    # body.
     patches = far_patches(scan, bare, body, far=OFF_BODY)
     where = ""
     if patches:
         face = point_to_surface(np.array([patches[0].center]), body)[2]
+        # Name the body's region under the patch by its nearest face's first corner.
         where = f"at the {region[body.faces[face[0], 0]]}; "
+    # Square metres to square centimetres.
     largest = patches[0].area * 1e4 if patches else 0.0
     checks.append(
         SKIN_PATCH.check(
@@ -104,6 +111,7 @@ def completeness_checks(
 
 def _body_side(body: TriangleMesh, region: np.ndarray, scan: TriangleMesh) -> tuple[list[Check], dict[str, Any]]:
     uncovered = uncovered_body(body, scan)
+    # A face takes the region of its first corner; faces across a border are too few to matter in a share of area.
     of_face = region[body.faces[:, 0]]
     shares = {name: uncovered.mean(of_face == name) for name in (*TRUNK_AND_LIMBS, *ENDS)}
     checks = [
@@ -118,6 +126,7 @@ def _body_side(body: TriangleMesh, region: np.ndarray, scan: TriangleMesh) -> tu
         ("hands and feet", ENDS_UNCOVERED, ENDS),
     ):
         order = sorted(among, key=lambda name: -shares[name])
+        # Name every region beyond the limit, and the worst one where all are within it.
         lost = [f"{name} {100 * shares[name]:.0f} %" for name in order if shares[name] > gate.warn] or [
             f"{order[0]} {100 * shares[order[0]]:.0f} %"
         ]
@@ -158,12 +167,14 @@ def photograph_checks(
     Returns:
         The check where scan and photographs have colours, and its numbers.
     """
+    # Without photographs, or with one colour for the whole scan, colours cannot tell an object from its mirror image.
     if not inputs.photographs or (colors == colors[0]).all():
         return [], {}
     views, notes = _views(inputs)
     figure = template.posed_body(params).frame(0)
     center, across = sagittal_plane(template, figure.joints)
     body = template.body.mesh(figure.vertices)
+    # Colours in [0, 1], as the photographs have them; the mirror image is taken across the body's sagittal plane.
     share = mirrored_by_views(scan, colors / 255.0, views, body=body, center=center, across=across)
     numbers = {"views": [camera.name for camera, _ in views], "unread": notes, "mirrored": share}
     if share is None:
@@ -190,7 +201,9 @@ def _views(inputs: BuildInputs) -> tuple[list[tuple[Camera, np.ndarray]], list[s
             continue
         camera, lens = lenses[name]
         try:
+            # The window scales the intrinsics with the image, so that camera and pixels agree at the small size.
             window = Window.full(camera).resized(min(1.0, longer_side / max(camera.width, camera.height)))
+            # The reader removes lens distortion, because the projection that follows is that of a pinhole.
             views.append((window.camera(camera), ViewReader(camera, window, lens).color(path) / 255.0))
         except InputError as error:
             notes.append(f"camera {name}: {error}")

@@ -104,6 +104,7 @@ def plan_build(request: BuildRequest) -> BuildPlan:
         InputError: neither or both ways of naming the input, files that a capture lacks, or photographs that cannot be
             used.
     """
+    # Exactly one of the two ways to name the input.
     if (request.capture is None) == (request.scan is None):
         raise InputError(
             "input",
@@ -111,6 +112,7 @@ def plan_build(request: BuildRequest) -> BuildPlan:
             received="both" if request.scan is not None else "neither",
         )
     inputs = _of_scan(request) if request.capture is None else _of_capture(request)
+    # Units and axis depend on the inputs: a capture's cameras fix the world, a lone scan's have to be found.
     config = resolved(request.config, inputs)
     return BuildPlan(inputs, config, _registration(request, inputs), _reconstruction(request, inputs))
 
@@ -119,7 +121,10 @@ def _of_capture(request: BuildRequest) -> BuildInputs:
     """The inputs of a capture: a scan that it lacks is reconstructed, parameters that it lacks are registered."""
     root, config = request.root, request.config
     assert root is not None
+    # Decide first who makes the parameters, because the search for the reference frame only asks for a fit if one is
+    # used.
     registers = _registers(request)
+    # Parameters in memory take the place of the capture's files; their rows are numbered by the capture's frames.
     in_memory = request.params if isinstance(request.params, BodyParams) else None
     found = find_reference(
         root,
@@ -129,6 +134,7 @@ def _of_capture(request: BuildRequest) -> BuildInputs:
         fitted=not registers and in_memory is None,
         scanned=False,
     )
+    # Labels of the user come first; those of the capture are used only if the source of labels allows it.
     labels = _scan_labels(request, found) if request.labels is None else request.labels
     by_body = config.label_source == "body"
     # A few photographs from all around tell left from right; more cost time and decide nothing.
@@ -141,10 +147,12 @@ def _of_capture(request: BuildRequest) -> BuildInputs:
         locates=registers and not _starts(request, found),
         registers=registers,
         frame=found.frame,
+        # A file of parameters has rows of its own, which need not be numbered like the frames.
         params_row=found.params_frame if in_memory is None else found.frame,
         labels=labels,
         label_maps={} if labels is not None or by_body else found.label_maps,
         photographs=dict(spread(list(found.photographs.items()), most_photographs)),
+        # Cameras are read to project label maps or photographs; labels given by the user need neither.
         cameras=found.cameras_file if found.photographs or labels is None else None,
         label_set="capture" if config.label_set == AUTO else config.label_set,
         label_source="body" if by_body else "auto",
@@ -161,9 +169,11 @@ def _of_scan(request: BuildRequest) -> BuildInputs:
         InputError: options that need a capture.
     """
     config = request.config
+    # These options choose among files of a capture, and a lone scan has none.
     for name in ("protocol", "keypoints", "masks"):
         if getattr(config, name) is not None:
             raise InputError(f"option {name}", expected="with --capture", received="with --scan")
+    # Parameters beside a lone scan are used unchanged, unless the user asks for a registration that starts from them.
     registers = request.params is not None and config.register == "on"
     return BuildInputs(
         subject=request.scan.stem if isinstance(request.scan, Path) else "scan",
@@ -184,13 +194,16 @@ def _registers(request: BuildRequest) -> bool:
     """Whether the parameters come from a registration of the capture."""
     root = request.root
     assert root is not None
+    # The user's word decides; without it an earlier registration stands, and repeated builds are equal.
     if request.config.register != AUTO:
         return request.config.register == "on"
     if _standing_registration(request) is not None:
         return True
+    # Parameters in memory are a fit already, and a capture without a folder has no declaration of its sources.
     if isinstance(request.params, BodyParams) or not root.is_dir():
         return False
     declared = DeclaredInputs.of_folder(root, request.protocol)
+    # Estimated parameters only start a registration; exact ones are used unchanged.
     params = declared.own_parameters() if request.params is None else request.named_params
     return params is None or declared.given_parameters(params) == TRACKED
 
@@ -199,6 +212,8 @@ def _starts(request: BuildRequest, found: ReferenceFrame) -> bool:
     """Whether a registration has something to start from: a fit, keypoints, or an earlier registration."""
     root = request.root
     assert root is not None
+    # Try the sources of a start from the best to the weakest: a fit, keypoints that are named, keypoints of the
+    # capture.
     if found.params is not None or isinstance(request.params, BodyParams):
         return True
     if request.config.keypoints is not None or _standing_registration(request) is not None:
@@ -210,10 +225,12 @@ def _starts(request: BuildRequest, found: ReferenceFrame) -> bool:
 def _standing_registration(request: BuildRequest) -> RegisterInputs | None:
     """The earlier registration, if it was of this capture and of these parameters, as far as any are named."""
     found, root = request.registration, request.root
+    # Compare folders only: a capture that was opened in memory has no identity that lasts between builds.
     if found is None or root is None or not isinstance(found.capture, Path):
         return None
     if not same_place(found.capture, root) or found.protocol != request.protocol:
         return None
+    # An earlier registration with other parameters was another fit, which must not be reused.
     params = request.named_params
     if params is None:
         return found
@@ -225,6 +242,8 @@ def _registration(request: BuildRequest, inputs: BuildInputs) -> RegisterInputs 
     if not inputs.registers:
         return None
     config = resolved(request.config, inputs)
+    # The scan to register to: the reconstructed one where the scan is made, else the file or mesh that the user
+    # named.
     return _standing_registration(request) or RegisterInputs(
         capture=request.capture,
         params=request.params if isinstance(request.params, BodyParams) else request.named_params,
@@ -251,12 +270,14 @@ def _reconstruction(request: BuildRequest, inputs: BuildInputs) -> ReconstructIn
         return None
     found, root = request.reconstruction, request.root
     assert request.capture is not None and root is not None
+    # An earlier surface is reused only if its file exists and its capture is in the same folder.
     made = isinstance(inputs.scan, Path) and inputs.scan.is_file()
     if found is not None and made and isinstance(found.capture, Path) and same_place(found.capture, root):
         return found
     asked = ReconstructInputs(
         request.capture, frames=(request.config.frame,), masks=request.config.masks, protocol=request.protocol
     )
+    # Open the capture and check cameras and frames now, because the reconstruction itself runs for minutes.
     capture = open_photographs(asked)
     usable_cameras(capture, ())
     usable_frames(capture, asked.frames)
@@ -270,6 +291,7 @@ def _scan_labels(request: BuildRequest, found: ReferenceFrame) -> Path | None:
         InputError: the labels that are asked for do not exist.
     """
     source, views, scan = request.config.label_source, bool(found.label_maps), found.scan_labels is not None
+    # Labels that were asked for by name must exist; a protocol may forbid those that the capture has.
     if source in ("views", "scan") and not {"views": views, "scan": scan}[source]:
         barred = f", by protocol {request.protocol}" if request.protocol else ""
         raise InputError(
@@ -278,6 +300,8 @@ def _scan_labels(request: BuildRequest, found: ReferenceFrame) -> Path | None:
             received=f"none for frame {found.frame}{barred}",
             remedy="name a file with --labels",
         )
+    # Label maps are preferred to labels of the scan: the latter are ground truth in most data sets, and a person who
+    # is recorded with cameras alone has none.
     if source == "body" or (views and source != "scan") or not scan:
         return None
     if source == AUTO:
@@ -301,10 +325,12 @@ def check_inputs(inputs: BuildInputs, body: BodyModel | None = None) -> BodyMode
     Raises:
         InputError: it names the option.
     """
+    # A reconstructed scan does not exist yet, so that its file is not looked for.
     for name in ("scan", "params", "labels", "cameras", "motion", "body"):
         value = None if name == "scan" and inputs.reconstructs else getattr(inputs, name)
         if isinstance(value, Path) and not value.exists():
             raise InputError(f"option {name}", expected="an existing file", received=str(value))
+    # Label maps are images; without a projection they say nothing about the scan's faces.
     if inputs.label_maps and inputs.cameras is None:
         raise InputError(
             "label maps",
@@ -312,6 +338,7 @@ def check_inputs(inputs: BuildInputs, body: BodyModel | None = None) -> BodyMode
             received="none",
             remedy="put cameras.json or calibration.csv into the capture",
         )
+    # Look up the label set and the motion for their errors: both are read by the last steps only.
     find_label_set(inputs.label_set)
     model = load_body(inputs.body) if body is None else body
     given_motion(inputs, model)

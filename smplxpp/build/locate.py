@@ -53,18 +53,23 @@ def locate_in_scan(
     Raises:
         InputError: no person, or landmarks that the body does not have.
     """
+    # Search on the surface that the template will be made of: smoothed where the scan is rough.
     mesh, colors = smooth_if_rough(scan.clean.mesh).mesh, scan.colors
     labeller = partial(certain_labels, mesh, body, colors)
     search = partial(locate_body, body, mesh, colors=colors, labeller=labeller)
+    # Search from the surface alone first, because it is precise; keypoints can only correct the front.
     found = search(landmarks=landmark_points(landmarks))
     note = ""
     if detector is not None and landmarks is None:
         found, note = _confirmed(found, search, mesh, colors, detector)
     # Keep the labels that a registration may lean on, a label for each vertex of a certain face.
     labels = np.full(mesh.vertex_count, BACKGROUND, dtype=np.int64)
+    # One label a face, BACKGROUND where body and colours disagree.
     of_faces = labeller(found.params)
     known = of_faces != BACKGROUND
+    # A vertex between faces with different labels takes the label of the last of them; such vertices lie on seams.
     labels[mesh.faces[known]] = of_faces[known][:, None]
+    # Skin that the scan shows without clothes; only there must the registration bring the body onto the scan.
     bare = bare_of_scan(body, found.params, ScanObservation(mesh, labels))
     numbers = {
         "units": scan.units,
@@ -77,6 +82,8 @@ def locate_in_scan(
         "candidates": found.candidates,
         "bare": float(bare.mean()),
     }
+    # Confidence is the lead over the best pose that faces another way; without a lead the person may stand turned by
+    # 180 degrees.
     check = Check(
         "confidence of the body found",
         found.confidence,
@@ -105,6 +112,8 @@ def _confirmed(
     front = facing(landmarks)
     if front is None:
         return found, "the detector's keypoints do not tell the front"
+    # The surface's front is (sin a, 0, cos a) with the angle a about +Y from +Z, and `front` is a horizontal unit
+    # vector. A positive dot product means that they differ by less than 90 degrees.
     own = np.radians(found.candidates[0].facing_degrees)
     if np.sin(own) * front[0] + np.cos(own) * front[2] > 0:
         return found, "the detector's keypoints face the same way"

@@ -48,6 +48,7 @@ class ViewMaps:
 
     def __call__(self, camera: str, frame: int) -> UInt8[np.ndarray, "H W"] | None:
         """Return the map of a camera and a frame; None where there is none."""
+        # A map that failed once is not read again, so that each bad file is noted once.
         if camera not in self.cameras or (camera, frame) in self.notes:
             return None
         try:
@@ -60,6 +61,7 @@ class ViewMaps:
         except InputError as error:
             self.notes[camera, frame] = f"camera {camera}, frame {frame}: {self.kind} left out: {error}"
             return None
+        # Masks of the solver hold uint8, so that BACKGROUND (-1) moves to 255.
         return np.where(ours == BACKGROUND, ELSEWHERE, ours).astype(np.uint8)
 
 
@@ -109,10 +111,12 @@ def observe(
         InputError: neither cameras nor scans, keypoints without cameras, nothing to start from, parameters of another
             body, unknown cameras or frames.
     """
+    # A lone scan has neither cameras nor splits.
     if inputs.capture is None:
         return _observe_scan(inputs, body, landmarks)
     capture = open_inputs(inputs, body)
     cameras = _training_cameras(capture, inputs)
+    # Collect cameras and frames before anything is read, so that held-out data never enters the fit.
     files = _scan_files(capture.root, inputs)
     frames = _frames(capture, files, inputs)
     # Leave out scans of held-out frames: they show what held-out cameras saw.
@@ -120,6 +124,7 @@ def observe(
     files = {frame: path for frame, path in files.items() if frame in frames and frame not in held_out}
     keypoints, unread = _keypoints(capture, cameras)
     if not cameras and not files:
+        # Scans alone suffice, and so do cameras alone; without both there is nothing to minimise a distance to.
         _refuse_nothing(capture)
     masks, labels = (_maps(capture, cameras, kind) for kind in ("mask", "label"))
     scans, notes = observed_scans(files, inputs, capture, labels, located)
@@ -127,10 +132,12 @@ def observe(
     # Begin with the fit that there is, else with the body that was found in the reference frame's scan.
     initial, more = _initial(capture, frames, body) if inputs.start else (None, [])
     placed = _placed(landmarks, inputs.frame, body) if landmarks is not None and inputs.frame in frames else {}
+    # Only the reference frame's body can be located, because landmarks and labels are known for that scan alone.
     found, bare = None, None
     if initial is None and located is not None and inputs.frame in frames:
         place = located()
         found, bare = place.params, place.bare_of(body)
+    # The problem is not convex: without a start near the person, Gauss-Newton ends in a local minimum.
     if initial is None and not keypoints and not placed and found is None:
         raise InputError(
             f"capture {capture.name}",
@@ -139,6 +146,7 @@ def observe(
             remedy="detect keypoints (smplxpp keypoints detect, then --keypoints), name a fit with --params, or let "
             "`smplxpp build` find the body in the reference frame",
         )
+    # The shape is one vector for all frames; it must not be fitted to frames that later test the avatar.
     shape = tuple(frame for frame in frames if frame not in held_out)
     if not shape:
         raise InputError(
@@ -165,6 +173,7 @@ def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | Map
     """One scan with a fit, or landmarks, to start from."""
     if inputs.scan is None:
         raise InputError("input", expected="--capture, or --scan with --params", received="neither")
+    # A scan alone does not tell limbs from each other, so that either a fit or landmarks must place the body.
     given = inputs.params if inputs.start else None
     if given is None and landmarks is None:
         raise InputError(
@@ -178,10 +187,13 @@ def _observe_scan(inputs: RegisterInputs, body: BodyModel, landmarks: Path | Map
     if given is not None:
         in_memory = isinstance(given, BodyParams)
         params = given if isinstance(given, BodyParams) else load_params(given, body=body)
+        # One row is the frame's whatever its number; of several rows it is the one with the frame's number.
         initial = params.frame(inputs.frame if len(params) > 1 else 0)
+        # Fail now if the fit is of another body model: the number of joints or betas would not match in the solver.
         _check_body(initial, body, "body parameters" if in_memory else str(given))
     placed = {} if landmarks is None else _placed(landmarks, inputs.frame, body)
     files: dict[int, Path | MeshLike] = {inputs.frame: inputs.scan}
+    # No capture, so that there are no label maps to vote and no body located in this scan.
     scans, _ = observed_scans(files, inputs, None, None, None)
     observations = Observations(
         (inputs.frame,), scans=scans, landmarks=placed, initial=initial, shape_frames=(inputs.frame,)
@@ -231,6 +243,7 @@ def _keypoints(capture: Capture, cameras: Sequence[str]) -> tuple[dict[str, Keyp
         InputError: none of the files can be read.
     """
     found, errors = {}, {}
+    # One broken file costs one camera. Only if all are broken is it an error of the input.
     for name in cameras:
         try:
             points = capture.keypoints(name)
@@ -246,11 +259,13 @@ def _keypoints(capture: Capture, cameras: Sequence[str]) -> tuple[dict[str, Keyp
 
 def _training_cameras(capture: Capture, inputs: RegisterInputs) -> tuple[str, ...]:
     splits = capture.splits
+    # Names that the user holds out must exist: a misspelt one would leak a test camera into the fit.
     unknown = sorted(set(inputs.hold_out) - set(capture.cameras))
     if unknown:
         have = ", ".join(capture.cameras) or "none"
         raise InputError("option hold-out", expected=f"cameras among {have}", received=", ".join(unknown))
     held_out = inputs.hold_out or splits.novel_view_cameras
+    # Cameras that are in no split are left out too.
     known = {*splits.train_cameras, *splits.novel_view_cameras}
     cameras = tuple(name for name in capture.cameras if name in known and name not in held_out)
     if capture.cameras and not cameras:
@@ -264,6 +279,7 @@ def _scan_files(root: Path, inputs: RegisterInputs) -> dict[int, Path | MeshLike
     Raises:
         InputError: a folder without scans.
     """
+    # The scan that is named stands for the reference frame alone.
     if inputs.scan is not None:
         return {inputs.frame: inputs.scan}
     if inputs.scans is None:
@@ -279,6 +295,7 @@ def _scan_files(root: Path, inputs: RegisterInputs) -> dict[int, Path | MeshLike
 def _frames(capture: Capture, scans: Mapping[int, Any], inputs: RegisterInputs) -> tuple[int, ...]:
     """The frames to register: those asked for, or all that are trained on or held out."""
     splits = capture.splits
+    # A frame exists if it has images or a scan.
     have = set(capture.frames) | set(scans)
     if inputs.frames is not None:
         outside = sorted(set(inputs.frames) - have)
@@ -289,6 +306,7 @@ def _frames(capture: Capture, scans: Mapping[int, Any], inputs: RegisterInputs) 
                 received=", ".join(map(str, outside[:_NAMED])),
             )
         return tuple(sorted(inputs.frames))
+    # Frames of scans are registered even outside the split, because the scan itself is then asked for.
     split = {*splits.train_frames, *splits.novel_pose_frames}
     frames = tuple(sorted(frame for frame in have if frame in split or frame in scans))
     if not frames:
@@ -330,6 +348,7 @@ def _initial(capture: Capture, frames: tuple[int, ...], body: BodyModel) -> tupl
     Raises:
         InputError: no frame's fit can be read, or one of another body.
     """
+    # Captures without any parameter file start from keypoints or landmarks.
     if capture.recording.params is None:
         return None, []
     known: dict[int, BodyParams] = {}
@@ -346,7 +365,9 @@ def _initial(capture: Capture, frames: tuple[int, ...], body: BodyModel) -> tupl
         if errors:
             raise next(iter(errors.values()))
         return None, [f"none of the {len(frames)} frames has a fit to start from"]
+    # One check suffices, because all frames' parameters come from one file or folder.
     _check_body(next(iter(known.values())), body, f"capture {capture.name}")
+    # Motion between neighbouring frames is small, so that the nearest frame in time is the best start.
     have = np.array(sorted(known))
     nearest = [int(have[np.abs(have - frame).argmin()]) for frame in frames]
     notes = [
@@ -360,6 +381,7 @@ def _initial(capture: Capture, frames: tuple[int, ...], body: BodyModel) -> tupl
 
 def _check_body(params: BodyParams, body: BodyModel, source: str) -> None:
     """Refuse parameters that another body file was fitted with, by its name."""
+    # A forward pass compares the number of joints, betas and expressions with the model's arrays.
     try:
         body.forward(params)
     except InputError as error:

@@ -54,12 +54,15 @@ def observed_scans(
                 warnings.simplefilter("ignore", GeometryWarning)
                 scan = read_scan(source, units=inputs.units, up=inputs.up)
         except InputError as error:
+            # The scan that the user named must be read, or the registration would silently fit something else.
             if source is inputs.scan or (isinstance(source, Path) and source == inputs.scan):
                 raise
             notes.append(f"frame {frame}: the scan is left out: {error}")
             continue
         mesh = scan.clean.mesh
         labels: Int64[np.ndarray, " V"] | None
+        # Labels of a file are in the file's order of elements; repair removes some, so that they are gathered by
+        # source.
         if frame == inputs.frame and inputs.labels is not None:
             labels = _given_labels(inputs.labels, scan, inputs.label_set)
         else:
@@ -92,10 +95,12 @@ def _voted_labels(
     for name, camera in capture.cameras.items():
         labels = maps(name, frame)
         if labels is not None and (labels < len(LABELS)).any():
+            # Values from the number of labels on (255 for "elsewhere") become BACKGROUND, which casts no vote.
             views.append((camera, np.where(labels < len(LABELS), labels.astype(np.int64), BACKGROUND)))
     if not views:
         return None
     try:
+        # (M, L): for each face the weight of its votes by label.
         faces = vote_on_faces(mesh, views)
     except InputError:  # maps that show nothing of the scan: nothing is known of it
         return None

@@ -43,6 +43,7 @@ def opened(
         InputError: no capture, or files named beside an open one that was opened with others.
     """
     file = None if isinstance(params, BodyParams) else params
+    # An open capture has been read with its options already; other options cannot be applied to it afterwards.
     if isinstance(capture, Capture):
         if protocol not in (None, capture.protocol):
             raise InputError("protocol", expected=f"that of the capture, {capture.protocol}", received=str(protocol))
@@ -54,11 +55,13 @@ def opened(
                     received="a folder beside an open capture",
                 )
         if file is not None:
+            # Only the parameters are exchanged: images, masks and keypoints of the open capture stay as they are.
             again = open_capture(capture.root, params=file, body=body, protocol=protocol)
             capture = replace(capture, recording=replace(capture.recording, params=again.recording.params))
     else:
         capture = open_capture(capture, params=file, body=body, protocol=protocol, keypoints=keypoints, masks=masks)
     if isinstance(params, BodyParams):
+        # One row belongs to the reference frame; several rows are the frames from 0 on.
         frames = (frame,) if len(params) == 1 else tuple(range(len(params)))
         return with_params(capture, frames, params, estimated=False)
     return capture

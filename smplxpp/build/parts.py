@@ -32,10 +32,13 @@ def clean_scan(
     parts, checks, numbers = {}, [], {}
     for name, part in cleaned.items():
         parts[name] = Part(part.mesh, part.label, part.source_vertex, np.asarray(part.vertex_colors))
+        # One-sided distance, from the part to the scan: simplification may cut corners, but must not invent surface.
         distance = point_to_surface(part.mesh.vertices, scan.mesh)[0] * MM
         quality = mesh_quality(part.mesh)
         numbers[name] = {"faces": part.mesh.face_count, "quality": quality, "report": part.report}
         checks += [
+            # No edge may have three faces or more: the Laplacian that spreads skin weights over the part is that of a
+            # 2-manifold.
             Check(f"{name}: non-manifold edges", quality.nonmanifold_edges, "", 0, 0),
             Check(f"{name}: vertices to scan, p95", float(np.percentile(distance, 95)), "mm", 2.0, 5.0),
         ]
@@ -59,6 +62,7 @@ def transfer_to_parts(
         mesh, source, found = _without_bridges(part.mesh, fit, body, settings, config.bridges)
         parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
         weights[name] = found
+        # Rows must sum to one, or blended transforms scale the part: T = sum_j w_j T_j is affine only then.
         report = weight_report(found)
         numbers[name] = {
             "matched_share": float(found.matched.mean()),
@@ -68,6 +72,7 @@ def transfer_to_parts(
             "web_faces": part.mesh.face_count - mesh.face_count,
             "web_area_share": 1.0 - float(mesh.face_areas.sum() / part.mesh.face_areas.sum()),
         }
+        # 1e-12 is the round-off of a sum of a few weights in double precision.
         checks += [
             Check(f"{name}: rows off partition of unity", report.row_sum_error, "", 1e-12, 1e-9),
             Check(f"{name}: negative weights and silent zero rows", report.negative + report.zero_rows, "", 0, 0),
@@ -110,12 +115,18 @@ def unpose_parts(
     """Bring the parts to the T-pose, by the inverse of the skinning that will drive them."""
     results, checks, numbers = {}, [], {}
     for name, part in parts.items():
+        # Inverse of linear blend skinning: v_rest = (sum_j w_j T_j)^-1 v_posed for each vertex.
         result = unpose(part.mesh.vertices, weights[name], fit.posed_from_rest)
+        # Edges that grow at rest were folded or bridged in the scan's pose; their 99.9th percentile finds webs that
+        # remain.
         stretch = stretch_report(part.mesh, part.mesh.with_vertices(result.vertices))
         results[name] = result
         numbers[name] = {"stretch": stretch.as_dict()}
+        # Posing the result again must give the scan back up to round-off; the limits are millimetres.
         checks += [
             Check(f"{name}: round trip", result.report.round_trip_max * MM, "mm", 1e-6, 1e-3),
+            # The determinant of the blended 3x3 falls where bones turn against each other (the "candy wrapper" of
+            # LBS); 1 is a rotation.
             Check(
                 f"{name}: smallest determinant",
                 result.report.determinant_min,

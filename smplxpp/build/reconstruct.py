@@ -60,12 +60,14 @@ def usable_cameras(capture: Capture, hold_out: tuple[str, ...]) -> tuple[str, ..
     Raises:
         InputError: an unknown camera, or none is left.
     """
+    # A misspelt name would leak a held-out camera into the surface.
     splits = capture.splits
     unknown = sorted(set(hold_out) - set(capture.cameras))
     if unknown:
         raise InputError(
             "option hold-out", expected=f"cameras among {', '.join(capture.cameras)}", received=", ".join(unknown)
         )
+    # The same rule as in a registration, so that both see the same cameras.
     known = {*splits.train_cameras, *splits.novel_view_cameras}
     held_out = hold_out or splits.novel_view_cameras
     cameras = tuple(name for name in capture.cameras if name in known and name not in held_out)
@@ -82,6 +84,7 @@ def usable_frames(capture: Capture, frames: tuple[int, ...] | None) -> tuple[int
     """
     splits = capture.splits
     if frames is None:
+        # Without a choice take all frames that are trained on and have images.
         frames = tuple(frame for frame in splits.train_frames if frame in set(capture.frames))
         if not frames:
             raise InputError(f"capture {capture.name}", expected="training frames with images", received="none")
@@ -94,6 +97,7 @@ def usable_frames(capture: Capture, frames: tuple[int, ...] | None) -> tuple[int
             expected=f"frames that capture {capture.name} has ({have})",
             received=", ".join(map(str, unknown[:_NAMED])),
         )
+    # A surface from a held-out frame would show the avatar what it is tested on.
     held_out = sorted(set(frames) & set(splits.novel_pose_frames))
     if held_out:
         raise InputError(
@@ -111,6 +115,7 @@ def check_masks(capture: Capture, cameras: tuple[str, ...], frames: tuple[int, .
     Raises:
         InputError: no frame has masks of any camera.
     """
+    # The visual hull is the start of every reconstruction; one mask anywhere shows that masks exist at all.
     for frame in frames:
         if any(capture.file(name, frame, "mask") is not None for name in cameras):
             return
@@ -125,6 +130,7 @@ def check_masks(capture: Capture, cameras: tuple[str, ...], frames: tuple[int, .
 def photographs(capture: Capture, cameras: tuple[str, ...], frame: int) -> tuple[list[PhotoView], list[str]]:
     """Read the photographs and masks of a frame, with a note on each that is missing or cannot be read."""
     views, notes = [], []
+    # Notes instead of errors, since the hull tolerates missing cameras; how many are needed is decided later.
     for name in cameras:
         if capture.file(name, frame) is None:
             continue
@@ -166,6 +172,7 @@ def reconstruct_frame(
     """
     views, notes = photographs(capture, cameras, frame)
     result = make(views, progress=progress)
+    # Intersection over union of the rendered surface and the mask, for the views that the reconstruction used.
     agreement = silhouette_agreement(result.mesh, [view for view in views if view.name in result.numbers["views"]])
     return result, {**result.numbers, "silhouettes": agreement, "problems": [*notes, *result.notes]}
 
@@ -178,9 +185,12 @@ def _adopt(views: list[PhotoView], *, mesh: Path, root: Path, progress: Progress
     """Bring another program's surface to the cameras' world and colour it."""
     progress("masks", 0.0)
     raw = read_raw_mesh(mesh)
+    # Other programs centre and scale the scene. Try the known normalisations and keep that whose silhouettes agree
+    # best.
     usable, _ = usable_views(views)
     surface, space, shares = mesh_in_world(sanitize(raw.vertices, raw.faces).mesh, usable, unit_cube_of(root))
     progress("colours", 0.0)
+    # Colours come from our own photographs, because meshes of neural fields often carry none.
     result = adopt_surface(surface, views)
     result.numbers.update(space=space, agreement_by_space=shares)
     return result
@@ -208,6 +218,8 @@ def reconstruction_output(
 
 def _checks(frames: list[dict[str, Any]], asked: int) -> list[Check]:
     """Limits held by the worst frame of each number."""
+    # The worst frame decides, because one bad frame spoils the motion. Silhouettes are averaged over a frame's views
+    # first.
     unseen = max(one["unseen"] for one in frames)
     silhouettes = min(float(np.mean(list(one["silhouettes"].values()))) for one in frames)
     left_out = max(len(one["left_out"]) / (len(one["left_out"]) + len(one["views"])) for one in frames)
@@ -226,6 +238,7 @@ def _checks(frames: list[dict[str, Any]], asked: int) -> list[Check]:
             left_out,
             explanation=f"contradicted by the others: {', '.join(names)}" if names else "none contradicts the others",
         ),
+        # Up to half of the frames may lack a surface: scans only refine a registration that has keypoints.
         Check(
             "frames without a surface",
             float(asked - len(frames)),

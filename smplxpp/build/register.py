@@ -38,6 +38,7 @@ class Residual:
 
 
 RESIDUALS: dict[str, Residual] = {
+    # Gates in pixels are shares of the image's height, since pixels depend on the resolution; others are millimetres.
     "keypoints_px": Residual("keypoints to the body", "px", (0.01, 0.03)),
     "landmarks_mm": Residual("landmarks to the body", "mm", (20.0, 50.0)),
     "silhouette_px": Residual("silhouette to the mask", "px"),
@@ -90,6 +91,7 @@ def register_observed(
         initial = follow(body, observations, observed.found, at=at, config=config, progress=progress)
         lost = lost_frames(body, observations, initial, at=at)
         observations = replace(observations, initial=initial)
+    # Gauss-Newton over pose, translation and one shape for all frames, from keypoints, masks, scans and priors.
     fit = register(body, observations, config, progress=progress)
     if not fit.frames:
         raise InputError(
@@ -100,10 +102,12 @@ def register_observed(
         )
     notes = (*observed.all_notes(), *fit.notes, *lost)
     content = summary(body, observations, fit, notes)
+    # Medians are robust against the few frames in which a limb is hidden; a residual that no frame has is left out.
     medians = {
         when: {name: float(np.nanmedian(values)) for name, values in found.items() if np.isfinite(values).any()}
         for when, found in content["residuals"].items()
     }
+    # Without a split all frames take part in the fit of the shape.
     shape_frames = observations.shape_frames or observations.frames
     numbers = {
         "frames": len(fit.frames),
@@ -131,8 +135,10 @@ def by_camera(body: BodyModel, observed: Observations, fit: BodyFit) -> dict[str
 
     Every keypoint with a confidence counts, whether the solver used it or not.
     """
+    # Keep the order of first mention, so that columns are equal from run to run. Cameras may differ in their names.
     names = list(dict.fromkeys(name for found in observed.keypoints.values() for name in found.names))
     landmarks = LandmarkModel.of(body, names)
+    # Rows of the initial parameters are those of the observed frames, not of the registered ones.
     at = {frame: row for row, frame in enumerate(observed.frames)}
     fits = {"after": _landmark_points(body, fit.params, landmarks)} if observed.keypoints else {}
     if fits and observed.initial is not None:
@@ -140,11 +146,13 @@ def by_camera(body: BodyModel, observed: Observations, fit: BodyFit) -> dict[str
         fits = {"before": _landmark_points(body, start, landmarks), **fits}
     out: dict[str, dict[str, Any]] = {}
     for name, keypoints in observed.keypoints.items():
+        # (F, K) confidences and (F, K, 2) pixels; frames or landmarks that a camera lacks have a confidence of zero.
         seen = keypoints.select(landmarks.names, fit.frames)
         counted = seen.confidence > 0
         if counted.any():
             out[name] = {"points": int(counted.sum())}
             for when, points in fits.items():
+                # World points to pixels; the third column, depth, is not needed.
                 pixels = observed.cameras[name].screen_from_world(points.reshape(-1, 3))[:, :2]
                 distance = np.linalg.norm(pixels.reshape(seen.points.shape) - seen.points, axis=-1)
                 out[name][when] = _spread_of(distance[counted])
@@ -171,9 +179,11 @@ def frame_confidence(confidence: Float64[np.ndarray, "F J"]) -> Float64[np.ndarr
 
 def registration_checks(observed: Observations, fit: BodyFit) -> list[Check]:
     """Check the medians of the residuals, and the shares of frames registered and observed."""
+    # Median height in pixels over the cameras, 1 where there are none and no residual in pixels exists.
     height = float(np.median([camera.height for camera in observed.cameras.values()] or [1]))
     checks = []
     for name, residual in RESIDUALS.items():
+        # NaN stands for a frame in which nothing of this kind was observed.
         values = np.asarray(fit.residuals.get(name, ()), dtype=np.float64)
         if residual.gate is None or not np.isfinite(values).any():
             continue
@@ -198,6 +208,7 @@ def registration_checks(observed: Observations, fit: BodyFit) -> list[Check]:
             explanation=f"without frames {_few(missing)}" if missing else f"all {len(fit.frames)}",
         )
     )
+    # A frame may have converged and still be the priors' guess, if all joints were hidden.
     means = frame_confidence(fit.confidence)
     doubtful = [frame for frame, mean in zip(fit.frames, means, strict=True) if mean < CONFIDENT]
     checks.append(

@@ -75,10 +75,13 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -
         path, raw = None, _raw_of(scan)
     name = "in memory" if path is None else path.name
     note = ""
+    # A search for units and axis needs faces; a cloud gets a coarse surface for it, because the full one needs
+    # metres.
     if AUTO in (units, up):
         vertices, faces = (raw.vertices, raw.faces) if not raw.is_cloud else _rough_surface(raw)
         frame = find_scan_frame(vertices, faces, units=units, up=up)
         units, up, note = frame.units, frame.up, frame.note
+    # From here on metres and +Y up; faces keep their orientation, since the change of axes is a rotation.
     vertices = convert_points(raw.vertices, units=units, up=up)
     try:
         clean = _of_cloud(path, raw, units, up) if raw.is_cloud else sanitize(vertices, raw.faces)
@@ -89,6 +92,7 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -
             received=error.received,
             remedy=error.remedy,
         ) from None
+    # The last guard of the units: a scan in centimetres, inches or millimetres that was read as metres fails here.
     check_human_scale(clean.mesh.vertices, subject=f"scan {name}")
     return ScanFile(raw, clean, units, up, note)
 
@@ -110,6 +114,7 @@ def scan_file_labels(
         InputError: no labels, another number of them than vertices or faces, or unknown ids.
     """
     vertex_count, face_count = len(raw.vertices), len(raw.faces)
+    # An array has lost its file's layout, so that its length alone tells vertices from faces.
     if isinstance(labels, np.ndarray):
         check_element_count(labels, vertex_count=vertex_count, face_count=face_count, subject="labels of the scan")
         found = map_labels(labels, label_set)
@@ -139,6 +144,8 @@ def _of_cloud(path: Path | None, raw: RawMesh, units: str, up: str) -> Sanitized
     if path is None:
         surface = _make_surface(raw, units, up)
     else:
+        # Poisson reconstruction is slow. The file's time and size are the key of the cache; the points are not
+        # compared.
         state = path.stat()
         surface = _surface(_Cloud(path, state.st_mtime_ns, state.st_size, units, up, raw))
     name = "scan in memory" if path is None else path.name
@@ -146,6 +153,7 @@ def _of_cloud(path: Path | None, raw: RawMesh, units: str, up: str) -> Sanitized
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)  # defects of our own reconstruction are not the user's
         clean = sanitize(surface.mesh.vertices, surface.mesh.faces)
+    # Vertices of the surface are traced to the nearest points of the cloud; its faces have no counterpart, hence -1.
     return Sanitized(
         clean.mesh,
         surface.source_point[clean.source_vertex],

@@ -94,19 +94,27 @@ def views_of_scan(
     Raises:
         InputError: fewer than two pictures with a person in them.
     """
+    # Vertices that no face uses may lie anywhere and would widen the frame of the pictures.
     used = mesh.vertices[np.unique(mesh.faces)]
     # Middle grey: neither light nor dark hair and clothes vanish before it.
     style = ShadeStyle(background=(128, 128, 128), relief=1.0 if colors is None else config.relief)
+    # The cameras stand on a circle around the vertical axis. The detector was trained on upright people.
     keypoints, cameras = {}, {}
     for k, camera in enumerate(turntable_cameras(used, count=config.count, height=config.height)):
         people = detector(render_shaded(mesh, camera, vertex_colors=colors, style=style))
+        # The first person is the most confident one; a scan holds one person.
         if people:
             name = f"view {k}"
             cameras[name] = camera
             keypoints[name] = Keypoints2D(
-                detector.names, np.array([0]), people[0].points[None], people[0].confidence[None]
+                # One frame with number 0: (1, K, 2) points and (1, K) confidences.
+                detector.names,
+                np.array([0]),
+                people[0].points[None],
+                people[0].confidence[None],
             )
         progress("views", (k + 1) / config.count)
+    # Two rays are the least that intersect in a point.
     if len(cameras) < 2:
         raise InputError(
             "scan",
@@ -128,20 +136,26 @@ def facing(landmarks: Mapping[str, tuple[Float64[np.ndarray, " 3"], float]]) -> 
         left, right = (landmarks.get(pair.format(side)) for side in ("left", "right"))
         if left is not None and right is not None:
             across += left[0] - right[0]
+    # The vector from right to left, turned by -90 degrees about +Y: (x, 0, z) -> (-z, 0, x). Left +X gives +Z.
     front = np.array([-across[2], 0.0, across[0]])
     length = float(np.linalg.norm(front))
     return front / length if length > 0 else None
 
 
 def _landmarks(seen: Triangulation, config: ScanViews) -> Landmarks:
+    # (V, K): the confidence of each view for each landmark.
     weights = np.stack([seen.keypoints[name].confidence[0] for name in seen.cameras if name in seen.keypoints])
     rows = [k for k, name in enumerate(seen.cameras) if name in seen.keypoints]
+    # RANSAC's inliers (K, V of all cameras), restricted to views with detections; a view of zero confidence does not
+    # vote.
     agree = seen.inliers[0][:, rows].T & (weights > 0)
     out: Landmarks = {}
     for k, name in enumerate(seen.names):
         count = int(agree[:, k].sum())
+        # A point that few views agree on is dropped: two wrong detections may intersect by chance.
         if count < config.least_views or not np.isfinite(seen.points[0, k]).all():
             continue
+        # Mean confidence of the views that agree, times the share of agreeing views among those that see the point.
         certainty = weights[agree[:, k], k].mean() * count / max((weights[:, k] >= _SEEN).sum(), count)
         out[name] = (seen.points[0, k], float(np.clip(certainty, 0.0, 1.0)))
     return out

@@ -54,6 +54,7 @@ def label_source(inputs: BuildInputs) -> str:
     """Return where labels come from: a "file" (or the scan's own), "views" and their label maps, or the "body"."""
     if inputs.label_source == "body":
         return "body"
+    # Labels that the user names come first, then label maps, then labels in the scan's own file, and last the body.
     if inputs.labels is None and inputs.label_maps:
         return "views"
     if inputs.labels is not None:
@@ -91,6 +92,7 @@ def label_faces(
         before = label_by_body(scan.mesh, body, params, colors=scan.own_colors)
     else:
         before = _by_file(scan, inputs, file)
+    # Corrections by hand come last: they overrule every source of labels.
     result = (corrections or Corrections()).apply(scan.mesh, before)
     labelled = LabelledFaces(result, before)
     return labelled, _measured(scan.mesh, labelled, source)
@@ -99,6 +101,7 @@ def label_faces(
 def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str) -> StageOutput:
     """Check the confidence, and the share of the surface that nothing saw or that is uncertain, by area."""
     result, uncertain = labelled.result, 0.5  # confidence below which a label should be looked at
+    # Normalised by area, so that `areas @ x` is the mean over the surface, whatever the density of faces.
     areas = mesh.face_areas / mesh.face_areas.sum()
     confidence = Check(
         "label confidence, mean",
@@ -110,6 +113,7 @@ def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str) -> Stage
         explanation="area-weighted; how clearly the labels speak for the answer",
     )
     if source == "body":
+        # Body and colours see every face, so that coverage says nothing here; low confidence does.
         coverage = Check(
             "share of the surface with a doubtful label",
             float(areas @ (result.confidence < uncertain)),
@@ -121,6 +125,7 @@ def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str) -> Stage
         )
     else:
         coverage = Check(
+            # Faces that no view sees, such as soles and armpits, take their neighbours' label in the graph cut.
             "share of the surface no label saw",
             float(areas @ ~result.seen),
             "",
@@ -153,6 +158,7 @@ def _by_views(scan: PreparedScan, inputs: BuildInputs, body: BodyModel, params: 
             remedy="put cameras.json or calibration.csv into the capture",
         )
     cameras = {camera.name: camera for camera in read_cameras(file)}
+    # Label maps of an unknown camera show that the wrong calibration file was found.
     missing = sorted(set(inputs.label_maps) - set(cameras))
     if missing:
         raise InputError(
@@ -163,6 +169,7 @@ def _by_views(scan: PreparedScan, inputs: BuildInputs, body: BodyModel, params: 
     views = [
         (cameras[name], read_label_map(path, label_set=inputs.label_set)) for name, path in inputs.label_maps.items()
     ]
+    # Each map is compared with the votes of the others; see `vote_in_agreement`.
     agreed = vote_in_agreement(scan.mesh, views)
     # A map that the others contradict is left out: an estimator's mistake would otherwise reach the template.
     notes = tuple(
@@ -172,6 +179,7 @@ def _by_views(scan: PreparedScan, inputs: BuildInputs, body: BodyModel, params: 
     for note in notes:
         warnings.warn(note, GeometryWarning, stacklevel=2)
     colors = scan.own_colors
+    # A prior for faces with few votes: which label the body's region and the scan's colours make likely.
     prior = label_by_body(scan.mesh, body, params, colors=colors)
     result = segment_scan(scan.mesh, votes=agreed.votes, colors=colors, prior=prior)
     return replace(result, notes=(*notes, *result.notes))
@@ -188,6 +196,8 @@ def _by_file(scan: PreparedScan, inputs: BuildInputs, file: ScanFile | None) -> 
         raise InputError("labels", expected="the scan that they are of", received="none")
     source = inputs.scan if inputs.labels is None else inputs.labels
     assert isinstance(source, Path | np.ndarray), "labels are a file or an array"
+    # Labels are in the file's order. The repair of the scan dropped and split elements, so that they are gathered by
+    # source.
     labels, of_faces = scan_file_labels(source, raw, label_set=inputs.label_set)
     if of_faces:
         return segment_scan(scan.mesh, face_labels=_taken(labels, scan.source_face, "source_face"))
@@ -200,6 +210,7 @@ def _taken(labels: np.ndarray, source: np.ndarray, name: str) -> np.ndarray:
     Raises:
         InputError: places that the file does not have.
     """
+    # An index beyond the file means that the prepared scan was made of another version of it.
     if source.size and source.max() >= len(labels):
         raise InputError(
             f"scan: {name}", expected=f"places below {len(labels)} in its file", received=f"up to {int(source.max())}"

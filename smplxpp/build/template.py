@@ -130,6 +130,7 @@ class _Build:
     def run(self) -> BuildResult:
         """Run the steps in order."""
         config, inputs, body = self.config, self.inputs, self.body
+        # Ask for optional programs and read small files first: a missing one would be noticed only after minutes.
         require_remesher(config.remesh)
         if config.detector is not None:
             load_detector(config.detector)
@@ -140,6 +141,7 @@ class _Build:
             self._reconstruct(self.plan.reconstruction)
         located, registration = None, None
         file: ScanFile | None = None
+        # Locating reads the scan already, which is kept, because Poisson surfaces of clouds are expensive.
         if inputs.locates:
             with self._step("locate") as step:
                 file = self._read_scan()
@@ -151,6 +153,7 @@ class _Build:
         with self._step("capture") as step:
             file = file or self._read_scan()
             scan, step.output = prepare_scan(file)
+            # One row of parameters: the template is built in the reference frame's pose.
             params = self._params(located, registration)
         with self._step("body") as step:
             fit, step.output = pose_fit(scan.mesh, body, params)
@@ -169,6 +172,7 @@ class _Build:
         with self._step("assemble") as step:
             template, step.output = assemble_parts(body, params, scan, face_labels, fit, cleaned, parts, config)
         with self._step("validate") as step:
+            # The motion that the template is tried with: the registered one, else the given one; None without either.
             motion = registration.fit.params if registration is not None else given_motion(inputs, body)
             _, step.output = validate_template(template, params, scan, face_labels, posed, motion, inputs, config)
         return BuildResult(template, parts, BuildReport(self.outputs, self.seconds), self._capture(registration))
@@ -191,6 +195,7 @@ class _Build:
         with self._step("reconstruct") as step:
             capture = open_photographs(asked)
             cameras = usable_cameras(capture, asked.hold_out)
+            # The plan asks for the reference frame alone.
             (frame,) = usable_frames(capture, asked.frames)
             check_masks(capture, cameras, (frame,))
             surface, numbers = reconstruct_frame(capture, cameras, frame, surface_maker(asked), ignore_progress)
@@ -223,6 +228,7 @@ class _Build:
         request, config = self.request, self.config
         if request.capture is None:
             return None
+        # A registration replaces the parameters of the capture, so that the files of a fit are not read.
         given = request.params if isinstance(request.params, BodyParams) else request.named_params
         capture = opened(
             request.capture,
@@ -235,6 +241,7 @@ class _Build:
         )
         if registration is None:
             return capture
+        # Marked as estimated, so that evaluations do not take them for ground truth.
         return with_params(capture, registration.fit.frames, registration.fit.params, estimated=True)
 
 

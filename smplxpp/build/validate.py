@@ -73,12 +73,14 @@ def validate_template(
         inputs: they name photographs, which tell a mirrored scan.
         config: choices of the build.
     """
+    # Pose with the parameters of the scan: the template should then lie on the scan.
     posed = template.mesh.with_vertices(template.pose(params)[0])
     found, checks, numbers = _against_scan(posed, template.vertex_labels, scan.mesh, face_labels, config)
     whole, numbers["completeness"] = completeness_checks(template, params, scan.mesh, face_labels, found.to_template)
     checks += whole
     seen, numbers["photographs"] = photograph_checks(template, params, scan.mesh, scan.colors, inputs)
     checks += seen
+    # Quality at rest, because the rest pose is what is exported.
     quality = {name: mesh_quality(template.part_mesh(name)) for name in template.part_names}
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
     numbers["shared_volume"] = _shared_volumes(template)
@@ -113,17 +115,22 @@ def _against_scan(
     config: BuildConfig,
 ) -> tuple[Validation, list[Check], dict]:
     """Distances between the posed template and the scan, both ways, by label."""
+    # Scanners do not see pockets, armpits and inner layers: only points visible from outside are compared.
     measured = partial(
         directed_distances, samples=config.samples, seed=config.seed, config=CompareConfig(visible_only=True)
     )
+    # Both directions with one seed: template to scan finds invented surface, scan to template finds lost surface.
     forth = measured(posed, scan, source_labels=vertex_labels, target_labels=face_labels)
     back = measured(scan, posed, source_labels=face_labels, target_labels=vertex_labels)
     result = summarize(forth, back, convention=convention_named("smplxpp"), threshold_mm=5.0)
     checks = []
     for label in LABELS:
         found = result.labels.get(label.name)
+        # Skin is checked below, since its distance measures the fit and not the template.
         if found is None or found.pred_to_gt is None or label == SKIN:
             continue
+        # Millimetres, (warn, fail) of the mean and of the p95. Hair and shoes get wider limits, because
+        # simplification costs their fine shapes more.
         warn, fail = ((1.0, 3.0), (2.0, 6.0)) if label in CLOTH_LABELS else ((2.0, 6.0), (5.0, 15.0))
         checks += [
             Check(f"template to scan, {label.name}: mean", found.pred_to_gt.mean, "mm", warn[0], fail[0]),
@@ -131,6 +138,7 @@ def _against_scan(
         ]
     skin = face_labels == SKIN.id
     if skin.any():
+        # Only vertices of faces that are skin on the scan itself, whose distance is the error of the body's fit.
         points = scan.vertices[np.unique(scan.faces[skin])]
         fit = float(point_to_surface(points, posed)[0].mean() * MM)
         checks.append(
@@ -146,12 +154,14 @@ def _shared_volumes(template: Template) -> dict[str, dict[str, float]]:
     """
     thickness = 1e-3  # metres, inward
     meshes = {name: template.part_mesh(name) for name in template.part_names}
+    # Shared volumes are those of solids: the body's openings are closed by fans of faces, cloth gets a thickness.
     solids = {
         name: closed_mesh(mesh) if name == BODY_PART else thickened(mesh, inward=thickness)
         for name, mesh in meshes.items()
     }
     out = {}
     for a, b in combinations(solids, 2):
+        # `interpenetration` refuses meshes that bound no volume.
         with suppress(InputError):
             out[f"{a}, {b}"] = interpenetration(solids[a], solids[b]).as_dict()
     return out
@@ -159,12 +169,14 @@ def _shared_volumes(template: Template) -> dict[str, dict[str, float]]:
 
 def _turned_faces(template: Template, posed: TriangleMesh, parts: Mapping[str, Part]) -> int:
     """Faces of the posed template's parts that face away from where they faced on the cleaned scan."""
+    # A face lies within one part, so that its first corner tells the part.
     part_of_face = template.vertex_part[template.faces[:, 0]]
     turned = 0
     for name, part in parts.items():
         there = posed.submesh(part_of_face == template.part_names.index(name))[0]
         # Faces that close holes follow the scan's faces.
         scanned = there.face_cross[: part.mesh.face_count]
+        # Twice the area times the normal of each face; a negative dot product means turned by more than 90 degrees.
         turned += int((np.einsum("ij,ij->i", part.mesh.face_cross, scanned) < 0).sum())
     return turned
 
@@ -182,13 +194,16 @@ def _stretch(template: Template, params: BodyParams, names: list[str]) -> tuple[
     """
     vertices = template.pose(params)
     out: dict[str, dict] = {}
+    # The body's stretch is that of the model itself and says nothing about the template.
     for part in template.part_names:
         if part == BODY_PART:
             continue
         chosen = template.vertex_part[template.faces[:, 0]] == template.part_names.index(part)
         rest = template.mesh.submesh(chosen)[0]
+        # Sorted, as `submesh` orders its vertices, so that `vertices[k][used]` matches the part's mesh.
         used = np.unique(template.faces[chosen])
         loops = border_loops(rest.faces)
+        # An opening is a border loop: a hem, a cuff or a neckline.
         longest = loops[int(np.argmax(loop_lengths(rest, loops)))] if loops else None
         out[part] = {}
         for k, name in enumerate(names):
@@ -196,6 +211,8 @@ def _stretch(template: Template, params: BodyParams, names: list[str]) -> tuple[
             report = stretch_report(rest, posed).as_dict()
             out[part][name] = {**report, "opening": 1.0 if longest is None else _lengthened(rest, posed, longest)}
     worst = max(
-        (pose["p999"] / max(pose["opening"], 1.0) for poses in out.values() for pose in poses.values()), default=1.0
+        # Division by at least 1: an opening that shrinks must not excuse stretched cloth.
+        (pose["p999"] / max(pose["opening"], 1.0) for poses in out.values() for pose in poses.values()),
+        default=1.0,
     )
     return out, worst
