@@ -14,8 +14,8 @@ from rich.logging import RichHandler
 from pipelines.commands.animate import Animate
 from pipelines.commands.build import Build
 from pipelines.commands.evaluate import Evaluate
-from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.talk import Talk
+from pipelines.commands.templates import BUNDLE_SUFFIX, export_bundle
 from pipelines.commands.train import Train
 from pipelines.commands.web import Web
 from pipelines.report.sections.build import rewrite_report
@@ -72,7 +72,7 @@ class Demo:
 
     def _talk(self, console: Console) -> dict[str, Path]:
         """Let her say something, in the report and in a page; where the extra is not installed, say how to get it."""
-        avatar = self.out / f"me{SUFFIX}"
+        avatar = self.out / f"me{BUNDLE_SUFFIX}"
         params = self.out / REFINED_PARAMS
         export_bundle(self.out, avatar, name=NAME, licence=LICENCE, params=params, exact=False)
         page = self.out / "talking.html"

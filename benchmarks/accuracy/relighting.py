@@ -24,7 +24,7 @@ import tyro
 
 from avatar.runtime import AvatarPlayer
 from benchmarks.support.results import FIXTURE, store_results
-from pipelines.commands.export_bundle import export_bundle
+from pipelines.commands.templates import export_bundle
 from pipelines.stages.run_inputs import params_in_use
 from pipelines.synth.person import person_of, read_layers
 from pipelines.synth.soft_light import LightConfig, environment_light, stage_light, vertex_light

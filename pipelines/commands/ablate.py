@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from pipelines.ablation.ablate import AblationOutcome
 
 
-UNTOLD = ("run_folder", "capture", "params", "body", "max_minutes", "device", "force", "json")
+_NOT_IN_RECORD = ("run_folder", "capture", "params", "body", "max_minutes", "device", "force", "json")
 
 
 @dataclass(frozen=True)
 class Ablate:
-    """Options of `smplxpp ablate`. The same command goes on with an ablation that was interrupted."""
+    """Options of `smplxpp ablate`. The same command resumes an ablation that was interrupted."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `smplxpp build` wrote; the ablation goes into RUN/ablation."""
@@ -39,7 +39,7 @@ class Ablate:
     rows: tuple[str, ...] = ("paper",)
     """Rows by name, or groups of them: paper, options, baselines, all. See docs/ablation.md."""
     iterations_share: float = 1.0
-    """Share of the preset's iterations of every training: 0.25 is a quarter of the time, and less good."""
+    """Fraction of the preset's iterations of every training: 0.25 takes a quarter of the time and is less accurate."""
     gaussians: OptionalInt = None
     """Number of Gaussians, in the place of the preset's."""
     scale: float = 1.0
@@ -59,14 +59,14 @@ class Ablate:
     body: OptionalPath = None
     """SMPL-X-layout body file that the parameters are for; the open body by default."""
     max_minutes: float = math.inf
-    """Stop after as many minutes and print the rows that are finished; the same command
-    then goes on (without --force, which would begin anew)."""
+    """Stop after this many minutes and print the finished rows. The same command then resumes, without --force, which
+    would start again."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
-    """Decides everything random."""
+    """Seed of all random numbers."""
     force: bool = False
-    """Train the rows anew even if they stand."""
+    """Train the rows again even if they are up to date."""
     json: bool = False
     """Print the results as JSON."""
 
@@ -81,10 +81,12 @@ class Ablate:
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.scene import TrainInputs
 
+        # Check folder and options before anything is trained: all rows together take hours.
         keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         for name, value in (("max-minutes", self.max_minutes), ("iterations-share", self.iterations_share)):
             if not value > 0:
                 raise InputError(f"option {name}", expected="a number above 0", received=f"{value:g}")
+        # Every row is measured by the same protocol; rendering speed is not part of the table.
         rows, preset = ablation_rows(self.rows), self.training()
         config = EvaluationConfig(
             protocol=ProtocolConfig(every=self.every), metric=self.metric, samples=self.samples, speed_pictures=0
@@ -105,17 +107,18 @@ class Ablate:
         return outcome.results
 
     def command(self) -> str:
-        """What was asked for, without where it lies and how long it may take."""
-        told = ["smplxpp ablate RUN --capture DIR"]
+        """Return the command line for the table's record, without paths, limits and display options."""
+        words = ["smplxpp ablate RUN --capture DIR"]
         for f in fields(self):
             value = getattr(self, f.name)
-            if f.name not in UNTOLD and (value != f.default or f.name == "preset"):
+            # The preset is always stated, other options only where they differ from their defaults.
+            if f.name not in _NOT_IN_RECORD and (value != f.default or f.name == "preset"):
                 shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
-                told.append(f"--{f.name.replace('_', '-')} {shown}")
-        return " ".join(told)
+                words.append(f"--{f.name.replace('_', '-')} {shown}")
+        return " ".join(words)
 
     def training(self) -> TrainingPreset:
-        """The preset with the options' changes.
+        """Return the preset with the changes of the options.
 
         Raises:
             InputError: numbers out of range.
@@ -141,7 +144,7 @@ Training = Callable[[str, "TrainingProgress"], None]
 
 @contextmanager
 def _progress(*, enabled: bool) -> Iterator[tuple[Training, ProgressCallback]]:
-    """A bar a piece with loss, held-out PSNR and speed, and one while a row is measured."""
+    """Show a bar with loss, held-out PSNR and speed for each training, and one while a row is measured."""
     columns = (
         TextColumn("{task.description:<18}"),
         BarColumn(bar_width=10),
@@ -151,6 +154,7 @@ def _progress(*, enabled: bool) -> Iterator[tuple[Training, ProgressCallback]]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
+    # Bars appear when their training reports first, so that rows up to date show none.
     tasks: dict[str, Any] = {}
     quality: dict[str, str] = {}
     with Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0) as bar:
@@ -161,6 +165,7 @@ def _progress(*, enabled: bool) -> Iterator[tuple[Training, ProgressCallback]]:
             return tasks[name]
 
         def training(name: str, state: TrainingProgress) -> None:
+            # Most steps have no evaluation; show the PSNR of the last one.
             if state.evaluation is not None and "psnr" in state.evaluation["mean"]:
                 quality[name] = f"PSNR {state.evaluation['mean']['psnr']:.2f} dB"
             figures = [f"loss {state.metrics['loss']:.4f}"] if "loss" in state.metrics else []

@@ -16,9 +16,8 @@ from rich.progress import track
 
 from pipelines.commands.animate_student import StudentFilm, student_frames
 from pipelines.commands.driving import Driving, unshaped
-from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import ClothMode, Lighting, OptionalFloat, OptionalInt
-from pipelines.commands.templates import load_run_template
+from pipelines.commands.templates import BUNDLE_SUFFIX, load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
 from pipelines.runs.artefacts import load_params_of_run
@@ -53,18 +52,20 @@ class Animate:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
     model: Literal["template", "student"] = "template"
-    """What moves: the textured template, or the trained student, drawn by the runtime; a bundle is a student."""
+    """Model to draw: the textured template, or the trained student in the runtime. A bundle is a student."""
     outside: Literal["keep", "clamp"] = "keep"
-    """Poses of a student beyond what its training saw: said and shown as they are, or held back joint by joint."""
+    """Poses of a student outside the range of its training. keep: show them and print a note. clamp: limit each joint
+    to the range."""
     codes: Literal["null", "trained"] = "null"
-    """Codes of a student's field: none, as for any new motion, or those of its training, for a motion whose
-    rows are the frames of the training by their numbers (with --cloth field, without --interpolate)."""
+    """Latent codes of a student's field: zero, as for any new motion, or those of its training frames. The motion's
+    rows are then the training frames by number (with --cloth field, without --interpolate)."""
     interpolate: OptionalFloat = None
-    """Show so many frames a second, poses in between turned along the shortest way; the speed stays (students)."""
+    """Frame rate to resample the motion to at the same speed; rotations between frames are interpolated along the
+    shortest arc (students only)."""
     fps: OptionalFloat = None
     """Frames a second; by default those of the parameters (or 30) over --step, so that the speed is true."""
     view: Literal["front", "side", "back", "three-quarter", "turntable"] = "front"
-    """Where the camera stands; turntable: once around over the whole film."""
+    """Position of the camera; turntable turns it once around over the whole film."""
     colors: Literal["scan", "labels", "semantic", "weights", "none"] = "scan"
     """Colours of the surface (pictures only; a GLB has those of the scan)."""
     cloth: ClothMode = "simulate"
@@ -104,6 +105,7 @@ class Animate:
 
             write_glb(self.out, template, animation=params)
         else:
+            # The iterator poses frames on demand, so that a long motion never lies in memory as a whole.
             posed = self._posed(template, garments, before, params, fps)
             # The first frame is posed before any file is touched: parameters of another body are refused here.
             first = next(posed)
@@ -112,12 +114,12 @@ class Animate:
             write_film(self.out, frames, fps=fps, size=(cameras[0].width, cameras[0].height))
         simulated = [garment.part for garment in garments]
         if not self.json:
-            self._tell(len(params), fps, simulated)
+            self._print(len(params), fps, simulated)
         return {"out": str(self.out), "frames": len(params), "fps": fps, "simulated": simulated, "notes": self._notes}
 
     @property
     def _of_student(self) -> bool:
-        return self.model == "student" or self.run_folder.suffix.lower() == BUNDLE
+        return self.model == "student" or self.run_folder.suffix.lower() == BUNDLE_SUFFIX
 
     def _student_film(self) -> dict:
         """Draw the student frame by frame and write the film."""
@@ -125,6 +127,7 @@ class Animate:
         from avatar.runtime.motion import resampled
         from avatar.runtime.skeleton import skeleton_body
 
+        # The whole motion drives the clothes; `first` is the row of the first frame that is shown.
         bundle = avatar.open_bundle(self.run_folder)
         given = self.driving.load(self.params, skeleton_body(bundle))
         chosen, fps, whole = self._chosen(given)
@@ -132,10 +135,12 @@ class Animate:
         first = len(whole) - 1 - (len(chosen) - 1) * self.step
         begin = range(len(given))[self.start : self.stop][0] - first
         shown = range(first, len(whole), self.step)
+        # Resampling changes the numbers of rows: convert the first shown row through its time.
         if self.interpolate is not None:
             motion = resampled(motion, self.interpolate)
             shown = range(round(first / (fps * self.step) * self.interpolate), len(motion))
             fps = self.interpolate
+        # Training codes hold for clothes as the field moved them, not for simulated ones.
         loose = bundle.garments_about.get("garments", [])
         simulated = [row["part"] for row in loose] if self.cloth == "simulate" else []
         if simulated and self.codes == "trained":
@@ -143,6 +148,7 @@ class Animate:
             raise InputError(
                 "option codes trained", expected="clothes as training had them (--cloth field)", received=received
             )
+        # Draw and write frame by frame; the number of cameras is that of the frames.
         film = StudentFilm(
             view=self.view,
             height=self.height,
@@ -158,7 +164,7 @@ class Animate:
         )
         write_film(self.out, shown_frames, fps=fps, size=(cameras[0].width, cameras[0].height))
         if not self.json:
-            self._tell(len(shown), fps, simulated)
+            self._print(len(shown), fps, simulated)
         return {
             "out": str(self.out),
             "frames": len(shown),
@@ -167,13 +173,15 @@ class Animate:
             "notes": self._notes,
         }
 
-    def _tell(self, frames: int, fps: float, simulated: list[str]) -> None:
+    def _print(self, frames: int, fps: float, simulated: list[str]) -> None:
+        """Print the result to standard output and the notes to standard error."""
         moved = f", simulated: {', '.join(simulated)}" if simulated else ""
         Console().print(f"{self.out}: {frames} frames at {fps:g} a second{moved}", markup=False)
         for sentence in self._notes:
             Console(stderr=True).print(sentence, markup=False)
 
     def _check_options(self, suffix: str) -> None:
+        # First the combinations of model and output, then each option's own range.
         if suffix == ".glb" and self._of_student:
             raise InputError(f"output {self.out}", expected=".mp4, .gif or a folder for a student", received=".glb")
         if suffix == ".glb" and self.lighting.environment is not None:
@@ -227,6 +235,7 @@ class Animate:
         That has all frames, begins a moment before the first one, and is what loose clothes follow.
         """
         count = len(params)
+        # Select the shown frames.
         chosen = range(count)[self.start : self.stop : self.step]
         if not len(chosen):
             raise InputError(
@@ -234,7 +243,9 @@ class Animate:
                 expected=f"some of the {count} frames of {self.params.name}",
                 received=f"--start {self.start} --stop {self.stop} --step {self.step}",
             )
+        # A step of n frames shows 1/n of the rate, so that the motion keeps its speed.
         fps = self.fps or (params.fps or DEFAULT_FPS) / self.step
+        # Clothes begin to move before the first shown frame, so that they swing there already.
         begin = max(0, chosen[0] - round(_PRE_ROLL * fps * self.step))
         whole = params.select(slice(begin, chosen[-1] + 1))
         return replace(params.select(list(chosen)), fps=fps), fps, whole
@@ -262,6 +273,7 @@ class Animate:
 
     def _cameras(self, template: Template, params: BodyParams) -> list[Camera]:
         """Place a camera a frame; it stands still, unless on a turntable, and sees the whole motion."""
+        # Frame the camera by a sample of the poses, since posing all of a long motion is slow.
         some = spread(range(len(params)), _FRAMING_POSES)
         points = template.pose(params.select(some)).reshape(-1, 3)
         height = self.height + self.height % 2  # h264 with 4:2:0 colour takes even sizes
@@ -282,8 +294,9 @@ class Animate:
             "none": lambda: None,
         }[self.colors]()
         relighting = self.lighting.relighting()
-        # The light is in the colours then; the figure's own would come on top.
+        # The colours contain the light already, so that the shading of the drawing is switched off.
         style = None if relighting is None else ShadeStyle(relief=0.0)
+        # `strict` detects a motion whose number of frames differs from that of the cameras.
         pairs = zip(posed, cameras, strict=True)
         for vertices, camera in track(
             pairs, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json

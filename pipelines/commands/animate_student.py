@@ -29,16 +29,18 @@ _FRAMING_POSES = 36
 
 @dataclass(frozen=True, kw_only=True)
 class StudentFilm:
-    """What is shown of a student.
+    """View, size and light of a film of a student.
 
     Attributes:
-        view: name of a view, or "turntable". height, width: pixels; no width: as wide as the motion needs.
-        cloth: what moves loose clothes: a simulation, the student's own field, or the joints alone.
-        clamp: joints turn no farther than in training.
-        numbered_from: number of the motion's first frame, where its frames are the training's: those that have a code
-            take it; None: as a new pose.
-        relighting: the light that the person is shown in; None: that of the capture.
-        below: metres below the highest point that the picture shows; None: the whole person.
+        view: name of a view, or "turntable".
+        height: height of the pictures, pixels.
+        width: width of the pictures, pixels; None fits the motion.
+        cloth: source of the motion of loose clothes: a simulation, the student's own field, or the joints alone.
+        clamp: whether joint rotations are limited to the range of the training.
+        numbered_from: training frame of the motion's first frame, whose latent codes are then used; None treats all
+            frames as new poses.
+        relighting: the light; None keeps that of the capture.
+        below: height of the picture below the highest point, metres; None shows the whole person.
     """
 
     view: str
@@ -64,12 +66,16 @@ def student_frames(
     """Return the cameras of a film and its pictures, drawn as they are asked for.
 
     Args:
-        motion: all frames that loose clothes follow, at the rate that it says. shown: those of the film.
+        bundle: the student.
+        motion: all frames that loose clothes follow, at their own frame rate.
+        shown: rows of the motion that the film shows.
+        film: view, size and light.
         notes: list to which remarks are added.
     """
     from avatar.runtime import AvatarPlayer
     from avatar.runtime.motion import pose_range
 
+    # Compare the shown frames with the joint range of the training: outside it the field extrapolates.
     limits = pose_range(bundle)
     if limits is not None:
         outside = limits.outside(motion)[list(shown)].any(axis=1)
@@ -86,6 +92,7 @@ def student_frames(
 
 
 def _cameras(player: AvatarPlayer, params: BodyParams, film: StudentFilm) -> list[Camera]:
+    # Frame the camera by the Gaussians of a sample of poses.
     some = spread(range(len(params)), _FRAMING_POSES)
     points = np.concatenate([player.pose(params.frame(k)).means.astype(np.float64) for k in some])
     if film.below is not None:
@@ -105,15 +112,17 @@ def _pictures(
     film: StudentFilm,
     notes: list[str],
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    # Step a simulation through every frame of the motion, and draw only the shown ones. Without a simulation, frames
+    # that are not shown need no pose.
     picture = dict(zip(shown, cameras, strict=True))
     coded = set() if film.numbered_from is None else set(player.bundle.about.frames)
     simulate, fps = film.cloth == "simulate" and player.has_clothes, motion.fps or 1.0
     skinned = player.skinned_clothes if film.cloth == "skin" else None
     paths = ways(motion, fps) if simulate else repeat([], len(motion))
-    for k, way in enumerate(paths):
+    for k, path in enumerate(paths):
         number = k + (film.numbered_from or 0)
         if simulate:
-            player.step(motion.frame(k), 1.0 / fps, path=way)
+            player.step(motion.frame(k), 1.0 / fps, path=path)
         if k not in picture:
             continue
         if not simulate:

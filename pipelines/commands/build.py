@@ -57,8 +57,7 @@ class Build:
     auto: `capture` with --capture, else 4ddress."""
     label_source: Literal["auto", "scan", "views", "body"] = "auto"
     """Labels that come with the scan, votes of its views' label maps, or what the body in the scan and its colours say.
-    auto: the first of views, scan and body that there is. Labels of a scan are what nobody has of a person that was
-    photographed."""
+    auto: the first of views, scan and body that there is. A photographed person has no such labels."""
     protocol: OptionalText = None
     """With --capture: the protocol whose parameters and labels are used; later commands on the run keep to it."""
     frame: int = 0
@@ -74,7 +73,8 @@ class Build:
     up: Literal["auto", "y", "z", "x", "-y", "-z", "-x"] = "auto"
     """Upward axis of the scan file. auto: found where the scan comes alone, else +Y."""
     detector: OptionalText = None
-    """`mediapipe` (extra detect) or a pose model in ONNX: asked which way the person faces whose scan comes alone."""
+    """Keypoint model that finds the facing direction of a scan without parameters: `mediapipe` (extra detect), or a
+    pose model in ONNX."""
     keep_bridges: bool = False
     """Keep faces of the scan that bridge two limbs, as under the arms; they tear when a pose opens the gap."""
     keep_holes: bool = False
@@ -86,12 +86,12 @@ class Build:
     ] = field(default_factory=dict)
     """Faces kept by part, for instance `--budgets upper 10000 hair 4000`; others keep their default."""
     remesh: Literal["quadric", "isotropic"] = "quadric"
-    """What the parts' faces are made by: quadric edge collapse, or isotropic remeshing to faces of one size by
-    pymeshlab (extra remesh; GPL-3)."""
+    """Remeshing of the parts: quadric edge collapse, or isotropic remeshing to faces of one size by pymeshlab (extra
+    remesh; GPL-3)."""
     clearance_mm: float = 1.0
     """Distance kept between layers, 0.1 to 10."""
     max_influences: int = 8
-    """Joints that a vertex may follow."""
+    """Largest number of joints with weight at a vertex."""
     samples: int = 100_000
     """Surface samples of the validation."""
     seed: int = 0
@@ -111,6 +111,7 @@ class Build:
         from pipelines.report.sections.build import update_build_report
         from pipelines.stages.build import build
 
+        # Decide on inputs and tools first; a wrong option must not end a build after minutes.
         keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         plan = self.plan()
         self._check_tools()
@@ -132,6 +133,7 @@ class Build:
                 progress=step,
                 report=None if self.no_report else update_build_report,
             )
+        # Print the same summary as `smplxpp inspect`.
         if not self.json:
             Inspect(run_folder=self.run_folder).run()
         metrics = read_json(self.run_folder / "metrics.json", subject="metrics")
@@ -139,7 +141,7 @@ class Build:
         return {**metrics, "failed": failed, "exit_status": 0}
 
     def plan(self) -> BuildPlan:
-        """Decide what this build takes.
+        """Decide which inputs and stages this build uses.
 
         Raises:
             InputError: neither or both ways of naming the input, files that a capture lacks, or choices out of range.
@@ -148,6 +150,7 @@ class Build:
 
     def request(self) -> BuildRequest:
         """Turn the options into one request, with what earlier commands have made in the run."""
+        # Earlier commands on this run leave registration and reconstruction, which the plan may use.
         registered = read_manifest(self.run_folder / REGISTER_STAGE) is not None
         return BuildRequest(
             scan=self.scan,
@@ -180,7 +183,7 @@ class Build:
         return BuildConfig(**{n: getattr(self, n) for n in names}, **changed)
 
     def _check_tools(self) -> None:
-        """Find that the detector and the remesher can be loaded before work starts."""
+        """Check that the detector and the remesher can be loaded, before work starts."""
         if self.detector is not None:
             load_detector(self.detector)
         require_remesher(self.remesh)

@@ -28,12 +28,12 @@ _FRAMES = "numbers and ranges START:STOP or START:STOP:STEP (STOP not included),
 
 @dataclass(frozen=True)
 class CaptureCheckCommand:
-    """Options of `smplxpp capture degrade`."""
+    """Options of `smplxpp capture check`."""
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Folder of the capture, in any layout of docs/captures.md."""
     format: FormatName = "auto"
-    """Layout; auto tells it by the files."""
+    """Layout; auto detects it from the files."""
     frames: OptionalText = None
     """Frames whose images are opened: all, or numbers and ranges START:STOP:STEP with commas between. By default as
     many, evenly spread, as make 2,000 images."""
@@ -61,9 +61,12 @@ class CaptureCheckCommand:
         from smplxpp.capture import open_capture
         from smplxpp.capture.check import CheckConfig
 
+        # A report inside the capture would be read as one of its files.
         if self.out is not None:
             keep_out_of_capture(self.out, self.capture)
         body = load_body(self.body)
+        # The command's folders replace the capture's own files, so that new masks can be checked before they are
+        # copied.
         capture = open_capture(
             self.capture,
             format=_reader(self.format),
@@ -73,6 +76,7 @@ class CaptureCheckCommand:
             protocol=self.protocol,
         )
         config = CheckConfig(frames=selected_frames(self.frames, capture))
+        # Findings go to the terminal, to the page and, with --json, to the answer.
         with shared_progress(enabled=not self.json) as progress:
             check = capture.check(body, config, progress=progress)
         if not self.json:
@@ -86,7 +90,7 @@ class CaptureCheckCommand:
 
 @dataclass(frozen=True)
 class CaptureConvertCommand:
-    """Options of `smplxpp capture degrade`."""
+    """Options of `smplxpp capture convert`."""
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Folder of the capture, in any layout of docs/captures.md."""
@@ -95,7 +99,7 @@ class CaptureConvertCommand:
     layout: Literal["simple", "actorshq"] = "simple"
     """Ours, or ActorsHQ's: images on black, masks, cameras, parameters."""
     format: FormatName = "auto"
-    """Layout of the source; auto tells it by the files."""
+    """Layout of the source; auto detects it from the files."""
     scale: float = 1.0
     """Resolution as a factor."""
     frames: OptionalText = None
@@ -107,14 +111,13 @@ class CaptureConvertCommand:
     keypoints: OptionalPath = None
     """Folder of keypoints of any detector (docs/captures.md) to take instead of the capture's own."""
     person: OptionalInt = None
-    """Whose keypoints, where there are several people; by default the surest of each frame."""
+    """Person whose keypoints to take, where there are several; by default the most confident of each frame."""
     matting: OptionalPath = None
-    """ONNX model of your own that makes the mattes; they go into the folder of --masks, those there are left alone."""
+    """ONNX model of your own that makes the mattes. They go into the folder of --masks; existing ones are kept."""
     params: OptionalPath = None
     """Body parameters to take instead of the capture's own."""
     body: OptionalPath = None
-    """Body model file that the parameters are for, where a layout turns it about the origin; the open body by
-    default."""
+    """Body model file of the parameters, for layouts that rotate it about the origin; the open body by default."""
     quality: int = 95
     """Quality of JPEG images that cannot be copied."""
     json: bool = False
@@ -127,9 +130,11 @@ class CaptureConvertCommand:
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
 
+        # Make the mattes first: the capture is opened with them.
         body = None if self.body is None else load_body(self.body)
         if self.matting is not None:
             self._matte(self.matting)
+        # No image cache: every image is read once.
         capture = open_capture(
             self.capture,
             format=_reader(self.format),
@@ -147,15 +152,16 @@ class CaptureConvertCommand:
             cameras=None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(",")),
             quality=self.quality,
         )
+        # The same command resumes an interrupted conversion, so that files of the first call count as kept.
         with shared_progress(enabled=not self.json) as progress:
             done = convert_capture(capture, self.out, config, progress=progress)
         if not self.json:
             console = Console()
-            for words in done.left_out[:_SHOWN]:
-                console.print(f"[yellow]left out[/]  {escape(words)}", soft_wrap=True, highlight=False)
+            for note in done.left_out[:_SHOWN]:
+                console.print(f"[yellow]left out[/]  {escape(note)}", soft_wrap=True, highlight=False)
             if len(done.left_out) > _SHOWN:
                 console.print(f"[dim]and {len(done.left_out) - _SHOWN} more (--json lists all)[/]")
-            files = f"{done.copied} files copied, {done.encoded} written anew, {done.kept} there already"
+            files = f"{done.copied} files copied, {done.encoded} encoded again, {done.kept} there already"
             console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False, markup=False)
         return {**vars(done), "exit_status": int(bool(done.left_out))}
 
@@ -190,6 +196,7 @@ def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | Non
     if text.strip() == "all":
         return capture.frames
     chosen: set[int] = set()
+    # Each part is a number, START:STOP or START:STOP:STEP; the result is the union of all.
     for part in text.split(","):
         try:
             numbers = tuple(int(n) if n.strip() else None for n in part.split(":"))
@@ -197,6 +204,7 @@ def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | Non
                 raise ValueError
         except ValueError:
             raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
+        # A range is cut to the capture's frames; a range without any is an error of the user.
         if len(numbers) == 1:
             found = {frame for frame in capture.frames if frame == numbers[0]}
         else:
@@ -241,8 +249,8 @@ class CaptureDegradeCommand:
         made = degrade_capture(self.capture, self.out, config, body=body)
         if not self.json:
             console = Console()
-            for words in made.left_out:
-                console.print(f"[yellow]left out[/]  {escape(words)}", soft_wrap=True, highlight=False)
+            for note in made.left_out:
+                console.print(f"[yellow]left out[/]  {escape(note)}", soft_wrap=True, highlight=False)
             labels = f"{100 * made.labels_wrong:.1f} % of the labels wrong"
             line = f"{made.out}: {made.frames} frames, keypoints of {made.cameras} cameras, {labels}"
             console.print(line, soft_wrap=True, highlight=False)
@@ -279,11 +287,13 @@ class CaptureMasks:
         from smplxpp.capture import open_capture
         from smplxpp.core.files.paths import same_place
 
+        # `masks` of the capture itself is allowed, any other place inside the capture is not.
         if not same_place(self.out, self.capture / "masks"):
             keep_out_of_capture(self.out, self.capture)
         capture = open_capture(self.capture, cache_bytes=0)
         names = None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(","))
         frames = selected_frames(self.frames, capture)
+        # Look for images before the model is loaded, which takes seconds.
         views = capture.views(names, frames)
         if not views:
             raise InputError(f"capture {capture.name}", expected="images to make masks of", received="none")

@@ -56,7 +56,9 @@ class Chat:
         import avatar
 
         with avatar.bundle_file(self.source) as path:
+            # Read the bundle once for the server and once for the motion.
             bundle, data = avatar.open_bundle(path), read_bytes(path, subject="avatar", most=MOST_AVATAR_BYTES)
+        # Load all engines before serving, so that the first answer does not wait for them.
         engines = self.engines(bundle, partner)
         console = Console(stderr=self.json)
         seconds = engines.voice.say("Hello.").sound.seconds  # the first sentence loads the rest of the voice
@@ -92,6 +94,7 @@ class Chat:
         from pipelines.chat.conversation import ChatParts
         from pipelines.chat.hearing import Recogniser, find_activity
 
+        # Speech recognition is optional: without its package the page takes typed messages only.
         face, stance = person_of_bundle(bundle)
         try:
             recogniser = Recogniser()
@@ -114,6 +117,7 @@ class Chat:
             parts = ", ".join(f"{part} {seconds:.2f}" for part, seconds in rounded(turn.marks).items())
             console.print(f"turn {turn.number}, seconds: {parts}", markup=False, highlight=False, soft_wrap=True)
 
+        # Serve until Ctrl-C; the shutdown joins the server's threads in any case.
         server = ChatServer(bundle, parts, name=name, port=self.port, report=report)
         console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False)
         if not self.no_browser:

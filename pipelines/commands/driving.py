@@ -28,15 +28,16 @@ class Driving:
     """Options of a motion."""
 
     retarget_from: OptionalPath = None
-    """Body that the motion is of, where it is another's: a body model file (the motion's betas are its shape), a run,
-    or `open`. Ways are then in proportion to the legs, and feet that stand do not slide. A .bvh has its own."""
+    """Body that the motion was recorded for, if it is another one: a body model file (with the motion's betas), a run,
+    or `open`. The root translation is then scaled by leg length, and planted feet do not slide. A .bvh has its own
+    skeleton."""
     joint_map: OptionalPath = None
     """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
     up: UpAxis | None = None
     """Axis that points up in the motion (AMASS: z); a .bvh tells it by its skeleton."""
 
     def load(self, path: Path, body: BodyModel) -> BodyParams:
-        """Read a motion for a body; in frames of a file that hold NaN stand poses in between.
+        """Read a motion for a body; frames with NaN get poses interpolated between their neighbours.
 
         Raises:
             InputError: no motion, one of another body, joints without a name that is known.
@@ -44,6 +45,7 @@ class Driving:
         Warns:
             GeometryWarning: frames that hold NaN or infinity.
         """
+        # A .bvh contains a skeleton and an upward axis, so that options for them are refused instead of ignored.
         if path.suffix.lower() == BVH:
             self._refuse("retarget-from", self.retarget_from, f"{path}, which has a skeleton of its own")
             self._refuse("up", self.up, f"{path}, which tells it by its skeleton")
@@ -52,13 +54,14 @@ class Driving:
         self._refuse("joint-map", self.joint_map, f"{path}, whose joints have SMPL's names")
         if self.retarget_from is None:
             return _whole(path, body, self.up)
+        # Read the motion for its own body, then transfer it to the person's skeleton.
         source, shaped = self._source()
         params = _whole(path, source, self.up)
         betas = params.betas[0] if shaped else None
         return retarget(params, Skeleton.of(source, betas), Skeleton.of(body))
 
     def _source(self) -> tuple[BodyModel, bool]:
-        """The body of the motion, and whether the motion's betas give it its shape."""
+        """Return the body of the motion, and whether the motion's betas give it its shape."""
         assert self.retarget_from is not None, "asked for"
         if str(self.retarget_from) == OPEN:
             return load_body(), True
@@ -78,7 +81,7 @@ class Driving:
 
 
 def _whole(path: Path, body: BodyModel, up: UpAxis | None) -> BodyParams:
-    """Read a motion whose frames without a pose get the ones between their neighbours', or the nearest at its ends."""
+    """Read a motion and interpolate frames without a pose between their neighbours, or copy the nearest at the ends."""
     holes: list[int] = []
     params = load_params(path, body=body, up=up, holes=holes)
     if not holes:
@@ -90,14 +93,16 @@ def _whole(path: Path, body: BodyModel, up: UpAxis | None) -> BodyParams:
         GeometryWarning,
         stacklevel=3,
     )
+    # Interpolate at the holes; times outside the known frames are clamped to the nearest one.
     known = np.setdiff1d(np.arange(count), holes)
     times = known.astype(np.float64)
     between = resampled(params.select(known), times, np.clip(np.arange(float(count)), times[0], times[-1]))
+    # Take row k of the motion, or of the interpolated copy (rows count to 2 count - 1) at a hole.
     rows = np.arange(count)
     rows[holes] += count
     return BodyParams.concatenate([params, between]).select(rows)
 
 
 def unshaped(body: BodyModel) -> BodyModel:
-    """A template's body, whose identity is in its mean shape: betas of a file do not move its joints once more."""
+    """Return a template's body without shape directions: its mean shape is the person's, so that betas must not act."""
     return replace(body, shapedirs=np.zeros_like(body.shapedirs))

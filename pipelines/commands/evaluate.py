@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 TURNS = (0.0, 120.0, 240.0)
-"""Degrees by which the light of the report's pictures is turned."""
+"""Rotations of the light about the vertical for the report's pictures, degrees."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Evaluate:
     capture: Path
     """Folder of the capture: cameras, images, masks, body parameters; true meshes where it has them."""
     models: tuple[Literal["fit", "teacher", "baked", "student", "compact"], ...] = ()
-    """Which to measure; by default fit, teacher and student, as far as the run has them. baked: the student
-    before its blend shapes. compact: its file for players."""
+    """Models to measure; by default fit, teacher and student, as far as the run has them. baked: the student before its
+    blend shapes. compact: its file for players."""
     sets: tuple[Literal["training", "novel_view", "novel_pose", "novel_pose_training_view"], ...] = ()
-    """Which views; by default all that the capture holds out something for, and training views."""
+    """View sets to measure; by default training views and every set with held-out cameras or frames."""
     every: int = 1
-    """Every n-th frame of what is held out: of held-out frames, and of training frames as held-out cameras see them."""
+    """Measure every n-th held-out frame, and every n-th training frame in held-out cameras."""
     training_every: int = 4
     """Every n-th training frame of the training views and of the true surfaces; never more often than --every."""
     hold_out: tuple[str, ...] = ()
@@ -76,7 +76,7 @@ class Evaluate:
     seed: int = 0
     """Seed of the points on the surfaces."""
     force: bool = False
-    """Measure anew even if the evaluation stands."""
+    """Measure again even if the evaluation is up to date."""
     no_report: bool = False
     """Leave report.html as it is."""
     json: bool = False
@@ -96,6 +96,7 @@ class Evaluate:
         from pipelines.stages.evaluate_config import REPORT_FILE
         from pipelines.stages.scene import TrainInputs
 
+        # Check options and read the light before models are loaded.
         keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         protocol = ProtocolConfig(
             sets=self.sets,
@@ -116,6 +117,7 @@ class Evaluate:
         )
         lights = self._lights()
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
+        # An evaluation that is up to date returns its record at once.
         with shared_progress(enabled=not self.json) as progress:
             record = evaluate(
                 self.run_folder,
@@ -129,14 +131,17 @@ class Evaluate:
                 progress=progress,
             )
         page, ran = self.run_folder / "report.html", record.ran
+        # Only a student can be relit; its pictures go to a stage of their own.
         if (self.run_folder / STUDENT).is_file():
             from pipelines.stages.relight import relight
 
             shown = self.lighting.environment
             relit = relight(self.run_folder, STUDIO if shown is None else shown.stem, lights, force=self.force)
             ran = ran or relit.ran
+        # The page is rewritten if it lacks the new figures.
         if not self.no_report and (ran or not page.is_file()) and rewrite_report(self.run_folder) is None:
-            log.warning("the run does not say what it was built from: `smplxpp build` writes the report with it")
+            log.warning("the run has no record of its build: `smplxpp build` writes the report with it")
+        # Print from the file, so that figures of an earlier evaluation look the same.
         report = EvalReport.load(record.folder / REPORT_FILE)
         if not self.json:
             console = Console()
@@ -153,10 +158,11 @@ class Evaluate:
         return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
 
     def _lights(self) -> dict[str, Relighting]:
-        """The lights of the report's pictures, by what is said of each."""
+        """Return the lights of the report's pictures by their captions."""
         out = {}
         for turn in TURNS:
             turned = replace(self.lighting, environment_turn=self.lighting.environment_turn + turn)
+            # Without a panorama, turn our studio light; white light is assumed for the capture.
             lit = (self.lighting if self.lighting.environment is None else turned).relighting()
             if lit is None:
                 studio = Irradiance.of_environment(panoramas()[STUDIO], turn=turn)
@@ -166,7 +172,7 @@ class Evaluate:
 
 
 def _metric(name: str) -> str:
-    """The metric's name for "auto"."""
+    """Return the name of the metric; "auto" is ST-LPIPS where it is installed."""
     if name != "auto":
         return name
     if find_spec("stlpips_pytorch") is not None:

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from pipelines.commands.export_bundle import export_bundle
 from pipelines.commands.export_request import FileRequest, export_file, format_of
-from pipelines.commands.export_solid import SolidRequest, export_solid, tell_solid
+from pipelines.commands.export_solid import SolidRequest, export_solid, print_solid
 from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt, OptionalPath, OptionalText
+from pipelines.commands.templates import export_bundle
 from smplxpp.core.errors import InputError
 
 
@@ -121,5 +121,5 @@ class Export:
             SolidRequest(self.params, self.frame, self.height_mm, self.thickness_mm, self.gap_mm, self.units),
         )
         if not self.json:
-            tell_solid(report, Console())
+            print_solid(report, Console())
         return report

@@ -77,6 +77,7 @@ class FileRequest:
         Raises:
             InputError: no row is left.
         """
+        # Negative rows would count from the end in Python; they are refused.
         first, stop, step = self.rows
         if step < 1:
             raise InputError("option step", expected="1 or more", received=str(step))
@@ -107,6 +108,7 @@ def format_of(out: Path, named: str) -> str:
     Raises:
         InputError: an unknown suffix, one that the format does not have, or a folder for a format that holds a motion.
     """
+    # A suffix of one format decides; one of several formats, or a folder, needs --format.
     suffix = out.suffix.lower()
     fitting = [name for name, suffixes in SUFFIXES.items() if suffix in suffixes]
     if suffix == SERIES:
@@ -115,6 +117,7 @@ def format_of(out: Path, named: str) -> str:
         return fitting[0]
     if named in fitting:
         return named
+    # Explain the mismatch in terms of the option that the user gave.
     if named != "auto":
         expected = f"a name that ends with {' or '.join(SUFFIXES[named])}"
         expected += ", or a folder (no suffix) with a file a frame" if named in IN_SERIES else ""
@@ -176,6 +179,7 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         InputError: options that do not go together, a source that lacks what is asked for, parameters of another body.
         MissingExtraError: a package of an extra that is not installed.
     """
+    # Find the module that writes this format; an OBJ always holds the template.
     model = "template" if request.format == "obj" else request.model
     writers = _FOR_ANY_MODEL.get(request.format) or _BY_MODEL.get((model, request.format))
     if writers is None:
@@ -184,11 +188,13 @@ def export_file(request: FileRequest) -> dict[str, Any]:
             expected=f"--model {'template' if model == 'student' else 'student'} for {request.format}",
             received=f"--model {model}",
         )
+    # Refuse options without effect, which a user would expect to see in the file.
     for option, given in (("full-harmonics", request.full_harmonics), ("up", request.up != "y")):
         if given and request.format != "ply":
             raise InputError(f"option {option}", expected="a PLY", received=request.format)
     if request.is_series:
         check_series(request.out)
+    # Import the writer only now: some of them need packages of an extra.
     module, function = writers
     fps, frames, notes = getattr(import_module(module), function)(request)
     count = _write_series(request, fps, frames) if request.is_series else _write_one(request, frames)

@@ -19,12 +19,12 @@ from smplxpp.metrics import self_intersections
 from smplxpp.metrics.distance import MM
 from smplxpp.template.template import BODY_PART, Template
 
-_GAP_MM = 10.0
+_GAP_MM = 10.0  # gap between body and cloth that is filled by default, mm of the person
 
 
 @dataclass(frozen=True)
 class SolidRequest:
-    """What `--solid` is asked for; the names are those of the options."""
+    """Options of `smplxpp export --solid`, by their names."""
 
     params: Path | None
     frame: int
@@ -41,16 +41,19 @@ def export_solid(run: Path, solid: Path, request: SolidRequest) -> dict[str, Any
         InputError: no finished template, another suffix, sizes that are not positive, parameters of another body.
     """
     check_solid_path(solid)
+    # Check suffix and sizes before the template is posed and voxelised.
     for name in ("thickness_mm", "height_mm", "gap_mm"):
         if getattr(request, name) is not None:
             require_positive(f"option {name}", getattr(request, name))
     template = load_run_template(run)
     posed = _posed(template, request)
+    # Scale the posed person to the wanted height. Only vertices of faces count: the template may hold unused ones.
     scale = 1.0
     if request.height_mm is not None:
         scale = request.height_mm / MM / float(np.ptp(posed.vertices[np.unique(posed.faces), 1]))
     posed = posed.with_vertices(posed.vertices * scale)
     parts = {name: posed.submesh(template.part_faces(name))[0] for name in template.part_names}
+    # The default gap is in the person's size and shrinks with it; thickness is in the size of the print.
     gap = _GAP_MM * scale if request.gap_mm is None else request.gap_mm
     config = SolidConfig(thickness=request.thickness_mm / MM, gap=gap / MM)
     made = solid_of_parts(parts.pop(BODY_PART), parts, config=config)
@@ -72,12 +75,13 @@ def _posed(template: Template, request: SolidRequest) -> TriangleMesh:
     if not 0 <= request.frame < len(params):
         raise InputError("option frame", expected=f"an index below {len(params)}", received=str(request.frame))
     params = params.frame(request.frame)
-    # Where the person stands and which way it looks is of no use on a printer's bed.
+    # Drop the translation: a printer's bed has no use for the person's position in the capture.
     still = replace(params, transl=np.zeros_like(params.transl))
     return template.mesh.with_vertices(template.pose(still)[0])
 
 
-def tell_solid(report: dict[str, Any], console: Console) -> None:
+def print_solid(report: dict[str, Any], console: Console) -> None:
+    """Print size, volume, wall thickness and self-intersections of a solid."""
     size = " x ".join(f"{length:.0f}" for length in report["size_mm"])
     console.print(
         f"{report['out']}: one closed, manifold piece of {report['faces']} faces, {size} mm, "

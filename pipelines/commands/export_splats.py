@@ -36,15 +36,20 @@ def splat_writers(
     from avatar.formats.splats_along import splats_along
     from avatar.runtime import AvatarPlayer
 
+    # Exact numbers (float32): the export must not contain the bundle's quantisation error.
     bundle = avatar.open_bundle(request.source, exact=True)
     player = AvatarPlayer(bundle)
+    # Without parameters: the motion of the bundle, or the rest pose of a bundle without one.
     motion = player.motion if request.params is None else motion_for(bundle, request.params)
     motion = BodyParams.rest(betas=0, expressions=0) if motion is None else motion
+    # A folder or a USD with parameters holds a motion; all other files hold one pose.
     moves = request.is_series or (request.format == "usd" and request.params is not None)
     rows = request.chosen(len(motion), moves=moves)
     fps = request.rate(motion) if moves and len(rows) > 1 else None
     notes = [] if request.params is None else _far_poses(bundle, motion.select(list(rows)))
+    # The field knows the clothes of training poses, so that nothing is simulated there by default.
     cloth = request.cloth if request.params is not None or request.cloth != "simulate" else "field"
+    # Evaluate the poses one by one while they are written.
     splats = splats_along(player, motion, rows, cloth=cloth, notes=notes)
     shown = track(
         splats,
@@ -53,6 +58,7 @@ def splat_writers(
         console=Console(stderr=True),
         disable=request.quiet or fps is None,
     )
+    # A USD stores all frames in one file; the other formats get a file for each.
     if request.format == "usd":
         from avatar.formats.splat_scenes import write_splat_usd
 

@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.progress import track
 
 from pipelines.commands.animate_student import motion_for
-from pipelines.commands.export_bundle import SUFFIX
 from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
-from pipelines.commands.templates import load_params_for, load_run_template
+from pipelines.commands.templates import BUNDLE_SUFFIX, load_params_for, load_run_template
 from pipelines.runs.layout import GARMENTS
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
@@ -34,6 +33,7 @@ def template_writers(request: FileRequest) -> Writers:
     Raises:
         InputError: no template, parameters of another body, rows that are not there, a series without a motion.
     """
+    # An OBJ has no skeleton: its surfaces are posed here. GLB and USD store skeleton and motion.
     template = load_run_template(request.source)
     params = None if request.params is None else load_params_for(template, request.params)
     if request.format == "obj":
@@ -79,6 +79,7 @@ def _posed(
     request: FileRequest, template: Template, params: BodyParams, rows: range, notes: list[str]
 ) -> Iterator[Float[np.ndarray, "V 3"]]:
     """Yield the surfaces of the chosen rows; loose clothes are simulated from `PRE_ROLL` before the first."""
+    # A template has no field. Without garments in the run all parts follow the joints.
     path, rate = request.source / GARMENTS, frames_a_second(params)
     if request.cloth == "field":
         raise InputError("option cloth", expected="simulate or skin for the template", received="field")
@@ -86,6 +87,7 @@ def _posed(
         for k in rows:
             yield template.pose(params.frame(k))[0]
         return
+    # Simulate every frame from the pre-roll on, and yield only the chosen rows.
     begin = max(0, rows[0] - round(PRE_ROLL * rate))
     whole = params.select(slice(begin, rows[-1] + 1))
     surfaces = play(template, load_garments(path, template), whole, fps=rate, notes=notes)
@@ -102,7 +104,8 @@ def motion_writers(request: FileRequest) -> tuple[float, Iterator[tuple[int, Cal
     """
     if request.params is None:
         raise InputError("option params", expected=f"a motion to write as {request.format}", received="none")
-    if request.source.suffix.lower() == SUFFIX:
+    # A bundle has the student's skeleton; a run has the template with its joint positions.
+    if request.source.suffix.lower() == BUNDLE_SUFFIX:
         import avatar
         from avatar.runtime.skeleton import skeleton_body
 
@@ -112,6 +115,7 @@ def motion_writers(request: FileRequest) -> tuple[float, Iterator[tuple[int, Cal
     else:
         template = load_run_template(request.source)
         body, joints, params = template.body, template.joints, load_params_for(template, request.params)
+    # The frame rate shrinks with the step, so that the motion keeps its speed.
     rows = request.chosen(len(params), moves=True)
     fps = request.rate(params)
     chosen = replace(params.select(list(rows)), fps=fps)

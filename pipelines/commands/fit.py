@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Fit:
-    """Options of `smplxpp fit`. The same command goes on with a fit that was interrupted."""
+    """Options of `smplxpp fit`. The same command resumes a fit that was interrupted."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `smplxpp build` wrote; the fit goes into it as 70_fit."""
@@ -43,8 +43,8 @@ class Fit:
     body: OptionalPath = None
     """SMPL-X-layout body file that the parameters are for; the open body by default."""
     preset: Literal["quick", "default", "paper"] = "default"
-    """quick: 60k Gaussians, 200 iterations, to see whether all fits together; default: 150k and 800; paper: 270k and
-    10,000, which is for many cameras."""
+    """quick: 60k Gaussians and 200 iterations, to check the inputs. default: 150k and 800. paper: 270k and 10,000, for
+    many cameras."""
     iterations: OptionalInt = None
     """Iterations, in the place of the preset's; each renders one view."""
     gaussians: OptionalInt = None
@@ -56,14 +56,14 @@ class Fit:
     scale: float = 1.0
     """Size of the images to work on, 1 for every pixel."""
     max_minutes: float = math.inf
-    """Stop after as many minutes of iterations and write what there is; the same command
-    then goes on (without --force, which would begin anew)."""
+    """Stop after this many minutes of iterations and write the model reached so far. The same command then resumes,
+    without --force, which would start again."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
-    """Decides the Gaussians' places and the views' order."""
+    """Seed of the Gaussians' positions and the order of views."""
     force: bool = False
-    """Fit anew even if the fit stands."""
+    """Fit again even if the fit is up to date."""
     no_report: bool = False
     """Leave report.html as it is."""
     json: bool = False
@@ -83,13 +83,16 @@ class Fit:
         from pipelines.stages.refine import refine, wants_refinement
         from pipelines.stages.scene import TrainInputs, open_frame
 
+        # Check options and presets before the capture is opened.
         keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         require_positive("option max-minutes", self.max_minutes, finite=False)
         config = self.config()
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
+        # Refined poses are used by all later stages, so that refinement comes before the fit.
         if wants_refinement(self.run_folder, inputs, self.refine_poses):
             with shared_progress(enabled=not self.json) as show:
                 refine(self.run_folder, inputs, RefineConfig(seed=self.seed), progress=show)
+        # `by_hand` in the record tells a later training to keep this fit.
         scene = open_frame(self.run_folder, inputs, self.frame)
         device = choose_device(self.device)
         with training_progress("fit", config.iterations, enabled=not self.json) as progress:
@@ -98,9 +101,10 @@ class Fit:
             )
             trainer = Trainer(self.run_folder, scene, options, Distributed(device=device), scale=self.scale)
             record = trainer.make(FitStage(name=FIT_STAGE, config=config, by_hand=True))
+        # The page is rewritten if it lacks the new figures.
         report = self.run_folder / REPORT_FILE
         if not self.no_report and (record.ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
-            log.warning("the run does not say what it was built from: `smplxpp build` writes the report with the fit")
+            log.warning("the run has no record of its build: `smplxpp build` writes the report with the fit")
         if not self.json:
             with values_of(record):
                 _print(record, report, force=self.force)
@@ -108,7 +112,7 @@ class Fit:
         return {**numbers, "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
 
     def config(self) -> FitConfig:
-        """The preset with the options' changes.
+        """Return the preset with the changes of the options.
 
         Raises:
             InputError: numbers out of range.
@@ -127,8 +131,10 @@ class Fit:
 
 
 def _print(record: StageRecord, report: Path, *, force: bool) -> None:
+    """Print the quality of each held-out camera and of the means, the progress, and the files."""
     console = Console()
     numbers = record.manifest["numbers"]
+    # One row for each held-out camera, then the means; dB for PSNR, no unit for SSIM.
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
     table.add_column("camera")
     for name in ("PSNR person", "PSNR image", "SSIM", "PSNR head"):
@@ -148,6 +154,7 @@ def _print(record: StageRecord, report: Path, *, force: bool) -> None:
         if which in numbers["mean"]:
             add(label, numbers["mean"][which], style="bold" if which == "held_out" else "dim")
     console.print(table)
+    # A fit that reached its time limit prints how to resume it.
     done, total = numbers["iterations_done"], numbers["iterations"]
     state = "finished" if numbers["finished"] else f"stopped; {how_to_continue(force=force)}"
     console.print(

@@ -1,4 +1,4 @@
-"""`smplxpp inspect`: what a run holds, how long it took, and its numbers against their gates."""
+"""`smplxpp inspect`: list a run's stages with their times, and check its numbers against their gates."""
 
 from __future__ import annotations
 
@@ -66,9 +66,11 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         InputError: the folder holds no run.
     """
     run = Path(run)
+    # Stages of the template are listed even if missing; others only where the run has them.
     others = sorted({p.parent.name for p in run.glob("[0-9][0-9]_*/manifest.json")} - set(TEMPLATE_STAGES))
     order = {name: number for number, name in enumerate(ALL_STAGES)}
     names = sorted({*TEMPLATE_STAGES, *others}, key=lambda name: (order.get(name, len(order)), name))
+    # Stages in their order, because outdated ones are found from earlier to later.
     stages = [_stage(run, name) for name in names]
     _mark_outdated(stages)
     metrics = _read_json(run / "metrics.json")
@@ -79,9 +81,11 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
             received=f"{run} with neither" if run.is_dir() else f"{run}, which does not exist",
             remedy="make one with `smplxpp build RUN --capture DIR`",
         )
+    # Manifests are the source of checks; metrics.json serves runs without any.
     checks = [CheckRow.of(record, stage=stage["stage"]) for stage in stages for record in stage.pop("records")]
     if not checks:
         checks = _checks_of(metrics.get("checks"))
+    # Suggest the command for the first stage to make; it leads to the rest.
     unfinished = [stage["stage"] for stage in stages if stage["state"] != "done"]
     report = run / "report.html"
     summary = {
@@ -114,6 +118,7 @@ def _stage(run: Path, name: str) -> dict[str, Any]:
     folder = run / name
     manifest, problem = _manifest(folder)
     files = manifest.get("files", {})
+    # Compare the manifest's files with the disk: a deleted file makes a stage incomplete.
     present = [folder / file for file in files if (folder / file).is_file()]
     if not manifest:
         state = "unreadable" if problem else "missing"
@@ -136,7 +141,7 @@ def _stage(run: Path, name: str) -> dict[str, Any]:
 
 
 def _manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """Read a stage's manifest, empty where there is none, and what is wrong with it."""
+    """Read a stage's manifest, empty without one, and the error of one that cannot be read."""
     path = folder / MANIFEST
     if not path.exists() and not path.is_symlink():
         return {}, None
@@ -147,11 +152,13 @@ def _manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def _mark_outdated(stages: list[dict[str, Any]]) -> None:
-    """Tell the stages that read files of earlier ones which have been made anew since, or whose source has."""
+    """Mark finished stages whose input files, or the sources of these, have been made again since."""
     digests: dict[str, str] = {}
     outdated: set[str] = set()
     for stage in stages:
         inputs, own = stage.pop("inputs"), stage.pop("digests")
+        # An input is outdated if its digest differs from the file's current one, or its stage is outdated. One pass
+        # suffices, since inputs come from earlier stages.
         changed = any(
             digests.get(file, digest) != digest or file.split("/")[0] in outdated for file, digest in inputs.items()
         )
@@ -163,7 +170,7 @@ def _mark_outdated(stages: list[dict[str, Any]]) -> None:
 
 
 def _checks_of(records: Any) -> list[CheckRow]:
-    """The checks of a metrics.json; none of one that is damaged."""
+    """Return the checks of a metrics.json; none for a damaged one."""
     try:
         return [CheckRow.of(as_object(one, subject="check")) for one in as_list(records or [], subject="checks")]
     except InputError:
@@ -182,6 +189,7 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
     console = Console()
     title = Text(str(summary["subject"] or Path(summary["run"]).name), style="bold")
     console.print(title + Text(f"  {summary['run']}", style="dim"))
+    # One row for each stage with state, time and size, then the totals.
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
     table.add_column("stage")
     table.add_column("state")
@@ -205,10 +213,12 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
     for stage in summary["stages"]:
         if stage["problem"]:
             console.print(Text("unreadable ", style="red") + Text(stage["problem"]), soft_wrap=True)
+    # By default only checks that need attention are listed.
     shown = [check for check in checks if show_all or check.status != "pass"]
     if shown:
         console.print()
         console.print(_check_table(shown))
+    # End with the counts, the command to continue, and the report.
     verdict = Text("no checks", style="dim") if not checks else _counts(summary["counts"], zeros=True)
     console.print(Text("\nchecks  ") + verdict)
     if summary["unfinished"]:

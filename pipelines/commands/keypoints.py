@@ -27,7 +27,7 @@ class KeypointsConvert:
     format: FormatName = "auto"
     """Layout of the input; auto tells it by the keys. OpenPose's BODY_25B has to be named: openpose-25b."""
     person: OptionalInt = None
-    """Id of the person in the files, or else the place in their lists; by default the surest of each frame."""
+    """Id of the person in the files, or else the place in their lists; by default the most confident of each frame."""
     first_frame: OptionalInt = None
     """Number of the first frame, where the files count otherwise than the capture (mmpose counts videos from 1)."""
     capture: OptionalPath = None
@@ -38,13 +38,14 @@ class KeypointsConvert:
     """Print the summary as JSON."""
 
     def run(self) -> dict:
-        """Convert; returns what was found of each camera."""
+        """Convert the files and return the number of frames and points for each camera."""
         from smplxpp.capture import open_capture
         from smplxpp.capture.keypoint_files import KeypointFiles, KeypointOptions, find_places
         from smplxpp.capture.writers.arrays import write_keypoints
 
         if not self.input.is_dir():
             raise InputError("keypoints", expected="an existing folder", received=str(self.input))
+        # The capture gives names of cameras, and image sizes for coordinates that are shares of them.
         options = KeypointOptions(self.format, self.person, _size(self.size), self.first_frame)
         cameras = None if self.capture is None else open_capture(self.capture).recording.cameras
         places = find_places(self.input, None if cameras is None else cameras)
@@ -61,6 +62,7 @@ class KeypointsConvert:
         for name, found in read.items():
             assert found is not None  # it has a place
             write_keypoints(self.out / f"{name}.npz", found)
+            # A confidence of 0 marks a point that the detector did not find.
             seen = float((found.confidence > 0).mean()) if found.confidence.size else 0.0
             summary[name] = {"frames": len(found.frames), "points": len(found.names), "seen": seen}
             log.info(
@@ -92,7 +94,7 @@ class KeypointsDetect:
     """Print the summary as JSON."""
 
     def run(self) -> dict:
-        """Detect; returns what was found of each camera."""
+        """Detect keypoints and return the number of frames for each camera."""
         from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes, detection_sheet
         from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import shared_progress
@@ -103,14 +105,17 @@ class KeypointsDetect:
         from smplxpp.core.files.paths import same_place
         from smplxpp.detect import load_detector
 
+        # `keypoints` of the capture itself is allowed, any other place inside the capture is not.
         if not same_place(self.out, self.capture / "keypoints"):
             keep_out_of_capture(self.out, self.capture)
         capture = open_capture(self.capture, masks=self.masks, cache_bytes=0)
         names = None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(","))
         frames = selected_frames(self.frames, capture)
+        # Check the output name before the detector is loaded.
         if self.sheet is not None and self.sheet.suffix.lower() not in (".png", ".jpg"):
             raise InputError("--sheet", expected="the name of a .png or .jpg", received=str(self.sheet))
         detector = load_detector(self.detector)
+        # `all` includes held-out cameras, whose keypoints serve measuring only.
         with shared_progress(enabled=not self.json) as progress:
             found = detect_keypoints(
                 capture,
@@ -120,6 +125,7 @@ class KeypointsDetect:
                 frames=frames,
                 progress=progress,
             )
+        # The contact sheet shows one frame of each camera with the detected points.
         if self.sheet is not None:
             encode = encode_png if self.sheet.suffix.lower() == ".png" else encode_jpeg
             atomic_write_bytes(self.sheet, encode(detection_sheet(capture, found)))
@@ -128,10 +134,10 @@ class KeypointsDetect:
             seen = float((one.people > 0).mean())
             summary[name] = {"frames": len(one.people), "with_a_person": seen, "detected_now": one.detected}
             log.info("%s: %d frames, a person in %.0f %% of them", name, len(one.people), 100 * seen)
-        problems = detection_notes(found, capture.splits.novel_view_cameras)
-        for words in problems:
-            log.warning(words)
-        return {"out": str(self.out), "detector": self.detector, "cameras": summary, "problems": problems}
+        notes = detection_notes(found, capture.splits.novel_view_cameras)
+        for note in notes:
+            log.warning(note)
+        return {"out": str(self.out), "detector": self.detector, "cameras": summary, "notes": notes}
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -33,7 +33,7 @@ from smplxpp.metrics import CompareConfig, MeshComparison, compare, presets
 FRAME_SUFFIXES = ((".ply", ".obj", ".glb", ".gltf", ".stl", ".off"), (".pkl",), (".npz",))
 LABEL_KEYS = ("face_labels", "vertex_labels", "labels", "label")
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-PLAUSIBLE_METRES = 20.0
+PLAUSIBLE_METRES = 20.0  # bounding-box diagonal above which the units are probably wrong
 Preset = Literal["smplxpp", "pifuhd-cm", "icon-cm", "now-mm", "occnet-l1", "occnet-l2", "pytorch3d"]
 
 
@@ -50,7 +50,7 @@ class Metrics:
     seed: int = 0
     """Seed of the points: the same seed gives the same numbers, bit for bit."""
     preset: Preset = "smplxpp"
-    """Whose definition of P2S and Chamfer; the output states it. Everything else is in mm."""
+    """Definition of P2S and Chamfer, which the output states. All other distances are in mm."""
     visible_only: bool = False
     """Measure from the outer surface of each mesh alone: skin hidden under clothes is left out."""
     threshold_mm: float = 5.0
@@ -77,6 +77,7 @@ class Metrics:
             raise InputError("output file", expected=".json or .csv", received=str(self.out))
         require_at_least("option seed", self.seed, 0)
         pairs, skipped = pair_frames(self.a, self.b)
+        # Compare pair by pair; the progress bar is of use for folders only.
         frames = []
         console = Console(stderr=True)
         hidden = self.json or len(pairs) == 1
@@ -100,6 +101,7 @@ class Metrics:
             )
         report = self._report(frames, skipped)
         if self.out is not None:
+            # JSON holds the whole report, CSV one flat row for each frame.
             as_csv = self.out.suffix.lower() == ".csv"
             atomic_write_text(self.out, _csv(frames) if as_csv else json_format.dumps(report, indent=1) + "\n")
         if not self.json:
@@ -109,6 +111,7 @@ class Metrics:
     def _compare(self, path_a: Path, path_b: Path) -> MeshComparison:
         meshes, labels = [], []
         for path, given in ((path_a, self.labels_a), (path_b, self.labels_b)):
+            # Convert to metres, the unit of all metrics.
             file = read_mesh(path)
             mesh = file.mesh.with_vertices(file.mesh.vertices * METRES[self.units])
             if mesh.bbox_diagonal > PLAUSIBLE_METRES:
@@ -131,6 +134,7 @@ class Metrics:
 
     def _report(self, frames: list[dict[str, Any]], skipped: list[dict[str, str]]) -> dict[str, Any]:
         convention = presets()[self.preset]
+        # Statistics over frames: a value that a frame lacks (for instance a label without faces) is left out.
         rows = [flat_row(frame) for frame in frames]
         keys = dict.fromkeys(key for row in rows for key in row)
         known = {key: [row[key] for row in rows if row.get(key) is not None] for key in keys}
@@ -155,7 +159,7 @@ class Metrics:
 
 
 def pair_frames(a: Path, b: Path) -> tuple[list[tuple[str, Path, Path]], list[dict[str, str]]]:
-    """Match pairs (name, file of A, file of B) and tell the frames without a partner, as {"frame", "reason"}.
+    """Return pairs (name, file of A, file of B), and the frames without a partner as {"frame", "reason"}.
 
     Two files are one pair. Two folders pair files of the same stem, or, where no stem occurs in both, files whose names
     end in the same number.
@@ -170,12 +174,14 @@ def pair_frames(a: Path, b: Path) -> tuple[list[tuple[str, Path, Path]], list[di
         raise InputError("inputs", expected="two files or two folders", received=f"{a} and {b}")
     if not a.is_dir():
         return [(a.stem, a, b)], []
+    # Equal stems are the safest match; otherwise the frame numbers at the names' ends decide.
     files = [_frames(a), _frames(b)]
     stems = [{f.stem for f in found} for found in files]
     key = _stem if stems[0] & stems[1] else frame_number
     keyed = [_by_key(found, key, folder) for found, folder in zip(files, (a, b), strict=True)]
     common = sorted(keyed[0].keys() & keyed[1].keys())
     pairs = [(keyed[0][k].stem, keyed[0][k], keyed[1][k]) for k in common]
+    # Frames without a partner are reported, not dropped in silence.
     skipped = [
         {"frame": path.name, "reason": f"no partner in {other}"}
         for own, theirs, other in ((0, 1, b), (1, 0, a))
@@ -197,9 +203,9 @@ def flat_row(frame: dict[str, Any]) -> dict[str, Any]:
     for prefix, result in [("", frame), *((f"{name}.", r) for name, r in frame["labels"].items())]:
         for key in ("p2s", "chamfer", "hausdorff", "precision", "recall", "fscore"):
             row[prefix + key] = result[key]
-        for way in ("pred_to_gt", "gt_to_pred"):
-            for key, value in (result[way] or {}).items():
-                row[f"{prefix}{way}.{key}"] = value
+        for direction in ("pred_to_gt", "gt_to_pred"):
+            for key, value in (result[direction] or {}).items():
+                row[f"{prefix}{direction}.{key}"] = value
     return row
 
 
@@ -238,6 +244,7 @@ def _labels(file: MeshFile, given: Path | None, mesh_path: Path) -> Shaped[np.nd
         # PLY files often store labels as floats.
         whole = stored is not None and np.array_equal(stored, np.round(stored))
         return stored.astype(np.int64) if stored is not None and whole else None
+    # A folder of label files is matched to the meshes by frame number.
     if given.is_dir():
         same = [
             p
@@ -270,6 +277,7 @@ def _csv(frames: list[dict[str, Any]]) -> str:
 def _print(report: dict[str, Any], console: Console) -> None:
     unit, frames = report["unit"], report["frames"]
     single = len(frames) == 1
+    # Column titles with the key of `flat_row` that each shows.
     columns = {
         f"P2S\n{unit}": "p2s",
         f"Chamfer\n{unit}": "chamfer",
@@ -297,6 +305,7 @@ def _print(report: dict[str, Any], console: Console) -> None:
         cells = ["-" if values.get(key) is None else f"{values[key]:.4g}" for key in columns.values()]
         table.add_row(name, *cells, style=style, end_section=end_section)
 
+    # A single pair also lists its labels; many frames list them under the mean.
     for frame in frames:
         row = flat_row(frame)
         add(frame["frame"], row, end_section=frame is frames[-1])

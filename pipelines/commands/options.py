@@ -14,7 +14,7 @@ from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.light import Irradiance, Relighting
 from smplxpp.core.validation import require_positive
 
-# Help shows them as what they take.
+# Types of optional values; the help shows the plain type instead of a union with None.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(optional)")]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(optional)")]
@@ -24,13 +24,13 @@ ClothMode = Literal["simulate", "field", "skin"]
 
 LARGEST_PORT = 65535
 MOST_AVATAR_BYTES = 1 << 30
-"""Of a bundle that is read whole."""
+"""Largest size in bytes of a bundle that is read into memory: 1 GiB."""
 
 _AVATAR_PACKAGES = ("torch", "safetensors", "threadpoolctl")
 
 
 def require_avatar(purpose: str) -> None:
-    """Say which package of the extra `avatar` is missing before anything imports it.
+    """Check that the packages of the extra `avatar` are installed, before anything imports them.
 
     Raises:
         MissingExtraError: one of them is not installed.
@@ -48,11 +48,11 @@ class Lighting:
     """Show the person in the light of this panorama: equirectangular, Radiance (.hdr) or OpenEXR (.exr, extra
     `exr`), straight up in its first row."""
     environment_turn: float = 0.0
-    """Degrees about the vertical by which that light is turned."""
+    """Rotation of that light about the vertical, degrees."""
     exposure: OptionalFloat = None
-    """Factor on that light; by default it is as bright in the mean as white light, so that colours keep their level."""
+    """Factor on that light; by default its mean equals that of white light, so that colours keep their brightness."""
     capture_light: OptionalPath = None
-    """Panorama of the light of the capture, which is divided out; by default white light, the same from everywhere."""
+    """Panorama of the light of the capture, which is divided out; by default uniform white light."""
 
     def relighting(self) -> Relighting | None:
         """Read the light; None where none is asked for.

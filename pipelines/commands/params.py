@@ -38,7 +38,7 @@ class ParamsConvert:
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
     """Axis that points up in the input (AMASS: z); the output has y up. None: -y for TalkBody4D, else y."""
     betas: OptionalInt = None
-    """Keep the first so many betas, for a body that has no more; says which share is lost (None: all)."""
+    """Number of leading betas to keep, for a body that has no more; the lost share is logged (None: all)."""
     flat_hand_mean: bool | None = None
     """Whether the hands are complete without the model's mean hand (None: as the layout implies)."""
     json: bool = False
@@ -48,6 +48,7 @@ class ParamsConvert:
         """Convert and return a summary."""
         if self.out.suffix.lower() != ".npz":
             raise InputError("--out", expected="a file name ending in .npz", received=str(self.out))
+        # A .bvh is retargeted to the body; all other layouts are read as they are.
         kept = _parse_frames(self.frames)
         if self.input.suffix.lower() == BVH:
             layout = "bvh"

@@ -1,4 +1,4 @@
-"""`smplxpp reconstruct`: photographs, cameras and masks in; the person's surface, and where it is sure, out."""
+"""`smplxpp reconstruct`: photographs, cameras and masks in; the person's surface and its confidence out."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ReconstructCommand:
     frame: str = "0"
     """Frame to reconstruct; all: every training frame; or numbers and ranges START:STOP:STEP with commas."""
     hold_out: tuple[str, ...] = ()
-    """Cameras that are not looked at; by default those that the capture holds out."""
+    """Cameras to leave out; by default those that the capture holds out."""
     masks: OptionalPath = None
     """Folder of masks, in the place of the capture's own."""
     protocol: OptionalText = None
@@ -43,29 +43,29 @@ class ReconstructCommand:
     cell: OptionalFloat = None
     """Size of the grid's cells in mm; by default two pixels, within 3 to 6 mm."""
     dissent: int = 0
-    """Views that may say of a point that it is outside: the surface grows by a centimetre with each, which is more than
-    holes in masks cost."""
+    """Number of views whose masks may exclude a point that the hull keeps. Each one lets the surface grow by about a
+    centimetre, which is more than holes in masks cost."""
     hull_only: bool = False
-    """Take the silhouettes' surface and do not compare the photographs."""
+    """Stop at the visual hull of the silhouettes, without refinement on the photographs."""
     mesh: OptionalPath = None
-    """Mesh of the frame by NeuS2, Instant-NGP or another program, which is taken in the place of ours; the masks tell
-    whether it lies in the cameras' world or in the trainer's unit cube."""
+    """Mesh of the frame by NeuS2, Instant-NGP or another program, used in the place of ours. The masks decide whether
+    its coordinates are the cameras' world or the trainer's unit cube."""
     method: Literal["sweep", "sdf"] = "sweep"
     """sweep: photographs compared along the normals. sdf: a neural signed distance over the hull, which needs the extra
     avatar and a CUDA device."""
     device: Literal["cuda", "cpu"] = "cuda"
     """Device of --method sdf; cpu takes hours."""
     iterations: int = 15_000
-    """Of --method sdf."""
+    """Iterations of --method sdf."""
     force: bool = False
-    """Reconstruct anew even if the stage stands."""
+    """Reconstruct again even if the stage is up to date."""
     no_report: bool = False
     """Leave out the page reconstruct.html."""
     json: bool = False
     """Print the summary as JSON."""
 
     def run(self) -> dict:
-        """Reconstruct, write the report, print what is sure and what is not."""
+        """Reconstruct the frames, write the report, print the surface's confidence and the notes."""
         from pipelines.commands.progress import shared_progress
         from pipelines.runs.folders import keep_out_of_capture, own_run_folder
         from pipelines.runs.layout import RECONSTRUCT_STAGE
@@ -73,6 +73,7 @@ class ReconstructCommand:
 
         keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         inputs, method = self.inputs(), self._method()
+        # Hold the run's lock during work and report.
         own = own_run_folder(self.run_folder, (RECONSTRUCT_STAGE, "reconstruct"))
         with own, shared_progress(enabled=not self.json) as progress:
             record = reconstruct_capture(self.run_folder, inputs, method=method, force=self.force, progress=progress)
@@ -81,30 +82,32 @@ class ReconstructCommand:
         content = as_object(read_json(path, subject="reconstruction"), subject=f"reconstruction {path}")
         frames = as_object(content["frames"], subject=f"reconstruction {path}: frames")
         scans = {frame: str(record.folder / f"scan_{int(frame):06d}.ply") for frame in frames}
-        problems = [f"frame {frame}: {words}" for frame, one in frames.items() for words in one["problems"]]
-        problems += [f"frame {frame} left out: {words}" for frame, words in content["absent"].items()]
+        # Notes of every frame, and the reasons of frames that could not be reconstructed.
+        notes = [f"frame {frame}: {note}" for frame, one in frames.items() for note in one["problems"]]
+        notes += [f"frame {frame} left out: {reason}" for frame, reason in content["absent"].items()]
         if not self.json:
-            _print(record, scans, problems, report)
+            _print(record, scans, notes, report)
         return {
             **record.manifest["numbers"],
             "run": str(self.run_folder),
             "ran": record.ran,
             "scans": scans,
-            "problems": problems,
+            "notes": notes,
             "checks": record.manifest["checks"],
             "report": None if report is None else str(report),
         }
 
     def inputs(self) -> ReconstructInputs:
-        """What is reconstructed.
+        """Check the options and return the inputs of the reconstruction.
 
         Raises:
-            InputError: options that make no sense, a missing folder, frames that the capture has not.
+            InputError: a number out of range, a missing file or folder, frames that the capture does not have.
         """
         from pipelines.commands.capture import selected_frames
         from pipelines.stages.build_config import ReconstructInputs
         from smplxpp.capture import open_capture
 
+        # Check ranges and files first: a reconstruction takes minutes for each frame.
         require_at_least("option dissent", self.dissent, 0)
         if self.cell is not None:
             require_positive("option cell", self.cell)
@@ -128,7 +131,7 @@ class ReconstructCommand:
         )
 
     def _method(self) -> Method | None:
-        """What makes the surfaces of --method sdf.
+        """Return the neural method for --method sdf, None for the plane sweep.
 
         Raises:
             MissingExtraError: the extra avatar is not installed.
@@ -137,6 +140,7 @@ class ReconstructCommand:
         if self.method != "sdf":
             return None
         require_avatar("--method sdf")
+        # The neural method makes its own surface within the hull, so that neither option applies.
         if self.mesh is not None or self.hull_only:
             raise InputError("--method sdf", expected="neither --mesh nor --hull-only with it", received="one of them")
         from avatar.reconstruct import SurfaceConfig
@@ -151,14 +155,17 @@ class ReconstructCommand:
         from pipelines.report.sections.reconstruct import write_reconstruct_report
 
         page = self.run_folder / "reconstruct.html"
+        # Compare modification times in nanoseconds: a page older than its stage shows old figures.
         made = (record.folder / "manifest.json").stat().st_mtime_ns
         if record.ran or not page.is_file() or page.stat().st_mtime_ns < made:
             write_reconstruct_report(page, self.run_folder, record)
         return page
 
 
-def _print(record: StageRecord, scans: dict[str, str], problems: list[str], report: Path | None) -> None:
+def _print(record: StageRecord, scans: dict[str, str], notes: list[str], report: Path | None) -> None:
+    """Print size and accuracy of the surfaces, checks that did not pass, the first notes, and the files."""
     console, numbers = Console(), record.manifest["numbers"]
+    # Size and resolution first, then the share of the surface that can be trusted.
     console.print(
         f"{numbers['frames']} frames, {len(numbers['seen']['cameras'])} cameras of {numbers['pixel_mm']:.1f} mm a "
         f"pixel, cells of {numbers['cell_mm']:.1f} mm: {numbers['vertices']:,} vertices; photographs moved the hull by "
@@ -175,12 +182,13 @@ def _print(record: StageRecord, scans: dict[str, str], problems: list[str], repo
     for check in map(CheckRow.of, record.manifest["checks"]):
         if check.status != "pass":
             style = "red" if check.status == "fail" else "yellow"
-            words = escape(f"{check.name}: {check.shown}, {check.explanation}")
-            console.print(f"[{style}]{check.status}[/]  {words}", soft_wrap=True)
-    for words in problems[:_SHOWN]:
-        console.print(f"[yellow]problem[/]  {escape(words)}", soft_wrap=True, highlight=False)
-    if len(problems) > _SHOWN:
-        console.print(f"[dim]and {len(problems) - _SHOWN} more (--json lists all)[/]")
+            line = escape(f"{check.name}: {check.shown}, {check.explanation}")
+            console.print(f"[{style}]{check.status}[/]  {line}", soft_wrap=True)
+    # A long sequence can have hundreds of notes: print the first ones only.
+    for note in notes[:_SHOWN]:
+        console.print(f"[yellow]note[/]  {escape(note)}", soft_wrap=True, highlight=False)
+    if len(notes) > _SHOWN:
+        console.print(f"[dim]and {len(notes) - _SHOWN} more (--json lists all)[/]")
     if not record.ran:
         console.print("stands, not run again")
     first = next(iter(scans.values()))

@@ -45,7 +45,7 @@ class Register:
     masks: OptionalPath = None
     """Folder of masks, in the place of the capture's own."""
     initial: Literal["params", "none"] = "params"
-    """none: no parameters are looked at, and the fit starts from keypoints alone."""
+    """params: start from the parameters. none: ignore them, and start from keypoints alone."""
     protocol: OptionalText = None
     """Protocol of the capture, which names the files that are read."""
     frames: OptionalText = None
@@ -60,7 +60,7 @@ class Register:
     """Landmarks of that scan, a JSON object of points by name; kept in the run as landmarks.json, which is read
     whenever it lies there."""
     hold_out: tuple[str, ...] = ()
-    """Cameras that are not looked at; by default those that the capture holds out."""
+    """Cameras to leave out; by default those that the capture holds out."""
     body: OptionalPath = None
     """SMPL-X-layout body file; the open body by default."""
     units: Literal["m", "cm", "mm", "inch"] = "m"
@@ -68,9 +68,9 @@ class Register:
     up: Literal["y", "z", "x", "-y", "-z", "-x"] = "y"
     """Upward axis of scan files."""
     seed: int = 0
-    """Seed of the points that are sampled."""
+    """Seed of the sampled points."""
     force: bool = False
-    """Register anew even if the registration stands."""
+    """Register again even if the registration is up to date."""
     no_report: bool = False
     """Leave out the page register.html, or the section of a run's report."""
     json: bool = False
@@ -89,6 +89,7 @@ class Register:
         require_at_least("option seed", self.seed, 0)
         require_at_least("option frame", self.frame, 0)
         inputs = self.inputs()
+        # Landmarks are copied into the run and stay there; the registration reads them from it.
         take_file(self.run_folder, LANDMARKS_FILE, self.landmarks, read=read_landmarks)
         with (
             own_run_folder(self.run_folder, (REGISTER_STAGE, "register")),
@@ -96,10 +97,11 @@ class Register:
         ):
             record = register_capture(self.run_folder, inputs, force=self.force, progress=progress)
             report = None if self.no_report else self._report(record)
+        # The details lie in the stage's file, because the manifest holds summary figures only.
         path = record.folder / "registration.json"
         content = as_object(read_json(path, subject="registration"), subject=f"registration {path}")
         with values_of(path):
-            told = {name: content[name] for name in ("by_camera", "problems")}
+            details = {"by_camera": content["by_camera"], "notes": content["problems"]}
             if not self.json:
                 _print(record, content, report)
         return {
@@ -107,13 +109,13 @@ class Register:
             "run": str(self.run_folder),
             "ran": record.ran,
             "params": str(record.folder / "params.npz"),
-            **told,
+            **details,
             "checks": record.manifest["checks"],
             "report": None if report is None else str(report),
         }
 
     def inputs(self) -> RegisterInputs:
-        """What the body is registered to.
+        """Check the options and return the inputs of the registration.
 
         Raises:
             InputError: neither a capture nor a scan, a missing file, frames that the capture has not.
@@ -123,6 +125,7 @@ class Register:
         from smplxpp.build.inputs import named_params
         from smplxpp.capture import open_capture
 
+        # Check that options fit together before files are read.
         if self.capture is None and self.scan is None:
             raise InputError("input", expected="--capture, or --scan with --params", received="neither")
         for name in ("scan", "labels", "landmarks", "body"):
@@ -139,6 +142,7 @@ class Register:
             raise InputError("option initial", expected="none without --params", received="both")
         if self.frames is not None and self.capture is None:
             raise InputError("--frames", expected="a --capture that has them", received="a scan alone: see --frame")
+        # Only a capture knows which frame numbers exist.
         frames = None
         if self.frames is not None and self.capture is not None:
             frames = selected_frames(self.frames, open_capture(self.capture, protocol=self.protocol))
@@ -167,6 +171,7 @@ class Register:
         from pipelines.report.sections.register import write_register_report
 
         page = self.run_folder / "register.html"
+        # Compare modification times in nanoseconds: a page older than its stage shows old figures.
         made = (record.folder / "manifest.json").stat().st_mtime_ns
         if record.ran or not page.is_file() or page.stat().st_mtime_ns < made:
             write_register_report(page, self.run_folder, record)
@@ -178,16 +183,18 @@ def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None)
 
     console, numbers = Console(), record.manifest["numbers"]
     medians = numbers["residuals"]
+    # Residuals before and after, as medians over frames.
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
     table.add_column("median over frames")
     for when in ("before", "after"):
         table.add_column(when, justify="right")
     for name, after in medians["after"].items():
         shown = RESIDUALS.get(name)
-        words, unit = (name, "") if shown is None else (shown.words, shown.unit)
+        title, unit = (name, "") if shown is None else (shown.words, shown.unit)
         before = medians["before"].get(name)
-        table.add_row(words, "-" if before is None else f"{before:.2f} {unit}", f"{after:.2f} {unit}")
+        table.add_row(title, "-" if before is None else f"{before:.2f} {unit}", f"{after:.2f} {unit}")
     console.print(table)
+    # A camera whose residual stays high has a wrong calibration or wrong keypoints.
     for name, found in content["by_camera"].items():
         before = f"{found['before']['median_px']:.2f} to " if "before" in found else ""
         after = f"{found['after']['median_px']:.2f}" if "after" in found else "-"
@@ -197,13 +204,14 @@ def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None)
     for check in map(CheckRow.of, record.manifest["checks"]):
         if check.status != "pass":
             style = "red" if check.status == "fail" else "yellow"
-            words = escape(f"{check.name}: {check.shown}, {check.explanation}")
-            console.print(f"[{style}]{check.status}[/]  {words}")
-    problems = content["problems"]
-    for words in problems[:_SHOWN]:
-        console.print(f"[yellow]problem[/]  {escape(words)}", soft_wrap=True, highlight=False)
-    if len(problems) > _SHOWN:
-        console.print(f"[dim]and {len(problems) - _SHOWN} more (--json lists all)[/]")
+            line = escape(f"{check.name}: {check.shown}, {check.explanation}")
+            console.print(f"[{style}]{check.status}[/]  {line}")
+    # A long sequence can have hundreds of notes: print the first ones only.
+    notes = content["problems"]
+    for note in notes[:_SHOWN]:
+        console.print(f"[yellow]note[/]  {escape(note)}", soft_wrap=True, highlight=False)
+    if len(notes) > _SHOWN:
+        console.print(f"[dim]and {len(notes) - _SHOWN} more (--json lists all)[/]")
     absent = f", {len(content['absent'])} could not be" if content["absent"] else ""
     how = "" if record.ran else "; stands, not run again"
     console.print(f"{numbers['frames']} frames registered{absent}{how}", highlight=False)

@@ -28,19 +28,19 @@ class Synth:
     out: Path
     """Folder to write; it must not exist, or be empty."""
     motion: str = "turning"
-    """What she does: turning (gestures, a turn with steps, arms overhead) or talking (stands, talks, gestures)."""
+    """Motion: turning (gestures, a turn with steps, arms overhead) or talking (standing, with gestures)."""
     frames: int = 24
     """Length of the motion; the last fifth of the frames is held out."""
     cameras: OptionalInt = None
-    """How many, 12 (talking: 8); from four on two are close-ups of the face, and some of the others are held out."""
+    """Number of cameras, 12 (talking: 8). From four on two are close-ups of the face, and some others are held out."""
     size: int = 640
     """Height of body images in pixels; close-ups are square and 3/4 as high."""
     width: OptionalInt = None
     """Width of body images in pixels, in eights; 4/5 of the height (talking: 3/5)."""
     clothes: OptionalText = None
-    """What she wears below the shirt: skirt (loose) or trousers (tight); a skirt (talking: trousers)."""
+    """Clothes below the shirt: skirt (loose) or trousers (tight); by default a skirt (talking: trousers)."""
     skirt_pattern: OptionalText = None
-    """Of a skirt: plaid (if left out), stripes (down), hoops (around), dots or plain."""
+    """Pattern of a skirt: plaid (default), stripes (vertical), hoops (horizontal), dots or plain."""
     seed: int = 0
     """Seed of the motion, the cameras and all noise."""
     fps: float = 10.0
@@ -59,7 +59,7 @@ class Synth:
     """Light of this panorama (.hdr, .exr) in the place of the stage's, with the shadows that she casts: with
     the same seed and options the same performance in a second light."""
     environment_turn: float = 0.0
-    """Degrees about the vertical by which that light is turned."""
+    """Rotation of that light about the vertical, degrees."""
     exposure: OptionalFloat = None
     """Factor on that light; by default it is as bright in the mean as the stage."""
     person: Path = FIXTURE
@@ -76,6 +76,7 @@ class Synth:
                 received=str(self.out),
                 remedy="name another, or delete it",
             )
+        # Check all options and read the panorama before rendering starts.
         config, environment = self._config(), self._environment()
         console = Console(stderr=True)
         columns = (TextColumn("{task.description:<8}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
@@ -108,7 +109,8 @@ class Synth:
         return Environment(panorama, self.environment.stem, self.environment_turn, self.exposure)
 
     def _config(self) -> SynthConfig:
-        """Make the configuration: what is left out is as the motion has it."""
+        """Make the configuration; the kind of motion gives the defaults of omitted options."""
+        # The motion determines sensible numbers of cameras, truth meshes and clothes.
         kind = motion_kind(self.motion)
         require_at_least("--size", self.size, 16)
         if self.width is not None:

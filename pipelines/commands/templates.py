@@ -1,11 +1,12 @@
-"""What commands on a finished template share: the file in its run, and frames of parameters that it can play."""
+"""Read the template of a run and motions for it, and write its student as a bundle."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipelines.commands.driving import Driving, unshaped
+from pipelines.commands.options import require_avatar
 from pipelines.runs.layout import PARAMS, TEMPLATE
 from smplxpp.core.errors import InputError
 from smplxpp.core.params import BodyParams
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def load_run_template(run: Path) -> Template:
-    """The template of a run.
+    """Load the template of a run.
 
     Raises:
         InputError: a run without one.
@@ -33,7 +34,7 @@ def load_run_template(run: Path) -> Template:
 
 
 def load_params_for(template: Template, path: Path) -> BodyParams:
-    """A motion in any layout, or a .bvh, for a template to make.
+    """Read a motion, in any layout or as .bvh, for the body of a template.
 
     Raises:
         InputError: no file of parameters, or of another body.
@@ -48,3 +49,33 @@ def person_of_run(run: Path) -> tuple[Face, StandingBody]:
 
     seen = load_params_of_run(run) if (run / PARAMS).is_file() else None
     return person_of_template(load_run_template(run), seen)
+
+
+BUNDLE_SUFFIX = ".avatar"
+
+
+def export_bundle(
+    run: Path, out: Path, *, name: str | None, licence: str, params: Path | None, exact: bool
+) -> dict[str, Any]:
+    """Write the student of a run as a bundle, whole or not at all.
+
+    Args:
+        run: folder of a training.
+        out: file of the bundle.
+        name: name of the avatar; None takes the run folder's.
+        licence: licence of the avatar.
+        params: parameters of the motion to play; None takes the poses of the training.
+        exact: whether to keep float32.
+
+    Returns:
+        The file, bytes of its pieces, and how many frames it plays.
+
+    Raises:
+        InputError: a run without template or student, or parameters of another body.
+    """
+    require_avatar("exporting a student")
+    import avatar
+
+    student = avatar.load(run)
+    motion = None if params is None else load_params_for(student.rig.template, params)
+    return avatar.export_student(student, out, params=motion, name=name, licence=licence, exact=exact)

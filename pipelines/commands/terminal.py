@@ -16,7 +16,7 @@ from rich.text import Text
 
 STDOUT = "standard output"
 CLOSED_PIPE = 128 + 13
-"""Status of a command whose output nobody reads any more, as the shell gives it to one that SIGPIPE ended."""
+"""Exit status after the reader of the output has closed its pipe: 128 + SIGPIPE, as a shell reports it."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REMEDIES = {
     errno.ENOSPC: "free some space or name a place on another disk; nothing half-written was kept",
@@ -28,7 +28,7 @@ _REMEDIES = {
     errno.EPERM: "see its permissions and those of its folder, or name another place",
     errno.ENAMETOOLONG: "shorten the name",
     errno.EIO: "the disk or the network does not answer as it should: see the system's log, try another disk",
-    errno.ESTALE: "the network's file system has lost it: open the folder anew",
+    errno.ESTALE: "the network's file system has lost it: open the folder again",
     errno.EMFILE: "raise the number of open files: `ulimit -n 4096`",
     errno.ENFILE: "end other programs: the system has too many files open",
     errno.ELOOP: "a link points to itself: name the file that is meant",
@@ -39,11 +39,11 @@ _REMEDIES = {
 
 
 class OutputError(OSError):
-    """Standard output takes no more; a type of its own, so that nobody takes it for the trouble of a file."""
+    """Standard output cannot be written; the separate type distinguishes it from errors of files."""
 
 
 class _Stream:
-    """A text stream whose failures are `OutputError`; or which swallows them, where there is nobody to tell."""
+    """A text stream whose failures raise `OutputError`, or are ignored (standard error has no place to report them)."""
 
     def __init__(self, stream: TextIO, *, silent: bool) -> None:
         self._stream, self._silent = stream, silent
@@ -83,6 +83,7 @@ def standard_streams() -> Iterator[None]:
     """
     with open(os.devnull, "w") as nothing:
         out, err = sys.stdout or nothing, sys.stderr or nothing
+        # Letters that the terminal's encoding lacks must not end a command after hours.
         for stream in (out, err):
             with suppress(AttributeError, ValueError, OSError):  # a stream of its own kind, or one already detached
                 stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -94,7 +95,7 @@ def standard_streams() -> Iterator[None]:
 
 
 def end_of_output(error: OutputError, console: Console) -> int:
-    """Say that standard output takes no more, unless nobody reads it; return the exit status."""
+    """Print that standard output failed, unless its reader has closed the pipe; return the exit status."""
     if error.errno == errno.EPIPE:
         return CLOSED_PIPE
     print_error(error, console)
@@ -112,6 +113,7 @@ def error_in_words(error: Exception) -> str:
     words = str(error)
     if isinstance(error, OSError) and error.strerror:
         place = "" if error.filename is None else os.fsdecode(error.filename)
+        # Name the file first, then the cause, the free space of a full disk, and a remedy.
         words = f"{place}: {error.strerror}" if place else error.strerror
         if error.errno in _FULL and place != STDOUT:
             words += _free_space(Path(place))

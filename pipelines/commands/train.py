@@ -39,9 +39,9 @@ class Train:
     capture: Path
     """Folder of the capture: cameras, images, masks and body parameters of its frames."""
     preset: Literal["paper", "gpu", "paper-small", "cpu", "demo"] = "cpu"
-    """paper: the numbers that the paper states (docs/training.md lists the others), for a GPU; gpu: smaller and some
-    hours; paper-small: the paper's recipe in the minutes of cpu; cpu: two cores, half an hour; demo: minutes, to see
-    whether all fits together."""
+    """paper: the published numbers, for a GPU (docs/training.md lists the others). gpu: smaller, some hours.
+    paper-small: the paper's recipe in the time of cpu. cpu: half an hour on two cores. demo: minutes, to check the
+    inputs."""
     stage: Annotated[
         Literal["refine", "teacher", "cloth", "bake", "compensate"] | None,
         tyro.conf.arg(metavar="{refine,teacher,cloth,bake,compensate}", help_behavior_hint="(optional)"),
@@ -50,16 +50,16 @@ class Train:
     until: Literal["refine", "fit", "teacher", "cloth", "bake", "compensate"] = "compensate"
     """The last stage to train."""
     refine_poses: Literal["auto", "on", "off"] = "auto"
-    """Refine the poses of the training frames on the photographs first; all that comes after takes them. auto: where
-    the capture says that its parameters are tracked, or the run has registered or refined some."""
+    """Refine the poses of the training frames on the photographs first; all later stages use them. auto: if the capture
+    declares its parameters as tracked, or the run has registered or refined some."""
     refine_cameras: bool = False
-    """With the poses, correct the poses of the training cameras by the photographs; their mean stays where it is, and
-    so do intrinsics and held-out cameras. For calibrations that are a little off, with many cameras."""
+    """Refine the poses of the training cameras together with the body poses. Their mean, all intrinsics and held-out
+    cameras stay fixed. For slightly wrong calibrations of many cameras."""
     max_minutes: float = math.inf
-    """Stop after as many minutes and write what there is; the same command
-    then goes on (without --force, which would begin anew)."""
+    """Stop after this many minutes and write the models reached so far. The same command then resumes, without --force,
+    which would start again."""
     iterations_share: OptionalFloat = None
-    """Share of the preset's iterations, of all stages."""
+    """Fraction of the preset's iterations, for all stages."""
     fit_iterations: OptionalInt = None
     """Iterations of the fit, in the place of the preset's."""
     teacher_iterations: OptionalInt = None
@@ -80,8 +80,8 @@ class Train:
     no_teacher: bool = False
     """Bake from the photographs alone, without stage 80."""
     cloth: Literal["auto", "none"] = "auto"
-    """Clothes that are simulated in new motion. auto: those that leave skinning in the photographs and that a
-    simulation brings nearer to them; none: the field moves all."""
+    """Clothes to simulate in new motion. auto: garments that deviate from skinning in the photographs and that a
+    simulation reproduces better. none: the student's field moves all clothes."""
     loose_parts: tuple[str, ...] = ()
     """Simulate these parts, in the place of what --cloth auto finds: names as `smplxpp inspect` lists them."""
     perceptual: Literal["auto", "lpips", "st-lpips", "none"] = "auto"
@@ -100,9 +100,9 @@ class Train:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
     seed: int = 0
-    """Decides everything that is drawn."""
+    """Seed of all random numbers."""
     force: bool = False
-    """Train anew even what stands; checkpoints go. A fit that you made stays."""
+    """Train again even what is up to date, and delete checkpoints. A fit by `smplxpp fit` is kept."""
     tensorboard: bool = False
     """Log for TensorBoard too, into the folders of the stages."""
     no_report: bool = False
@@ -114,7 +114,7 @@ class Train:
         """Train, write the report, print the figures; None on all but the first of several processes."""
         require_avatar("training an avatar")
         if int(os.environ.get("RANK") or 0):
-            logging.disable(logging.WARNING)  # the first process says it
+            logging.disable(logging.WARNING)  # rank 0 logs the same warnings
         from avatar.training.engine.processes import join_processes
         from avatar.training.engine.resources import choose_device
         from avatar.training.recipe import with_batch
@@ -124,6 +124,7 @@ class Train:
         from pipelines.stages.scene import TrainInputs, open_scene
         from pipelines.stages.train import train
 
+        # Check options before processes are joined, so that every process fails alike.
         keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         config, steps = self.config(), self.steps()
@@ -131,6 +132,7 @@ class Train:
         with join_processes(choose_device(self.device)) as together:
             # Every process needs a pose of each step.
             recipe = replace(recipe, preset=with_batch(recipe.preset, least=together.world_size))
+            # Rank 0 decides and opens the scene, so that all ranks train with the same steps on the same data.
             first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
             recipe = replace(recipe, refine=config.refinement(wanted=first))
             refines = first and "refine" in steps
@@ -154,6 +156,7 @@ class Train:
         Raises:
             InputError: options that exclude each other.
         """
+        # Loose clothes are calibrated on the teacher's tracked surface, so that they need a teacher.
         if self.no_teacher and "teacher" in (self.stage, self.until):
             raise InputError("option no-teacher", expected="another last stage than the teacher", received="teacher")
         if self.loose_parts or "cloth" in (self.stage, self.until):
@@ -178,6 +181,7 @@ class Train:
         """
         from avatar.training.recipe import TrainConfig
 
+        # Only given numbers are passed on; the rest comes from the preset.
         given = {step: getattr(self, f"{step}_iterations") for step in ("fit", "teacher", "bake", "compensate")}
         return TrainConfig(
             refine_cameras=self.refine_cameras,
@@ -200,15 +204,17 @@ class Train:
         from pipelines.report.sections.build import rewrite_report
 
         report = self.run_folder / "report.html"
+        # The page is rewritten if it lacks the new figures.
         ran = any(record.ran for record in records.values())
         if not self.no_report and (ran or not report.is_file()) and rewrite_report(self.run_folder) is None:
-            log.warning("the run does not say what it was built from: `smplxpp build` writes the report")
+            log.warning("the run has no record of its build: `smplxpp build` writes the report")
         if not self.json:
             _print(records, report, force=self.force)
         stages = {
             name: {**record.manifest["numbers"], "ran": record.ran, "checks": record.manifest["checks"]}
             for name, record in records.items()
         }
+        # Refinement has no entry among the stages when it is not wanted.
         last = self.steps()[-1]
         finished = all(record.finished for record in records.values()) and (last in stages or last == "refine")
         return {"run": str(self.run_folder), "finished": finished, "stages": stages}
@@ -230,9 +236,10 @@ def _print(records: dict[str, StageRecord], report: Path, *, force: bool) -> Non
 
 
 def _row(record: StageRecord, *, force: bool) -> tuple[str, ...]:
-    """A stage's line of the table."""
+    """Return a stage's row of the table."""
     numbers = record.manifest["numbers"]
     stage = record.folder.name
+    # A fit stores means by held-out and training views; other stages store them by kind of views.
     views = (
         numbers["mean"].get("held_out", numbers["mean"].get("train", {}))
         if stage == FIT_STAGE

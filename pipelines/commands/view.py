@@ -40,6 +40,7 @@ class Label:
         from pipelines.viewer.window import open_window
 
         require_between("option port", self.port, 1, LARGEST_PORT)
+        # Unsaved corrections are written on Ctrl-C too, since they are manual work.
         window = open_window(open_session(self.run_folder), self.run_folder, host=self.host, port=self.port)
         console = Console(stderr=self.json)
         console.print(f"{window.address}  (Ctrl-C ends it)", highlight=False)
@@ -75,7 +76,7 @@ class View:
     """Options of `smplxpp view`."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `smplxpp build` wrote; a training in it may be under way."""
+    """Folder that `smplxpp build` wrote; a training in it may be running."""
     capture: OptionalPath = None
     """Capture whose photographs and frames are shown; by default the one that the run was made from."""
     params: OptionalPath = None
@@ -96,6 +97,7 @@ class View:
 
         require_between("option port", self.port, 1, LARGEST_PORT)
         require_avatar("the viewer of a run")
+        # Parameters and light are read before the window opens, so that errors appear in the terminal.
         template = load_run_template(self.run_folder)
         session = open_run(
             self.run_folder,

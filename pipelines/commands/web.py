@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from pipelines.commands.export_bundle import SUFFIX, export_bundle
 from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, Lighting, OptionalPath, OptionalText
 from pipelines.commands.talking_page import PAGES, live_lips
+from pipelines.commands.templates import BUNDLE_SUFFIX, export_bundle
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import read_bytes
@@ -57,6 +57,7 @@ class Web:
         bundle, name, lips = self._bundle()
         from pipelines.web.page import PageContent, page_files, single_page, write_page_folder
 
+        # The same content serves folder, single file and server.
         content = PageContent(name=name, light=light, lips=lips)
         console = Console(stderr=self.json)
         written: dict[str, int] = {}
@@ -104,19 +105,21 @@ class Web:
         """The bytes of the bundle, one that can be opened, the avatar's name, and how its lips move."""
         from avatar.runtime import load_bundle
 
+        # A run is bundled first, into a temporary folder; a bundle is taken as it is.
         if self.source.is_dir():
             with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / f"me{SUFFIX}"
+                path = Path(folder) / f"me{BUNDLE_SUFFIX}"
                 export_bundle(self.source, path, name=self.name, licence=self.licence, params=self.params, exact=False)
                 name = self.name or self.source.resolve().name
                 return read_bytes(path, subject="avatar"), name, live_lips(load_bundle(path))
+        # Name and licence are part of a finished bundle.
         given = [option for option in ("params", "name", "licence") if getattr(self, option)]
         if given:
             raise InputError(
                 f"option {given[0]}",
                 expected="a run",
                 received=f"{self.source}, which says it already",
-                remedy=f"give it to `smplxpp export RUN --out NAME{SUFFIX}`",
+                remedy=f"give it to `smplxpp export RUN --out NAME{BUNDLE_SUFFIX}`",
             )
         data = read_bytes(self.source, subject="avatar", most=MOST_AVATAR_BYTES)
         bundle = load_bundle(self.source)
