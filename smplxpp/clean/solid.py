@@ -17,6 +17,7 @@ from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.solids import closed_mesh, mesh_of_solid, solid_of_mesh
+from smplxpp.core.surface_points import draw_on_surface
 from smplxpp.core.topology import component_labels, face_components
 from smplxpp.core.validation import require_at_least, require_positive
 
@@ -262,9 +263,7 @@ def wall_thickness(
     """
     solid = solid_of_mesh(mesh) if solid is None else solid
     rays = 4000
-    rng = np.random.default_rng(seed)
-    face = rng.choice(mesh.face_count, rays, p=mesh.face_areas / mesh.face_areas.sum())
-    weights = rng.dirichlet((1.0, 1.0, 1.0), rays)
+    face, weights = draw_on_surface(mesh, rays, seed=seed, method="unsorted")
     points = np.einsum("nk,nkd->nd", weights, mesh.triangles[face])
     # A ray starts slightly below its surface point, in order not to hit the surface there.
     reach = mesh.bbox_diagonal

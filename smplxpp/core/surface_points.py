@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -12,6 +13,53 @@ from smplxpp.core.mesh import TriangleMesh
 
 TRUNCATION_M = 0.25
 """Distance, metres, at which `truncated_distance` saturates: more only says that the surfaces are apart."""
+
+
+def draw_on_surface(
+    mesh: TriangleMesh,
+    count: int,
+    *,
+    seed: int | tuple[int, ...] = 0,
+    method: Literal["stratified", "independent", "unsorted"] = "stratified",
+) -> tuple[Int64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
+    """Draw random points on a mesh with equal density per area.
+
+    The generator is PCG64, so that one seed gives the same bits on all machines. The methods have different streams of
+    random numbers:
+
+    - "stratified": point i lies in stratum i of `count` equal shares of the area, in the order of the faces. It has
+      less variance than independent points. Barycentric coordinates are `(1 - sqrt(a), sqrt(a) (1 - b), sqrt(a) b)`
+      with a
+      and b uniform (Osada et al. 2002).
+    - "independent": independent points, sorted by face, with coordinates from the unit square folded at its diagonal.
+    - "unsorted": independent points in random order, with coordinates from a Dirichlet distribution.
+
+    Args:
+        mesh: a mesh with area.
+        count: number of points.
+        seed: seed of the generator.
+        method: one of the above.
+
+    Returns:
+        The face of each point, and its barycentric coordinates there.
+    """
+    rng = np.random.Generator(np.random.PCG64(seed))
+    if method == "stratified":
+        cumulative = np.cumsum(mesh.face_areas)
+        share = (np.arange(count) + rng.random(count)) / count
+        face = np.searchsorted(cumulative, share * cumulative[-1], side="right")
+        # A share that rounds up to the whole area would fall behind the last face that has any.
+        face = np.minimum(face, np.flatnonzero(mesh.face_areas)[-1])
+        a, b = np.sqrt(rng.random(count)), rng.random(count)
+        return face, np.stack([1 - a, a * (1 - b), a * b], axis=1)
+    face = rng.choice(mesh.face_count, count, p=mesh.face_areas / mesh.face_areas.sum())
+    if method == "unsorted":
+        return face, rng.dirichlet((1.0, 1.0, 1.0), count)
+    u, v = rng.random((2, count))
+    # Pairs of the unit square above its diagonal are reflected into the triangle.
+    over = u + v > 1.0
+    u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
+    return np.sort(face), np.stack([1 - u - v, u, v], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +81,12 @@ class SurfacePoints:
     @staticmethod
     def sample(mesh: TriangleMesh, count: int, *, seed: int = 0) -> SurfacePoints:
         """Draw `count` points with equal density per area, with interpolated vertex normals."""
-        rng = np.random.default_rng(seed)
-        share = mesh.face_areas / mesh.face_areas.sum()
-        face = np.sort(rng.choice(mesh.face_count, count, p=share))
-        u, v = rng.random((2, count))
-        # Uniform barycentric coordinates: pairs of the unit square above its diagonal are reflected into the triangle.
-        over = u + v > 1.0
-        u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
+        face, barycentric = draw_on_surface(mesh, count, seed=seed, method="independent")
+        w, u, v = barycentric.T
         a, b, c = mesh.triangles[face].transpose(1, 0, 2)
         points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
         normals = mesh.vertex_normals[mesh.faces[face]]
-        smooth = normals[:, 0] * (1 - u - v)[:, None] + normals[:, 1] * u[:, None] + normals[:, 2] * v[:, None]
+        smooth = normals[:, 0] * w[:, None] + normals[:, 1] * u[:, None] + normals[:, 2] * v[:, None]
         # Where interpolated normals nearly cancel, take the face's normal.
         length = np.linalg.norm(smooth, axis=1, keepdims=True)
         smooth = np.where(length > 0.1, smooth / np.maximum(length, 0.1), mesh.face_normals[face])

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int64, Integer, Shaped
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh, normalize_rows
+from smplxpp.core.surface_points import draw_on_surface
 from smplxpp.core.validation import require_at_least
 
 
@@ -35,12 +36,10 @@ class SurfaceSamples:
 
 
 def sample_surface(mesh: MeshLike, count: int, *, seed: int | tuple[int, ...] = 0) -> SurfaceSamples:
-    """`count` points spread over the surface in proportion to area, ordered by face.
+    """Sample `count` points of a surface in proportion to area, ordered by face.
 
-    Stratified: the i-th point falls into the i-th of `count` equal shares of the area, uniformly inside it, and
-    uniformly inside its face (`p = (1 - sqrt(a)) v0 + sqrt(a) (1 - b) v1 + sqrt(a) b v2`, Osada et al. 2002). Unbiased
-    like independent samples, with less variance; neighbouring samples are near each other, which a tree query likes.
-    The generator is PCG64, so that the same seed gives the same bits everywhere.
+    The samples are stratified (`draw_on_surface`): unbiased like independent ones, with less variance. Neighbouring
+    samples are near each other, which makes tree queries faster.
 
     Raises:
         InputError: `count` below 1, or a mesh without area.
@@ -48,14 +47,7 @@ def sample_surface(mesh: MeshLike, count: int, *, seed: int | tuple[int, ...] = 
     mesh = as_mesh(mesh, subject="mesh")
     require_at_least("sample count", count, 1)
     require_surface(mesh, "mesh to sample")
-    rng = np.random.Generator(np.random.PCG64(seed))
-    cumulative = np.cumsum(mesh.face_areas)
-    share = (np.arange(count) + rng.random(count)) / count
-    face = np.searchsorted(cumulative, share * cumulative[-1], side="right")
-    # A share that rounds up to the whole area would fall behind the last face that has any.
-    face = np.minimum(face, np.flatnonzero(mesh.face_areas)[-1])
-    a, b = np.sqrt(rng.random(count)), rng.random(count)
-    weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
+    face, weights = draw_on_surface(mesh, count, seed=seed)
     points = np.einsum("pk,pkd->pd", weights, mesh.triangles[face])
     return SurfaceSamples(points, face, interpolated_normals(mesh, face, weights))
 
