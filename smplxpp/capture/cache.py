@@ -42,17 +42,22 @@ class ArrayCache:
         if self._process != os.getpid():  # a lock that another thread held at the fork would never be released
             self._start()
         with self._lock:
+            # The dictionary is kept in the order of use: the most recent item is the last.
             if key in self._items:
                 self._items.move_to_end(key)
                 return self._items[key]
         arrays = make()  # outside the lock: threads decode at the same time
+        # Callers share the arrays; a write into one of them would change what the others see.
         for array in arrays:
             array.setflags(write=False)
         size = sum(array.nbytes for array in arrays)
         with self._lock:
+            # Another thread may have stored the same key in the meantime. An array above the bound is returned, but
+            # never kept.
             if size <= self.max_bytes and key not in self._items:
                 self._items[key] = arrays
                 self._bytes += size
+                # Drop the least recently used items first.
                 while self._bytes > self.max_bytes:
                     _, dropped = self._items.popitem(last=False)
                     self._bytes -= sum(array.nbytes for array in dropped)

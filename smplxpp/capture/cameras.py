@@ -29,6 +29,8 @@ def read_cameras(path: str | Path) -> list[Camera]:
         InputError: missing file, unknown layout, fields missing, a camera with distortion.
     """
     lenses = read_lenses(path)
+    # Callers of this function project with K alone, which would be off by many pixels near the borders of a distorted
+    # image.
     distorted = [camera.name for camera, distortion in lenses if distortion is not None]
     if distorted:
         raise InputError(
@@ -55,6 +57,7 @@ def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
         raise InputError(f"camera file {path}", expected="a .json or .csv file", received=path.suffix or "no suffix")
     lenses = reader(regular_file(path, subject="camera file"))
     names = Counter(camera.name for camera, _ in lenses)
+    # Names are keys of folders and splits, so that they must be unique.
     twice = [name for name, count in names.items() if count > 1]
     if twice:
         raise InputError(f"camera file {path}", expected="every name once", received=f"{twice[:5]} several times")
@@ -63,6 +66,7 @@ def read_lenses(path: str | Path) -> list[tuple[Camera, Distortion | None]]:
 
 def _read_opencv(path: Path) -> list[tuple[Camera, Distortion | None]]:
     content = read_json(path, subject="camera file")
+    # Both a bare list and an object with a list under "cameras" are read.
     if isinstance(content, dict):
         content = required(content, "cameras", source=f"camera file {path}")
     lenses = []
@@ -90,11 +94,14 @@ def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
         ) from None
     for name, value in zip(names, numbers, strict=True):
         source = f"camera file {path}: camera {name}"
+        # ActorsHQ's calibration.csv: rotation vectors are camera-to-world, focal lengths and principal point are
+        # shares of width and height.
         as_numbers(list(value.values()), subject=source)
         width, height = (as_integer(value[key], subject=f"{source}: {key}") for key in ("w", "h"))
         world_from_cam = np.eye(4)
         world_from_cam[:3, :3] = matrix_from_rotvec(np.array([value["rx"], value["ry"], value["rz"]]))
         world_from_cam[:3, 3] = value["tx"], value["ty"], value["tz"]
+        # Back to pixels. ActorsHQ counts pixels from the image's corner, as this package does.
         K = np.diag([value["fx"] * width, value["fy"] * height, 1.0])
         K[:2, 2] = value["px"] * width, value["py"] * height
         lenses.append((pinhole(name, K, *inverted(world_from_cam), (width, height)), None))

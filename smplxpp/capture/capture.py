@@ -166,6 +166,7 @@ class Capture:
 
     def presence(self, kind: str = "image") -> Bool[np.ndarray, "C F"]:
         """Return for each camera and frame whether there is a file of a kind, without opening files."""
+        # (C, F): a row for each camera in the recording's order, a column for each frame.
         table = np.zeros((len(self.recording.cameras), len(self.frames)), dtype=bool)
         numbers = np.array(self.frames, dtype=np.int64)
         for row, camera in enumerate(self.recording.cameras):
@@ -173,6 +174,7 @@ class Capture:
             if series is not None and (camera, None) not in self.excluded:
                 table[row] = series.has(numbers)
         rows, columns = {c: i for i, c in enumerate(self.recording.cameras)}, {f: i for i, f in enumerate(self.frames)}
+        # Single excluded views; whole cameras are left out above.
         for without, when in self.excluded:
             if without in rows and when in columns:
                 table[rows[without], columns[when]] = False
@@ -186,6 +188,7 @@ class Capture:
         for camera in wanted_cameras:
             self._full_camera(camera)
         wanted_frames = set(self.frames if frames is None else frames)
+        # Frame by frame, so that neighbours in the list show one pose.
         columns = [k for k, frame in enumerate(self.frames) if frame in wanted_frames]
         rows = [k for k, name in enumerate(names) if name in wanted_cameras]
         return [(names[r], self.frames[c]) for c in columns for r in rows if table[r, c]]
@@ -236,8 +239,10 @@ class Capture:
             InputError: as `image` and `mask`; no mask; or images that are not on the colour the capture declares.
         """
         foreground, alpha = self.foreground(camera, frame)
+        # sRGB in [0, 1]; F is already multiplied by the opacity.
         out = np.multiply(foreground, np.float32(1 / 255), dtype=np.float32)
         colour = np.asarray(background, dtype=np.float32).reshape(3)
+        # A black background adds nothing, so that the pass over the image is saved.
         if colour.any():
             transparent = 1.0 - alpha * np.float32(1 / 255)
             for channel in range(3):
@@ -253,6 +258,7 @@ class Capture:
             InputError: as `composited`.
         """
         image = self.required_file(camera, frame)
+        # Without a mask there is no opacity, and a background made up would be trained on.
         mask = self.file(camera, frame, "mask")
         if mask is None:
             raise InputError(
@@ -288,10 +294,12 @@ class Capture:
         found = None if source is None else source.read(camera)
         if found is None:
             return None
+        # Keypoints of excluded frames go too: the check found them to belong to a defective view.
         dropped = {frame for name, frame in self.excluded if name in (camera, None)}
         kept = [frame for frame in found.frames.tolist() if frame not in dropped]
         if len(kept) < len(found.frames):
             found = found.select(found.names, kept)
+        # From pixels of the file (distorted, full size) to those of the shown image.
         return shown_keypoints(found, full, self.windows[camera], self.recording.distortions.get(camera))
 
     def truth_mesh(self, frame: int) -> TriangleMesh | None:
@@ -312,6 +320,7 @@ class Capture:
     def without(self, problems: Iterable[Problem]) -> Capture:
         """Return the capture without the views, frames and cameras that the problems name."""
         excluded = self.excluded | {(p.camera, p.frame) for p in problems if (p.camera, p.frame) != (None, None)}
+        # An exclusion without a frame is of a whole camera, one without a camera of a whole frame.
         dropped_cameras = {camera for camera, frame in excluded if frame is None}
         dropped_frames = {frame for camera, frame in excluded if camera is None}
         recording = replace(
@@ -319,6 +328,7 @@ class Capture:
             cameras={name: c for name, c in self.recording.cameras.items() if name not in dropped_cameras},
         )
         kept_frames = [frame for frame in self.frames if frame not in dropped_frames]
+        # Splits may not name cameras or frames that no longer exist.
         splits = self.splits.restricted(list(recording.cameras), kept_frames)
         return replace(self, recording=recording, splits=splits, excluded=frozenset(excluded))
 

@@ -73,6 +73,7 @@ class DeclaredInputs:
         """Return the word for parameters that lie in the capture; "not known" for files elsewhere and for None."""
         if path is None:
             return NOT_KNOWN
+        # Files of single frames share one declaration; they are known by a folder, or by a name of digits.
         folder = self.root / "params"
         if same_place(path, folder) or path.stem.isdigit():
             name, inside = OWN_PARAMETERS, lies_in(path, folder)
@@ -82,6 +83,7 @@ class DeclaredInputs:
 
     def own_parameters(self) -> Path | None:
         """Return the file (or the folder of single frames) that is read where the user names no parameters."""
+        # A protocol decides alone: where it names no parameters, none are read.
         files = self.protocols.get(self.protocol or "")
         if files is not None:
             return files.parameter_file(self.root)
@@ -101,6 +103,8 @@ class DeclaredInputs:
         return NOT_KNOWN if folder is None else self._word(kind, folder, kind)
 
     def _word(self, kind: str, name: str, default: str) -> str:
+        # The declaration by name wins; a single word is for the default file; then the protocols that name the file
+        # count.
         """Return what is declared of a file or folder by its name; a single word stands for the default name."""
         declared = self.inputs.get(kind)
         if isinstance(declared, Mapping) and name in declared:

@@ -61,6 +61,7 @@ class Distortion(ABC):
                 nonzero ones after the eighth), no field of view.
         """
         require_choice(f"{subject}: model of the lens", model, LENS_MODELS)
+        # OpenCV writes coefficients as a row, a column or nested lists.
         values = as_numbers(coefficients, subject=f"{subject}: distortion").ravel()
         largest = 1e12  # telephoto lenses have large coefficients, because their radii are small
         if np.abs(values).max(initial=0.0) > largest:
@@ -92,10 +93,12 @@ class RationalDistortion(Distortion):
     @staticmethod
     def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> RationalDistortion | None:
         """Read k1, k2, p1, p2[, k3[, k4, k5, k6]]; None where all are zero."""
+        # Twelve and fourteen are OpenCV's counts with thin prism and tilt, which are read only if these are zero.
         if len(values) not in (0, 4, 5, 8, 12, 14) or values[8:].any():
             raise _coefficient_error(subject, "4, 5 or 8 finite coefficients k1 k2 p1 p2 k3 k4 k5 k6", values)
         if not values.any():
             return None
+        # OpenCV's order puts the tangential p1, p2 between k2 and k3.
         full = np.zeros(8)
         full[: min(len(values), 8)] = values[:8]
         k1, k2, p1, p2, k3, k4, k5, k6 = full.tolist()
@@ -119,11 +122,17 @@ class RationalDistortion(Distortion):
         target = np.asarray(xy, dtype=np.float64)
         found, step = target.copy(), 1e-6
         for _ in range(12):
+            # Newton for distort(x) = target, with the Jacobian [[a, b], [c, d]] by forward differences on the plane z
+            # = 1.
             value = self.distort(found)
+            # Columns of the Jacobian, (N, 2) each: derivatives by x, then by y.
             columns = [(self.distort(found + shift) - value) / step for shift in step * np.eye(2)]
             (a, c), (b, d) = (column.T for column in columns)
             determinant = a * d - b * c
+            # A singular Jacobian marks the fold of the polynomial; a small determinant keeps the numbers finite
+            # there.
             determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+            # The inverse of a 2 x 2 matrix, written out for all points at once.
             u, v = (target - value).T
             found = found + np.stack([d * u - b * v, a * v - c * u], axis=1) / determinant[:, None]
         return found
@@ -262,6 +271,7 @@ def undistort(
     for columns, rows in ((image.shape[1], image.shape[0]), size):
         check_size(columns, rows, "image to undistort")
     channels = 1 if image.ndim == 2 else image.shape[2]
+    # Bilinear sampling treats channels separately, so that any number of them can be done one at a time.
     if channels not in (1, 3):  # the kernel takes one or three channels
         planes = [
             undistort(plane, distortion, source_K=source_K, target_K=target_K, size=size, nearest=nearest)
@@ -272,6 +282,7 @@ def undistort(
         raise InputError("intrinsics of the undistorted image", expected="focal lengths that are not 0", received="0")
     # The kernel maps each pixel of the result to the plane z = 1, distorts it there, and samples the source.
     out = np.empty((height, width, *image.shape[2:]), dtype=np.uint8)
+    # Rows of K^-1 that map a pixel (u, v, 1) to x and y on the plane z = 1; the third row is (0, 0, 1).
     inverse = np.ascontiguousarray(np.linalg.inv(target_K)[:2], dtype=np.float64)
     K = np.ascontiguousarray(np.asarray(source_K)[:2], dtype=np.float64)
     lens = np.ascontiguousarray(distortion.native_parameters(), dtype=np.float64)

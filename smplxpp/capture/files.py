@@ -40,9 +40,11 @@ class FileSeries:
         Raises:
             InputError: a frame number over 2^53.
         """
+        # float64, in which tables may hold frame numbers, represents every integer up to 2^53.
         if max(names, default=0) > _LAST_FRAME:
             raise InputError(f"frames of {folder}", expected=f"numbers up to {_LAST_FRAME}", received=f"{max(names)}")
         numbers = np.array(sorted(names), dtype=np.int64)
+        # Names as one array of bytes, far smaller than as many Python strings and paths.
         encoded = np.array([os.fsencode(names[int(n)]) for n in numbers], dtype=bytes)
         return FileSeries(folder, numbers, encoded)
 
@@ -56,6 +58,7 @@ class FileSeries:
         found: dict[int, str] = {}
         if folder.is_dir():
             with os.scandir(folder) as entries:
+                # Sorted, because `scandir` returns an order that differs between file systems.
                 for name in sorted(entry.name for entry in entries):
                     if (match := compiled.fullmatch(name)) and (frame := int(match["frame"])) <= _LAST_FRAME:
                         found.setdefault(frame, name)

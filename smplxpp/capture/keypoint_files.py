@@ -119,6 +119,7 @@ def find_places(folder: Path, cameras: Iterable[str] | None = None) -> dict[str,
         folder: folder with a file or a folder for each camera.
         cameras: names of the cameras; None: every file and every folder belongs to a camera.
     """
+    # A folder of the camera's name wins over files, since OpenPose writes a file a frame.
     inside = set(subfolders(folder))
     files = sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in _SUFFIXES)
     if cameras is None:
@@ -128,7 +129,9 @@ def find_places(folder: Path, cameras: Iterable[str] | None = None) -> dict[str,
         if camera in inside:
             found[camera] = folder / camera
             continue
+        # "cam1" must not match the file of "cam10": no digit may follow the name.
         own = [path for path in files if re.match(rf"(results_)?{re.escape(camera)}(?!\d)", path.stem)]
+        # Prefer the exact name, then the shortest: additions such as dates make names longer.
         own.sort(key=lambda path: (_camera_of(path) != camera, len(path.stem)))
         if own:
             found[camera] = own[0]
@@ -140,6 +143,7 @@ def _camera_of(path: Path) -> str:
 
 
 def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
+    # An npz of our own layout has names; otherwise it holds MediaPipe's arrays.
     if path.suffix.lower() == ".npz" and path.is_file():
         arrays = safe_npz(path)
         if "joint_names" in arrays and options.format in ("auto", "simple"):
@@ -147,6 +151,7 @@ def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
         frames = dict(_mediapipe_arrays(arrays, path, options))
     elif path.is_dir():
         frames = {}
+        # A folder with a file a frame: the last number of the name is the frame (`CAM_000012_keypoints.json`).
         files = {_last_number(p): p for p in sorted(path.iterdir()) if p.suffix.lower() == ".json"}
         for number in sorted(files):
             frames.update(_frames(read_json(files[number]), number, options, source=f"file {files[number]}"))
@@ -165,17 +170,21 @@ def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
 
 def _joined(frames: Mapping[int, list[Person]], options: KeypointOptions) -> Keypoints2D:
     """Join the chosen person of each frame into one table; frames without one are all 0."""
+    # One person a frame; by id if the user names one, else the most confident.
     chosen = {number: chosen_person(people, options.person) for number, people in frames.items()}
     if options.person is not None and not any(chosen.values()):
         ids = sorted({-1 if one.id is None else one.id for people in frames.values() for one in people})
         raise InputError("--person", expected=f"one of the ids {ids[:12]}, or a place", received=str(options.person))
+    # Detectors may leave points out, so that the columns are the union of all names in order of first appearance.
     names = tuple(dict.fromkeys(name for one in chosen.values() if one is not None for name in one.points))
     numbers, column = sorted(chosen), {name: k for k, name in enumerate(names)}
+    # (F, K, 3): u, v in pixels and confidence, 0 where a point is missing.
     table = np.zeros((len(numbers), len(names), 3))
     for row, number in enumerate(numbers):
         one = chosen[number]
         for name, point in one.points.items() if one is not None else ():
             table[row, column[name]] = point
+    # The numbers of files may start anywhere; `first_frame` says which frame of the capture the first one is.
     shift = 0 if options.first_frame is None else options.first_frame - numbers[0]
     return Keypoints2D(names, np.array(numbers, dtype=np.int64) + shift, table[..., :2], table[..., 2])
 
@@ -184,6 +193,7 @@ def _own_layout(arrays: Mapping[str, Any], path: Path) -> Keypoints2D:
     """Read this project's layout: `keypoints` (frames, K, 3), `joint_names` and perhaps `frames`."""
     values = np.asarray(arrays.get("keypoints"), dtype=np.float64)
     names = tuple(str(name) for name in np.ravel(arrays["joint_names"]))
+    # Missing points are rows of zeros, so that the array has no gaps.
     if values.ndim != 3 or values.shape[1:] != (len(names), 3):
         raise InputError(
             f"file {path}: keypoints", expected=f"shape (frames, {len(names)}, 3)", received=f"shape {values.shape}"
@@ -203,6 +213,7 @@ def _frames(content: Any, number: int, options: KeypointOptions, *, source: str)
         yield number, openpose_people(content, body_25b=kind == "openpose-25b", source=source)
     elif kind == "easymocap":
         yield number, easymocap_people(content, body_25b=False, source=source)
+    # mmpose: either a list of frames, each with `instances`, or the instances of one frame.
     elif kind == "mmpose":
         entries = content["instance_info"] if isinstance(content, Mapping) else content
         if all("instances" in entry for entry in entries) and entries:
@@ -219,6 +230,7 @@ def _frames(content: Any, number: int, options: KeypointOptions, *, source: str)
             frame = image if isinstance(image, int) else _last_number(Path(image))
             by_image.setdefault(frame, []).append(coco_person(entry, source=source))
         yield from by_image.items()
+    # MediaPipe has no standard file; the parts of its Holistic result are looked for by name.
     elif kind == "mediapipe":
         entries = content.get("frames", [content]) if isinstance(content, Mapping) else content
         normalised = content.get("normalized") if isinstance(content, Mapping) else None
@@ -232,12 +244,14 @@ def _frames(content: Any, number: int, options: KeypointOptions, *, source: str)
 
 def _kind(content: Any) -> str:
     """Recognise the format by the keys of a JSON file; "" if none fits."""
+    # Objects with a list at the top: the key names the format.
     if isinstance(content, Mapping):
         for key, kind in (("people", "openpose"), ("annots", "easymocap"), ("instance_info", "mmpose")):
             if key in content:
                 return kind
         if "annotations" in content:
             return "coco"
+        # Lists: the first entry's keys tell the format.
         first = next(iter(content.get("frames", [])), content)
     else:
         first = content[0] if content else {}
@@ -254,6 +268,7 @@ def _mediapipe_arrays(
     arrays: Mapping[str, Any], path: Path, options: KeypointOptions
 ) -> Iterator[tuple[int, list[Person]]]:
     parts = {name: arrays.get(f"{name}_landmarks", arrays.get(name)) for name in _HOLISTIC}
+    # Each part is (F, n, 3 or 4); all parts need the same number of frames.
     have = {name: np.asarray(values, dtype=np.float64) for name, values in parts.items() if values is not None}
     counts = {len(values) for values in have.values()}
     if len(counts) != 1:

@@ -64,10 +64,12 @@ def openpose_people(content: Any, *, body_25b: bool, source: str) -> list[Person
     """Read `people` of OpenPose's JSON: BODY_25, or BODY_25B, or BODY_135 as one list; hands and face beside it."""
     people = []
     for one in content["people"]:
+        # OpenPose puts pixel centres at whole numbers, and this package at +0.5.
         points = _named(one["pose_keypoints_2d"], _with_25b(body_25b), source=source, shift=_HALF)
         for key, orders in _OPENPOSE.items():
             if one.get(key):
                 points |= _named(one[key], orders, source=f"{source}: {key}", shift=_HALF)
+        # OpenPose writes person_id as [-1] where it does not track.
         number = int(np.ravel(one.get("person_id", -1))[0])
         people.append(Person(points, number if number >= 0 else None))
     return people
@@ -91,6 +93,7 @@ def mmpose_people(instances: Any, *, source: str) -> list[Person]:
     """Read `instances` of mmpose: `keypoints` [[u, v], ...] and `keypoint_scores`."""
     people = []
     for one in instances:
+        # (K, 2) pixels and (K, 1) scores, in the order that the number of points tells.
         uv = np.asarray(one["keypoints"], dtype=np.float64).reshape(-1, 2)
         scores = np.asarray(one["keypoint_scores"], dtype=np.float64).reshape(-1, 1)
         track = one.get("track_id")
@@ -100,6 +103,7 @@ def mmpose_people(instances: Any, *, source: str) -> list[Person]:
 
 
 def coco_person(entry: Any, *, source: str) -> Person:
+    # COCO-WholeBody keeps body, feet, face and hands in lists of their own.
     """Read one entry of COCO's list of results: `keypoints` [u, v, score, ...]; COCO-WholeBody's four further lists."""
     points = _named(entry["keypoints"], BY_COUNT, source=source, shift=_HALF)
     parts = {
@@ -146,6 +150,8 @@ def mediapipe_person(
                     received="none",
                     remedy="give --size WIDTHxHEIGHT, or the capture",
                 )
+            # Shares of the image's width and height become pixels; they already count from the image's corner, hence
+            # no shift.
             rows[:, :2] *= size
         # A face has hundreds of points; the named ones are means of a few of them.
         if name == "face":
@@ -160,6 +166,7 @@ def mediapipe_person(
 
 def landmark_rows(value: Any, *, source: str) -> Float64[np.ndarray, "N 3"] | None:
     """Return rows of x, y, confidence of MediaPipe's landmarks; confidence is the visibility, or 1 without one."""
+    # Protobuf's JSON wraps the list in an object.
     if isinstance(value, Mapping):
         value = value.get("landmark", value.get("landmarks"))
     if value is None or not len(value):
@@ -171,6 +178,7 @@ def landmark_rows(value: Any, *, source: str) -> Float64[np.ndarray, "N 3"] | No
         raise InputError(source, expected="rows of x, y[, z[, visibility]]", received=f"shape {rows.shape}")
     # Columns are x, y, z, visibility.
     visibility = rows[:, 3] if rows.shape[1] > 3 else np.ones(len(rows))
+    # A point with NaN counts as missing, because solvers multiply by the confidence and 0 times NaN is NaN.
     there = np.isfinite(rows[:, :2]).all(axis=1) & np.isfinite(visibility)
     out = np.concatenate([rows[:, :2], visibility[:, None]], axis=1)
     out[~there] = 0.0
@@ -192,9 +200,11 @@ def _named(rows: Any, orders: Mapping[int, Order], *, source: str, shift: float 
             received=f"{len(values)} points",
             remedy="name the format, or convert the points to keypoints/CAM.npz by hand (docs/captures.md)",
         )
+    # Copy, because the array may be a view of the caller's content.
     values = values.copy()
     there = np.isfinite(values).all(axis=1) & (values[:, 2] > 0)
     values[:, :2] += shift
     values[:, 2] = np.clip(values[:, 2], 0.0, 1.0)
+    # Missing points are all zero, coordinates too, so that they compress and compare well.
     values[~there] = 0.0
     return {name: row for name, row in zip(orders[len(values)], values, strict=True) if name is not None}

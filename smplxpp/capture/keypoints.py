@@ -59,7 +59,9 @@ def moved_keypoints(
     found: Keypoints2D, camera: Camera, change: Callable[[Float64[np.ndarray, "N 2"]], Float64[np.ndarray, "N 2"]]
 ) -> Keypoints2D:
     """Apply a map of the plane z = 1 to keypoints; points that it maps to NaN get confidence 0."""
+    # Only seen points are mapped: the others lie at (0, 0), which a lens may map to infinity.
     there, K = found.confidence > 0, camera.K
+    # Pixel to the plane z = 1: x = K^-1 (u - c), for row vectors with the transpose.
     plane = change((found.points[there] - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
     points, confidence = found.points.copy(), found.confidence.copy()
     points[there] = plane @ K[:2, :2].T + K[:2, 2]

@@ -33,6 +33,7 @@ def with_masks(recording: Recording, folder: Path) -> Recording:
     if not folder.is_dir():
         raise InputError("folder of masks", expected="an existing folder", received=str(folder))
     images = recording.files.get("image", {})
+    # Mattes in a folder for each camera, or all in one folder with the camera's name in front.
     inside = set(subfolders(folder))
     masks = {}
     for camera, series in images.items():
@@ -53,6 +54,7 @@ def with_masks(recording: Recording, folder: Path) -> Recording:
 
 def _match(folder: Path, camera: str, images: FileSeries, *, shared: bool) -> dict[int, str]:
     """Return the file name of the matte of each frame; in a shared folder names start with the camera's name."""
+    # The stem of each image, with which mattes of most tools share their name.
     by_stem = {images.required(int(number)).stem: int(number) for number in images.numbers}
     known = set(by_stem.values())
     found: dict[int, str] = {}
@@ -61,15 +63,18 @@ def _match(folder: Path, camera: str, images: FileSeries, *, shared: bool) -> di
             continue
         own = path.stem
         if shared:
+            # "cam1" must not match files of "cam10".
             named = re.match(rf"{re.escape(camera)}(?!\d)", own)
             if not named:
                 continue
             own = own[named.end() :]
+        # First by the image's name, else by the last number after the camera's name, if a frame has it.
         frame = _by_image(path.stem, by_stem)
         if frame is None:
             numbers = re.findall(r"\d+", own)
             frame = int(numbers[-1]) if numbers and int(numbers[-1]) in known else None
         if frame is not None:
+            # Sorted names: with several mattes of a frame the first in alphabetical order counts.
             found.setdefault(frame, path.name)
     return found
 
@@ -121,6 +126,7 @@ class MattingModel:
         self._model = OnnxModel(path, kind="matting model", extra="matting", threads=self.config.threads)
         self._subject = self._model.subject
         entries = self._model.inputs
+        # A fixed input size is the model's own; free sides become 1024 pixels.
         sizes = [self._size_of(entry) for entry in entries]
         if len(sizes) != 1 or sizes[0] is None:
             raise InputError(
@@ -145,17 +151,21 @@ class MattingModel:
         from PIL import Image
         from PIL.Image import Resampling
 
+        # Resize, normalise by mean and standard deviation of ImageNet (or those given), and reorder to (1, 3, H, W).
         small = np.asarray(Image.fromarray(image).resize(self._size, Resampling.BILINEAR), dtype=np.float32) / 255.0
         tensor = ((small - np.array(self.config.mean, np.float32)) / np.array(self.config.std, np.float32)).transpose(
             2, 0, 1
         )[None]
         outputs = self._model.run({self._name: tensor.astype(self._dtype)})
+        # The matte has the model's size; bring it back to the photograph's.
         matte = self._opacity(outputs)
         back = Image.fromarray(matte).resize((image.shape[1], image.shape[0]), Resampling.BILINEAR)
+        # Add one half before the conversion, which truncates.
         return np.clip(np.asarray(back) * 255.0 + 0.5, 0, 255).astype(np.uint8)
 
     def _opacity(self, outputs: list[Any]) -> np.ndarray:
         """Return the first matte among the outputs as opacities, (H, W) float32 in [0, 1]."""
+        # Models return several scales and auxiliary outputs; the first of the input's size is the matte.
         arrays = [o for o in outputs if isinstance(o, np.ndarray) and o.dtype.kind in "fiub"]
         mattes = [o.astype(np.float32) for o in arrays if o.ndim >= 2 and o.size == self._pixels]
         if not mattes or not np.isfinite(mattes[0]).all():
@@ -167,6 +177,7 @@ class MattingModel:
         matte = mattes[0].reshape(self._size[1], self._size[0])
         # Within [0, 1], up to rounding in half precision, values are opacities.
         inside = matte.min() >= -1e-3 and matte.max() <= 1.0 + 1e-3
+        # Other values are logits, whose sigmoid is the opacity; at +-30 it is 0 or 1 in single precision.
         return np.clip(matte, 0.0, 1.0) if inside else 1.0 / (1.0 + np.exp(-np.clip(matte, -30, 30)))
 
     @property
@@ -207,6 +218,8 @@ def write_mattes(
         target = matte_path(folder, camera, frame)
         if not target.is_file():
             image = np.asarray(read_color(capture.required_file(camera, frame)))
+            # Write through a temporary file: an interrupted run must not leave half a matte that the next run would
+            # keep.
             with atomic_path(target) as temporary:
                 Image.fromarray(model(image)).save(temporary, format="PNG")
         yield target

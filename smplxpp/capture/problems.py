@@ -29,10 +29,12 @@ def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:
         decode: whether to open every image file.
     """
     found = list(capture.problems)
+    # A reader may have reported the same view already, with a better reason.
     known = {(problem.camera, problem.frame) for problem in found}
     found += [problem for problem in _missing_images(capture) if (problem.camera, problem.frame) not in known]
     found += [*_wrong_up_axis(capture), *_missing_masks(capture), *_parameters(capture), *_keypoints(capture)]
     if decode:
+        # Threads, because decoding JPEG and PNG releases the interpreter's lock.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for problems in pool.map(lambda view: list(_damaged(capture, *view)), capture.views()):
                 found += problems
@@ -47,9 +49,11 @@ def _missing_images(capture: Capture) -> Iterator[Problem]:
     for name, has in zip(names, table, strict=True):
         if len(capture.frames) and not has.any() and name not in tracked:
             yield Problem(f"camera {name}: calibrated, but without any image", name)
+    # Cameras without any image were reported as a whole and do not count as gaps.
     used = table.any(axis=1)
     for column, frame in enumerate(capture.frames):
         seen = [name for name, has in zip(names, table[:, column], strict=True) if has]
+        # A frame in one camera of many is a stray file, and one report suffices for it.
         if len(seen) == 1 and used.sum() > 1:
             yield Problem(f"frame {frame}: an image in camera {seen[0]} alone", None, frame)
         elif seen:
@@ -65,8 +69,10 @@ def _wrong_up_axis(capture: Capture) -> Iterator[Problem]:
     """
     if len(capture.cameras) < 3:
         return
+    # In OpenCV's axes y points down, so that minus the second row of R is the image's up direction in the world.
     up = -np.mean([camera.cam_from_world[1, :3] for camera in capture.cameras.values()], axis=0)
     axis = int(np.abs(up).argmax())
+    # Allowed is +y alone; the length of the mean tells how much the cameras agree.
     if abs(up[axis]) > 0.8 and (axis, up[axis] > 0) != (1, True):
         name = ("+" if up[axis] > 0 else "-") + "xyz"[axis]
         yield Problem(
@@ -83,6 +89,7 @@ def _missing_masks(capture: Capture) -> Iterator[Problem]:
             yield Problem("no masks: give a folder of mattes, or make them with a matting model")
         return
     names = list(capture.cameras)
+    # (N, 2) rows and columns: images that exist without their mask.
     for row, column in np.argwhere(images & ~masks):
         frame = capture.frames[column]
         path = capture.file(names[row], frame)
@@ -122,6 +129,7 @@ def _damaged(capture: Capture, camera: str, frame: int) -> Iterator[Problem]:
     """Decode all files of a view, and find the damaged ones."""
     reader = capture.reader(camera)
     image, mask = capture.file(camera, frame), capture.file(camera, frame, "mask")
+    # Image and mask together: their product is what a training reads, and a wrong background shows only there.
     if image is not None:
         try:
             if mask is None:

@@ -96,6 +96,7 @@ def choose_protocol(root: Path, description: Mapping[str, Any], name: str | None
             remedy='name its files under "protocols" in capture.json (docs/captures.md)',
         )
     files = protocols[name]
+    # Check existence now, so that a protocol never falls back on files that it does not name.
     wanted = [files.parameter_file(root), *(root / f for f in (files.labels, files.normals, files.keypoints) if f)]
     missing = [path.relative_to(root).as_posix() for path in wanted if path is not None and not path.exists()]
     if missing:
@@ -121,6 +122,7 @@ def _protocol(name: str, values: Any) -> ProtocolFiles:
         raise InputError(f"{subject}: scan_labels", expected="true or false", received=repr(scan_labels))
     names = {key: values.get(key) for key in _KEYS if key != "scan_labels"}
     for key, value in names.items():
+        # A plain name cannot leave the capture's folder: no separators, no "..".
         plain = value is None or (isinstance(value, str) and Path(value).name == value and value not in ("", ".."))
         if not plain:
             raise InputError(f"{subject}: {key}", expected="a name without a path, or null", received=repr(value))

@@ -43,8 +43,10 @@ def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], 
         sampler: gives the view of a camera and a frame to try corrections on.
     """
     frames = by_frame(views)
+    # Frames first: one frame with wrong parameters would otherwise count against every camera.
     lost = {frame for frame in _outliers(frames) if frames[frame].views > 1}
     lost = {frame for frame in lost if frames[frame].bad >= _MOST * frames[frame].views}
+    # Cameras are judged by the frames that do fit.
     rest = [view for view in views if view.frame not in lost]
     cameras = by_camera(rest)
     for frame in sorted(lost):
@@ -52,12 +54,15 @@ def calibration_findings(views: Sequence[ViewCheck], rig: Mapping[str, Camera], 
         words = f"frame {frame}: the body does not fit the masks in {s.bad} of {s.views} cameras ({_figures(s)})"
         yield Finding("calibration-frame", words, None, frame)
     bad = [name for name, s in cameras.items() if s.verdict == "bad"]
+    # If half of the cameras are bad, the convention of the whole calibration is wrong rather than single cameras.
     if bad and 2 * len(bad) >= len(cameras):
         yield _everywhere(rest, bad, cameras, sampler)
         return
+    # Single bad cameras: their images may be exchanged with those of another camera.
     to_blame = _outliers(cameras)
     for name in to_blame:
         yield _one_camera(name, rest, cameras[name], sampler, rig)
+    # What remains fits roughly: a noisy tracker, or loose calibration.
     doubtful = [name for name, s in cameras.items() if s.verdict != "good" and name not in to_blame]
     if doubtful:
         yield _loose(doubtful, rest, cameras, sampler)
@@ -67,6 +72,7 @@ def _outliers(fits: Mapping[Key, FitSummary]) -> list[Key]:
     """Return the bad ones that are much worse than most: with rough parameters all are, and none is to blame."""
     if not fits:
         return []
+    # An outlier is judged against the median, which single bad keys do not move.
     usual = float(np.median([fit.outside for fit in fits.values()]))
     return [
         key
@@ -88,6 +94,7 @@ def blind_cameras(views: Iterable[ViewCheck]) -> Iterator[Finding]:
 def _everywhere(
     views: Sequence[ViewCheck], bad: Sequence[str], cameras: Mapping[str, FitSummary], sampler: Sampler
 ) -> Finding:
+    # A few cameras show a wrong convention as well as all do, and each correction is rendered for each of them.
     chosen = spread(bad, _SAMPLE_CAMERAS)
     result = diagnose(_samples(views, chosen, sampler))
     fit = summary(view.fit for view in views if view.fit)
@@ -105,6 +112,8 @@ def _one_camera(
     sampler: Sampler,
     rig: Mapping[str, Camera],
 ) -> Finding:
+    # A folder under the wrong name is the usual mistake with a single camera; only cameras of the same size can be
+    # exchanged.
     swaps = [
         Mistake(
             f"its images are those of camera {other.name}",

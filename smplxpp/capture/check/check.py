@@ -109,13 +109,17 @@ def check_capture(
     """
     config = config or CheckConfig()
     frames = _chosen_frames(capture, config)
+    # What needs no image comes first: files, splits, then parameters.
     findings = [*missing_findings(capture), *split_findings(capture)]
     params = read_parameters(capture)
     findings += parameter_findings(capture, params, body)
     poser = _Poser(body, params)
+    # Silhouettes are compared at a reduced size, which keeps shares of pixels and saves time quadratically.
     small = capture.resized(_scale(capture, config.size))
     views: list[ViewCheck] = []
     wanted = small.views(frames=frames)
+    # Decoding and rendering release the interpreter's lock, so that threads suffice. One body is posed for each
+    # frame.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for frame, group in groupby(wanted, key=lambda view: view[1]):
             vertices = poser.vertices(frame)
@@ -124,8 +128,10 @@ def check_capture(
             views += pool.map(lambda camera, f=frame, b=posed: check_view(small, camera, f, b), cameras)
             progress("images", len(views) / len(wanted))
     findings += [finding for view in views for finding in view.findings]
+    # Findings over many views: a colour that all photographs share, cameras that never see the person.
     findings += [*poser.findings, *_plain_background(views), *blind_cameras(views)]
     findings += calibration_findings(views, small.cameras, lambda camera, frame: _sample(small, poser, camera, frame))
+    # The same defect may be found twice, for instance by the list of files and by decoding.
     shown = tuple(_relative(finding, capture.root) for finding in dict.fromkeys(findings))
     return CaptureCheck(capture, small, shown, tuple(views), poser.vertices, body.faces)
 
@@ -163,6 +169,7 @@ def _sample(small: Capture, poser: _Poser, camera: str, frame: int) -> Sample | 
     if vertices is None or mask is None:
         return None
     p = poser.params[frame]
+    # Rotation about the origin instead of the root joint moves the body by R r - r, with r the root joint at rest.
     root = poser.body.rest_joints(p)[0, 0]
     neighbours = {k: poser.vertices(frame + k) for k in _SHIFTS}
     return Sample(
@@ -178,6 +185,7 @@ def _sample(small: Capture, poser: _Poser, camera: str, frame: int) -> Sample | 
 
 def _chosen_frames(capture: Capture, config: CheckConfig) -> list[int]:
     if config.frames is None:
+        # Spread over the capture; at least two, so that a bad frame can be told from a bad calibration.
         return spread(capture.frames, max(2, config.max_views // max(1, len(capture.cameras))))
     unknown = sorted(set(config.frames) - set(capture.frames))
     if unknown:
@@ -198,8 +206,10 @@ def _scale(capture: Capture, size: int) -> float:
 def _plain_background(views: Sequence[ViewCheck]) -> list[Finding]:
     """Photographs that all lie on one plain colour were composited, whatever the capture declares."""
     colours = [view.plain for view in views if view.plain is not None]
+    # Nine views of ten must lie on a plain colour of their own.
     if len(colours) < 0.9 * len(views) or not colours:
         return []
+    # All must be the same colour: 16 of 255 is above the error of JPEG.
     common = np.median(colours, axis=0)
     if np.abs(np.array(colours) - common).max() > 16:
         return []

@@ -38,12 +38,14 @@ def diagnose(samples: Sequence[Sample], extra: Sequence[Mistake] = ()) -> Diagno
         extra: corrections to try besides the usual ones (another camera's calibration, say).
     """
     before = _score(samples, Mistake("", ""))
+    # Single mistakes before combined ones: the simplest explanation wins.
     for level in ((*SINGLE, *extra, *shifts(samples)), COMBINED):
         # Most corrections are hopeless, which a few views show.
         likely = [mistake for mistake in level if _score(samples[::_FEW], mistake).outside < _HOPELESS]
         scored = [(_score(samples, mistake), mistake) for mistake in likely]
         fitting = [item for item in scored if _explains(before, item[0])]
         if fitting:
+            # Overlap alone would prefer a large body; the share outside the mask tells whether it fits inside.
             after, mistake = max(fitting, key=lambda item: item[0].iou - item[0].outside)
             return Diagnosis(mistake, before, after)
     return None
@@ -60,8 +62,10 @@ def _score(samples: Sequence[Sample], mistake: Mistake) -> SilhouetteFit:
     for sample in samples:
         vertices = mistake.body(sample)
         if vertices is not None:
+            # A mistake corrects the camera, the body, or both; a body that is not seen counts as all outside.
             silhouette = body_silhouette(vertices, sample.faces, mistake.camera(sample.camera))
             fits.append(compare_silhouettes(silhouette, sample.mask) or SilhouetteFit(1.0, 0.0))
+    # A correction that applies to fewer than half of the samples (a shift in time at the ends) proves nothing.
     if 2 * len(fits) < max(1, len(samples)):
         return SilhouetteFit(1.0, 0.0)
     return SilhouetteFit(float(np.mean([f.outside for f in fits])), float(np.mean([f.iou for f in fits])))

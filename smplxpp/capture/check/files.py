@@ -47,8 +47,10 @@ def _classified(problem: Problem) -> Finding:
 def split_findings(capture: Capture) -> Iterator[Finding]:
     """Find splits that hold nothing to train or to test on, and what no split holds."""
     splits, images = capture.splits, capture.presence()
+    # (C, F): a camera or a frame is seen if any image of it exists.
     seen_cameras = {name for name, has in zip(capture.cameras, images, strict=True) if has.any()}
     seen_frames = {frame for frame, has in zip(capture.frames, images.T, strict=True) if has.any()}
+    # Empty training sets stop a training; empty test sets make its evaluation meaningless.
     if not seen_cameras.intersection(splits.train_cameras):
         yield Finding("split-empty", "no camera with images is trained on")
     if not seen_frames.intersection(splits.train_frames):
@@ -59,6 +61,7 @@ def split_findings(capture: Capture) -> Iterator[Finding]:
     for frame in splits.novel_pose_frames:
         if frame not in seen_frames:
             yield Finding("split-empty", f"frame {frame} is held out as a novel pose, but has no image", None, frame)
+    # Data that no split holds is silently unused, which is rarely intended.
     unused = sorted(seen_cameras - set(splits.train_cameras) - set(splits.novel_view_cameras))
     if unused:
         yield Finding("split-leftover", f"cameras that no split holds: {', '.join(unused)}")

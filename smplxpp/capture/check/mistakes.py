@@ -119,6 +119,7 @@ def _scaled_K(scale: float) -> CameraCorrection:
     return _with_K(lambda camera: np.diag([scale, scale, 1.0]) @ camera.K)
 
 
+# With x_cam = R x + t: a file may hold the inverse pose, or only one half of it inverted.
 _POSES = tuple(
     Mistake(words, advice, _posed(change))
     for words, advice, change in (
@@ -128,6 +129,7 @@ _POSES = tuple(
         ("R is camera to world and T is negated", "transpose R, then write T = R T", lambda R, t: (R.T, R.T @ t)),
     )
 )
+# Axes of the camera: OpenCV has x right, y down, z forward. Each row negates what another convention turns around.
 _AXES = tuple(
     Mistake(words, advice, _signed_axes(signs))
     for words, advice, signs in (
@@ -143,6 +145,7 @@ _AXES = tuple(
         ),
     )
 )
+# Up axes of the two worlds. The body is rotated about the world's origin, with its translation.
 _UPS = tuple(
     Mistake(words, advice, body=_turned_body(rotation))
     for words, advice, rotation in (
@@ -155,6 +158,7 @@ _UPS = tuple(
         ),
     )
 )
+# One mistake at a time; the order has no meaning, since the best fit is taken.
 SINGLE: tuple[Mistake, ...] = (
     *_POSES,
     *_AXES,
@@ -196,6 +200,8 @@ def _both(*mistakes: Mistake) -> Mistake:
             original = mistake.camera(original)
         return original
 
+    # Corrections of cameras compose; of the body at most one takes part, because rotations of its world exclude each
+    # other.
     body = next((mistake.body for mistake in mistakes if mistake in _UPS), mistakes[0].body)
     words, advice = (", and ".join(m.words for m in mistakes), "; ".join(m.advice for m in mistakes))
     return Mistake(words, advice, camera, body)
@@ -210,6 +216,7 @@ COMBINED: tuple[Mistake, ...] = (
 
 def shifts(samples: Sequence[Sample]) -> tuple[Mistake, ...]:
     """Return the mistakes of images that show another frame's pose, as far as the samples know their neighbours."""
+    # Frames at the ends of the recording have neighbours on one side only.
     known = {k for sample in samples for k in sample.neighbours}
     return tuple(
         Mistake(

@@ -46,15 +46,18 @@ def parameter_findings(capture: Capture, params: dict[int, BodyParams], body: Bo
         found += _out_of_range(frame, p, body)
     found += _varying_betas(params)
     if params:
+        # Units come before jumps: in millimetres every step is a jump.
         units = list(_wrong_units(capture, params))
         found += units or _jumps(capture, params)
     return found
 
 
 def _out_of_range(frame: int, p: BodyParams, body: BodyModel) -> Iterator[Finding]:
+    # Betas are in standard deviations of the shapes that the model was learned from.
     largest = float(np.abs(p.betas).max(initial=0.0))
     if largest > BETA_LIMIT:
         yield Finding("params-betas", f"frame {frame}: betas reach {largest:.3g}", None, frame)
+    # Learned expressions are unbounded principal components, named blend shapes are weights.
     named = not body.expression_names[:1] == ("expression_00",)
     low, high = _BLEND_SHAPE_LIMITS if named else _EXPRESSION_LIMITS
     least, most = float(p.expression.min(initial=0.0)), float(p.expression.max(initial=0.0))
@@ -63,6 +66,7 @@ def _out_of_range(frame: int, p: BodyParams, body: BodyModel) -> Iterator[Findin
         yield Finding("params-expression", message, None, frame)
     # Hands of fewer than 45 numbers are coefficients, no angles.
     blocks = {name: getattr(p, name) for name, joints in POSE_BLOCKS if getattr(p, name).shape[1] == 3 * joints}
+    # A rotation vector of more than 2 pi is legal but never written by a fit; degrees exceed it at once.
     name, angle = max(((n, float(np.abs(v).max(initial=0.0))) for n, v in blocks.items()), key=lambda item: item[1])
     if angle > _ANGLE_LIMIT:
         unit = ", as degrees would" if angle > 30 else ""
@@ -78,6 +82,7 @@ def _varying_betas(params: dict[int, BodyParams]) -> Iterator[Finding]:
 
 
 def _wrong_units(capture: Capture, params: dict[int, BodyParams]) -> Iterator[Finding]:
+    # The median of the cameras' positions is the middle of the rig even if one camera is far off.
     positions = np.array([camera.position for camera in capture.cameras.values()])
     if not len(positions):
         return
@@ -89,6 +94,7 @@ def _wrong_units(capture: Capture, params: dict[int, BodyParams]) -> Iterator[Fi
     def distance(scale: float) -> float:
         return float(np.median(np.linalg.norm(transl * scale - center, axis=1)))
 
+    # Try other units: the right one puts the person among the cameras.
     if distance(1.0) > limit:
         fitting = next((name for scale, name in _UNITS if distance(scale) < 2 * radius + 1.0), None)
         hint = f"; in {fitting} it would be among the cameras" if fitting else ""
@@ -97,6 +103,7 @@ def _wrong_units(capture: Capture, params: dict[int, BodyParams]) -> Iterator[Fi
             f"transl puts the person {distance(1.0):.4g} m from the cameras' middle, {radius:.3g} m around which they "
             f"stand{hint}",
         )
+    # Person and cameras agree, but both are huge: both are in another unit.
     elif radius > 100.0:
         yield Finding("params-units", f"the cameras stand {radius:.4g} m around their middle: are they in millimetres?")
 

@@ -63,6 +63,7 @@ def check_view(
         camera, frame: with an image.
         body: vertices and faces of the posed body; None where there are no parameters.
     """
+    # The reader resamples and undistorts, so that damage anywhere in the file shows.
     reader = capture.reader(camera)
     findings: list[Finding] = []
 
@@ -78,12 +79,14 @@ def check_view(
 
     image = opened("image", reader.color)
     alpha = opened("mask", reader.alpha)
+    # Labels and normals are decoded for their errors alone.
     opened("label", reader.labels)
     opened("normal", reader.normals)
     if alpha is None:
         return ViewCheck(camera, frame, tuple(findings))
     mask = alpha > OPAQUE
     silhouette = None if body is None else body_silhouette(*body, capture.cameras[camera])
+    # A mask that cannot be the person's makes every further comparison meaningless.
     wrong = _wrong_mask(mask, silhouette)
     if wrong is not None:
         kind, words = wrong
@@ -93,6 +96,7 @@ def check_view(
     if image is not None:
         name = f"image {capture.file(camera, frame)}"
         background = capture.recording.background
+        # A photograph must not be on a plain colour; a composited image must be on the declared one.
         if background is None:
             plain = _plain_colour(image, alpha)
         else:
@@ -108,6 +112,7 @@ def check_view(
 def _wrong_mask(mask: Bool[np.ndarray, "H W"], silhouette: Bool[np.ndarray, "H W"] | None) -> tuple[str, str] | None:
     """Return kind and words of a mask that cannot be one of the person, else None."""
     share = float(mask.mean())
+    # Even a close-up leaves a corner of background.
     if share > 0.995:
         return "mask-full", f"covers {share:.1%} of the image"
     visible = None if silhouette is None else float(silhouette.mean())
@@ -121,6 +126,7 @@ def _wrong_mask(mask: Bool[np.ndarray, "H W"], silhouette: Bool[np.ndarray, "H W
         # Inverted: most of the body is outside of the mask, and it overlaps with the complement.
         inverted = fit.outside > 0.7 and inverse.iou > 0.5
     else:
+        # The person rarely touches most of the image's rim, the background does.
         rim = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
         # Without a body: most of the rim is opaque, more than of the whole image.
         inverted = rim > 0.6 and share > 0.5 and rim > share
@@ -131,6 +137,7 @@ def _against_background(
     image: UInt8[np.ndarray, "H W 3"], alpha: UInt8[np.ndarray, "H W"], colour: Float[np.ndarray, " 3"]
 ) -> Iterator[tuple[str, str]]:
     """Yield kind and words where an image is not on the colour (of 255) outside its mask."""
+    # (N, 3) pixels that the mask declares as background, sampled with a step.
     outside = _outside(image, alpha)
     if not len(outside):
         return
@@ -139,6 +146,7 @@ def _against_background(
         declared = colour.round().astype(int).tolist()
         yield "background", f"RGB {found.astype(int).tolist()} outside the mask, where the capture declares {declared}"
         return
+    # Each sampled pixel stands for `_STEP` squared pixels of the image.
     shown = int((np.abs(outside - colour).max(axis=1) > _SHOWS_SOMETHING).sum()) * _STEP**2
     area = int((alpha > OPAQUE).sum())
     if shown > _MISMATCH * area and shown > MIN_SHARE * alpha.size:

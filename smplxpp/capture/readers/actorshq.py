@@ -31,6 +31,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     Raises:
         InputError: several scales, no camera, a broken calibration.
     """
+    # The images exist at several scales, each with its own calibration; more than one at a place is ambiguous.
     scales = _scales(root)
     if len(scales) != 1:
         raise InputError(
@@ -42,6 +43,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     folder = scales[0]
     sequence = folder.parent if folder.name in _SCALES else folder
     cameras = {camera.name: camera for camera in read_cameras(folder / "calibration.csv")}
+    # Names are CAM/CAM_rgbFFFFFF.jpg and CAM/CAM_maskFFFFFF.png.
     files = {
         kind: {name: FileSeries.find(folder / place / name, image_name(f"{name}_{tag}")) for name in cameras}
         for kind, place, tag in (("image", "rgbs", "rgb"), ("mask", "masks", "mask"))

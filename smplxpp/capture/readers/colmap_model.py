@@ -84,9 +84,11 @@ class ColmapCamera:
             )
         p = as_numbers(self.params, (None,), subject=f"{source}: camera parameters").tolist()
         focal_lengths, model = _SUPPORTED[self.model]
+        # Models with one focal length use it for both axes: p = (f, cx, cy, ...) or (fx, fy, cx, cy, ...).
         K = np.diag([p[0], p[focal_lengths - 1], 1.0])
         K[:2, 2] = p[focal_lengths : focal_lengths + 2]
         lens = p[focal_lengths + 2 :]
+        # OpenCV's models need four coefficients; COLMAP's shorter models leave the last ones out, which are zero.
         if model != FOV:
             lens += [0.0] * (4 - len(lens))
         return K, Distortion.from_opencv(lens, subject=source, model=model)
@@ -154,6 +156,7 @@ def _cameras_txt(path: Path) -> dict[int, ColmapCamera]:
         for line in file:
             if not line.strip() or line.lstrip().startswith("#"):
                 continue
+            # CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]
             number, model, width, height, *params = line.split()
             if model not in dict(MODELS):
                 raise _unknown(path, model[:80])
@@ -167,6 +170,7 @@ def _images_txt(path: Path) -> list[ColmapImage]:
     images = []
     with path.open(encoding="utf-8") as file:
         for line in file:
+            # IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; the name may contain spaces, hence at most nine splits.
             fields = line.split(maxsplit=9)
             if not fields or fields[0].startswith("#"):
                 continue
@@ -180,6 +184,8 @@ def _cameras_bin(path: Path) -> dict[int, ColmapCamera]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         (count,), at = struct.unpack_from("<Q", data), 8
         for _ in range(count):
+            # camera id (uint32), model id (int32), width and height (uint64): 24 bytes, then the parameters as
+            # doubles; little-endian without padding.
             number, model, width, height = struct.unpack_from("<IiQQ", data, at)
             if not 0 <= model < len(MODELS):
                 raise _unknown(path, f"number {model}")
@@ -196,11 +202,14 @@ def _images_bin(path: Path) -> list[ColmapImage]:
         for _ in range(count):
             # Id, quaternion, translation, camera, name ending in NUL, number of points, 24 bytes for each point.
             values = struct.unpack_from("<I7dI", data, at)
+            # 64 bytes precede the name: 4 of the id, 56 of seven doubles, 4 of the camera's id. The bound keeps a
+            # damaged file from being searched to its end.
             end = data.find(b"\0", at + 64, at + 64 + 4096)
             if end < 0:
                 raise ValueError(f"image {values[0]} without the end of its name")
             (points,) = struct.unpack_from("<Q", data, end + 1)
             images.append(_image(path, list(values[1:8]), values[8], data[at + 64 : end].decode()))
+            # NUL and the count of points (9 bytes), then x, y and the id of each point (24 bytes).
             at = end + 9 + 24 * points
             if at > len(data):
                 raise ValueError(f"{points} points of image {values[0]} past the end of the file")

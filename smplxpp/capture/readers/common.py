@@ -56,6 +56,7 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
         InputError: wrong counts, anything but finite numbers, R that is not a rotation, no focal length, an impossible
             image size, or a name that no file can have.
     """
+    # Names come from files and end up in paths and messages, so that they are cut and checked.
     subject = f"camera {name[:80]!r}"
     check_name(name, subject=f"{subject}: name")
     intrinsics, rotation = as_numbers(K, subject=f"{subject}: K"), as_numbers(R, subject=f"{subject}: R")
@@ -78,8 +79,10 @@ def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_
         )
     # The largest sensors have 20,000 pixels a side.
     width, height = (as_integer(side, subject=f"{subject}: image size", least=1, most=1 << 16) for side in size)
+    # Normalise the scale of the homogeneous matrix.
     K = intrinsics / intrinsics[2, 2]
     if opencv_pixels:
+        # From pixel centres at whole numbers to centres at +0.5: the principal point moves by half a pixel.
         K[:2, 2] += 0.5
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, shift.ravel()
@@ -101,11 +104,13 @@ def inverted(world_from_cam: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[n
     matrix = as_numbers(world_from_cam, subject="camera-to-world matrix")
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError("camera-to-world matrix", expected="shape (4, 4) or (3, 4)", received=f"{matrix.shape}")
+    # The inverse of a rotation is its transpose; with uniformly scaled axes s R the determinant is s^3.
     rotation = matrix[:3, :3].T
     with np.errstate(over="ignore", invalid="ignore"):
         volume = np.linalg.det(rotation)
     if 0 < volume < np.inf:
         rotation = rotation / np.cbrt(volume)
+    # t = -R c, with the camera's position c.
     return rotation, -rotation @ matrix[:3, 3]
 
 
@@ -164,10 +169,12 @@ def camera_names(paths: Iterable[PurePosixPath], *, subject: str) -> dict[PurePo
         InputError: names that remain equal, or that no file can have.
     """
     distinct = list(dict.fromkeys(paths))
+    # Short names first: the first folder, then the suffix are added only where names would collide.
     for folder, suffix in ((False, False), (True, False), (True, True)):
         names = {path: _spelled(path, folder=folder, suffix=suffix) for path in distinct}
         if len(set(names.values())) == len(distinct):
             return {path: check_name(name, subject=f"{subject}: image {path}") for path, name in names.items()}
+    # Name two paths that collide: sorted by name they are neighbours.
     alike = sorted(names, key=lambda path: names[path])
     pair = next((a, b) for a, b in pairwise(alike) if names[a] == names[b])
     raise InputError(

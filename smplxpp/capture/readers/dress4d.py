@@ -46,6 +46,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     files = {kind: {name: s for name, s in series.items() if len(s)} for kind, series in files.items()}
     # More cameras were calibrated than released; the image size of the others is unknown.
     released = {str(name): entry for name, entry in content.items() if str(name) in files["image"]}
+    # Meshes and fits are pickles, which `safe_load` reads without executing them.
     meshes = FileSeries.find(root / "Meshes_pkl", r"mesh-f(?P<frame>\d+)\.pkl")
     fits = FileSeries.find(root / "SMPLX", r"mesh-f(?P<frame>\d+)_smplx\.pkl")
     fitted = ParamFiles(fits, "smplx", options.body) if len(fits) else None

@@ -62,6 +62,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             size = size_of_first_image(name, images)
         K = required(intri, f"K_{name}", source=f"file {root / 'intri.yml'}")
         cameras[name] = pinhole(name, K, *_pose(extri, name, root / "extri.yml"), size, opencv_pixels=True)
+        # Either name of the coefficients occurs.
         coefficients = intri.get(f"dist_{name}", intri.get(f"D_{name}", []))
         distortion = Distortion.from_opencv(
             np.ravel(coefficients).tolist(), subject=f"file {root / 'intri.yml'}: {name}"
@@ -120,6 +121,7 @@ def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | s
         InputError: a missing file, not a text, or a matrix whose numbers do not match its size.
     """
     lines = read_text(path).splitlines()
+    # `cv2.FileStorage` writes "%YAML:1.0" and "!!opencv-matrix", which YAML libraries refuse; hence our own parser.
     blocks: dict[str, list[str]] = {}
     current: list[str] | None = None
     for line in lines:
@@ -131,6 +133,7 @@ def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | s
     return {key: _value(key, block, path) for key, block in blocks.items()}
 
 
+# Matrices, numbers, texts, and lists in either of YAML's notations.
 def _value(key: str, block: list[str], path: Path) -> np.ndarray | list[str] | float | str:
     if block[0].startswith("!!opencv-matrix"):
         return _matrix(key, " ".join(block[1:]), path)

@@ -62,6 +62,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     parts: dict[str, set[tuple[str, int]]] = {_TRAIN: set(), _TEST: set(), _NEITHER: set()}
     for image, (name, frame) in zip(images, places(images, subject=f"capture {root}"), strict=True):
         camera = replace(image.camera, name=name)
+        # The first frame fixes the camera; all others must agree with it.
         known = cameras.setdefault(name, camera)
         if not same_camera(known, camera):
             raise InputError(
@@ -72,6 +73,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             )
         if image.lens is not None:
             distortions[name] = image.lens
+        # A missing image leaves a gap in its camera, while its pose stays known.
         if not image.exists:
             problems.append(Problem(f"{root / image.path}: named in {image.source.name}, but missing", name, frame))
             continue
@@ -83,6 +85,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         kind: {name: FileSeries.from_names(root, names) for name, names in by_camera.items()}
         for kind, by_camera in files.items()
     }
+    # Images with an alpha channel carry their mask themselves (Blender's scenes).
     if not series["mask"] and _has_alpha(series["image"]):
         series["mask"] = series["image"]
     return Recording(
@@ -107,6 +110,7 @@ def _images(root: Path, path: Path, content: Mapping[str, Any], problems: list[P
     found = []
     frame = _frame_of(path)
     listed = _listed_parts(root, path, content)
+    # A file or folder of test or val holds out its images; nerfstudio's lists overrule this.
     default = _TEST if {path.parent.name, path.stem.rpartition("_")[2]} & set(_HELD_OUT) else _TRAIN
     for index, entry in enumerate(as_list(required(content, "frames", source=f"file {path}"), subject=f"file {path}")):
         source = f"file {path}: frame {index}"
@@ -114,6 +118,7 @@ def _images(root: Path, path: Path, content: Mapping[str, Any], problems: list[P
         source = f"file {path}: {name[:200]}"
         image = find_image(root, path.parent, name, subject=source)
         try:
+            # Values of the frame overrule those of the file.
             size = _size(root / image, {**content, **entry})
         except InputError as error:
             problems.append(Problem(str(error)))
@@ -188,6 +193,7 @@ def _splits(cameras: Mapping[str, Camera], parts: Mapping[str, set[tuple[str, in
     """Hold out the cameras and frames that only test and val name; None without any training image."""
     if not parts[_TRAIN]:
         return None
+    # Both sets of each axis; what training and test share is trained on, or nothing would be left to train.
     train_cameras, test_cameras = ({name for name, _ in parts[part]} for part in (_TRAIN, _TEST))
     train_frames, test_frames = ({frame for _, frame in parts[part]} for part in (_TRAIN, _TEST))
     return Splits(

@@ -152,6 +152,7 @@ def _files(
     files: dict[str, dict[str, FileSeries]] = {}
     problems = []
     chosen = {"label": protocol.labels, "normal": protocol.normals}
+    # Each kind has its folder; a protocol may name another one for labels and normals, or none.
     for kind, (own, tag) in _FOLDERS.items():
         folder = chosen.get(kind, own)
         if folder is None:
@@ -162,6 +163,7 @@ def _files(
             for name in cameras
         }
         files[kind] = {name: series for name, series in found.items() if len(series)}
+        # A folder without calibration is reported: its images would be ignored in silence.
         for name in sorted(set(subfolders(root / folder)) - set(cameras)):
             problems.append(
                 Problem(f"{root / folder / name}: a folder of camera {name}, which is not calibrated", name)
@@ -176,6 +178,7 @@ def _files(
 
 
 def _background(description: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    # Black without a description, as in ActorsHQ; null declares photographs with their own background.
     value = description.get("background", (0.0, 0.0, 0.0))
     if value is None:
         return None
@@ -195,6 +198,7 @@ def _splits(recording: Recording, description: Mapping[str, Any]) -> Splits:
     novel_frames = _ranges(description, "novel_pose_frames", frames) or []
     train_frames = _ranges(description, "train_frames", frames)
     return Splits(
+        # A split that is named is taken as it is; else everything that is not held out is trained on.
         tuple(train_views if train_views is not None else [c for c in cameras if c not in novel_views]),
         tuple(novel_views),
         tuple(train_frames if train_frames is not None else [f for f in frames if f not in set(novel_frames)]),

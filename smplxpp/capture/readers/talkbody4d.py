@@ -59,6 +59,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     up: UpAxis = declared.get("up", "-y")
     require_choice("up in capture.json of a TalkBody4D folder", up, ("y", "-y"))
     cameras, distortions = _read_calibration(path)
+    # x_cam = R x + t in the set's world; with x = F x' the pose becomes [R|t] F, where F is its own inverse.
     if up == "-y":
         cameras = {name: replace(c, cam_from_world=c.cam_from_world @ _Y_UP_FROM_Y_DOWN) for name, c in cameras.items()}
     params, problems = _params(root, options, up)
@@ -139,6 +140,7 @@ def _images(root: Path, cameras: Mapping[str, Any]) -> dict[str, Path]:
     Raises:
         InputError: no images in any of them.
     """
+    # Releases differ in where images are, so that the usual places are tried in turn.
     others = [name for name in subfolders(root) if name not in _MATTES]
     for folder in (root / "images", root, *(root / name for name in others)):
         if numbered_images({name: folder / name for name in cameras if (folder / name).is_dir()}):
@@ -155,8 +157,11 @@ def _params(root: Path, options: ReaderOptions, up: UpAxis) -> tuple[ParamSource
         return chosen_params(options), []
     for name in subfolders(root):
         series = FileSeries.find(root / name, r"\D*(?P<frame>\d+)\.json")
+        # Three files at most are opened, so that a long recording is recognised at once.
         content = _first_readable(series)
         if content.keys() >= _PARAM_KEYS:
+            # Rh and Th rotate the posed body about the origin; their conversion needs the root joint of the very same
+            # body.
             reason = _unfitting(content, options.body or load_body())
             if reason is None:
                 return ParamFiles(series, "talkbody4d", options.body, up), []

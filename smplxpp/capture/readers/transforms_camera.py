@@ -51,6 +51,7 @@ def frame_camera(
 
 def _pose(content: Mapping[str, Any], frame: Mapping[str, Any], source: str) -> Float64[np.ndarray, "N 4"]:
     """Return the camera-to-world matrix in OpenCV's camera axes, which `from_na` marks as given (NeuS2)."""
+    # NeuS2 and Instant-NGP may name poses at the start and the end of the exposure; they must be equal.
     key = "transform_matrix_start" if "transform_matrix_start" in frame else "transform_matrix"
     matrix = as_numbers(required(frame, key, source=source), (None, 4), subject=f"{source}: {key}")
     end = as_numbers(frame.get("transform_matrix_end", matrix), (None, 4), subject=f"{source}: transform_matrix_end")
@@ -63,6 +64,7 @@ def _pose(content: Mapping[str, Any], frame: Mapping[str, Any], source: str) -> 
         )
     if matrix.shape[0] not in (3, 4):
         raise InputError(f"{source}: {key}", expected="shape (4, 4) or (3, 4)", received=f"{matrix.shape}")
+    # Right multiplication changes the camera's axes (columns) and leaves its position.
     return matrix if "from_na" in content else matrix @ _OPENCV_FROM_OPENGL
 
 
@@ -75,6 +77,7 @@ def _intrinsics(
         if min(matrix.shape) < 3:
             raise InputError(f"{source}: intrinsic_matrix", expected="3 rows and columns", received=f"{matrix.shape}")
         return matrix[:3, :3]
+    # Values of the frame come first, then those of the file.
     found = _focal_lengths(frame, size, source) or _focal_lengths(content, size, source)
     if found is None:
         raise InputError(
@@ -82,6 +85,7 @@ def _intrinsics(
             expected="intrinsic_matrix, fl_x, x_fov or camera_angle_x (or these of y)",
             received="none of them",
         )
+    # The principal point defaults to the image's middle, at half the size with pixel centres at +0.5.
     K = np.diag([*found, 1.0])
     for row, key in enumerate(("cx", "cy")):
         K[row, 2] = as_number(values.get(key, size[row] / 2), subject=f"{source}: {key}")
@@ -106,6 +110,7 @@ def _focal_length(values: Mapping[str, Any], axis: str, side: int, source: str) 
 
 def _lens(values: Mapping[str, Any], source: str) -> Distortion | None:
     """Return the distortion by camera model and coefficients; None for a pinhole."""
+    # A projection counts as absent if it is false or null.
     other = [key for key in _PROJECTIONS if key in values and values[key] is not False and values[key] is not None]
     if other:
         raise InputError(f"{source}: lens", expected="a pinhole or a fisheye", received=other[0], remedy=_REMEDY)
@@ -127,6 +132,7 @@ def _lens(values: Mapping[str, Any], source: str) -> Distortion | None:
         )
     if fisheye:
         return Distortion.from_opencv(k[:4], subject=source, model=FISHEYE)
+    # OpenCV's order: k1, k2, p1, p2, k3.
     return Distortion.from_opencv([*k[:2], *p, k[2]], subject=source, model=OPENCV)
 
 
