@@ -1,4 +1,4 @@
-"""Lays a `Report` out as one HTML file that needs nothing else: no network, no fonts, no other files."""
+"""Lay out a `Report` as one self-contained HTML file, without network, fonts or other files."""
 
 from __future__ import annotations
 
@@ -40,6 +40,8 @@ _VERDICTS = {
 def write_report(path: str | Path, report: Report) -> Path:
     """Write `report` to `path` as one self-contained HTML file, whole or not at all."""
     folder = resources.files("pipelines.report")
+    # Escape all text, since names of files and cameras come from users; an unknown variable of the template is an
+    # error.
     environment = jinja2.Environment(
         autoescape=True,
         undefined=jinja2.StrictUndefined,
@@ -49,6 +51,7 @@ def write_report(path: str | Path, report: Report) -> Path:
     )
     environment.filters |= {"value": format_value, "flat": _flatten, "worst": worst_status}
     environment.tests["number"] = _is_number
+    # Charts are drawn as SVG within the page while the template is rendered.
     environment.globals |= {
         "histogram_svg": _histogram,
         "curve_svg": _curve,
@@ -61,6 +64,7 @@ def write_report(path: str | Path, report: Report) -> Path:
         counts=count_statuses(report.checks),
         worst=worst,
         verdict=_VERDICTS[worst] if report.checks else "No checks were made",
+        # List the checks that failed or warned first; STATUSES is ordered from the worst on.
         attention=sorted(
             (check for check in report.checks if check.status != "pass"), key=lambda c: STATUSES.index(c.status)
         ),
@@ -95,7 +99,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Nested mappings as (dotted key, value) rows."""
+    """Return the rows (dotted key, value) of nested mappings."""
     rows: list[tuple[str, Any]] = []
     for key, value in values.items():
         name = f"{prefix}{key}"
@@ -104,12 +108,21 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any
 
 
 def readable(record: StageRecord, title: str, make: Callable[[], Section]) -> Section:
-    """The section that `make` takes from a stage's files, or one that says why it cannot.
+    """Make a section from a stage's files, or one with the error message where they cannot be read.
 
-    A stage that ran in this very call wrote its files just now: what is wrong with them is ours, and an error.
+    Files of a stage that ran in this call must be readable, so that their errors are raised.
+
+    Args:
+        record: the stage.
+        title: title of the section in case of an error.
+        make: function that makes the section.
+
+    Raises:
+        InputError: unreadable files of a stage that ran in this call.
     """
     try:
         with values_of(record), np.errstate(over="raise", divide="raise", invalid="raise"):
+            # Draw all charts here too, so that values which cannot be drawn are caught with the rest.
             section = make()
             for curve in section.curves:
                 curve_svg(curve)
@@ -119,14 +132,15 @@ def readable(record: StageRecord, title: str, make: Callable[[], Section]) -> Se
     except InputError as error:
         if record.ran:
             raise
-        words = f"{record.folder.name} cannot be read: {error}"
-        warnings.warn(f"report: {words}", GeometryWarning, stacklevel=2)
+        # One damaged stage must not cost the page of all others: show the message and the checks instead.
+        message = f"{record.folder.name} cannot be read: {error}"
+        warnings.warn(f"report: {message}", GeometryWarning, stacklevel=2)
         checks = tuple(CheckRow.of(check, stage=record.folder.name) for check in record.manifest["checks"])
-        return Section(title=title, text=(words,), checks=checks)
+        return Section(title=title, text=(message,), checks=checks)
 
 
 def readable_numbers(record: StageRecord, make: Callable[[], tuple[KeyNumber, ...]]) -> tuple[KeyNumber, ...]:
-    """The numbers for the head of the report that `make` takes from a stage's manifest; none where it cannot."""
+    """Make the key numbers of a stage from its manifest; none, with a warning, where it cannot be read."""
     try:
         with values_of(record):
             return make()

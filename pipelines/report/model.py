@@ -1,4 +1,4 @@
-"""What a report holds. Everything is already computed: the builder only lays it out."""
+"""Content of a report: sections, tables, charts and checks. The builder only lays them out."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ class CheckRow:
     """A check as a manifest records it.
 
     Attributes:
-        value: None where the number was not finite (JSON has none).
-        gate: the gate in words. stage: folder of the stage that made the check.
+        value: measured value; None where it was not finite, because JSON has no such numbers.
+        gate: the gate as text.
+        stage: folder of the stage that made the check.
     """
 
     name: str
@@ -70,7 +71,7 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The picture as a data URI."""
+        """Return the picture as a data URI."""
         kind = next((mime for start, mime in _SIGNATURES.items() if self.data.startswith(start)), None)
         if kind is None:
             raise InputError(f"picture {self.caption!r}", expected="PNG or JPEG bytes", received=repr(self.data[:4]))
@@ -94,7 +95,7 @@ class Film:
 
     @property
     def uri(self) -> str:
-        """The film as a data URI."""
+        """Return the film as a data URI."""
         return f"data:video/mp4;base64,{base64.b64encode(self.data).decode()}"
 
 
@@ -243,6 +244,7 @@ def _format_float(value: float) -> str:
         return "not a number" if math.isnan(value) else ("∞" if value > 0 else "-∞")
     if value == 0:
         return "0"
+    # Exponents outside 1e-3 to 1e7; whole numbers from 1000; otherwise three significant digits, four from 100.
     size = abs(value)
     if size < 1e-3 or size >= 1e7:
         return f"{value:.2e}"

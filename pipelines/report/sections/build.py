@@ -82,10 +82,12 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     """Write `run/report.html` from a finished run, with what was fitted, trained and measured on it."""
     with values_of(records[ASSEMBLE_STAGE]):
         template_digest = records[ASSEMBLE_STAGE].manifest["files"]["smplxpp.npz"]
+    # Only results on this very template are shown: a run may hold older ones of another.
     fit, evaluation = standing_fit(run, template_digest), standing_evaluation(run, template_digest)
     poses, relit = standing_refinement(run, template_digest), standing_relighting(run, template_digest)
     records = {**records, **({} if poses is None else {REFINE_STAGE: poses})}
     records = {**records, **({} if fit is None else {FIT_STAGE: fit})}
+    # Trainings are compared with the records found so far, from which they were made.
     trainings = standing_trainings(run, records.values())
     records = {**records, **trainings, **({} if evaluation is None else {EVALUATE_STAGE: evaluation})}
     records = {**records, **({} if relit is None else {RELIGHT_STAGE: relit})}
@@ -93,13 +95,16 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     reference = load_params_of_run(run)
     checks = [CheckRow.of(c, stage=name) for name, r in records.items() for c in r.manifest["checks"]]
     by_stage = {name: tuple(c for c in checks if c.stage == name) for name in records}
+    # The posed template and the scan share cameras, so that their pictures can be compared.
     posed = template.mesh.with_vertices(template.pose(reference)[0])
     scan, colors, _ = load_scan(run)
     cameras = body_cameras(scan, views=("front", "back"), height=HEIGHT)
+    # The first three stages share a section.
     early = tuple(c for c in checks if c.stage in ("08_capture", "10_body", "20_segment"))
     registration = records.get(REGISTER_STAGE)
     kept, moved, checked = (records[name] for name in ("30_clean", "40_transfer", VALIDATE_STAGE))
     found = records.get(LOCATE_STAGE)
+    # Sections in the order of the stages. `readable` turns a damaged stage into a message.
     sections = (
         *_optional(records.get(RECONSTRUCT_STAGE), "Reconstruction", lambda record: reconstruct_section(run, record)),
         *_optional(
@@ -205,7 +210,7 @@ def rewrite_report(run: Path) -> Path | None:
     """Rewrite the report of a finished run from the run alone.
 
     Returns:
-        The report, or None where the run does not say what it was built from.
+        The report, or None for a run without a record of its build.
 
     Raises:
         InputError: a stage of the template is missing or changed.

@@ -24,7 +24,7 @@ _FIGURES = ("psnr", "psnr_image", "ssim", "psnr_head")
 
 
 def standing_fit(run: Path, template_digest: str) -> StageRecord | None:
-    """The fit in a run, None where there is none or one of another template than the run has now."""
+    """Return the record of a run's fit; None without one, or for one of another template."""
     manifest = read_manifest(run / FIT_STAGE)
     if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest:
         return None
@@ -32,7 +32,7 @@ def standing_fit(run: Path, template_digest: str) -> StageRecord | None:
 
 
 def fit_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
-    """The fit's numbers for the head of the report."""
+    """Return the key numbers of the fit for the head of the report."""
     numbers = record.manifest["numbers"]
     which, names = _shown(numbers)
     figures = numbers["mean"][which]
@@ -41,9 +41,10 @@ def fit_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
 
 
 def fit_section(record: StageRecord) -> Section:
-    """Photograph, rendering and error beside each other, figures by camera, and quality as time went by."""
+    """Show photograph, rendering and error side by side, figures by camera, and quality over time."""
     numbers = record.manifest["numbers"]
     which, names = _shown(numbers)
+    # A strip holds photograph, rendering and error of one camera. A missing one is skipped: strips are previews only.
     pictures, comparisons = [], []
     for name in names:
         strip = path_inside(record.folder, f"previews/{name}.png")
@@ -58,6 +59,7 @@ def fit_section(record: StageRecord) -> Section:
                 Picture("rendered", encode_png(parts[1])),
             )
         )
+        # The head is shown enlarged, because faces are judged by it.
         head = numbers["heads"].get(name)
         if head is not None:
             pictures.append(_head_picture(name, parts, head))
@@ -83,23 +85,24 @@ def fit_section(record: StageRecord) -> Section:
 
 
 def _shown(numbers: dict[str, Any]) -> tuple[str, list[str]]:
-    """The views that speak for the fit: held-out ones, or the training views where none is held out."""
+    """Return the kind and names of the views to show: held-out ones, or training views where none is held out."""
     which = "held_out" if numbers["held_out"] else "train"
     return which, list(numbers[which])
 
 
 def _head_picture(name: str, parts: tuple[UInt8[np.ndarray, "H W 3"], ...], box: Any) -> Picture:
     x0, y0, x1, y1 = head_box(box, parts[0])
+    # Enlarge by whole numbers, so that pixels stay sharp squares.
     factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
     crops = [enlarge(part[y0:y1, x0:x1], factor) for part in parts]
     return Picture(f"{name}, head, {factor} times enlarged: photograph, rendered, error", encode_png(row(crops)))
 
 
 def head_box(value: Any, image: UInt8[np.ndarray, "H W 3"]) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of a head in a picture, as a manifest has it.
+    """Parse the box of a head from a manifest: left, top, right and bottom in pixels.
 
     Raises:
-        InputError: no such numbers, outside of the picture, or so flat that enlarged it would be a wall.
+        InputError: other values, a box outside of the picture, or one more than 8 times as wide as high.
     """
     x0, y0, x1, y1 = (int(number) for number in as_numbers(value, (4,), subject="head in a picture"))
     height, width = image.shape[:2]
@@ -120,7 +123,7 @@ def _table(numbers: dict[str, Any]) -> Table:
 
 
 def _curves(path: Path) -> tuple[Curve, ...]:
-    """Quality over the time spent in steps."""
+    """Return curves of PSNR and SSIM over the seconds spent in steps; none for fewer than two evaluations."""
     found = [entry for entry in read_metrics(path) if entry["kind"] == "evaluation"]
     if len(found) < 2:
         return ()

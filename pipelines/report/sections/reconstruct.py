@@ -107,12 +107,14 @@ def _surfaces(
     mesh: TriangleMesh, colors: np.ndarray | None, hull: TriangleMesh, confidence: np.ndarray, seen: np.ndarray
 ) -> list[Picture]:
     """Return pictures of hull and surface side by side, of their difference, and of the confidence."""
+    # The hull and the refined surface, from the front and the back.
     cameras = body_cameras(mesh, views=("front", "back"), height=HEIGHT)
     shaded = []
     for camera in cameras:
         shaded.append(caption(render_shaded(hull, camera), "silhouettes alone"))
         shaded.append(caption(render_shaded(mesh, camera), "photographs compared"))
     pictures = [Picture("the hull, and the surface after the search along its normals", encode_jpeg(row(shaded)))]
+    # Colours and confidence of the surface.
     panels = []
     for camera in cameras:
         if colors is not None:
@@ -126,9 +128,11 @@ def _surfaces(
         Picture("colours from the photographs; confidence: 0 where no photographs agree", encode_jpeg(row(panels)))
     )
     panels = []
+    # The distance moved exists only if the surface has the hull's vertices, not for a mesh of another program.
     if len(hull.vertices) == len(mesh.vertices):
         moved = MM * np.linalg.norm(mesh.vertices - hull.vertices, axis=1)
         panels = [caption(render_heat(mesh, one, moved, limits=(0, _MOVED_MM), unit="mm"), "moved") for one in cameras]
+    # Fewer than two cameras cannot triangulate a point.
     unseen = np.where(seen < 2, 1.0, 0.0)
     below = body_cameras(mesh, views=("front", "side"), height=HEIGHT)
     panels += [caption(render_heat(mesh, one, unseen, limits=(0, 1), bar=False), "unseen") for one in below]
@@ -141,7 +145,7 @@ def _surfaces(
 def _on_photographs(
     inputs: ReconstructInputs, frame: int, numbers: Mapping[str, Any], mesh: TriangleMesh
 ) -> list[Picture]:
-    """The outlines of surface and mask on some photographs, the worst among them, and on those that were left out."""
+    """Draw the outlines of surface and mask on some photographs, including the worst and those left out."""
     capture = open_photographs(inputs)
     agreement = numbers["silhouettes"]
     worst = min(agreement, key=agreement.get)

@@ -16,7 +16,7 @@ from smplxpp.core.files.paths import path_inside
 
 
 def standing_refinement(run: Path, template_digest: str) -> StageRecord | None:
-    """The refinement in a run, None where there is none or one on another template than the run has now."""
+    """Return the record of a run's refinement; None without one, or for one on another template."""
     manifest = read_manifest(run / REFINE_STAGE)
     if manifest is None or manifest["inputs"].get(TEMPLATE) != template_digest:
         return None
@@ -24,18 +24,19 @@ def standing_refinement(run: Path, template_digest: str) -> StageRecord | None:
 
 
 def refinement_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
-    """How far the refinement turned joints, for the head of the report."""
+    """Return the mean rotation and translation of the refinement for the head of the report."""
     found = record.manifest["numbers"]["training"]
     note = f"{np.mean(found['moved_mm']):.1f} mm of translation, {len(found['frames'])} frames"
     return (KeyNumber("poses refined by", f"{np.mean(found['turned_degrees']):.2f} degrees", note),)
 
 
 def refine_section(record: StageRecord) -> Section:
-    """Loss of every frame before and after, how far poses turned, and the worst frames as pictures."""
+    """Show the loss of every frame before and after, the change of the poses, and pictures of the worst frames."""
     numbers = record.manifest["numbers"]
     found = numbers["training"]
     frames = np.array(found["frames"])
     before, after = np.array(found["loss_before"]), np.array(found["loss_after"])
+    # Curves over the frames show whether single frames or the whole sequence changed.
     curves = [
         Curve("loss of a frame", {"before": (frames, before), "after": (frames, after)}, "frame"),
         Curve(
@@ -46,6 +47,7 @@ def refine_section(record: StageRecord) -> Section:
         ),
         Curve("shift of the translation", {"moved": (frames, np.array(found["moved_mm"]))}, "frame", "mm"),
     ]
+    # Tiles are photograph, initial pose and refined pose.
     pictures, comparisons = [], []
     for shown in numbers["pictures"]:
         photograph, (start, refined) = read_tiles(path_inside(record.folder, shown["file"]), 2)

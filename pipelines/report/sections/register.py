@@ -35,7 +35,7 @@ from smplxpp.core.spread import spread
 HEIGHT = 560
 REFERENCE_VIEWS, WORST_FRAMES = 2, 3
 STRIP_COLUMNS = 240
-PROBLEMS_SHOWN = 20
+NOTES_SHOWN = 20
 _MARGIN, _WHOLE = 0.14, 0.95
 _EYES = ("left_eye_smplhf", "right_eye_smplhf")
 
@@ -83,7 +83,7 @@ def register_section(run: Path, record: StageRecord) -> Section:
         ),
         pictures=tuple(pictures),
         curves=_curves(content),
-        tables=tuple(table for table in (_camera_table(content), _problem_table(content)) if table is not None),
+        tables=tuple(table for table in (_camera_table(content), _note_table(content)) if table is not None),
         checks=tuple(CheckRow.of(check, stage=REGISTER_STAGE) for check in record.manifest["checks"]),
     )
 
@@ -239,23 +239,25 @@ def _camera_table(content: Mapping[str, Any]) -> Table | None:
     return Table(header, tuple(rows), "keypoints to the body's joints, by camera") if rows else None
 
 
-def _problem_table(content: Mapping[str, Any]) -> Table | None:
-    problems = content["problems"]
-    if not problems:
+def _note_table(content: Mapping[str, Any]) -> Table | None:
+    notes = content["problems"]
+    if not notes:
         return None
-    rows = [(words,) for words in problems[:PROBLEMS_SHOWN]]
-    if len(problems) > PROBLEMS_SHOWN:
-        rows.append((f"and {len(problems) - PROBLEMS_SHOWN} more in {REGISTER_STAGE}/registration.json",))
+    rows = [(note,) for note in notes[:NOTES_SHOWN]]
+    if len(notes) > NOTES_SHOWN:
+        rows.append((f"and {len(notes) - NOTES_SHOWN} more in {REGISTER_STAGE}/registration.json",))
     return Table(("what was wrong, and what was done about it",), tuple(rows), "problems of the inputs")
 
 
 def _confidence_picture(confidence: np.ndarray, names: Sequence[str], frames: np.ndarray) -> Picture:
-    """The joints' confidence over the frames; fingers as one row a hand."""
+    """Draw the confidence of the joints over the frames, with one row for the fingers of each hand."""
+    # Sample the frames, so that a long sequence fits the width.
     columns = spread(range(len(frames)), STRIP_COLUMNS)
     rows = {name.replace("_", " "): confidence[:, k] for k, name in enumerate(names[:BODY_JOINTS])}
     if "jaw" in names:
         rows["jaw"] = confidence[:, names.index("jaw")]
     for side in ("left", "right"):
+        # Single fingers have similar confidence, so that their mean represents the hand.
         fingers = [
             k for k, name in enumerate(names) if k >= BODY_JOINTS and name.startswith(f"{side}_") and "eye" not in name
         ]
@@ -271,19 +273,21 @@ _BARE, _COVERED = (226, 142, 96), (150, 150, 158)
 
 
 def locate_section(record: StageRecord, body: BodyModel, scan: TriangleMesh) -> Section:
-    """Show the body within a run's scan from three sides, and the table of what it might have been."""
+    """Show the body within a run's scan from three sides, and the table of candidate poses."""
     path = record.folder / LOCATION_FILE
     content = as_object(read_json(path, subject="location"), subject=f"location {path}")
     located = load_located(record.folder)
     bare = located.bare_of(body)
     found = body.mesh(body.forward(located.params).vertices[0])
     cameras = body_cameras(scan, views=("front", "side", "back"), height=HEIGHT)
+    # The body within a transparent scan, then the body alone with bare skin marked.
     glass = [render_overlay(found, scan, camera) for camera in cameras]
     shown = np.where(bare[:, None], _BARE, _COVERED).astype(np.uint8)
     bodies = [render_shaded(found, camera, vertex_colors=shown) for camera in cameras]
+    # The first candidate is the chosen one.
     with values_of(path):
-        said = [as_text(content[name], subject=name) for name in ("said", "detector")]
-        problems = [as_text(words, subject="problem") for words in as_list(content["problems"], subject="problems")]
+        sentences = [as_text(content[name], subject=name) for name in ("said", "detector")]
+        notes = [as_text(note, subject="problem") for note in as_list(content["problems"], subject="problems")]
         candidates = [
             as_object(one, subject="candidate") for one in as_list(content["candidates"], subject="candidates")
         ]
@@ -305,20 +309,20 @@ def locate_section(record: StageRecord, body: BodyModel, scan: TriangleMesh) -> 
         "of hands, face, feet shown",
     )
     tables = [Table(header, rows, "ways to stand in the scan that were followed to the end; a lower cost is better")]
-    if problems:
-        tables.append(Table(("where it is unsure, and what to do",), tuple((words,) for words in problems)))
+    if notes:
+        tables.append(Table(("uncertainties, and remedies",), tuple((note,) for note in notes)))
     return Section(
         title="Body found in the scan",
         text=(
-            ". ".join(words for words in said if words),
-            "Nothing but the surface said where the body is. Look at hands, feet and face: the body's own colour shows "
-            "where it comes through. Landmarks placed with `smplxpp label` settle what is wrong.",
+            ". ".join(sentence for sentence in sentences if sentence),
+            "The body was located from the surface alone. Check hands, feet and face: the body's own colour shows "
+            "where it penetrates the scan. Landmarks placed with `smplxpp label` correct it.",
         ),
         pictures=(
             Picture("the body within the scan (glass)", encode_jpeg(row(glass))),
             Picture("the body that was found; bare skin in its colour", encode_jpeg(row(bodies))),
         ),
         tables=tuple(tables),
-        legend=(("bare", _BARE), ("covered, or not sure", _COVERED)),
+        legend=(("bare", _BARE), ("covered, or uncertain", _COVERED)),
         checks=tuple(CheckRow.of(check, stage=record.folder.name) for check in record.manifest["checks"]),
     )

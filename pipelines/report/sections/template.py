@@ -80,6 +80,7 @@ def scan_section(
         source = as_text(record.manifest["numbers"].get("labels_from", "file"), subject="labels_from")
         notes = as_list(record.manifest["numbers"].get("notes", []), subject="notes")
     labels, confidence = read_named(run / SCAN_LABELS, "face_labels", "confidence")
+    # A colour bar beside the last view serves all.
     heat = [
         render_heat(scan, camera, confidence, cmap="weight", limits=(0.0, 1.0), bar=camera is cameras[-1])
         for camera in cameras
@@ -111,6 +112,7 @@ _METHODS = {
 def parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
     """Show the parts and how simplification changed them."""
     parts = load_cleaned_parts(run)
+    # Draw all parts together, coloured by their label.
     mesh = concatenate_meshes([part.mesh for part in parts.values()])
     labels = np.concatenate([np.full(part.mesh.face_count, part.label) for part in parts.values()])
     numbers = record.manifest["numbers"]
@@ -143,11 +145,13 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
     """Show the skin weights of the parts."""
     parts = load_parts(run)
     weights = load_weights(run, parts)
+    # Draw all parts together: joint colours mixed by weight, then matched against free cloth.
     mesh = concatenate_meshes([part.mesh for part in parts.values()])
     colors = np.concatenate([blend_joint_colors(weights[name]) for name in parts])
     matched = np.concatenate([weights[name].matched for name in parts])
     tint = np.where(matched[:, None], (90, 170, 120), (230, 160, 60)).astype(np.uint8)
     numbers = record.manifest["numbers"]
+    # Share of matched vertices, pieces, and the bridges that were cut.
     rows = tuple(
         (
             n,

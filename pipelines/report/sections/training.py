@@ -187,8 +187,9 @@ _WHAT = (
 
 
 def cloth_section(record: StageRecord) -> Section:
-    """Parts, what was fitted to them with its uncertainty, and why the others were left to the field."""
+    """Show the calibrated cloth parameters of each part with their spread, and why others are left to the field."""
     numbers = record.manifest["numbers"]
+    # One row for each examined part: errors of skinning and simulation, then the fitted parameters with their spread.
     rows = tuple(
         (
             part,

@@ -120,7 +120,7 @@ def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
 
 def test_a_build_takes_up_what_register_has_made(tmp_path, solver, capsys):
     assert main(["register", str(tmp_path), *ASKED, "--seed", "3", "--json", "--no-report"]) == 0
-    options = ["--capture", str(FIXTURE), "--out", str(tmp_path), "--until-stage", "10_body", "--json"]
+    options = [str(tmp_path), "--capture", str(FIXTURE), "--until-stage", "10_body", "--json"]
     assert main(["build", *options]) == 0
     assert len(solver.shown) == 1
     assert registration_of(tmp_path).seed == 3
