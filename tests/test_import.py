@@ -347,3 +347,40 @@ def test_plain_pickle_is_never_loaded():
             for node in ast.walk(tree):
                 if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
                     assert isinstance(node.value, ast.Constant) and node.value.value is False, path
+
+
+# Modules of under 60 lines with one user, and why each stands alone; all others join the module that uses them.
+SMALL_WITH_A_REASON = {
+    "avatar.baselines.build": "the registry in which CONTRIBUTING asks to list a new baseline",
+    "avatar.baselines.outer_template": "one baseline a file",
+    "avatar.export.bundle_numbers": "figures of a bundle, apart from its format",
+    "avatar.export.posed": "needs torch, which formats does not",
+    "avatar.models.networks.presets": "sizes of networks, apart from the trainings that use them",
+    "smplxpp.capture.readers.thuman4": "one reader of a data set a file",
+    "smplxpp.cloth.carriers": "a step of the method with a page section of its own",
+    "smplxpp.detect.load": "the registry in which CONTRIBUTING asks to list a new detector",
+    "smplxpp.export.by_suffix": "keeps the writers of formats out of the light room of templates",
+    "smplxpp.transfer.laplacian": "one operator a file",
+}
+SMALL_MODULE = 60
+
+
+def test_small_modules_have_a_second_user_or_a_reason():
+    """A module is used by an import or by its dotted name, as in lazy exports and in the table of commands."""
+    modules = {name: path for package in PACKAGES for name, path in modules_of(package).items()}
+    texts = {name: path.read_text(encoding="utf-8") for name, path in modules.items()}
+    small = {name for name, path in modules.items() if len(texts[name].splitlines()) < SMALL_MODULE}
+    alone = []
+    for name in sorted(small):
+        if modules[name].name == "__init__.py":
+            continue
+        package, _, own = name.rpartition(".")
+        users = {
+            other
+            for other, text in texts.items()
+            if other != name and (f"{name}" in text or (f"from {package} import" in text and own in text))
+        }
+        if len(users) < 2:
+            alone.append(name)
+    assert set(alone) <= SMALL_WITH_A_REASON.keys(), "join these modules with their users, or give a reason"
+    assert all(name in modules for name in SMALL_WITH_A_REASON), "reasons of modules that are gone"
