@@ -1,22 +1,80 @@
-"""Data types that the stages exchange, and the errors that they raise."""
+"""Data types that the stages exchange, the errors that they raise, and checks of numbers.
+
+Names that most rooms need are exported here; the modules of the room hold the rest.
+"""
 
 from smplxpp.core.camera import Camera
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError, ProgressCallback
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.checks import Check, Gate, StageOutput
+from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError, ProgressCallback, ignore_progress
+from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core.labels import (
+    BACKGROUND,
+    CLOTH_LABELS,
+    HAIR,
+    LABEL_BY_NAME,
+    LABELS,
+    LOWER,
+    OUTER,
+    SHOE,
+    SKIN,
+    UPPER,
+    display_colors,
+)
+from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh, concatenate_meshes, normalize_rows, row_lengths
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
+from smplxpp.core.params import ARRAY_NAMES, DEFAULT_FPS, POSE_BLOCKS, BodyParams
+from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core.spread import spread
+from smplxpp.core.validation import (
+    require_at_least,
+    require_between,
+    require_choice,
+    require_known,
+    require_positive,
+)
 
 __all__ = [
-    "DEFAULT_FPS",
+    "ARRAY_NAMES",
+    "BACKGROUND",
     "BodyParams",
+    "CLOTH_LABELS",
     "Camera",
+    "Check",
+    "DEFAULT_FPS",
+    "Gate",
     "GeometryWarning",
+    "HAIR",
     "InputError",
+    "Keypoints2D",
+    "LABELS",
+    "LABEL_BY_NAME",
+    "LOWER",
+    "MeshLike",
     "MissingExtraError",
+    "OUTER",
+    "POSE_BLOCKS",
     "ProgressCallback",
+    "SHOE",
+    "SKIN",
     "SkinWeights",
+    "StageOutput",
     "TriangleMesh",
+    "UPPER",
+    "as_mesh",
+    "concatenate_meshes",
+    "display_colors",
+    "ignore_progress",
+    "matrix_from_rotvec",
+    "normalize_rows",
     "read_mesh",
+    "require_at_least",
+    "require_between",
+    "require_choice",
+    "require_known",
+    "require_positive",
+    "rotvec_from_matrix",
+    "row_lengths",
+    "spread",
     "write_ply",
 ]
