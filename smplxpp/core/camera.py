@@ -65,11 +65,14 @@ class Camera:
     def screen_from_world(self, points: Num[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:
         """Project world points to x, y in pixels, depth in metres and interpolation weight (1/z, orthographic 1)."""
         # One row per coordinate, so that every operation reads contiguous memory.
+        # (3, N) points in the camera's axes: x_cam = R x + t.
         cam = self.cam_from_world[:3, :3] @ np.asarray(points, dtype=np.float64).T + self.cam_from_world[:3, 3:]
         screen = np.empty((4, cam.shape[1]))
         screen[2] = cam[2]
+        # Points in the camera's plane give infinity; callers test the depth instead.
         with np.errstate(divide="ignore", invalid="ignore"):
             screen[3] = 1.0 if self.orthographic else 1.0 / cam[2]
+            # K without its last row: u = f x / z + c; an orthographic camera leaves out the division.
             screen[:2] = self.K[:2, :2] @ cam[:2] * screen[3] + self.K[:2, 2:]
         return screen.T
 
@@ -95,6 +98,7 @@ class Camera:
             )
         width, height = size or (int(x1 - x0), int(y1 - y0))
         sx, sy = width / (x1 - x0), height / (y1 - y0)
+        # u' = (u - x0) s as a matrix on homogeneous pixels, so that K' = W K keeps the skew right too.
         window_from_full = np.array([[sx, 0.0, -x0 * sx], [0.0, sy, -y0 * sy], [0.0, 0.0, 1.0]])
         return replace(self, K=window_from_full @ self.K, width=width, height=height)
 
@@ -118,9 +122,11 @@ class Camera:
         `direction` points from the centre to the camera.
         """
         direction = np.asarray(direction, float) / np.linalg.norm(direction)
+        # The eye lies outside the ball, at twice its radius, so that all depths are positive.
         eye = np.asarray(center, float) + direction * 2.0 * half_extent
         # A view along the vertical takes +z as its upper edge, because +y has no direction in the image.
         up = (0.0, 1.0, 0.0) if abs(direction[1]) < 0.99 else (0.0, 0.0, 1.0)
+        # Pixels per metre; the ball fills the square image.
         scale = size / (2.0 * half_extent)
         K = np.array([[scale, 0, size / 2], [0, scale, size / 2], [0, 0, 1.0]])
         return Camera(K, _look_at_pose(eye, np.asarray(center, float), up), size, size, orthographic=True)

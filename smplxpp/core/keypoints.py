@@ -38,6 +38,7 @@ class Keypoints2D:
 
     def __post_init__(self) -> None:
         frames = np.asarray(self.frames, dtype=np.int64).reshape(-1)
+        # Copies, because the coordinates of missing points are overwritten below.
         points, confidence = np.array(self.points, dtype=np.float64), np.array(self.confidence, dtype=np.float64)
         shape = (len(frames), len(self.names))
         if points.shape != (*shape, 2) or confidence.shape != shape:
@@ -56,6 +57,7 @@ class Keypoints2D:
             )
         if not np.isfinite(points[confidence > 0]).all():
             raise InputError("keypoints", expected="finite pixels where the confidence is above 0", received="others")
+        # Coordinates of missing points may be NaN in files; zero keeps later arithmetic finite.
         points[confidence == 0] = 0.0
         object.__setattr__(self, "frames", frames)
         object.__setattr__(self, "points", points)
@@ -65,6 +67,7 @@ class Keypoints2D:
         """Return the keypoints with these names and frames, in this order; missing ones have confidence 0."""
         columns, rows = {n: k for k, n in enumerate(self.names)}, {int(f): k for k, f in enumerate(self.frames)}
         points, confidence = np.zeros((len(frames), len(names), 2)), np.zeros((len(frames), len(names)))
+        # Rows and columns that exist on both sides; the others stay at zero confidence.
         to_row = [k for k, frame in enumerate(frames) if frame in rows]
         to_column = [k for k, name in enumerate(names) if name in columns]
         source = np.ix_([rows[frames[k]] for k in to_row], [columns[names[k]] for k in to_column])

@@ -59,10 +59,12 @@ class Irradiance:
             raise InputError("panorama", expected="finite light, not negative, not all zero", received="others")
         height, width = picture.shape[:2]
         # Solid angle of a pixel: the difference of cos(polar angle) at the row's edges times its width in radians.
+        # The solid angles of all pixels sum to 4 pi exactly.
         edges = np.cos(np.linspace(0.0, np.pi, height + 1))
         solid = (edges[:-1] - edges[1:]) * (2.0 * np.pi / width)
         total = np.zeros((9, 3))
         for row in range(height):  # row by row, because panoramas are large
+            # (W, 9) harmonics of the row's directions; the coefficients are integrals of light times harmonic.
             of_row = harmonics(panorama_directions(height, width, turn=turn, rows=slice(row, row + 1))[0])
             total += solid[row] * of_row.T @ picture[row].astype(np.float64)
         return Irradiance(total)

@@ -41,6 +41,7 @@ class TriangleMesh:
     faces: Int64[np.ndarray, "M 3"]
 
     def __post_init__(self) -> None:
+        # Copies in C order: meshes are immutable and compiled kernels take contiguous arrays.
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
         faces = np.asarray(self.faces)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -59,6 +60,7 @@ class TriangleMesh:
                 received=f"{int(bad.sum())} vertices with NaN or infinity, first at index {int(np.argmax(bad))}",
                 remedy="remove them with smplxpp.clean.sanitize(vertices, faces)",
             )
+        # Zero-based indices; a file with indices from 1 shows itself by one index equal to the number of vertices.
         faces = faces.astype(np.int64, order="C")  # a copy; np.array would keep C's long long as it is
         if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise InputError(
@@ -134,9 +136,12 @@ class TriangleMesh:
         t, normals = self.triangles, self.face_normals
         out = np.zeros_like(self.vertices)
         for k in range(3):
+            # Unit vectors of the two edges at corner k.
             u = normalize_rows(t[:, (k + 1) % 3] - t[:, k])
             v = normalize_rows(t[:, (k + 2) % 3] - t[:, k])
+            # arctan2 of |u x v| and u . v is accurate for angles near 0 and pi, where arccos is not.
             angle = np.arctan2(row_lengths(np.cross(u, v)), np.einsum("ij,ij->i", u, v))
+            # `bincount` sums in a fixed order, so that normals are equal from run to run.
             for axis in range(3):
                 out[:, axis] += np.bincount(self.faces[:, k], angle * normals[:, axis], minlength=len(out))
         return normalize_rows(out)
@@ -195,6 +200,7 @@ class TriangleMesh:
         """
         faces = self.faces[face_mask]
         used = _occurring(faces, self.vertex_count)
+        # Old index to new index, -1 for vertices that are dropped.
         lookup = np.full(self.vertex_count, -1, dtype=np.int64)
         lookup[used] = np.arange(len(used))
         return TriangleMesh(self.vertices[used], lookup[faces]), used

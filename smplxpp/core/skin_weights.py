@@ -67,7 +67,9 @@ class SkinWeights:
         if weights.ndim != 2 or not np.isfinite(weights).all():
             raise InputError("skinning weights", expected="finite (N, J)", received=f"shape {weights.shape} or NaN")
         n, joint_count = weights.shape
+        # Negative weights are round-off of solvers.
         clipped = np.clip(weights, 0.0, None)
+        # No row needs more slots than its number of positive weights.
         used = int((clipped > 0).sum(axis=1).max(initial=1))
         k = max(1, min(used, max_influences or joint_count))
         # Stable order: larger weight first, then lower joint index. Joints without any weight are not sorted, unless
@@ -75,6 +77,7 @@ class SkinWeights:
         joints = np.flatnonzero(clipped.any(axis=0)) if n else np.arange(joint_count)
         joints = joints if len(joints) >= k else np.arange(joint_count)
         order = joints[np.argsort(-clipped[:, joints], axis=1, kind="stable")[:, :k]]
+        # (N, k) weights in the order of `order`; dividing by their sum keeps the partition of unity.
         kept = np.take_along_axis(clipped, order, axis=1)
         total = kept.sum(axis=1, keepdims=True)
         if (total <= 0).any():

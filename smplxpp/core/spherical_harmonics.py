@@ -66,6 +66,8 @@ def _terms(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
     """Return the polynomials of degrees 1 to `degree` in the coordinates of a unit vector."""
     terms: list[Any] = []
     if degree > 0:
+        # The Condon-Shortley signs and the order -m..m are those of the reference implementation of Gaussian
+        # splatting.
         terms += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree > 1:
         xx, yy, zz = x * x, y * y, z * z
@@ -102,6 +104,7 @@ def rotate_sh(
     out = np.zeros(sh.shape)
     if not degree:
         return out
+    # Directions (S, 3) and the (K, S) pseudo-inverse of their harmonics.
     directions, solve = _sample_directions(degree)
     rows_of = np.arange(len(sh)) if index is None else index
     block = 4096  # rows rotated at once: each takes a matrix of 32 x K numbers

@@ -84,6 +84,7 @@ class SurfacePoints:
         face, barycentric = draw_on_surface(mesh, count, seed=seed, method="independent")
         w, u, v = barycentric.T
         a, b, c = mesh.triangles[face].transpose(1, 0, 2)
+        # Barycentric coordinates are (1 - u - v, u, v).
         points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
         normals = mesh.vertex_normals[mesh.faces[face]]
         smooth = normals[:, 0] * w[:, None] + normals[:, 1] * u[:, None] + normals[:, 2] * v[:, None]
@@ -128,7 +129,9 @@ def truncated_distance(
 
     Distances are those of `position_normal_features`, so that opposite normals add to them.
     """
+    # Points and normals as one feature vector, so that a nearest-neighbour query respects both.
     there = position_normal_features(points, normals)
+    # Beyond the bound the query returns infinity, which the truncation replaces.
     one, _ = surface.tree.query(there, distance_upper_bound=far)
     other, _ = cKDTree(there).query(surface.tree.data, distance_upper_bound=far)
     return float(0.5 * (np.minimum(one, far).mean() + np.minimum(other, far).mean()))

@@ -25,9 +25,12 @@ def edge_groups(
     run's length.
     """
     ends = half_edges(faces)
+    # An undirected edge as one integer, low * n + high, which sorts faster than pairs.
     low, high = np.minimum(*ends.T), np.maximum(*ends.T)
     key = low * (int(faces.max(initial=0)) + 1) + high
+    # Stable: half-edges of an edge stay in index order.
     order = np.argsort(key, kind="stable")
+    # Runs of equal keys begin where the sorted key changes.
     first = np.flatnonzero(np.diff(key[order], prepend=-1)) if len(key) else np.zeros(0, np.int64)
     return order, first, np.diff(first, append=len(key))
 
@@ -49,6 +52,7 @@ def face_adjacency(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "P 2"
     last[first + count - 1] = True
     position = np.flatnonzero(~last)
     pairs = np.stack([order[position], order[position + 1]], axis=1)
+    # Half-edge h belongs to face h // 3.
     return pairs // 3, half_edges(faces)[pairs[:, 0]]
 
 
@@ -80,9 +84,12 @@ def manifold_corners(faces: Int[np.ndarray, "M 3"]) -> tuple[Int[np.ndarray, "M 
     # Join corners across edges with exactly two faces of opposite direction; a fan is a component of joined corners.
     pairs = paired_half_edges(faces)
     ends = half_edges(faces)
+    # Opposite direction: the start of one half-edge is the end of the other.
     pairs = pairs[ends[pairs[:, 0], 0] == ends[pairs[:, 1], 1]]
     following = np.arange(3 * len(faces)).reshape(-1, 3)[:, [1, 2, 0]].ravel()
     a, b = pairs[:, 0], pairs[:, 1]
+    # Across an edge, the corner at the start of one half-edge lies at the same vertex as the corner after the other's
+    # start.
     links = np.concatenate([np.stack([a, following[b]], 1), np.stack([following[a], b], 1)])
     fan = component_labels(links, 3 * len(faces))
     # Number the fans: the first of each vertex in the order of the vertices, further ones after all of these.
@@ -103,16 +110,19 @@ def border_loops(faces: Int[np.ndarray, "M 3"]) -> list[Int[np.ndarray, " _"]]:
     Loops come in order of their lowest vertex.
     """
     order, first, count = edge_groups(faces)
+    # Half-edges without a partner; on a manifold each border vertex starts exactly one.
     start, end = half_edges(faces)[order[first[count == 1]]].T
     if not len(start):
         return []
     nodes = np.sort(start)
+    # The successor of each border vertex along the loop, as an index into `nodes`.
     following = np.searchsorted(nodes, end[np.argsort(start, kind="stable")])
     loop = component_labels(np.stack([np.arange(len(nodes)), following], 1), len(nodes))
     # Count the steps from each vertex to the lowest one of its loop by pointer doubling, then sort by them.
     _, head = np.unique(loop, return_index=True)
     jump, steps = following.copy(), np.ones(len(nodes), np.int64)
     jump[head], steps[head] = head, 0
+    # log2 n doublings cover any loop; the head points at itself with zero steps.
     for _ in range(int(np.ceil(np.log2(len(nodes) + 1)))):
         steps, jump = steps + steps[jump], jump[jump]
     length = np.bincount(loop)

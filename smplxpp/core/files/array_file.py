@@ -53,6 +53,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, packing:
     Raises:
         ValueError: an array of objects.
     """
+    # Level 1 of deflate trades some size for speed.
     level = 1 if packing == zipfile.ZIP_DEFLATED else None
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in arrays.items():
@@ -93,6 +94,7 @@ def read_arrays(
             if len(set(names)) != len(names) or len(names) > max_entries:
                 raise ValueError(f"{len(names)} arrays of {len(set(names))} names")
             chosen = [(n, e) for n, e in zip(names, entries, strict=True) if wanted is None or n in wanted]
+            # Refuse decompression bombs by the sizes in the directory, before anything is unpacked.
             _check_unpacking(sum(entry.file_size for _, entry in chosen), path.stat().st_size)
             for name, entry in chosen:
                 with archive.open(entry) as stream:
@@ -189,7 +191,9 @@ def _read(stream: Any, size: int, subject: str, remedy: str, objects: ObjectRead
             if objects is None:
                 raise ValueError("an array of objects, which is a program and not numbers")
             return objects(stream, subject)
+        # The type string decides how many bytes are read, so that only numbers, bools and texts pass.
         dtype = check_dtype(descr)
+        # The header must agree with the entry's size exactly; it would otherwise decide how much memory is taken.
         if count * dtype.itemsize != size - start:
             raise ValueError(f"{size - start} bytes for {dtype} of shape {shape}")
         # In chunks of a MiB, because one read of a compressed entry would hold its bytes twice.
@@ -200,17 +204,21 @@ def _read(stream: Any, size: int, subject: str, remedy: str, objects: ObjectRead
         if stream.read(1):  # reading to the end also verifies the checksum of an archive's entry
             raise ValueError("more than the array")
         array = data.view(dtype).reshape(shape, order="F" if fortran_order else "C")
+        # Native byte order, because compiled kernels take no other.
         return array.astype(dtype.newbyteorder("="), copy=False)
 
 
 def _header(stream: Any) -> tuple[str, bool, tuple[int, ...], int]:
     """Return type string, Fortran order, shape and the place of the first number; the text is never evaluated."""
+    # Format of npy: magic string, version, length of the header (2 bytes in version 1, 4 later), header, numbers.
     start = stream.read(8)
     if start[:6] != b"\x93NUMPY" or len(start) != 8 or start[6] not in (1, 2, 3):
         raise ValueError("no npy header")
     width = 2 if start[6] == 1 else 4
     length = int.from_bytes(stream.read(width), "little")
     text = stream.read(length).decode("latin1") if length <= 1 << 16 else ""
+    # `np.load` evaluates the header as a Python literal; three regular expressions read the same keys without
+    # evaluation.
     descr = re.findall(r"""['"]descr['"]\s*:\s*['"]([^'"]{1,16})['"]\s*[,}]""", text)
     order = re.findall(r"""['"]fortran_order['"]\s*:\s*(True|False)\s*[,}]""", text)
     shape = re.findall(r"""['"]shape['"]\s*:\s*\(([\d\sL,]{0,600})\)\s*[,}]""", text)

@@ -23,6 +23,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _named(None, path):
+        # In the folder of the target, because a rename is atomic only within one file system.
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
@@ -33,6 +34,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         with _named(temporary, path):
             yield temporary
+            # Readers see either the old file or the whole new one.
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

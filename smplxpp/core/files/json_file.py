@@ -41,6 +41,7 @@ def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
         InputError: broken JSON, more than 64 levels, integers of more than 18 digits, or texts with a NUL or half a
             surrogate pair, which no file name can have.
     """
+    # Integers are bounded while they are parsed: the conversion of long digits takes quadratic time.
     try:
         value = json.loads(data, parse_int=_integer)
     except RecursionError:
@@ -49,8 +50,10 @@ def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
         ) from None
     except ValueError as error:  # broken JSON, broken UTF-8, and long integers
         raise InputError(subject, expected="JSON", received=str(error)[:200], remedy=remedy) from None
+    # Deep nesting would exhaust the stack of later recursive walks.
     if _levels(value) > _MAX_LEVELS:
         raise InputError(subject, expected=f"JSON of at most {_MAX_LEVELS} levels", received="more", remedy=remedy)
+    # The search for escapes is quick and spares most files the walk through all texts.
     raw = data if isinstance(data, bytes) else data.encode(errors="surrogatepass")
     if (_UNUSABLE_ESCAPE.search(raw) or b"\0" in raw) and not _all_text_usable(value):
         raise InputError(
@@ -81,6 +84,7 @@ def as_number(value: Any, *, subject: str, least: float = -math.inf, most: float
         InputError: anything else.
     """
     try:
+        # bool is a subclass of int in Python.
         number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else math.nan
     except OverflowError:
         number = math.inf
@@ -157,6 +161,7 @@ def _integer(digits: str) -> int:
 def _levels(value: Any) -> int:
     """Return the nesting depth of containers, at most one more than allowed."""
     layer = [value] if isinstance(value, dict | list) else []
+    # Breadth first, a layer at a time, so that no recursion is needed.
     for level in range(_MAX_LEVELS + 1):
         if not layer:
             return level
@@ -185,6 +190,7 @@ def _all_text_usable(value: Any) -> bool:
 
 def _number_array(value: Any) -> np.ndarray | None:
     """Convert nested lists to float64; None if they hold anything but numbers (numpy would accept "1" and true)."""
+    # A walk with a stack of its own, since the depth of lists comes from the file.
     pending = [value]
     while pending:
         item = pending.pop()
@@ -202,6 +208,7 @@ def _number_array(value: Any) -> np.ndarray | None:
 
 def jsonable(value: Any) -> Any:
     """Convert configs, paths and numpy values to JSON values; non-finite numbers become null."""
+    # Dataclasses first: their fields may hold any of the types below.
     if is_dataclass(value) and not isinstance(value, type):
         return jsonable(asdict(value))
     if isinstance(value, Mapping):
@@ -212,6 +219,7 @@ def jsonable(value: Any) -> Any:
         return jsonable(value.tolist())
     if isinstance(value, np.generic):
         return jsonable(value.item())
+    # JSON has no NaN and no infinity.
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Path):

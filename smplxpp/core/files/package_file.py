@@ -35,6 +35,7 @@ def write_package(path: str | Path, pieces: Mapping[str, bytes]) -> dict[str, in
             raise ValueError(f"piece {name!r}")
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
         for name, data in pieces.items():
+            # A fixed time and one compression level make equal content equal byte for byte.
             package.writestr(zipfile.ZipInfo(name, _TIME), data, zipfile.ZIP_DEFLATED, compresslevel=9)
         return {entry.filename: entry.compress_size for entry in package.infolist()}
 
@@ -58,6 +59,7 @@ def read_package(path: str | Path, *, subject: str, expected: str, remedy: str =
         with zipfile.ZipFile(path) as package:
             entries = package.infolist()
             _check(entries, packed, about, remedy)
+            # Sizes in the directory were checked; each entry is read to no more than its own.
             return {entry.filename: _unpacked(package, entry) for entry in entries}
     except InputError:
         raise
@@ -112,6 +114,7 @@ def _unpacked(package: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
         while left > 0 and (piece := stream.read(min(1 << 20, left))):
             parts.append(piece)
             left -= len(piece)
+        # Less or more than the stated size means a forged directory; reading to the end also verifies the CRC.
         if left or stream.read(1):
             raise zipfile.BadZipFile(f"{entry.filename}: not the {entry.file_size} bytes that it states")
     return b"".join(parts)

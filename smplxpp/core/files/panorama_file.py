@@ -47,6 +47,8 @@ def read_radiance(path: str | Path) -> Float32[np.ndarray, "H W 3"]:
     at = begin
     for row in rows:
         at = _decode_row(data, at, row, subject)
+    # The bias of 136 is 128 of the exponent and 8 of the mantissa's bits. An exponent of 0 is black, whatever the
+    # mantissas.
     scale = np.ldexp(np.float32(1.0), rows[..., 3].astype(np.int32) - 136)
     return rows[..., :3].astype(np.float32) * np.where(rows[..., 3] > 0, scale, np.float32(0.0))[..., None]
 
@@ -55,6 +57,7 @@ def _radiance_header(data: bytes, subject: str) -> tuple[int, int, int]:
     """Return width, height, and the place of the first pixel."""
     longest_header = 1 << 16
     remedy = "Blender, GIMP, oiiotool and most viewers of panoramas write .hdr"
+    # The header ends with an empty line, after which one line gives the size.
     end = data.find(b"\n\n", 0, longest_header)
     if not data.startswith((b"#?RADIANCE", b"#?RGBE")) or end < 0:
         raise InputError(subject, expected=_RADIANCE, received="another kind of file", remedy=remedy)
@@ -63,6 +66,7 @@ def _radiance_header(data: bytes, subject: str) -> tuple[int, int, int]:
     if kinds and kinds != [b"32-bit_rle_rgbe"]:
         raise InputError(subject, expected=_RADIANCE, received=f"format {kinds[0][:40]!r}", remedy=remedy)
     stop = data.find(b"\n", end + 2, end + 2 + longest_header)
+    # "-Y height +X width": rows from the top, columns from the left; the seven other orders are rare and refused.
     size = re.fullmatch(rb"-Y (\d{1,6}) \+X (\d{1,6})", data[end + 2 : max(stop, 0)].strip())
     if size is None:
         line = data[end + 2 : end + 42].split(b"\n")[0]
@@ -79,6 +83,7 @@ def _decode_row(data: bytes, at: int, row: np.ndarray, subject: str) -> int:
     head = data[at : at + 4]
     # Run-length encoding is marked by 2, 2 and the width. Rows without the mark are plain RGBE pixels.
     if not (8 <= width < 1 << 15 and head[:2] == b"\x02\x02" and len(head) == 4):
+        # Pixels 1, 1, 1 mark repetitions in the old run-length encoding, which is not supported.
         flat = data[at : at + 4 * width]
         if len(flat) != 4 * width or head[:3] == b"\x01\x01\x01":
             raise _damaged_row(subject)
@@ -138,6 +143,7 @@ def read_openexr(path: str | Path) -> Float32[np.ndarray, "H W 3"]:
     except (RuntimeError, ValueError, TypeError, KeyError, OverflowError) as error:
         reason = str(error).split("\n")[0][:120]
         raise InputError(subject, expected=_OPENEXR, received=f"a damaged one: {reason}") from None
+    # A picture of luminance alone becomes grey.
     names = ("R", "G", "B") if "R" in channels else ("Y",) * 3
     found = [channels.get(name) for name in names]
     if any(one is None or one.shape != (height, width) for one in found):
@@ -147,6 +153,7 @@ def read_openexr(path: str | Path) -> Float32[np.ndarray, "H W 3"]:
 
 def _openexr_size(header: dict[str, Any], subject: str) -> tuple[int, int]:
     """Return height and width of the data window, which must be the display window."""
+    # Corners of both windows are inclusive.
     low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
     display = [np.asarray(corner, dtype=np.int64) for corner in header["displayWindow"]]
     width, height = (int(side) for side in high - low + 1)

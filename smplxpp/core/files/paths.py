@@ -73,11 +73,13 @@ def path_inside(root: str | Path, name: str, *, base: str | Path | None = None, 
     Raises:
         InputError: an absolute name, a name that leaves `root`, or an impossible name.
     """
+    # Normalise without following links: ".." is resolved in the text alone.
     text = name.replace("\\", "/")
     joined = Path(os.path.normpath(Path(root if base is None else base) / text))
     inside = joined.is_relative_to(os.path.normpath(root))
     # File systems take 255 bytes for the name of a file or folder.
     too_long = any(len(part.encode(errors="replace")) > 255 for part in joined.parts)
+    # Absolute paths of Unix ("/...") and of Windows ("C:/...") are refused.
     if not text or "\0" in text or text.startswith("/") or text[1:3] == ":/" or not inside or too_long:
         raise InputError(
             subject,

@@ -101,6 +101,8 @@ class PickleMachine(pickle._Unpickler):
         self.append(self._call(token, tuple(arguments)))
 
     def load_build(self) -> None:
+        # BUILD gives a state to the object below it on the stack: an array its content, a type its byte order, a
+        # record its attributes.
         state = self.stack.pop()
         top = self.stack[-1]
         if isinstance(top, Unbuilt) and top.value is None:
@@ -188,11 +190,14 @@ def check_unfolding(value: Any, budget: int) -> None:
         pickle.UnpicklingError: too deep, too large with every reference counted, or a container within itself.
     """
     max_levels = 200
+    # Sizes of finished containers by identity: a second reference adds the size without a second walk.
     sizes: dict[int, int] = {}
     begun = {id(value)}
+    # Each level of the path holds a container, the iterator over its children, and the bytes added up so far.
     path = [(value, _children(value), _own_size(value))]
     while path:
         node, children, size = path[-1]
+        # The path itself serves as a sentinel that no child can be.
         child = next(children, path)
         if child is path:
             path.pop()

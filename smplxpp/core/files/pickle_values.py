@@ -135,6 +135,7 @@ def _array(budget: Budget, shape: Any, dtype: Any, order: str, content: Any) -> 
         shape = (shape,)
     if not (isinstance(shape, tuple) and all(type(n) is int for n in shape) and isinstance(dtype, Dtype)):
         broken("an array without shape and type")
+    # The product of the shape is bounded before any memory is taken.
     count = check_shape(shape)
     if dtype.kind in _OBJECT_KINDS:
         # As bytes, objects would be pointers.
@@ -146,10 +147,12 @@ def _array(budget: Budget, shape: Any, dtype: Any, order: str, content: Any) -> 
         for index, value in enumerate(values):
             out[index] = value
         return out.reshape(shape, order=order)  # type: ignore[call-overload]
+    # Numbers come as bytes, whose length must fit shape and type exactly.
     resolved, raw = dtype.resolved(), _bytes(content)
     if count * resolved.itemsize != len(raw):
         broken(f"{len(raw)} bytes for {resolved} of shape {shape}")
     budget.spend(len(raw))
+    # The copy in native order does not share memory with the pickle's bytes.
     flat = np.frombuffer(raw, dtype=resolved, count=count) if count else np.empty(0, resolved)
     return flat.reshape(shape, order=order).astype(resolved.newbyteorder("="), order="K")  # type: ignore[call-overload]
 

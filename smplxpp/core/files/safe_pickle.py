@@ -88,14 +88,17 @@ def dense_array(value: Any, *, subject: str) -> np.ndarray:
 def _dense(value: Any, subject: str) -> np.ndarray:
     if isinstance(value, InertObject) and isinstance(value.state, dict):
         state = value.state
+        # scipy's compressed matrices: values, their column (or row) indices, and where each row (or column) begins.
         if value.origin.startswith("scipy.sparse") and {"data", "indices", "indptr", "_shape"} <= state.keys():
             return _dense_sparse(value, subject)
+        # chumpy's array Ch holds its numbers as `x`.
         if value.origin.startswith("chumpy") and "x" in state:
             return _dense(state["x"], subject)
         # chumpy's Select holds flat indices into another object.
         if value.origin.startswith("chumpy") and {"a", "idxs"} <= state.keys():
             taken = _dense(state["a"], subject).ravel()[np.asarray(state["idxs"])]
             return taken.reshape(state.get("preferred_shape", taken.shape))
+    # An object array of one element only wraps its content.
     if isinstance(value, np.ndarray) and value.dtype.hasobject and value.size == 1:
         return _dense(value.item(), subject)
     array = None if isinstance(value, InertObject) else np.asarray(value)
@@ -119,6 +122,7 @@ def _dense_sparse(value: InertObject, subject: str) -> np.ndarray:
     if len(shape) != 2 or min(shape) < 0 or math.prod(shape) > max_dense:
         raise InputError(subject, expected=f"a matrix of at most {max_dense} elements", received=f"shape {shape}")
     try:
+        # The full check catches indices outside the shape, which would otherwise read foreign memory.
         matrix = build((state["data"], state["indices"], state["indptr"]), shape=shape)
         matrix.check_format(full_check=True)
     except (TypeError, ValueError) as error:

@@ -37,9 +37,11 @@ def pack_tensors(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any] | N
     Raises:
         ValueError: an array of another type.
     """
+    # safetensors: eight bytes of the header's length, a JSON header, then the tensors without gaps.
     header: dict[str, Any] = {} if about is None else {_METADATA: {"about": json.dumps(about, sort_keys=True)}}
     blocks, start = [], 0
     for name, value in sorted(tensors.items(), key=lambda item: (-item[1].dtype.itemsize, item[0])):
+        # The format is little-endian.
         array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
         if array.dtype not in _NAMES:
             raise ValueError(f"tensor {name} of type {value.dtype}")
@@ -61,6 +63,7 @@ def unpack_tensors(data: bytes, *, subject: str, remedy: str = "") -> tuple[dict
     Raises:
         InputError: anything but tensors that fill the data without gaps, each of its type and shape.
     """
+    # The format itself allows headers of 100 MB; ours are thousands of bytes.
     longest_header = 1 << 20
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(longest_header, len(data) - 8):
@@ -101,6 +104,7 @@ def _tensor(
     if len(shape) > 8 or len(span) != 2:
         raise InputError(subject, expected="a shape and two offsets", received=shown(entry), remedy=remedy)
     first, last = span
+    # The span must lie inside the body and have exactly the bytes of type and shape.
     if not first <= last <= most or last - first != math.prod(shape) * dtype.itemsize:
         raise InputError(
             subject,
@@ -109,6 +113,7 @@ def _tensor(
             remedy=remedy,
         )
     array = np.frombuffer(body[first:last], dtype=np.uint8)
+    # A byte other than 0 and 1 in a bool array is undefined behaviour in numpy.
     if name == "BOOL" and array.size and array.max() > 1:
         raise InputError(subject, expected="bools", received="other bytes", remedy=remedy)
     return array.view(dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False), (first, last)

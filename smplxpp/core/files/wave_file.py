@@ -66,6 +66,7 @@ def read_wave(path: str | Path) -> Sound:
         raise InputError(subject, expected=_EXPECTED, received="no description or no samples", remedy=_REMEDY)
     # Format header: sample format, channels, rate, bytes per second, bytes per block, bits per sample.
     kind, channels, rate, _, block, bits = struct.unpack("<HHIIHH", chunks[b"fmt "][:16])
+    # WAVE_FORMAT_EXTENSIBLE keeps the true code in the first two bytes of its GUID, at byte 24.
     if kind == _EXTENSIBLE and len(chunks[b"fmt "]) >= 26:
         (kind,) = struct.unpack("<H", chunks[b"fmt "][24:26])
     known = (kind == _PCM and bits in (8, 16, 24, 32)) or (kind == _FLOAT and bits in (32, 64))
@@ -77,10 +78,12 @@ def read_wave(path: str | Path) -> Sound:
             expected=f"1 to {max_channels} channels at {lowest_rate} to {highest_rate} Hz",
             received=f"{channels} at {rate} Hz in blocks of {block} bytes",
         )
+    # Drop an incomplete last block, which recorders leave when they are interrupted; (N, channels) afterwards.
     raw = np.frombuffer(chunks[b"data"], np.uint8)
     values = _numbers(raw[: len(raw) // block * block], kind, bits).reshape(-1, channels)
     if not np.isfinite(values).all():
         raise InputError(subject, expected="finite samples", received="NaN or infinity")
+    # Floats may exceed 1; the bound of 8 (18 dB) keeps damaged samples from overflowing later sums.
     return Sound(np.clip(values.mean(axis=1), -8.0, 8.0).astype(np.float32), rate)
 
 
@@ -107,8 +110,10 @@ def _numbers(raw: UInt8[np.ndarray, " B"], kind: int, bits: int) -> np.ndarray:
     """Convert raw samples to float64 from -1 to 1."""
     if kind == _FLOAT:
         return raw.view(f"<f{bits // 8}").astype(np.float64)
+    # Eight-bit samples are unsigned around 128, all wider ones are signed.
     if bits == 8:
         return (raw.astype(np.float64) - 128.0) / 128.0
+    # 24 bits become the upper three bytes of a 32-bit integer, which keeps the sign.
     if bits == 24:
         wide = np.zeros((len(raw) // 3, 4), np.uint8)
         wide[:, 1:] = raw.reshape(-1, 3)

@@ -41,8 +41,10 @@ def primitive_colors(document: GltfDocument, primitive: dict[str, Any], count: i
         ]
         if factor is None and not found:
             return None
+        # One source without a factor needs no arithmetic.
         if len(found) == 1 and found[0].dtype == np.uint8 and (factor is None or (factor == 1).all()):
             return found[0]  # the file's own bytes, which a round trip through linear light could change
+        # Products are formed in linear light, as glTF 2.0 prescribes (section 3.9.2).
         light = np.ones((count, 3)) if factor is None else np.repeat(factor[None], count, axis=0)
         for colors in found:
             light *= _linear(colors) if colors.dtype == np.uint8 else colors
@@ -69,6 +71,7 @@ def _picture_colors(document: GltfDocument, primitive: dict[str, Any], count: in
     if name not in surface:
         return None
     use = document.part(surface, name)
+    # The extension may name another set of texture coordinates than the texture's own.
     transform = document.part(document.part(use, "extensions"), "KHR_texture_transform")
     layer = document.number(transform if "texCoord" in transform else use, "texCoord", 0)
     attributes = document.part(primitive, "attributes")
@@ -78,6 +81,7 @@ def _picture_colors(document: GltfDocument, primitive: dict[str, Any], count: in
     if uv.shape != (count, 2):
         raise InputError("texture coordinates", expected="two a vertex", received=f"shape {uv.shape}")
     picture = _picture(document, use)
+    # glTF puts the origin of texture coordinates at the upper left corner.
     return sample_texture(picture, _transformed(uv, transform), top_down=True, wrap=_wrap(document, use))
 
 
@@ -122,6 +126,7 @@ def _transformed(uv: Float64[np.ndarray, "N 2"], transform: dict[str, Any]) -> F
         as_numbers(transform.get(name, default), (2,), subject=f"texture {name}")
         for name, default in (("scale", [1, 1]), ("offset", [0, 0]))
     )
+    # Counter-clockwise rotation in a frame whose v points down (KHR_texture_transform).
     angle = as_number(transform.get("rotation", 0), subject="texture rotation")
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     with np.errstate(all="ignore"):
@@ -141,6 +146,7 @@ def _vertex_colors(document: GltfDocument, primitive: dict[str, Any], count: int
     if stored == 5121:
         # glTF defines vertex colours as linear, but 8-bit ones are in practice sRGB bytes of another file.
         return np.rint(rgb * (255.0 if colors.dtype.kind == "f" else 1.0)).astype(np.uint8)
+    # Normalised 16-bit integers.
     rgb = rgb if colors.dtype.kind == "f" else rgb / 65535.0
     return np.clip(np.nan_to_num(rgb), 0.0, 1.0)
 

@@ -41,6 +41,7 @@ class GltfDocument:
         data = read_bytes(path, subject="mesh file")
         self.size = len(data)
         self._binary: bytes | None = None
+        # GLB (glTF 2.0, section 4.4): magic, version, total length, then chunks.
         if data[:4] == b"glTF":
             data, self._binary = self._chunks(data)
         self.json = as_object(parse_json(data, subject=self.subject), subject=self.subject)
@@ -55,9 +56,11 @@ class GltfDocument:
         """Return the JSON chunk and the binary chunk (None without one) of a GLB."""
         json_chunk, binary_chunk = 0x4E4F534A, 0x004E4942  # "JSON" and "BIN\0" as little-endian integers
         found: dict[int, bytes] = {}
+        # The header of 12 bytes; the stated length bounds the walk, even if more data follow.
         place, end = 12, min(int.from_bytes(data[8:12], "little"), len(data))
         if int.from_bytes(data[4:8], "little") != 2 or int.from_bytes(data[8:12], "little") > len(data):
             raise InputError(self.subject, expected="a whole GLB 2 file", received="another", remedy=_DAMAGED)
+        # A chunk: length, type, data.
         while place + 8 <= end:
             length, kind = (int.from_bytes(data[place + k : place + k + 4], "little") for k in (0, 4))
             if place + 8 + length > end:
@@ -140,6 +143,7 @@ class GltfDocument:
         if "sparse" in accessor:
             values = self._with_sparse(values, self.part(accessor, "sparse"), kind)
         values = values.astype(np.dtype(kind).newbyteorder("="))
+        # Signed integers map to max(c / max, -1), unsigned ones to c / max.
         if accessor.get("normalized") is True and values.dtype.kind in "iu":
             return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
         return values
@@ -148,6 +152,7 @@ class GltfDocument:
         """Return a view of values in a buffer view, without a copy."""
         data, stride = self.view(of["bufferView"])
         start, item = self.number(of, "byteOffset", 0), width * np.dtype(kind).itemsize
+        # A stride of zero means tightly packed values.
         stride = stride or item
         if count and (start + (count - 1) * stride + item > len(data) or stride < item):
             raise InputError(
@@ -156,6 +161,7 @@ class GltfDocument:
                 received=f"{count} of {item} bytes, {stride} apart, from {start} on",
                 remedy=_DAMAGED,
             )
+        # numpy refuses a zero-length view at the end of a buffer.
         if not count:
             return np.empty((0, width), kind)
         return np.ndarray((count, width), kind, buffer=data, offset=start, strides=(stride, item // width))
@@ -173,6 +179,7 @@ class GltfDocument:
         if count and places.max() >= len(values):
             raise InputError(f"{self.subject}: sparse accessor", expected="indices below its count", received="others")
         values = values.copy()
+        # Later entries overwrite earlier ones at the same place.
         values[places] = self._values(what, count, values.shape[1], kind)
         return values
 

@@ -42,11 +42,13 @@ def read_gltf(path: Path) -> RawMesh:
         if "mesh" in node:
             mesh = document.entry("meshes", node["mesh"])
             joints = None
+            # The joints' matrices of a skin are computed once, even if several nodes use it.
             if "skin" in node:
                 skin = document.number(node, "skin")
                 if skin not in skins:
                     skins[skin] = _joint_matrices(document, skin, worlds)
                 joints = skins[skin]
+            # Primitives of one mesh often share an accessor of positions, which is then added once.
             shared: dict[int, int] = {}
             for primitive in document.items(mesh, "primitives"):
                 parts.add(as_object(primitive, subject=f"{document.subject}: primitive"), world, joints, shared)
@@ -84,6 +86,7 @@ class _Parts:
         mode = as_integer(primitive.get("mode", _TRIANGLES), subject=f"{subject}: mode", least=0, most=6)
         attributes = document.part(primitive, "attributes")
         if mode < _TRIANGLES or "POSITION" not in attributes:
+            # Points and lines have no surface.
             self._left_out += 1
             return
         position = document.number(attributes, "POSITION")
@@ -183,6 +186,7 @@ def _triangles(indices: Int64[np.ndarray, " n"], mode: int) -> Int64[np.ndarray,
 
 def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
     """Return the nodes of the scene, depth first, with their transforms to the world."""
+    # The default scene; without scenes every node that is nobody's child is a root.
     scenes = document.items(document.json, "scenes")
     if scenes:
         roots = document.items(document.entry("scenes", document.json.get("scene", 0)), "nodes")
@@ -192,6 +196,7 @@ def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[n
         roots = [k for k in range(len(nodes)) if k not in below]
     found = []
     seen: set[int] = set()
+    # Reversed, so that the stack yields nodes in the file's order.
     stack = [(index, np.eye(4)) for index in reversed(roots)]
     while stack:
         index, parent = stack.pop()
@@ -209,8 +214,10 @@ def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[n
 def _local(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     """Return the transform of a node to its parent: its matrix, or translation times rotation times scale."""
     subject = f"{document.subject}: node"
+    # glTF stores matrices column by column.
     if "matrix" in node:
         return as_numbers(node["matrix"], (16,), subject=f"{subject} matrix").reshape(4, 4).T
+    # Quaternions are (x, y, z, w), unit by the specification.
     x, y, z, w = as_numbers(node.get("rotation", [0, 0, 0, 1]), (4,), subject=f"{subject} rotation")
     rotation = np.array(
         [
@@ -220,6 +227,7 @@ def _local(document: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, 
         ]
     )
     out = np.eye(4)
+    # R S: each column of the rotation is scaled.
     out[:3, :3] = rotation * as_numbers(node.get("scale", [1, 1, 1]), (3,), subject=f"{subject} scale")
     out[:3, 3] = as_numbers(node.get("translation", [0, 0, 0]), (3,), subject=f"{subject} translation")
     return out
@@ -237,6 +245,8 @@ def _joint_matrices(
     """
     skin = document.entry("skins", index)
     joints = document.items(skin, "joints")
+    # A skin's joint matrix is G_j B_j: from the bind pose to the joint, then to the world. The node's own transform
+    # is ignored (section 3.7.3.3).
     try:
         out = np.stack([worlds[id(document.entry("nodes", joint))] for joint in joints])
     except (KeyError, ValueError):
@@ -246,6 +256,7 @@ def _joint_matrices(
         if bind.shape[1] != 16 or len(bind) < len(out):
             raise InputError(f"{document.subject}: skin", expected="a matrix a joint", received="others")
         with np.errstate(all="ignore"):
+            # Column-major matrices, hence the transpose of the last two axes.
             out = out @ bind[: len(out)].astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
     return out
 
@@ -259,6 +270,7 @@ def _skinned(
     """Pose vertices by linear blend skinning; weights are normalised, and vertices without weights stay."""
     out = np.zeros_like(points)
     total = np.zeros((len(points), 1))
+    # Sets of four influences each: JOINTS_0, JOINTS_1, ...
     k = 0
     while f"JOINTS_{k}" in attributes and f"WEIGHTS_{k}" in attributes:
         index, weights = (document.accessor(attributes[f"{name}_{k}"]) for name in ("JOINTS", "WEIGHTS"))
@@ -270,4 +282,5 @@ def _skinned(
             out += weight[:, None] * moved
             total += weight[:, None]
         k += 1
+    # Weights are divided by their sum, because quantised ones do not sum to one.
     return np.divide(out, total, out=points.copy(), where=total > 0)

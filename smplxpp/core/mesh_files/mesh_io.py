@@ -98,6 +98,7 @@ def _read_pickle(path: Path) -> RawMesh:
 def _from_arrays(path: Path, values: Mapping[Any, Any]) -> RawMesh:
     """Make a mesh from arrays by name: vertices, faces or none for a point cloud, colours and normals if present."""
     subject = f"mesh file {path}"
+    # Names that exporters and data sets use for the same arrays, the most specific first.
     names = {"vertices": ("vertices", "verts", "v", "points"), "faces": ("faces", "f"), "normals": ("normals",)}
     found = {key: next((values[k] for k in known if k in values), None) for key, known in names.items()}
     if found["faces"] is None and "points" in values:
@@ -107,6 +108,7 @@ def _from_arrays(path: Path, values: Mapping[Any, Any]) -> RawMesh:
         raise InputError(subject, expected="arrays `vertices` and `faces`, or `points`", received=f"keys {keys}"[:300])
     vertices = as_numbers(found["vertices"], (None, 3), subject=f"{subject}: vertices", finite=False)
     faces = as_numbers(found["faces"], (None, 3), subject=f"{subject}: faces")
+    # Indices may arrive as floats from MATLAB or pickles.
     if not ((faces == np.rint(faces)) & (np.abs(faces) < 2**53)).all():
         raise InputError(f"{subject}: faces", expected="whole numbers", received="others")
     colors = values.get("vertex_colors", values.get("colors"))

@@ -52,15 +52,18 @@ def read_obj(path: Path) -> RawMesh:
     """
     subject = f"mesh file {path}"
     lines = _Lines.of(read_bytes(path, subject="mesh file"))
+    # Faces first as references of the file, since negative ones depend on how many vertices precede their line.
     vertices, colors = _read_vertices(lines, subject)
     face_lines = lines.of_kind(b"f")
     references, sizes = _read_faces(lines, face_lines, subject)
     if len(sizes) != len(face_lines):
         raise InputError(subject, expected="corners in each f line", received="f lines without any")
+    # The line of each corner, (C,).
     corner_lines = np.repeat(face_lines, sizes)
     corners = _resolve(references[:, 0], lines.of_kind(b"v"), corner_lines)
     fans = fan_triangles(corners, sizes, subject=subject)
     require_indices(fans.faces, len(vertices), subject=subject)
+    # Colours of the `v` lines win over materials.
     if colors is None and len(fans.faces):
         colors = _material_colors(path, lines, corners, references[:, 1], corner_lines, vertex_count=len(vertices))
     return RawMesh(vertices, fans.faces, colors, source_faces=fans.source_faces)
@@ -139,6 +142,7 @@ def _read_vertices(lines: _Lines, subject: str) -> tuple[Float64[np.ndarray, "N 
     for values, counts in _rows(lines, b"v", subject):
         if counts.min() < 3:
             raise InputError(subject, expected="three numbers in each v line", received=f"{counts.min()}")
+        # `v x y z r g b`: (n, 3) places, and colours where a line has at least six numbers.
         first = np.cumsum(counts) - counts
         places.append(values[first[:, None] + np.arange(3)])
         colored = first[counts >= 6]
@@ -196,6 +200,7 @@ def _resolve(
     """Convert references to indices from 0 (-1: none); a negative one counts back from its own line."""
     if len(references) and references.min() < 0:
         back = references < 0
+        # The number of vertices defined before the face's line; reference -1 is the last of them.
         known = np.searchsorted(defined, corner_lines[back])
         references = references.copy()
         references[back] = np.maximum(known + references[back] + 1, 0)
@@ -219,6 +224,7 @@ def _material_colors(
     names = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in uses))}
     inside = (corners >= 0) & (corners < vertex_count)  # other corners belong to faces that were left out
     corners, uv_references, corner_lines = corners[inside], uv_references[inside], corner_lines[inside]
+    # The last `usemtl` before the face's line is in force; -1 before the first.
     use = np.searchsorted([line for line, _ in uses], corner_lines) - 1
     used = np.where(use >= 0, np.array([names[name] for _, name in uses])[use], -1)
     # A vertex between two materials takes the material of its first corner.
@@ -226,12 +232,14 @@ def _material_colors(
     vertices, places = np.unique(corners, return_index=True)
     first[vertices] = used[places]
     used = np.where(used == first[corners], used, -1)
+    # Texture coordinates of the whole file, (T, 2); a third coordinate is left out.
     rows = _rows(lines, b"vt", f"mesh file {path}")
     uv = np.concatenate([np.empty((0, 2))] + [_first_two(values, counts) for values, counts in rows])
     index = _resolve(uv_references, lines.of_kind(b"vt"), corner_lines)
     index = np.where(index < len(uv), index, -1)
     colors, found = np.full((vertex_count, 3), MISSING_GRAY, np.uint8), False
     pictures = TextureCache(f"mesh file {path}")
+    # Corners sorted by material, so that each texture is decoded and sampled once.
     order = np.argsort(used, kind="stable")
     bounds = np.searchsorted(used[order], np.arange(len(names) + 1))
     # One material at a time: texture at the corners' coordinates, else the plain colour.

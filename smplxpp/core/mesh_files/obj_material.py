@@ -48,6 +48,7 @@ def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
     out: dict[str, Material] = {}
     seen: set[Path] = set()
     for entry in dict.fromkeys(libraries):
+        # A name may contain blanks; only if no such file exists does the line list several libraries.
         for name in [entry] if file_beside(path, entry) is not None else entry.split():
             found = file_beside(path, name)
             if found is None:
@@ -69,6 +70,7 @@ def _parse(text: str) -> dict[str, Material]:
         if keyword == "newmtl":
             name = rest
             out[name] = Material()
+        # A texture replaces the plain colour, whichever line comes first.
         elif keyword == "kd" and known.picture is None:
             out[name] = Material(_kd(rest))
         elif keyword == "map_kd" and rest:

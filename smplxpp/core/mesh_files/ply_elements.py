@@ -91,6 +91,7 @@ class Cells:
             InputError: an ASCII number that the type does not hold.
         """
         if self.byte_order:
+            # (n, size) bytes of each value, viewed as its type.
             rows = self.data[places[:, None] + np.arange(self.size(value_type))]
             return rows.view(self.byte_order + value_type).reshape(-1).astype(value_type)
         return _converted(self.data[places], value_type, subject)
@@ -104,6 +105,7 @@ class Cells:
             InputError: an ASCII number that the type does not hold.
         """
         stored, cell = (self.byte_order + value_type, 1) if self.byte_order else ("f8", 8)
+        # Strides in bytes: between rows, and between the values of a row.
         strides = (width * cell, self.size(value_type) * cell)
         # numpy refuses an array that would extend past the buffer.
         block = np.ndarray(shape, stored, buffer=self.data.data, offset=start * cell, strides=strides)
@@ -139,6 +141,7 @@ def read_element(cells: Cells, start: int, element: Element, *, subject: str) ->
         InputError: data that end too early, or a list of negative length.
     """
     subject = f"{subject}: element {element.name}"
+    # The shortest possible row has empty lists, so that a forged count is refused before allocation.
     least = sum(cells.size(p.length_type or p.value_type) for p in element.properties)
     if element.count * least > len(cells.data) - start:
         raise _too_short(subject, element.count, len(cells.data) - start)
@@ -157,6 +160,7 @@ def read_element(cells: Cells, start: int, element: Element, *, subject: str) ->
         columns = _read_uniform(cells, start, element, lengths, width, subject=subject)
         if columns is not None:
             return columns, start + element.count * width
+    # Lists of different lengths are read row by row, which is slower.
     return _read_varying(cells, start, element, lines, subject)
 
 
@@ -197,7 +201,9 @@ def _read_uniform(
 ) -> Columns | None:
     """Read an element whose lists are all as long as those of its first row; None if they are not."""
     sizes = [_cells_of(cells, p, length) for p, length in zip(element.properties, lengths, strict=True)]
+    # The place of each property in the first row.
     starts = list(accumulate(sizes[:-1], initial=start))
+    # The guess holds only if every list has the length of the first row's.
     for p, length, at in zip(element.properties, lengths, starts, strict=True):
         if p.length_type is not None:
             stored = p.length_type if cells.byte_order else "f8"
@@ -220,6 +226,7 @@ def _read_varying(
     properties, data, end = element.properties, cells.data, len(cells.data)
     places = np.empty((len(properties), element.count), np.int64)
     lengths = np.zeros((len(properties), element.count), np.int64)
+    # For each property the cells of its head (value or length) and of a list's item.
     steps = [(cells.size(p.length_type or p.value_type), cells.size(p.value_type)) for p in properties]
     bytewise = [p.length_type is not None and (p.length_type == "u1" or not cells.byte_order) for p in properties]
     # Walk through the rows and note the place of every value or list.
@@ -247,6 +254,7 @@ def _read_varying(
             columns[p.name] = cells.values(places[k], p.value_type, subject=f"{subject}: property {p.name}")
             continue
         head, step = steps[k]
+        # The index of each value within its list.
         within = np.arange(lengths[k].sum()) - np.repeat(np.cumsum(lengths[k]) - lengths[k], lengths[k])
         inner = np.repeat(places[k] + head, lengths[k]) + step * within
         values = cells.values(inner, p.value_type, subject=f"{subject}: property {p.name}")

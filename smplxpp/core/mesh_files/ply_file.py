@@ -68,6 +68,7 @@ def read_ply(path: Path) -> RawMesh:
         corners = ListColumn(np.empty(0, np.int64), np.empty(0, np.int64))
     if not isinstance(corners, ListColumn) or corners.values.dtype.kind not in "iu":
         raise InputError(f"{subject}: faces", expected="lists of whole numbers", received="another property")
+    # Indices beyond the vertices would read foreign memory in later steps.
     require_indices(corners.values, len(vertices), subject=subject)
     fans = fan_triangles(corners.values, corners.lengths, subject=subject)
     # A texture replaces vertex colours that are all equal.
@@ -80,6 +81,7 @@ def read_ply(path: Path) -> RawMesh:
         fans.faces,
         colors,
         _extra(vertex),
+        # A polygon's properties apply to each of its triangles.
         {name: column[fans.polygons] for name, column in _extra(face).items()},
         source_faces=fans.source_faces,
         vertex_normals=None if len(fans.faces) else _normals(vertex),
@@ -90,6 +92,7 @@ def _read_header(data: bytes, subject: str) -> tuple[str, list[Element], list[st
     """Return the byte order, the elements, the names of textures, and the place of the data."""
     if not data.startswith(b"ply"):
         raise InputError(subject, expected="a PLY file, which begins with `ply`", received=repr(data[:16]))
+    # The header is looked for in the first MiB; line ends of all three systems occur.
     end = re.search(rb"(?:^|[\r\n])[ \t]*end_header[ \t]*(\r\n|\n|\r)", data[: 1 << 20])
     if end is None:
         raise InputError(subject, expected="a header that ends with `end_header`", received="none")
@@ -174,6 +177,7 @@ def _picture_colors(
     scalars = {name: column for name, column in vertex.items() if isinstance(column, np.ndarray)}
     pairs = [(scalars[a], scalars[b]) for a, b in _TEXTURE_COORDINATES if a in scalars and b in scalars]
     coordinates = np.stack(pairs[0], axis=1) if pairs else None
+    # By default each vertex has one coordinate and all use the first texture.
     vertices, page = np.arange(vertex_count), np.zeros(vertex_count, np.int64)
     # Without coordinates of vertices there may be a list of two for each corner in the faces.
     if coordinates is None:

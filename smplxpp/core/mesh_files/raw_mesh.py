@@ -72,11 +72,15 @@ def fan_triangles(corners: Integer[np.ndarray, " C"], sizes: Integer[np.ndarray,
     few = int((sizes < 3).sum())
     if few:
         warn(f"{subject}: {few} faces with fewer than three corners are left out")
+    # The first corner of each polygon in the concatenated list.
     first = np.cumsum(sizes) - sizes
+    # A polygon of n corners gives n - 2 triangles (0, k, k + 1).
     triangles = np.maximum(sizes.astype(np.int64) - 2, 0)
     polygons = np.repeat(np.arange(len(sizes), dtype=np.int64), triangles)
+    # The index of each triangle within its polygon.
     step = np.arange(len(polygons), dtype=np.int64) - np.repeat(np.cumsum(triangles) - triangles, triangles)
     start = first.astype(np.int64)[polygons]
+    # (M, 3) places of corners in the list.
     places = np.stack([start, start + step + 1, start + step + 2], axis=1)
     return Fans(corners.astype(np.int64)[places].reshape(-1, 3), places, polygons, len(sizes))
 
@@ -128,11 +132,13 @@ def color_bytes(colors: Num[np.ndarray, "N C"], *, subject: str) -> UInt8[np.nda
     """
     rgb = np.asarray(colors)[:, :3]
     if rgb.dtype.kind == "u":
+        # Unsigned integers are scaled by the maximum of their type: 65535 becomes 255.
         top = np.iinfo(rgb.dtype).max
         return rgb if top == 255 else np.rint(rgb * (255.0 / top)).astype(np.uint8)
     if not np.isfinite(rgb).all():
         warn(f"{subject}: vertex colours with NaN or infinity are left out")
         return None
+    # Floats are shares if none exceeds 1, else bytes.
     if rgb.dtype.kind == "f":
         rgb = rgb * (255.0 if rgb.size and rgb.max() <= 1.0 else 1.0) + 0.5
     return np.clip(rgb, 0, 255).astype(np.uint8)
