@@ -170,6 +170,7 @@ def assemble_template(
         raise InputError("parameters", expected="one frame", received=f"{len(params)}", remedy="choose it with frame()")
     for name, part in parts.items():
         _check_part(name, part, body, config)
+    # The shaped body in its T-pose; then the parts in order of layers; then one template of all.
     neutral = BodyParams.rest(betas=params.betas[0], expressions=0, v_shape=params.v_shape)
     # Without the mean hand, because its pose correctives are not part of the T-pose.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
@@ -180,6 +181,7 @@ def assemble_template(
 
 
 def _check_part(name: str, part: CanonicalPart, body: BodyModel, config: AssemblyConfig) -> None:
+    # Each row: the condition, what was expected, and what was received.
     count = part.mesh.vertex_count
     checks = [
         (name != BODY_PART, "another name than the body's", repr(name)),
@@ -286,6 +288,7 @@ def _stack(weights: list[SkinWeights]) -> SkinWeights:
     def padded(values: np.ndarray) -> np.ndarray:
         return np.pad(values, ((0, 0), (0, width - values.shape[1])))
 
+    # Components of a part follow those of the parts before it.
     merged = {name: np.concatenate([getattr(w, name) for w in weights]) for name in ("matched", "distance", "angle")}
     start = np.cumsum([0] + [_components(w) for w in weights])
     return SkinWeights(

@@ -69,6 +69,7 @@ def cut_holes(
         after: the part after the cut.
         after_index: the scan's vertex of each of its vertices, which identifies vertices of both.
     """
+    # Scan vertices on the borders before the cut.
     openings = border_loops(before.faces)
     at_openings = before_index[np.concatenate(openings)] if openings else np.zeros(0, dtype=np.int64)
     return [loop for loop in border_loops(after.faces) if not np.isin(after_index[loop], at_openings).any()]
@@ -86,6 +87,7 @@ def fill_holes(
     open.
     """
     config = config or FillHolesConfig()
+    # Close each loop, and keep patches that are narrow enough; loops that cannot be closed are skipped.
     patches = []
     for loop in holes:
         with suppress(InputError):
@@ -123,6 +125,7 @@ def _with_rows(weights: SkinWeights, rows: np.ndarray, component: int) -> SkinWe
     count = len(rows)
     if not count:
         return weights
+    # New rows are padded to the same number of influences; they are unmatched, with unknown distance and angle.
     slots = weights.joint_indices.shape[1]
     added = SkinWeights.from_dense(rows, max_influences=slots)
     missing = ((0, 0), (0, slots - added.joint_indices.shape[1]))

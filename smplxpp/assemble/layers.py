@@ -109,6 +109,7 @@ class Penetration:
 
 def measure_penetration(mesh: TriangleMesh, obstacle: Obstacle) -> Penetration:
     """Count an outer layer's vertices and face centres inside an inner layer, and measure their depth."""
+    # Face centres are tested too, because a face may cut through a corner that its vertices avoid.
     distance, _ = obstacle.distance(mesh.vertices, mesh.vertex_normals)
     centers, _ = obstacle.distance(face_centers(mesh, mesh.vertices), mesh.face_normals)
     depth = -distance[distance < -TOUCHING]
@@ -161,6 +162,7 @@ def remaining_penetration(
         body: the body model, which names the places.
         body_mesh: its surface in the part's pose.
     """
+    # The largest depth of each vertex over all inner layers.
     depth = np.zeros(mesh.vertex_count)
     for obstacle in obstacles:
         depth = np.maximum(depth, -obstacle.distance(mesh.vertices, mesh.vertex_normals)[0])

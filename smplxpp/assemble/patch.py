@@ -78,6 +78,7 @@ def _chords(faces: Int[np.ndarray, "M 3"], loop: Int[np.ndarray, " L"]) -> set[t
     """Return the pairs of positions in the loop, lower first, between which the mesh has an edge."""
     at = np.full(int(faces.max()) + 1, -1)
     at[loop] = np.arange(len(loop))
+    # Edges with both ends in the loop; -1 marks vertices outside of it.
     ends = np.sort(at[half_edges(faces)], axis=1)
     return {(int(a), int(b)) for a, b in ends[ends[:, 0] >= 0]}
 
@@ -149,6 +150,7 @@ def _flip_to_delaunay(
     while todo and budget:
         budget -= 1
         a, b = todo.pop()
+        # Skip edges that are gone, whose other diagonal exists, or that are Delaunay already.
         if (a, b) not in beside or (b, a) not in beside:
             continue
         first, second = beside[a, b], beside[b, a]
@@ -178,6 +180,7 @@ def _harmonic(faces: Int64[np.ndarray, "F 3"], rim: int, count: int) -> Float64[
     """Return the coefficients of the rim in every new vertex, each of which is the mean of its neighbours."""
     if count == rim:
         return np.zeros((0, rim))
+    # Solve the graph Laplacian's equations of the new vertices for the unit values of each rim vertex.
     order, first, _ = edge_groups(faces)
     a, b = half_edges(faces)[order[first]].T
     laplacian = np.zeros((count, count))

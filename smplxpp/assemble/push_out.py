@@ -92,6 +92,7 @@ def stand_off(mesh: TriangleMesh, body: Obstacle, config: PushConfig | None = No
     push would shape the garment after a wrong body. The result is the 95th percentile of the vertices' signed
     distances, clipped to `config.reach`.
     """
+    # Distances are capped at the upper bound first, so that a far hem does not count more than that.
     low, high = (config or PushConfig()).reach
     distance = body.distance(mesh.vertices, mesh.vertex_normals)[0]
     return float(np.clip(np.percentile(np.minimum(distance, high), 95.0), low, high))
@@ -127,6 +128,7 @@ def _unflip_rigidly(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], limit
     flipped = flipped_faces(mesh, mesh.vertices + d)
     best, fewest = d, int(flipped.sum())
     for _ in range(_UNFLIP_ROUNDS):
+        # All corners of a flipped face take the displacement of the corner that moves farthest.
         corners = mesh.faces[flipped]
         longest = np.linalg.norm(d[corners], axis=-1).argmax(axis=1)
         d = d.copy()
@@ -226,6 +228,7 @@ def _clear(mesh: TriangleMesh, d: np.ndarray, walls: list[_Wall], limit: float) 
 
 def _neighbour_mean(mesh: TriangleMesh) -> csr_matrix:
     """Return (N, N) rows that average a vertex's neighbours; zero rows where there are none."""
+    # The symmetric adjacency matrix, divided by the number of neighbours.
     edges = mesh.edges
     ones = np.ones(2 * len(edges))
     pairs = np.concatenate([edges, edges[:, ::-1]])

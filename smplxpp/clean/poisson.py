@@ -29,7 +29,7 @@ _CUBE, _DEEPEST, _SHALLOWEST = 1.1, 10, 5
 
 @dataclass(frozen=True)
 class PoissonConfig:
-    """Options of `surface_from_points`.
+    """Options of reconstructing a surface with `surface_from_points`.
 
     Attributes:
         reach: distance to the nearest point, in median point spacings, above which the surface is cut away.

@@ -51,7 +51,7 @@ class SolidConfig:
 
 @dataclass(frozen=True)
 class SolidReport:
-    """Measurements of a solid.
+    """Measurements of a solid that a printer is given.
 
     Attributes:
         faces: number of faces of its surface.
@@ -154,6 +154,7 @@ def separate_touching_vertices(mesh: TriangleMesh) -> TriangleMesh:
     A solid may touch itself in a vertex or an edge; a file of unconnected triangles, as STL is, would join it there.
     Vertices with equal normals still coincide then; they are moved to the centres of their one-rings.
     """
+    # Pairs closer than a printer's files resolve: first along the normals, then, if still together, towards one-rings.
     size = _SHORT * float(np.ptp(mesh.vertices, axis=0).max())
     pairs = cKDTree(mesh.vertices).query_pairs(size, output_type="ndarray")
     vertices, moved = mesh.vertices.copy(), np.unique(pairs)

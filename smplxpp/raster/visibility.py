@@ -49,6 +49,7 @@ def outer_visible_points(
     seen = np.zeros(len(points), dtype=bool)
     for camera in outside_views(mesh, views=views, resolution=resolution):
         depth = rasterize_mesh(mesh, camera).depth
+        # Project the points that no view has seen yet, and compare their depth with the mesh's at their pixel.
         todo = np.flatnonzero(~seen)
         x, y, z = camera.screen_from_world(points[todo]).T[:3]
         col, row = np.floor(x).astype(int), np.floor(y).astype(int)

@@ -72,6 +72,7 @@ def rasterize_triangles(
         InputError: as `rasterize_mesh`; other shapes or types; faces with indices of no vertex.
     """
     vertices, faces = np.asarray(vertices), np.asarray(faces)
+    # Shapes, types and indices are checked, because the native code trusts them.
     for name, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
         if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
             raise InputError(

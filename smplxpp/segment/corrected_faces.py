@@ -82,7 +82,7 @@ def stroked_faces(
     # Sample the polyline at eighths of the radius, at least a millimetre apart.
     line, of_point = _sampled(np.asarray(points, dtype=np.float64), max(radius / 8, 1e-3))
     # Look up the face below each sample from up to 1 mm above the surface, so that a second sheet close below does not
-    # win, and drop samples whose face is too far away or faces the other way.
+    # win, and drop samples whose face is too far away or has an opposite normal.
     lift, above = min(0.5 * radius, 0.001), line
     if normals is not None:
         upwards = normalize_rows(np.asarray(normals, dtype=np.float64))[of_point]
@@ -118,7 +118,7 @@ def nearest_faces(surface: ScanSurface, triangles: Float[np.ndarray, "n 3 3"]) -
     Returns:
         The faces, and their area as a share of the triangles' area.
     """
-    # Metres along the normal by which the scan may have moved: more than noise, less than the distance between limbs.
+    # Largest distance along the normal, metres: more than noise, less than the distance between limbs.
     reach = 0.015
     triangles = np.asarray(triangles, dtype=np.float64)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

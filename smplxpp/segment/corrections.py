@@ -34,7 +34,7 @@ class FaceCorrection:
     Attributes:
         label: label id.
         faces: indices of the faces in the scan.
-        triangles: corners of the faces, metres, by which they are found in another triangulation; None: only by index.
+        triangles: corners of the faces, metres, which locate them in another triangulation; None: only by index.
         scan: digest of the scan that the indices belong to; None: indices hold for any scan.
     """
 
@@ -117,7 +117,7 @@ class Corrections:
 
     @staticmethod
     def load(path: str | Path) -> Corrections:
-        """Read corrections from `labels_corrections.json` (docs/corrections.md).
+        """Read and check the corrections in `labels_corrections.json` (docs/corrections.md).
 
         Raises:
             InputError: no such file, another version, unknown labels, numbers out of range; it names the entry.
@@ -307,6 +307,7 @@ def _require_near(values: Float[np.ndarray, "*n"], subject: str) -> None:
 
 
 def _written(item: Correction) -> dict[str, Any]:
+    # Each kind of correction has a field of its own, which `_read` tells it by; metres have four digits or more.
     def rounded(values: Any, digits: int = 4) -> list:
         return np.round(values, digits).tolist()
 

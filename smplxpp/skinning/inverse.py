@@ -173,6 +173,7 @@ def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):
     vertices = np.asarray(vertices, dtype=np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.isfinite(vertices).all():
         raise InputError(subject, expected="finite (N, 3), N > 0", received=_describe(vertices))
+    # Vertices and weights: finite, of matching lengths.
     dense = weights.dense() if isinstance(weights, SkinWeights) else np.asarray(weights, dtype=np.float64)
     if dense.ndim != 2 or len(dense) != len(vertices) or not np.isfinite(dense).all():
         raise InputError("skinning weights", expected=f"finite ({len(vertices)}, J)", received=_describe(dense))
@@ -185,6 +186,7 @@ def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):
             received=f"a sum of {dense[np.argmax(error)].sum():.6g} at vertex {int(np.argmax(error))}",
             remedy="normalise them, for instance with SkinWeights.from_dense",
         )
+    # Transforms: one affine matrix for each joint. Transposed matrices have other last rows.
     transforms = np.asarray(posed_from_rest, dtype=np.float64)
     if transforms.shape != (dense.shape[1], 4, 4) or not np.isfinite(transforms).all():
         raise InputError(

@@ -36,6 +36,7 @@ def forward_kinematics(
         posed_from_rest: transform of each joint.
         joints: positions of the joints in the pose, metres.
     """
+    # Offsets from each joint's parent; the root starts at its own place and the translation.
     xp = array_namespace(rotations)
     parents = np.asarray(parents)
     levels = _levels(parents)
@@ -54,6 +55,7 @@ def forward_kinematics(
     back = np.argsort([j for level in levels for j in level])
     turned = xp.concatenate(turned, -3)[..., back, :, :]
     joints = xp.concatenate(moved, -2)[..., back, :]
+    # G_j [I, -J_j]: the rotation stays, the translation is joint - R J.
     shift = joints - (turned @ rest_joints[..., None])[..., 0]
     upper = xp.concatenate([turned, shift[..., None]], -1)
     last = xp.zeros_like(upper[..., :1, :])
