@@ -41,7 +41,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "iterations of the fit": f"{preset.fit.iterations:,}",
         "teacher: maps in, out, pixels": f"{network.in_size}, {network.out_size}",
         "teacher: parameters, millions": f"{millions:.3g}",
-        "surface followed first": "no" if teacher.track is None else f"{teacher.track.steps} steps a frame",
+        "surface tracked first": "no" if teacher.track is None else f"{teacher.track.steps} steps a frame",
         "control points of surface and field": f"{preset.control_points:,}"
         if preset.control_points
         else "all vertices",
@@ -63,7 +63,7 @@ def _column(preset: TrainingPreset) -> dict[str, str]:
         "penalties of large, of far Gaussians": "; ".join(
             f"{stage.scale_penalty:g}, {stage.offset_penalty:g}" if stage.attributes else "-" for stage in stages
         ),
-        "followed clothes give normals where a capture has none": (
+        "tracked clothes give normals where a capture has none": (
             "yes" if all(stage.surface_normals for stage in stages) else "no"
         ),
         "share of poses shown as new ones": f"-, {bake.null_share:g}, {compensate.null_share:g}",
