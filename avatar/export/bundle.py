@@ -85,16 +85,20 @@ def write_bundle(
     """
     config = config or BundleConfig()
     template = student.rig.template
+    # Sort the Gaussians by their face: a player then needs the number on each face instead of an index for each
+    # Gaussian. The sort is stable, so that the order within a face is reproducible.
     bound = student.gaussians.snapshot()
     order = torch.argsort(bound.face_index, stable=True)
     bound = bound.select(order)
     faces, per_face = np.unique(bound.face_index.numpy(), return_counts=True)
+    # Keep only the vertices and faces that carry Gaussians or that garments need.
     cut = _Cut.of(template, faces, extras.garments)
     pieces: dict[str, tuple[Tensors, Mapping[str, Any]]] = {
         "skeleton": (_skeleton(template), {}),
         "surface": (_surface(template, cut, config), {}),
         "gaussians": (_gaussians(bound.tensors, per_face, config), {}),
     }
+    # Optional pieces follow the parts that the student was trained with.
     if student.field is not None and student.codes is not None:
         pieces["field"] = (_field(student, cut, config), {})
     if student.regression is not None:
@@ -109,6 +113,7 @@ def write_bundle(
         pieces[GARMENTS] = _garments(extras.garments, cut)
     if extras.motion is not None:
         pieces[MOTION] = (motion_tensors(extras.motion), {})
+    # The header describes the avatar, so that a player can name joints and expressions without the template.
     codes = student.codes
     about = AboutAvatar(
         name=extras.name,

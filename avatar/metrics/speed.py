@@ -71,11 +71,13 @@ def measure_speed(
         raise InputError(
             "speed", expected="at least one pose and one picture", received=f"{len(params)} and {pictures}"
         )
+    # The view and its background live on the model's device, so that no transfer is timed.
     device = model.rig.device
     view = _blank(fitted(camera, *size)).to(device)
     background = torch.zeros(3, device=device)
     now = _clock(device)
     times = []
+    # Time three steps of each picture: the pose of the body, the deformation of the Gaussians, and the rendering.
     with at_rest(model):
         for k in range(warmup + pictures):
             begin = now()
@@ -85,6 +87,7 @@ def measure_speed(
             deformed = now()
             render_view(posed, 0, view, background, eps2d=eps2d).image.clamp(0.0, 1.0)
             times.append((placed - begin, deformed - placed, now() - deformed))
+    # Drop the warm-up, in which kernels compile and caches fill; the median resists other load on the machine.
     times = times[warmup:]
     pose, deform, render = (median(column) for column in zip(*times, strict=True))
     return Speed(

@@ -78,17 +78,21 @@ def view_quality(
         head: x0, y0, x1, y1 in pixels. head_pixels: those that show the head, see `head_shown`.
         metric: perceptual distance to measure too.
     """
+    # Both images lie on the same background, so that its pixels differ only where the silhouettes do.
     real = view.composited(background)
     image = image.clamp(0.0, 1.0)
     error = (image - real).square()
+    # The person's pixels are the union of both silhouettes: a missing or a surplus limb counts as error.
     person = (view.opacity() > OPACITY_THRESHOLD) | (alpha > OPACITY_THRESHOLD)
     psnr_head = ssim_head = perceptual_head = psnr_head_alone = None
+    # The head's figures come from its box: PSNR over the person's pixels, SSIM and perception over the whole crop.
     if head is not None:
         part = (slice(head[1], head[3]), slice(head[0], head[2]))
         if bool(person[part].any()):
             psnr_head = psnr_from_mse(float(error[part][person[part]].mean()))
             ssim_head = float(ssim(image[part].contiguous(), real[part].contiguous()))
             perceptual_head = _distance(metric, image[part], real[part])
+    # The stricter figure leaves out hands and shoulders that enter the box.
     if head_pixels is not None and bool((alone := person & head_pixels).any()):
         psnr_head_alone = psnr_from_mse(float(error[alone].mean()))
     return ViewQuality(

@@ -121,23 +121,30 @@ def calibrate(
     expected = (len(followed.params), len(garment.particles), 3)
     if followed.world.shape != expected:
         raise InputError("followed surface", expected=f"shape {expected}", received=str(followed.world.shape))
+    # A frame counts as followed where at least one particle has a finite place.
     followed_frames = np.isfinite(followed.world).all(axis=2).any(axis=1)
     if not followed_frames.any():
         raise InputError("followed surface", expected="particles in one frame at least", received="none")
     bodies = [template.posed_body(followed.params.frame(k)) for k in range(len(followed.params))]
+    # Weigh each particle by its share of the surface. Particles that the deepest trial pins would count for nothing in
+    # the choice, so only those that stay free in every trial are weighed, unless no particle does.
     area = _particle_areas(garment) * (garment.depth > max(config.pin_depths))
     if not area.sum() > 0:
         area = _particle_areas(garment)
 
+    # The confidence of the tracking multiplies these weights; without one, all observations count alike.
     trust = np.ones(followed.world.shape[:2]) if followed.confidence is None else followed.confidence
 
     def errors(positions: Sequence[Float[np.ndarray, "n 3"]]) -> Float[np.ndarray, " L"]:
         """Of the L frames in which the surface was followed."""
+        # The weighted mean of min(distance, MOST) over the particles seen in each frame; the cut-off bounds outliers.
         apart = np.linalg.norm((np.stack(positions) - followed.world)[followed_frames], axis=2)
         weight = area * trust[followed_frames] * np.isfinite(apart)
         return (np.minimum(np.nan_to_num(apart, nan=0.0), MOST) * weight).sum(1) / np.maximum(weight.sum(1), 1e-12)
 
     def simulated(drag: float, pin: float) -> Float[np.ndarray, " L"]:
+        # Play all frames from the first with the trial's values: cloth has a history, so frames cannot be drawn at
+        # random.
         trial = with_values(garment, drag=drag, pin_depth=pin)
         player = ClothDriver(template, [trial], driver)
         positions = []
@@ -146,6 +153,8 @@ def calibrate(
             positions.append(player.particles(trial.part))
         return errors(positions)
 
+    # The baseline is linear blend skinning, v' = sum_j w_j (R_j v + t_j). Where it explains the surface already, the
+    # cloth hardly moves of its own, and neither parameter can be identified.
     weights = template.weights.dense()[garment.particles]
     blends = [np.einsum("nj,jab->nab", weights, body.posed_from_rest[0, :, :3]) for body in bodies]
     rest = template.vertices[garment.particles]
@@ -153,6 +162,7 @@ def calibrate(
     if skinned.mean() < config.least_motion:
         return garment, _found(garment, skinned, skinned, moves=False)
 
+    # Search the grid of all pairs: the error is chaotic in the parameters, so it has no useful gradient.
     pairs = list(product(config.drags, config.pin_depths))
     table: dict[tuple[float, float], Float[np.ndarray, " L"]] = {}
 
@@ -160,6 +170,8 @@ def calibrate(
         """The pair of the least distance in these frames, the prior counted."""
 
         def cost(pair: tuple[float, float]) -> float:
+            # The prior is quadratic in the logarithm of the drag: it grows with the octaves away from the fabric's
+            # value.
             octaves = np.log2(pair[0] / garment.config.fabric.drag)
             return float(table[pair][frames].mean() * (1.0 + config.drag_prior * octaves**2))
 
@@ -171,8 +183,10 @@ def calibrate(
         table[pair] = simulated(*pair)
     progress("calibration", 1.0)
     drag, pin = best(frames)
+    # Keep the garment's own values where the best simulation is not clearly nearer than skinning.
     if table[drag, pin].mean() > config.most_share * skinned.mean():
         return garment, _found(garment, skinned, table[drag, pin], moves=True)
+    # Estimate the spread by the jackknife over blocks of consecutive frames, since neighbouring frames are correlated.
     left_out = [best(np.setdiff1d(frames, block)) for block in np.array_split(frames, config.blocks)]
     spread = [_jackknife([pair[k] for pair in left_out]) for k in (0, 1)]
     found = with_values(garment, drag=drag, pin_depth=pin)

@@ -90,6 +90,7 @@ def add_animation(
         GeometryWarning: the template has pose correctives, which glTF's skinning leaves out.
     """
     times = _times(params)
+    # Without morph targets the expressions must not move the joints either.
     if morph_node is None:
         params = replace(params, expression=np.zeros((len(params), 0)))
     rotations, translations = joint_motion(template, params)
@@ -100,6 +101,7 @@ def add_animation(
             stacklevel=3,
         )
     animation = pygltflib.Animation(name="motion")
+    # All channels share one input accessor; glTF demands the bounds of its times.
     clock = buffers.add(times, bounds=True)
 
     def add_channel(node: int, path: str, values: np.ndarray) -> None:
@@ -108,12 +110,15 @@ def add_animation(
         output = buffers.add(values.astype(np.float32))
         animation.samplers.append(pygltflib.AnimationSampler(input=clock, output=output, interpolation="LINEAR"))
 
+    # Every joint turns, but few translate: a translation channel is written for roots and for joints that leave their
+    # rest offset in some frame, which keeps the file small.
     moved = np.abs(translations - rest_offsets(template)).max(axis=(0, 2)) > _STILL
     for j, (node, quaternions) in enumerate(zip(joint_nodes, _quaternions(rotations), strict=True)):
         add_channel(node, "rotation", quaternions)
         if moved[j] or template.body.parents[j] < 0:
             add_channel(node, "translation", translations[:, j])
     if morph_node is not None:
+        # glTF wants a weight for every morph target of the mesh, frame by frame; missing expressions are zero.
         weights = np.zeros((len(params), template.body.num_expressions))
         weights[:, : params.expression.shape[1]] = params.expression
         add_channel(morph_node, "weights", weights.reshape(-1))
@@ -142,6 +147,8 @@ def _quaternions(rotations: np.ndarray) -> np.ndarray:
     """(T, J, 3, 3) -> (J, T, 4) xyzw; the sign follows the frame before, so that interpolation takes the short way."""
     frames, joints = rotations.shape[:2]
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(frames, joints, 4)
+    # q and -q are one rotation: flip the sign where the dot product with the frame before is negative, accumulated over
+    # the frames.
     turns = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=-1) < 0, -1.0, 1.0)
     quaternions[1:] *= np.cumprod(turns, axis=0)[..., None]
     return quaternions.swapaxes(0, 1)

@@ -80,11 +80,14 @@ def mesh_quality(mesh: MeshLike, *, self_intersection: bool = False) -> MeshQual
     """
     mesh = as_mesh(mesh, subject="mesh")
     require_surface(mesh, "mesh")
+    # Vertices without a face are reported, but belong to no component and do not count in Euler's characteristic
+    # V - E + F.
     edges, counts = mesh.edges_with_counts
     used = np.unique(mesh.faces)
     length = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
     borders = border_loop_lengths(mesh)
     inconsistent = int(inconsistent_edges(mesh).sum())
+    # Faces without area have an infinite ratio; they are counted on their own and left out of the percentiles.
     aspect = aspect_ratios(mesh)
     aspect = aspect[np.isfinite(aspect)]
     p50, p95, p99 = np.percentile(aspect, (50, 95, 99))
@@ -144,9 +147,11 @@ def fan_counts(mesh: TriangleMesh) -> Integer[np.ndarray, " N"]:
     low, high = np.where(forward, tail, head), np.where(forward, head, tail)
     order = np.argsort(vertex[low] * mesh.vertex_count + vertex[high], kind="stable")
     low, high = low[order], high[order]
+    # Sorted by their two ends, half-edges of one edge are neighbours: link the corners that they share at each end.
     same = (vertex[low][1:] == vertex[low][:-1]) & (vertex[high][1:] == vertex[high][:-1])
     links = np.concatenate([np.stack([end[:-1], end[1:]], axis=1)[same] for end in (low, high)])
     fan = component_labels(links, 3 * m)
+    # Each component of linked corners is one fan; count it at the vertex of its first corner.
     first = np.unique(fan, return_index=True)[1]
     return np.bincount(vertex[first], minlength=mesh.vertex_count)
 
@@ -155,6 +160,7 @@ def inconsistent_edges(mesh: TriangleMesh) -> Bool[np.ndarray, " E"]:
     """The edges, in the order of `mesh.edges`, along which two faces run in the same direction."""
     edges, counts = mesh.edges_with_counts
     f, n = mesh.faces, mesh.vertex_count
+    # Two faces wound alike run along their common edge in opposite directions, so the sum of the signs is 0.
     directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
     index = np.searchsorted(edges[:, 0] * n + edges[:, 1], directed.min(axis=1) * n + directed.max(axis=1))
     direction = np.where(directed[:, 0] < directed[:, 1], 1, -1)

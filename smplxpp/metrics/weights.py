@@ -73,12 +73,14 @@ def weight_report(
     """
     dense = _dense(weights, "skinning weights")
     count, joints = dense.shape
+    # Total variation against the reference, vertex by vertex: the share of weight that lies on other joints.
     variation = None
     if reference is not None:
         truth = _dense(reference, "reference weights")
         if truth.shape != dense.shape:
             raise InputError("reference weights", expected=f"shape {dense.shape}", received=f"shape {truth.shape}")
         variation = _variation_stats(total_variation(dense, truth))
+    # Total variation along the edges measures smoothness: neighbours should follow nearly the same joints.
     along = None
     if edges is not None:
         edges = np.asarray(edges)
@@ -92,6 +94,7 @@ def weight_report(
                 "edges", expected=f"indices in [0, {count})", received=f"indices in [{edges.min()}, {edges.max()}]"
             )
         along = _variation_stats(total_variation(dense[edges[:, 0]], dense[edges[:, 1]]))
+    # Skinning is an affine combination of joint transforms only if each row sums to 1.
     sums = dense.sum(axis=1)
     return WeightReport(
         vertex_count=count,

@@ -106,6 +106,7 @@ class Template:
 
     def _check(self) -> None:
         V, J, Vb = len(self.vertices), self.body.joint_count, self.body.vertex_count
+        # Every array must have the shape that the number of vertices demands, and no NaN.
         shapes = {
             "vertices": (V, 3),
             "faces": (len(self.faces), 3),
@@ -120,10 +121,12 @@ class Template:
             value = getattr(self, name)
             _require(value.shape == shape, name, f"shape {shape}", f"shape {value.shape}")
             _require(bool(np.isfinite(value).all()), name, "finite values", "NaN or infinity")
+        # The body model has checked the shapes of its own arrays; what remains is that they are finite.
         for name in template_arrays.BODY_KEYS:
             value = getattr(self.body, name)
             if isinstance(value, np.ndarray):
                 _require(bool(np.isfinite(value).all()), f"body.{name}", "finite values", "NaN or infinity")
+        # The template's vertices begin with the body's; indices must lie inside what they point into.
         _require(Vb <= V, "vertices", f"at least the body's {Vb}", str(V))
         for name, bound in {
             "faces": V,
@@ -134,6 +137,7 @@ class Template:
             value = getattr(self, name)
             inside = not value.size or (value.min() >= 0 and value.max() < bound)
             _require(inside, name, f"indices in [0, {bound})", "others")
+        # One row of skinning weights for each vertex, over the body's joints.
         _require(
             len(self.weights) == V and self.weights.joint_count == J,
             "weights",
@@ -146,6 +150,8 @@ class Template:
             f"distinct names, {BODY_PART!r} first",
             str(self.part_names),
         )
+        # Parts are contiguous ranges in order, the body first, so that a part is a slice of the vertices; no face joins
+        # two.
         body_first = bool((self.vertex_part[:Vb] == 0).all() and (np.diff(self.vertex_part[Vb:], prepend=1) >= 0).all())
         _require(body_first, "vertex_part", f"0 for the body's {Vb} vertices, then increasing", "another order")
         crossing = (self.vertex_part[self.faces] != self.vertex_part[self.faces[:, :1]]).any()
