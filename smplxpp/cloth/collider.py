@@ -53,8 +53,10 @@ def collider_of(template: Template, part: str, posed: TriangleMesh, config: Garm
     Args:
         posed: the template in the pose that the part was scanned in.
     """
+    # Only surfaces near the part at rest can touch it; this keeps the collider small.
     own = posed.vertices[np.unique(template.faces[template.part_faces(part)])]
     near = cKDTree(own).query(posed.vertices, distance_upper_bound=NEAR)[0] < NEAR
+    # Fingers and the face are too fine for the collider's spacing; only hair collides with the head.
     hair = part == HAIR.name
     usable = near & ~_small_skin(template, head=hair)
     vertices, faces, margin, deepest, start = [], [], [], [], 0
@@ -62,14 +64,18 @@ def collider_of(template: Template, part: str, posed: TriangleMesh, config: Garm
         chosen = template.part_faces(name) & usable[template.faces].all(axis=1)
         if not chosen.any():
             continue
+        # Coarsen each surface on its own: particles are as sparse, and contact costs grow with the number of faces.
         mesh, index = posed.submesh(chosen)
         seeds, triangles = coarsen(mesh, config.collider_spacing)
+        # The body is solid, so cloth is pushed out from as deep as half a limb. A sheet has two sides:
+        # cloth a little deeper is taken to lie on the other one.
         solid = name == BODY_PART
         vertices.append(index[seeds])
         faces.append(triangles + start)
         margin.append(np.full(len(seeds), config.skin_margin if solid else config.sheet_margin))
         deepest.append(np.full(len(seeds), SOLID_DEPTH if solid else SHEET_DEPTH))
         start += len(seeds)
+    # A part that floats free of everything gets an empty collider of the right types.
     if not vertices:
         return ColliderMesh(
             np.zeros(0, np.int64), np.zeros((0, 3), np.int32), np.zeros(0, np.float32), np.zeros(0, np.float32)

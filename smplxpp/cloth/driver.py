@@ -159,6 +159,7 @@ class ClothDriver:
         if len(params) != 1:
             raise InputError("pose of a step", expected="one frame", received=f"{len(params)} frames")
         posed = self.template.posed_body(params) if posed is None else posed
+        # The very first pose has no state to continue from.
         if self._last is None:
             self._start(params, posed)
             return self._shaped(posed)
@@ -167,6 +168,7 @@ class ClothDriver:
         if seconds > LONGEST_STEP:
             self.notes.append(f"{seconds:.2f} s without a pose before {self._time:.2f} s: the clothes restart")
             self._start(params, posed)
+        # A leap faster than the teleport speed is a cut in the motion: carrying the state across would tear the cloth.
         elif not self._advance(posed, seconds):
             self.notes.append(f"a leap at {self._time:.2f} s: the clothes restart")
             self._start(params, posed)
@@ -175,6 +177,7 @@ class ClothDriver:
 
     def _start(self, params: BodyParams, posed: PosedBody) -> None:
         """Come to a first pose from the reference pose, where the cloth hangs as it was scanned."""
+        # The reference is turned to face as the first pose does, so that the ramp does not whirl the cloth around.
         start = reference_facing_as(self._threads[0].garment.reference, params)
         steps, still = (round(t / _RAMP_STEP) for t in (self.config.ramp, self.config.hold))
         self._origin = np.array(posed.joints[0, 0])
@@ -183,10 +186,13 @@ class ClothDriver:
             thread.reset(places)
         for k in range(1, steps):
             t = k / steps
+            # The smoothstep 3 t^2 - 2 t^3 starts and ends without velocity, so the ramp gives the cloth no jolt.
             between = pose_between(start, params, t * t * (3.0 - 2.0 * t))
             self._advance(self.template.posed_body(between), _RAMP_STEP, at_any_speed=True)
+        # Hold the first pose until the swing of the ramp has died down.
         for _ in range(still + min(steps, 1)):
             self._advance(posed, _RAMP_STEP, at_any_speed=True)
+        # Contact cannot push out particles that start too deep; report them instead of failing.
         for thread in self._threads:
             if buried := thread.buried():
                 self.notes.append(
@@ -197,15 +203,18 @@ class ClothDriver:
 
     def _advance(self, posed: PosedBody, seconds: float, *, at_any_speed: bool = False) -> bool:
         """Move all garments on to a pose; False, and nothing moved, where what holds them went too fast."""
+        # Keep the origin near the person: float32 coordinates lose precision with their distance from it.
         away = posed.joints[0, 0] - self._origin
         if np.abs(away).max() > _FAR:
             self._origin = self._origin + away
             for thread in self._threads:
                 thread.shift(-away.astype(np.float32))
         places = self._places(posed)
+        # Measure the fastest pin before any particle moves, so that a refusal leaves the state untouched.
         farthest = max(thread.way_to(places) for thread in self._threads)
         if farthest > self.config.teleport * seconds and not at_any_speed:
             return False
+        # Inner garments move first, since the outer ones collide with their new surfaces.
         for thread in self._threads:
             note = thread.advance(places, seconds, self._threads)
             if note:

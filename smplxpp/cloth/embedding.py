@@ -57,12 +57,16 @@ class Embedding:
 def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
     """Bind points to the nearest triangles of a mesh; `carried` by that mesh they stay where they are."""
     face, near = igl.point_mesh_squared_distance(np.ascontiguousarray(points), coarse.vertices, coarse.faces)[1:3]
+    # Barycentric coordinates of the foot point; those of triangles without area fall back to equal weights. Clipping
+    # and normalising keep them a convex combination.
     corners = coarse.faces[face].astype(np.int32)
     with np.errstate(invalid="ignore", divide="ignore"):  # triangles without area
         weights = barycentric_coordinates(near, coarse.vertices[corners])
     weights = np.clip(np.nan_to_num(weights, nan=1 / 3, posinf=1.0, neginf=0.0), 1e-12, 1.0)
     weights /= weights.sum(axis=1, keepdims=True)
     zero = Embedding(corners, weights.astype(np.float32), np.zeros((len(points), 3), dtype=np.float32))
+    # The rest between the point and the foot point is expressed in a frame of the triangle's tangents and the smooth
+    # normal, which turns with the mesh when it deforms.
     missing = points - zero.carried(coarse)
     normals = _smooth_normals(coarse)
     normal = _unit(sum(weights[:, k : k + 1] * normals[corners[:, k]] for k in range(3)))
@@ -71,6 +75,7 @@ def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
     first, second = _tangents(coarse.vertices, corners)
     # What is left may lean out of the triangle's plane by as much as the smooth normal does: solved exactly.
     frame = np.stack([first, second, normal], axis=2)
+    # A frame that is nearly flat would amplify rounding; there the projections have to do.
     exact = np.linalg.det(frame) > 0.1
     offset = np.stack([np.einsum("ni,ni->n", left, first), np.einsum("ni,ni->n", left, second), along], axis=1)
     offset[exact] = np.linalg.solve(frame[exact], missing[exact][:, :, None])[:, :, 0]

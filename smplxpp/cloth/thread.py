@@ -64,16 +64,19 @@ class GarmentThread:
         Args:
             threads: all garments, the inner ones moved on already: where one is under this one it counts as it is.
         """
+        # Where an inner garment lies under this one, collide with its simulated surface instead of the skinned one.
         surface = places[self._skin]
         for other in threads:
             if other is self:
                 break
             surface = other.laid_over(self.garment.collider.vertices, surface)
         own = places[self._particles]
+        # Four moments define the Catmull-Rom curves along which pins and collider move during the substeps.
         try:
             self._solver.advance(
                 self._state, seconds, _four_moments(self._places, own), _four_moments(self._surfaces, surface)
             )
+        # Remember the places even after an error, so that the next step interpolates from the right moment.
         finally:
             self._places, self._surfaces = [self._places[-1], own], [self._surfaces[-1], surface]
         if self._sound():
@@ -119,6 +122,7 @@ class GarmentThread:
             return surface
         out = surface.copy()
         share = self._share[at[mine], None]
+        # Blend as the drawn surface does: near the pins skinning holds, beyond the band the simulation.
         out[mine] += share * (self.carried()[at[mine]] - out[mine])
         return out
 
@@ -126,6 +130,7 @@ class GarmentThread:
         x = self._state.position
         if not (np.isfinite(x).all() and np.isfinite(self._state.velocity).all()):
             return False
+        # Compare squared lengths with the squared limit, which saves a square root for each edge.
         ends = x[self._model.edges.T]
         apart = ends[0] - ends[1]
         return bool((np.einsum("ei,ei->e", apart, apart) <= self._most_squared).all())
