@@ -68,8 +68,6 @@ def test_every_example_is_listed_and_short() -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path) -> None:
-    if name == "00_main_job" and not hasattr(smplxpp, "build_template"):
-        pytest.skip("smplxpp.build_template is not exported yet")
     text = run_example(name, tmp_path / "out", *SHORT.get(name, ()))
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES[name]
     check = {
