@@ -15,8 +15,9 @@ Array: TypeAlias = Any
 
 
 def array_namespace(array: Array) -> ModuleType:
-    """Return the module torch for a torch tensor, else numpy, without importing torch."""
-    return sys.modules["torch"] if type(array).__module__.partition(".")[0] == "torch" else np
+    """Return the module torch for a tensor, derived classes included, else numpy, without importing torch."""
+    is_tensor = any(kind.__module__.partition(".")[0] == "torch" for kind in type(array).__mro__)
+    return sys.modules["torch"] if is_tensor else np
 
 
 def matrix_from_rotvec(rotvec: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:

@@ -156,11 +156,12 @@ def test_corrections_of_another_run_are_copied(small, capsys):
     Corrections((BoxCorrection(HAIR.id, np.array([0.0, 9.0, 0.0]), np.full(3, 20.0), np.eye(3)),)).save(
         small.folder / "mine.json"
     )
-    files = {"--scan": "scan.npz", "--labels": "labels.npz", "--corrections": "mine.json", "--out": "run"}
+    files = {"--scan": "scan.npz", "--labels": "labels.npz", "--corrections": "mine.json"}
     options = [word for option, name in files.items() for word in (option, str(small.folder / name))]
-    command = ["build", *options, "--params", str(PARAMS), "--label-set", "capture", "--until-stage", "20_segment"]
-    assert main([*command, "--json"]) == 0
     run = small.folder / "run"
+    options += ["--params", str(PARAMS), "--label-set", "capture", "--until-stage", "20_segment"]
+    command = ["build", str(run), *options]
+    assert main([*command, "--json"]) == 0
     assert (run / "labels_corrections.json").read_bytes() == (small.folder / "mine.json").read_bytes()
     with np.load(run / "20_segment" / "labels.npz") as labels:
         assert (labels["face_labels"] == HAIR.id).all()

@@ -142,7 +142,7 @@ def test_later_commands_keep_to_the_protocol_of_the_build(root, tmp_path, caplog
     assert open_frame(run, TrainInputs(root), 0).capture.protocol == "tracked"
     with pytest.raises(
         InputError,
-        match=r"received exact, for a template .* built by protocol tracked.*--protocol exact --out OTHER.*--params",
+        match=r"received exact, for a template .* built by protocol tracked.*build OTHER --protocol exact.*--params",
     ):
         open_scene(run, TrainInputs(root, protocol="exact"))
     assert not caplog.records

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -56,7 +57,7 @@ def _told(capture: Path) -> tuple[str, ...]:
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
-    monkeypatch.setattr(init_blend_shapes, "STEPS", 2)
+    monkeypatch.setattr(init_blend_shapes, "_fit", partial(init_blend_shapes._fit, steps=2))
 
 
 @pytest.fixture(scope="module")

@@ -62,7 +62,7 @@ def test_kernels_belong_to_what_calls_them():
         ("smplxpp/core/errors.py", "class InputError", "# A comment.\nclass InputError"),
         ("smplxpp/core/errors.py", '"""', '"""Other words. '),
         ("smplxpp/native/raster/zbuffer.cpp", "#include", "// A comment.\n#include"),
-        ("avatar/losses/ssim.py", "def ssim", "def other():\n    pass\n\n\ndef ssim"),
+        ("avatar/losses/image_similarity.py", "def ssim(", "def other():\n    pass\n\n\ndef ssim("),
     ],
 )
 def test_what_does_nothing_or_is_elsewhere_changes_nothing(copy, path, old, new):

@@ -75,9 +75,11 @@ def _components(shapes: BlendShapes, residuals: Float[Tensor, "T M 3"]) -> Float
     return out
 
 
-def _fit(shapes: BlendShapes, pose: Float[Tensor, "T 63"], targets: Float[Tensor, "T parts n_b"]) -> None:
-    """Fit B(theta) to the coefficients by AdamW on poses with noise."""
-    steps, rate, pose_noise, weight_decay = 600, 3e-3, 0.03, 1e-3  # noise in radians; no rendering, so that it is quick
+def _fit(
+    shapes: BlendShapes, pose: Float[Tensor, "T 63"], targets: Float[Tensor, "T parts n_b"], *, steps: int = 600
+) -> None:
+    """Fit B(theta) to the coefficients by AdamW on poses with noise, in quick steps that render nothing."""
+    rate, pose_noise, weight_decay = 3e-3, 0.03, 1e-3  # noise in radians
     network = shapes.body
     # The weight of a coefficient's error is the norm of its blend shape.
     size = shapes.U.detach()[..., shapes.config.head_shapes :].square().sum((0, 1)).sqrt()
