@@ -1,4 +1,4 @@
-"""Skin weights from the body to the parts it wears."""
+"""Transfer skin weights from the body to the parts that it wears."""
 
 from smplxpp.transfer.config import TransferConfig
 from smplxpp.transfer.transfer import transfer_weights

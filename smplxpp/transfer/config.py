@@ -1,4 +1,4 @@
-"""What skin-weight transfer does, as data."""
+"""Hold the settings of skin-weight transfer, and the joints that a part of each label can follow."""
 
 from __future__ import annotations
 
@@ -11,23 +11,39 @@ from jaxtyping import Bool
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core.errors import InputError
 from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
-from smplxpp.transfer.regions import JOINTS_OF_LABEL
+
+_BOTH = ("left_", "right_")
+_TRUNK = ("pelvis", "spine1", "spine2", "spine3")
+_ARMS = tuple(side + joint for side in _BOTH for joint in ("collar", "shoulder", "elbow", "wrist"))
+_THIGHS = tuple(side + "hip" for side in _BOTH)
+_LEGS = _THIGHS + tuple(side + joint for side in _BOTH for joint in ("knee", "ankle", "foot"))
+
+# Joints that a part of each label can follow. Others are impossible, though near: a skirt hangs beside the hands, a
+# collar and hair touch the jaw. Everything else stays possible, as hair may fall down the back and a boot reach the
+# knee.
+JOINTS_OF_LABEL: dict[str, tuple[str, ...]] = {
+    "hair": ("head", "neck", "left_collar", "right_collar", *_TRUNK),
+    "shoe": tuple(side + joint for side in _BOTH for joint in ("knee", "ankle", "foot")),
+    "lower": ("pelvis", "spine1", "spine2", *_LEGS),
+    "upper": (*_TRUNK, "neck", *_ARMS, *_THIGHS),
+    "outer": (*_TRUNK, "neck", *_ARMS, *_THIGHS, "left_knee", "right_knee"),
+}
 
 
 @dataclass(frozen=True)
 class TransferConfig:
     """Settings of `transfer_weights`; every length is a fraction of a mesh's `extent`, so units do not matter.
 
-    The default goes beyond the published method in four ways, each of which None or 0 turns off: `falloff`,
+    The default adds four steps to the published method, each of which None or 0 turns off: `falloff`,
     `smoothing`, `confident`, and (through `for_label`) `allowed_joints`; `published` mixes both.
     `TransferConfig.paper()` is the published method.
 
     Attributes:
         falloff: p of the extension of the source's weights into free space (`extend_weights`); None copies the closest
             point's weights whatever the distance.
-        smoothing: how strongly a vertex is believed: weights are smoothed over this multiple of its distance to the
-            source. None believes matched vertices wholly and the others not at all.
-        normal_widening: how many times wider still where the normals are perpendicular (twice as many where opposite).
+        smoothing: width over which weights are smoothed, as a multiple of the vertex's distance to the source. None
+            keeps the weights of matched vertices and inpaints all others.
+        normal_widening: growth of that width where the normals are perpendicular (twice that where opposite).
         turned: a vertex that faces away from the nearest skin is smoothed as if it lay this fraction of the source's
             extent away, however near it lies.
         confident: a matched vertex within this fraction of the source's extent is confident and keeps the weights of
@@ -37,8 +53,8 @@ class TransferConfig:
             of the body nearby.
         anchor_length: `l` of the energy that inpaints the anchor weights, as a fraction of the source's extent. With a
             short length a skirt keeps a share of what its waist follows, a longer one continues the trend.
-        published: share of the published method's answer in that of cloth off the skin. The two err differently: on
-            loose cloth their mean is mostly nearer to the truth than either.
+        published: share of the published method's weights in those of cloth off the skin. The errors of both differ, so
+            that on loose cloth their mean is mostly nearer to the truth than either.
         allowed_joints: names or indices of the joints that the target may follow; None allows all. They steer what is
             not confident: a confident vertex keeps the joints that it is matched to. Without confident vertices
             (`confident` None) the source is restricted to the faces that these joints own.
@@ -129,7 +145,7 @@ class TransferConfig:
     def for_label(name: str, *, base: TransferConfig | None = None) -> TransferConfig:
         """Settings for a part of one of `smplxpp.core.labels`: `base` with the joints that such a part can follow.
 
-        Only what is impossible is left out (`regions.JOINTS_OF_LABEL`): hair does not follow the jaw, arms and legs,
+        Only what is impossible is left out (`JOINTS_OF_LABEL`): hair does not follow the jaw, arms and legs,
         lower clothes not the arms, upper clothes not head, fingers and shins. A label that is not listed (skin) is not
         restricted.
         """

@@ -1,4 +1,4 @@
-"""Where each vertex of the target meets the source, and whether that is believed."""
+"""Match each vertex of the target to the source: closest points, outward normals, components without a match."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
-from smplxpp.core.errors import GeometryWarning
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
-
-# Beyond this angle a closest point faces against the target: an arm against the bodice beside it.
-_AGAINST = np.radians(70.0)
-# Lengths within which another point may take its place: as far as a confident match goes.
-_NEAR_LENGTHS = 0.75
+from smplxpp.core.topology import component_labels
+from smplxpp.transfer.config import TransferConfig
 
 
 @dataclass(frozen=True)
@@ -37,19 +34,19 @@ class Correspondence:
     angle: Float64[np.ndarray, " N"]
 
     def interpolate(self, source: TriangleMesh, values: Float[np.ndarray, "V D"]) -> Float64[np.ndarray, "N D"]:
-        """The values at the closest points, from those at the source's vertices."""
+        """Interpolate values of the source's vertices at the closest points."""
         rows = np.repeat(np.arange(len(self.face)), 3)
         corners = source.faces[self.face].ravel()
         matrix = sp.csr_matrix((self.barycentric.ravel(), (rows, corners)), (len(self.face), source.vertex_count))
         return matrix @ values
 
     def matched(self, *, max_distance: float, max_angle: float) -> Bool[np.ndarray, " N"]:
-        """The points near enough (metres) and facing the same way (radians)."""
+        """Return the points that are near enough (metres) and whose normals agree (radians)."""
         return (self.distance <= max_distance) & (self.angle <= max_angle)
 
 
 def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence:
-    """Closest point of `source` for every vertex of `target`, in float64.
+    """Find the closest point of `source` for every vertex of `target`, in float64.
 
     Normals are weighted by angle on both meshes and interpolated on the source. Of several points
     as close as each other (borders of two layers that coincide) the first that the tree finds is taken.
@@ -76,32 +73,42 @@ def prefer_facing(
     *,
     length: float,
 ) -> Correspondence:
-    """Where the closest point faces another way, a near point that faces the same way, if there is one.
+    """Replace closest points that face another direction by near points that face the same direction, where possible.
 
-    What a garment covers lies behind it and faces as it does; a hand beside a skirt, the arm beside a bodice faces
-    against it, however near, and the back of that hand lies before the cloth. For vertices whose closest point faces
-    more than 70 degrees away, the face is taken whose centre y and normal n' minimise
-    `|x - length n / 2 - y|^2 + length^2 |n - n'|^2`, and its point nearest to x, if x is outside of it, it is no
-    farther than 3/4 `length` and faces better; so an opposite normal costs as much as `2 length` of distance. A
-    lining, which faces against all that is near, keeps its closest point.
+    The body below a garment faces as the garment does. A hand beside a skirt or the arm beside a bodice faces against
+    it, however near it is, and the back of that hand lies outside of the cloth. For vertices whose closest point faces
+    more than 70 degrees away, take the face whose centre y and normal n' minimise
+
+        |x - length n / 2 - y|^2 + length^2 |n - n'|^2
+
+    and its point nearest to x, if x lies outside of it, it is no farther than 3/4 `length` (as far as a confident match
+    may be) and it faces better. So an opposite normal costs as much as `2 length` of distance. A lining, which faces
+    against all that is near, keeps its closest point.
 
     Args:
-        points, normals: of the target, turned outwards. length: metres.
+        found: closest points.
+        source: the body.
+        points: the target's vertices, metres.
+        normals: of the target, outward.
+        length: metres.
     """
-    rows = np.flatnonzero(~(found.angle <= _AGAINST) & normals.any(axis=1))
+    rows = np.flatnonzero(~(found.angle <= np.radians(70.0)) & normals.any(axis=1))
     if not len(rows):
         return found
+    # Search positions and scaled normals together: one nearest neighbour in six dimensions.
     x, n = points[rows], normals[rows]
     tree = cKDTree(np.hstack([source.face_centers, length * source.face_normals]))
     face = tree.query(np.hstack([x - 0.5 * length * n, length * n]), workers=-1)[1]
+    # Find the point of that face nearest to the vertex, and the angle there.
     corners = source.faces[face]
     barycentric = _barycentric(x, *(source.vertices[corners[:, k]] for k in range(3)))
     there = Correspondence(face, barycentric, np.empty(len(rows)), np.empty(len(rows)))
     offset = x - there.interpolate(source, source.vertices)
     theirs = normalize_rows(there.interpolate(source, source.vertex_normals))
     distance, angle = row_lengths(offset), _angles(n, theirs)
+    # Take it only where it lies below the cloth, is near and faces better.
     better = ~(angle >= found.angle[rows]) & (np.einsum("ij,ij->i", offset, theirs) >= 0)
-    better &= distance <= _NEAR_LENGTHS * length
+    better &= distance <= 0.75 * length
     out = {name: getattr(found, name).copy() for name in ("face", "barycentric", "distance", "angle")}
     for name, value in (("face", face), ("barycentric", barycentric), ("distance", distance), ("angle", angle)):
         out[name][rows[better]] = value[better]
@@ -111,14 +118,20 @@ def prefer_facing(
 def face_outward(
     found: Correspondence, target: TriangleMesh, component: Int32[np.ndarray, " N"], *, max_distance: float
 ) -> tuple[Correspondence, Float64[np.ndarray, "N 3"]]:
-    """Turn the normals of components that are inside out: most of their near vertices face against the source.
+    """Flip the normals of components that are inside out, where most near vertices face against the source.
 
     Args:
-        component: (N,) ids. max_distance: metres, which vertices are near.
+        found: closest points.
+        target: the part.
+        component: ids of the vertices' components.
+        max_distance: metres, up to which a vertex is near.
 
     Returns:
-        The correspondence with the angles turned, and (N, 3) the target's normals, turned alike.
+        found: with the angles of the flipped normals.
+        normals: (N, 3) of the target, flipped where needed.
     """
+    # A component is inside out if more than twice as many near vertices face against the source as with it, and these
+    # are more than a tenth of it.
     near = found.distance <= max_distance
     against = near & (found.angle > np.pi / 2)
     count = int(component.max(initial=-1)) + 1
@@ -138,14 +151,68 @@ def face_outward(
     return replace(found, angle=angle), np.where(turned[:, None], -1.0, 1.0) * target.vertex_normals
 
 
+def vertex_components(mesh: TriangleMesh) -> Int32[np.ndarray, " N"]:
+    """Return the connected component of every vertex, numbered from 0."""
+    return component_labels(mesh.edges, mesh.vertex_count).astype(np.int32)
+
+
+def settle_unmatched(
+    component: Int32[np.ndarray, " N"],
+    matched: Bool[np.ndarray, " N"],
+    weights: Float[np.ndarray, "N J"],
+    config: TransferConfig,
+) -> tuple[Bool[np.ndarray, " N"], Float64[np.ndarray, "N J"], tuple[str, ...]]:
+    """Apply the policy `config.unmatched` to every component without a match.
+
+    Args:
+        component: ids 0 to P - 1.
+        matched: vertices with a match.
+        weights: of each vertex before the smooth fit.
+        config: the policy.
+
+    Returns:
+        settled: (N,) bool, rows whose weights are final.
+        weights: (N, J), with those rows set.
+        policies: the policy of each of the P components.
+
+    Raises:
+        InputError: a component without a match under the policy "raise".
+    """
+    # A component is lost if none of its vertices is matched.
+    count = int(component.max(initial=-1)) + 1
+    lost = np.bincount(component, matched, minlength=count) == 0
+    policies = tuple(np.where(lost, config.unmatched, "matched").tolist())
+    rows = lost[component]
+    if not rows.any() or config.unmatched == "extend":
+        return np.zeros_like(rows), weights, policies
+    message = f"{int(lost.sum())} of {count} components ({int(rows.sum())} of {len(rows)} vertices) have no match"
+    if config.unmatched == "raise":
+        raise InputError(
+            "target mesh",
+            expected="a matched vertex in every component",
+            received=f"{message}, first at vertex {int(np.argmax(rows))}",
+            remedy="choose the policy TransferConfig(unmatched='nearest') or 'rigid:JOINT', or remove those pieces",
+        )
+    if config.unmatched == "nearest":
+        warnings.warn(f"skin weights: {message}; they take the nearest weights", GeometryWarning, stacklevel=3)
+        return rows, weights, policies
+    out = weights.copy()
+    out[rows] = 0.0
+    out[rows, config.joint_index(config.unmatched.removeprefix("rigid:"), weights.shape[1])] = 1.0
+    return rows, out, policies
+
+
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Radians between unit vectors."""
+    """Return the angles between unit vectors, radians."""
     # arctan2 keeps its precision at small angles, where arccos of a rounded cosine does not.
     return np.arctan2(row_lengths(np.cross(a, b)), np.einsum("ij,ij->i", a, b))
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Weights of points on triangles (Ericson 2004, 3.4); on a triangle without area, along its longest edge."""
+    """Return barycentric weights of points on triangles (Ericson 2004, 3.4), clipped to the triangle.
+
+    On a triangle without area the point is placed along its longest edge.
+    """
     u, v, w = b - a, c - a, p - a
     uu, uv, vv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (u, v), (v, v)))
     wu, wv = np.einsum("ij,ij->i", w, u), np.einsum("ij,ij->i", w, v)

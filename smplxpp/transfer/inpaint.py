@@ -1,4 +1,4 @@
-"""Weights made smooth over the surface, where the body nearby does not settle them."""
+"""Smooth and inpaint weights over a surface, by the bi-Laplacian energy of robust skin weight transfer."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64
 
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.transfer.laplacian import edge_lengths, laplacian_and_mass
-
-_SHARP = 0.5  # of the median edge: smoothing over so little is none
+from smplxpp.core.mesh import TriangleMesh, row_lengths
 
 
 def fit_smoothly(
@@ -23,7 +20,7 @@ def fit_smoothly(
     length: float,
     laplacian: str = "auto",
 ) -> Float64[np.ndarray, "N J"]:
-    """Smooth `values` over the surface, each as far as it is doubted.
+    """Smooth `values` over the surface, each over a neighbourhood of its own width.
 
     Minimises `tr(W' Q W) + sum_i (l^2 M_i / h_i^4) |W_i - values_i|^2` with `Q = -C + l^2 C M^-1 C`, the energy of
     robust skin weight transfer (Abdrashitov et al. 2023). C is the cotangent matrix (negative semi-definite, no unit),
@@ -33,21 +30,23 @@ def fit_smoothly(
 
     Args:
         mesh: every vertex referenced; every component with a finite width.
-        values: (N, J).
-        width: (N,) h, in the mesh's unit; rows far below the edges' length are kept.
+        values: the data.
+        width: h, in the mesh's unit; rows below half the median edge are kept, as smoothing over so little does
+        nothing.
         length: l.
         laplacian: see `laplacian_and_mass`.
 
     Returns:
         (N, J); may leave [0, 1] a little (the energy is biharmonic).
     """
-    fixed = width <= _SHARP * float(np.median(edge_lengths(mesh)))
+    fixed = width <= 0.5 * float(np.median(edge_lengths(mesh)))
     if fixed.all():
         return values
     # A free row's equation reaches two rings; faces further away do not matter.
     touched = np.zeros(mesh.vertex_count, dtype=bool)
     touched[mesh.faces[(~fixed)[mesh.faces].any(axis=1)]] = True
     near, used = mesh.submesh(touched[mesh.faces].any(axis=1))
+    # Set up the normal equations of the free rows, divided by l^2; fixed rows go to the right-hand side.
     stiffness, mass = laplacian_and_mass(near, kind=laplacian)
     free = ~fixed[used]
     data = np.zeros(len(used))
@@ -62,19 +61,21 @@ def fit_smoothly(
 
 
 def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
-    """The solution (n, J) of a symmetric positive definite system; the joints that a piece knows differ by piece."""
+    """Solve a symmetric positive definite system (n, J) piece by piece, each for the joints that occur in it."""
+    # Sort the rows by connected component of the matrix, which makes it block diagonal.
     piece = sp.csgraph.connected_components(matrix, directed=False)[1]
     order = np.argsort(piece, kind="stable")
     matrix, right = matrix[order][:, order], right[order]
     out = np.zeros_like(right)
     start = np.concatenate([[0], np.cumsum(np.bincount(piece))])
-    nobody = np.zeros(0, np.int64)
+    no_rows = np.zeros(0, np.int64)
+    # Solve each block by a sparse Cholesky factorisation in minimum-degree order.
     for low, high in itertools.pairwise(start):
         occurring = right[low:high].any(axis=0)
         no_values = np.zeros((0, int(occurring.sum())))
-        solver = igl.min_quad_with_fixed_data()  # a sparse Cholesky, minimum degree
+        solver = igl.min_quad_with_fixed_data()
         block = sp.csc_matrix(matrix[low:high, low:high])
-        igl.min_quad_with_fixed_precompute(block, nobody, sp.csc_matrix((0, high - low)), True, solver)
+        igl.min_quad_with_fixed_precompute(block, no_rows, sp.csc_matrix((0, high - low)), True, solver)
         linear = np.ascontiguousarray(-right[low:high, occurring])
         out[low:high, occurring] = igl.min_quad_with_fixed_solve(solver, linear, no_values, no_values)
     back = np.empty_like(out)
@@ -85,7 +86,7 @@ def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
 def average_neighbours(
     mesh: TriangleMesh, values: Float[np.ndarray, "N J"], rows: Bool[np.ndarray, " N"], *, steps: int
 ) -> Float64[np.ndarray, "N J"]:
-    """Move the rows selected by a mask a fifth of the way to their neighbours' mean, `steps` times, all at once."""
+    """Move masked rows 20 % towards the mean of their neighbours, `steps` times, all rows at once."""
     n, e = mesh.vertex_count, mesh.edges
     adjacency = sp.coo_matrix((np.ones(len(e)), (e[:, 0], e[:, 1])), shape=(n, n)).tocsr()
     adjacency = adjacency + adjacency.T
@@ -96,3 +97,48 @@ def average_neighbours(
     for _ in range(steps):
         out[rows] = 0.8 * out[rows] + 0.2 * (mean @ out)
     return out
+
+
+def edge_lengths(mesh: TriangleMesh) -> Float64[np.ndarray, "M 3"]:
+    """Return the lengths of the edges opposite to each corner."""
+    t = mesh.triangles
+    return np.stack([row_lengths(t[:, (k + 1) % 3] - t[:, (k + 2) % 3]) for k in range(3)], axis=1)
+
+
+def mollify(lengths: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
+    """Lengthen all edges by the least constant that makes every face a proper triangle.
+
+    `l_a + l_b - l_c >= 1e-4 * mean` afterwards (Sharp and Crane, "A Laplacian for Nonmanifold Triangle Meshes", 2020,
+    section 4.5); unchanged where all faces are proper already.
+    """
+    shortfall = 1e-4 * lengths.mean() - (lengths.sum(axis=1, keepdims=True) - 2.0 * lengths)
+    return lengths + max(0.0, float(shortfall.max(initial=0.0)))
+
+
+def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> tuple[sp.csc_matrix, Float64[np.ndarray, " N"]]:
+    """Return the cotangent matrix C (N, N), negative semi-definite, and Voronoi masses (N,), all positive.
+
+    Args:
+        mesh: every vertex referenced by a face.
+        kind: "cotangent": as the mesh is (zero-area faces are still mollified: their cotangents do not exist).
+            "intrinsic": edges flipped to an intrinsic Delaunay triangulation (Bobenko and Springborn 2007), which has
+            no negative weights; needs at most two faces at an edge, wound alike. "auto": "intrinsic"
+            where some angle is below 0.1 degrees, else "cotangent".
+    """
+    lengths = edge_lengths(mesh)
+    if kind == "auto":
+        kind = "intrinsic" if _smallest_angle(lengths) < np.radians(0.1) else "cotangent"
+    lengths, faces = mollify(lengths), mesh.faces
+    if kind == "intrinsic" and igl.is_edge_manifold(faces)[0]:
+        lengths, faces = igl.intrinsic_delaunay_triangulation(lengths, faces)[:2]
+    cotangent = igl.cotmatrix_intrinsic(lengths, faces)
+    mass = igl.massmatrix_intrinsic(lengths, faces, igl.MASSMATRIX_TYPE_VORONOI).diagonal()
+    return sp.csc_matrix(cotangent), mass
+
+
+def _smallest_angle(lengths: np.ndarray) -> float:
+    """Return the smallest angle of all faces in radians; 0 where a face has no area."""
+    a, b, c = np.sort(lengths, axis=1).T  # the smallest angle lies opposite to a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.where(b * c > 0, (b * b + c * c - a * a) / (2 * b * c), 1.0)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)).min(initial=np.pi / 3))

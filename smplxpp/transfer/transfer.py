@@ -1,4 +1,4 @@
-"""Skin weights from a body to what it wears."""
+"""Transfer skin weights from a body to the parts that it wears."""
 
 from __future__ import annotations
 
@@ -13,22 +13,33 @@ from smplxpp.transfer.anchors import (
     anchor_share,
     anchor_weights,
     components_without,
-    joint_reach,
+    joint_admissibility,
     neighbouring_joints,
     smooth_step,
     turned_away,
 )
-from smplxpp.transfer.components import settle_unmatched, vertex_components
+from smplxpp.transfer.checks import (
+    check_placement,
+    check_source,
+    check_target,
+    consistent_winding,
+    extent,
+    restrict_source,
+)
 from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.correspond import Correspondence, closest_points, face_outward, prefer_facing
-from smplxpp.transfer.extend import extend_weights, sample_surface
+from smplxpp.transfer.correspond import (
+    Correspondence,
+    closest_points,
+    face_outward,
+    prefer_facing,
+    settle_unmatched,
+    vertex_components,
+)
+from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
-from smplxpp.transfer.regions import restrict_source
-from smplxpp.transfer.repair import check_placement, check_source, check_target, consistent_winding, extent
 
-_FACING_LENGTH = 0.02  # of the source's extent: what an opposite normal costs in distance, halved
-_LEAST_KEPT = 1e-3  # of a row
-_OFF_THE_SKIN = (0.01, 0.025)  # of the source's extent: between these the published method comes to have its share
+_LEAST_SUM = 1e-3
+"""Least sum of a row's weights that is worth normalising; also the least weight that counts as following a joint."""
 
 
 def transfer_weights(
@@ -38,27 +49,29 @@ def transfer_weights(
     *,
     config: TransferConfig | None = None,
 ) -> SkinWeights:
-    """Skin weights for `target` from those of the body it is worn on, both in the same pose and place.
+    """Transfer skin weights to `target` from the body that it is worn on, both in the same pose and place.
 
     With the default settings each vertex takes the body's weights, averaged over a neighbourhood that grows with its
-    distance from the body (`extend_weights`), and the whole is smoothed along the cloth over a length that grows alike
-    (`fit_smoothly`): close cloth moves with the skin under it, loose cloth between two limbs blends them instead of
-    tearing. Vertices that lie on the skin and face as it does are confident: they keep its weights whatever the label
-    says, and their anchor weights along the cloth decide which limbs the others may follow at all (`anchor_weights`),
-    so that a skirt does not follow the hand beside it, and far from the body it takes the place of what the body says.
+    distance from the body (`extend_weights`). These values are smoothed along the cloth over a length that grows in the
+    same proportion (`fit_smoothly`). So close cloth moves with the skin under it, and loose cloth between two limbs
+    blends them instead of tearing. Vertices that lie on the skin and face as it does are confident: they keep its
+    weights whatever the label says. Inpainting from them gives all others anchor weights (`anchor_weights`), which
+    decide the limbs that a vertex may follow, so that a skirt does not follow the hand beside it. Far from the body
+    anchor weights replace the body's values.
+
     `TransferConfig.paper()` is "Robust Skin Weights Transfer via Weight Inpainting" (Abdrashitov, Raichstat,
-    Monsen, Hill; SIGGRAPH Asia 2023 Technical Communications): closest points are believed where near and facing the
-    same way, the rest is inpainted.
+    Monsen, Hill; SIGGRAPH Asia 2023 Technical Communications): weights of closest points are kept where these are near
+    and face the same direction, the rest is inpainted.
 
     Args:
-        source: the body. Inconsistent winding is mended with a warning.
+        source: the body. Inconsistent winding is repaired with a warning.
         source_weights: (V, J), rows sum to 1; read where a face uses the vertex.
         target: what it wears; open, with several components, bad faces or unreferenced vertices.
         config: settings; `TransferConfig.for_label("lower")` and the like know which joints a part can follow.
 
     Returns:
-        Weights of the target's vertices; rows sum to 1, none negative. `matched`, `distance` and `angle` tell how each
-        was found and `policies` what happened to each connected component: "matched", or the policy of the settings.
+        Weights of the target's vertices; rows sum to 1, none negative. `matched`, `distance` and `angle` are those
+        of the closest points, `policies` has "matched" or the policy of the settings for each connected component.
 
     Raises:
         InputError: meshes without faces, weights that are none, another unit or other axes than the source's, a
@@ -75,6 +88,7 @@ def transfer_weights(
         >>> bool(np.allclose(weights.dense().sum(axis=1), 1.0))
         True
     """
+    # Check the inputs, and repair their winding.
     source = as_mesh(source, subject="source mesh")
     target = as_mesh(target, subject="target mesh")
     config = config or TransferConfig()
@@ -87,33 +101,38 @@ def transfer_weights(
     allowed = config.allowed_mask(joint_count)
     if allowed is not None and config.confident is None:
         source, weights = restrict_source(source, weights, allowed)
+    # Match vertices to the source; find the confident ones among the matched.
     found = closest_points(source, target)
     check_placement(source, target, found.distance)
     component = vertex_components(target)
     limit = config.max_distance * extent(target)
     found, normals = face_outward(found, target, component, max_distance=limit)
     if config.confident is not None:
-        found = prefer_facing(found, source, target.vertices, normals, length=_FACING_LENGTH * size)
+        # An opposite normal costs 4 % of the source's extent in distance.
+        found = prefer_facing(found, source, target.vertices, normals, length=0.02 * size)
     angle = np.radians(config.max_angle_deg)
     matched = found.matched(max_distance=limit, max_angle=angle)
     near = min(limit, (config.confident or 0.0) * size)
     confident = found.matched(max_distance=near, max_angle=angle) & (config.confident is not None)
+    # Compute each vertex's own value, then smooth the values over the surface.
     values = _values(source, weights, _Matches(target, normals, found, component, confident), allowed, size, config)
     settled, values, policies = settle_unmatched(component, matched, values, config)
-    # Joints that nothing uses cost nothing in the solver.
+    # Joints without weight are left out of the linear systems.
     occurring = np.flatnonzero(values.any(axis=0))
     dense = np.zeros((target.vertex_count, joint_count))
     dense[:, occurring] = _smooth(target, found, values[:, occurring], matched, settled, size, config)
     if config.published:
+        # Mix in the published method's weights. Their share rises from 1 % to 2.5 % of the source's extent off the
+        # skin.
         answer = _published(_Matches(target, normals, found, component, matched), source, weights, size, config)
-        share = config.published * smooth_step(found.distance, *(k * size for k in _OFF_THE_SKIN))
+        share = config.published * smooth_step(found.distance, *(k * size for k in (0.01, 0.025)))
         share[settled | components_without(component, matched)] = 0.0
         if allowed is not None:
-            # What the label excludes and nothing here follows stays out: a skirt does not take a third of the hand.
-            answer = np.where(allowed | (dense > _LEAST_KEPT), answer, 0.0)
+            # Leave out joints that the label excludes and nothing here follows, such as the hand beside a skirt.
+            answer = np.where(allowed | (dense > _LEAST_SUM), answer, 0.0)
             total = answer.sum(axis=1)
-            share[total <= _LEAST_KEPT] = 0.0
-            answer /= np.maximum(total, _LEAST_KEPT)[:, None]
+            share[total <= _LEAST_SUM] = 0.0
+            answer /= np.maximum(total, _LEAST_SUM)[:, None]
         dense += share[:, None] * (answer - dense)
     return SkinWeights.from_dense(
         dense,
@@ -128,7 +147,15 @@ def transfer_weights(
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """The target, its outward normals, where its vertices meet the source, their component, and which are confident."""
+    """Hold the target and its matches to the source.
+
+    Attributes:
+        target: N vertices.
+        normals: outward.
+        found: closest points of the source.
+        component: of each vertex.
+        confident: vertices that keep the weights of their closest points.
+    """
 
     target: TriangleMesh
     normals: np.ndarray
@@ -145,34 +172,38 @@ def _values(
     size: float,
     config: TransferConfig,
 ) -> np.ndarray:
-    """The weights (N, J) each vertex would take by itself, blended with its anchor weights."""
+    """Return the weights (N, J) that each vertex takes from the body nearby, blended with its anchor weights."""
     joint_count, used = weights.shape[1], np.flatnonzero(weights.any(axis=0))
     weights = weights[:, used]
     copied = at.found.interpolate(source, weights)
-    anchors = reach = None
+    anchors = admissible = None
+    # Compute anchor weights and the admissible joints; components without a confident vertex have the label's alone.
     alone = components_without(at.component, at.confident)
     if at.confident.any():
         anchors = _anchor_weights(at, copied, config.anchor_length * size, config)
-        reach = joint_reach(anchors, neighbouring_joints(weights), None if allowed is None else allowed[used])
-        reach[alone] = 1.0 if allowed is None else allowed[used]
+        possible = None if allowed is None else allowed[used]
+        admissible = joint_admissibility(anchors, neighbouring_joints(weights), possible)
+        admissible[alone] = 1.0 if possible is None else possible
     elif allowed is not None and config.confident is not None:
-        reach = np.repeat(allowed[None, used].astype(np.float64), len(copied), axis=0)
-    values, heard = copied, np.ones(len(copied))
+        admissible = np.repeat(allowed[None, used].astype(np.float64), len(copied), axis=0)
+    # Extend the body's weights into space.
+    values, admissible_share = copied, np.ones(len(copied))
     if config.falloff is not None:
-        samples = sample_surface(source, weights)
-        values, heard = extend_weights(
-            at.target.vertices, at.normals, at.found, copied, samples, falloff=config.falloff, reach=reach
+        samples = sample_weights(source, weights)
+        values, admissible_share = extend_weights(
+            at.target.vertices, at.normals, at.found, copied, samples, falloff=config.falloff, admissible=admissible
         )
+    # Replace them by anchor weights far from the body, and where hardly any of it is admissible.
     if anchors is not None:
         far = (config.far[0] * size, config.far[1] * size)
-        lean = anchor_share(at.found.distance, at.found.angle, heard, far=far)
-        lean[at.confident | alone] = 0.0
-        values = values + lean[:, None] * (anchors - values)
-    if reach is not None and alone.any():
-        # A little of what may not speak comes along with what may; where nothing else is near it stays.
-        kept = np.where(reach > 0, values, 0.0)
+        share = anchor_share(at.found.distance, at.found.angle, admissible_share, far=far)
+        share[at.confident | alone] = 0.0
+        values = values + share[:, None] * (anchors - values)
+    if admissible is not None and alone.any():
+        # Remove what is left of inadmissible joints, unless nothing else is near.
+        kept = np.where(admissible > 0, values, 0.0)
         total = kept.sum(axis=1, keepdims=True)
-        values = np.where(alone[:, None] & (total > _LEAST_KEPT), kept / np.maximum(total, _LEAST_KEPT), values)
+        values = np.where(alone[:, None] & (total > _LEAST_SUM), kept / np.maximum(total, _LEAST_SUM), values)
     out = np.zeros((len(values), joint_count))
     out[:, used] = values
     return out
@@ -181,7 +212,7 @@ def _values(
 def _published(
     at: _Matches, source: TriangleMesh, weights: np.ndarray, size: float, config: TransferConfig
 ) -> np.ndarray:
-    """The published method's answer (N, J), with `at.confident` all that is matched."""
+    """Return the published method's weights (N, J), where `at.confident` are all matched vertices."""
     used = np.flatnonzero(weights.any(axis=0))
     out = np.zeros((at.target.vertex_count, weights.shape[1]))
     out[:, used] = _anchor_weights(
@@ -208,13 +239,15 @@ def _smooth(
     size: float,
     config: TransferConfig,
 ) -> np.ndarray:
-    """The values (N, J) fitted smoothly over the surface; vertices without a face keep theirs."""
+    """Fit the values (N, J) smoothly over the surface; vertices without a face keep theirs."""
+    # The width of smoothing: smoothing (1 + widening (1 - cos a)) sqrt(d^2 + (turned E s)^2), see docs/template.md.
     if config.smoothing is None:
         width = np.where(matched | settled, 0.0, np.inf)
     else:
-        doubt = 1.0 + config.normal_widening * (1.0 - np.cos(np.nan_to_num(found.angle)))
-        doubted = np.hypot(found.distance, config.turned * size * turned_away(found.angle))
-        width = np.where(settled, 0.0, config.smoothing * doubt * doubted)
+        widening = 1.0 + config.normal_widening * (1.0 - np.cos(np.nan_to_num(found.angle)))
+        distance = np.hypot(found.distance, config.turned * size * turned_away(found.angle))
+        width = np.where(settled, 0.0, config.smoothing * widening * distance)
+    # Fit, clip what the biharmonic energy overshoots, and normalise.
     mesh, used = target.submesh(np.ones(target.face_count, dtype=bool))
     length = config.length_scale * size
     fitted = fit_smoothly(mesh, values[used], width[used], length=length, laplacian=config.laplacian)

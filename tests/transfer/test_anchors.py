@@ -1,4 +1,4 @@
-"""What confident vertices say about the others, and when they are heard in the body's place."""
+"""What confident vertices imply for the others, and when that replaces the body's weights."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.anchors import anchor_share, anchor_weights, turned_away
 
 FAR = (0.1, 0.2)
-UNHEARD, HEARD = 0.2, 0.9
+SCARCE, ADMISSIBLE = 0.2, 0.9
 
 
 @pytest.mark.parametrize(
-    ("distance", "degrees", "heard", "least", "most"),
+    ("distance", "degrees", "admissible", "least", "most"),
     [
-        (0.05, 0, HEARD, 0.0, 0.0),
-        (0.25, 0, HEARD, 1.0, 1.0),
-        (0.15, 0, HEARD, 0.4, 0.6),
+        (0.05, 0, ADMISSIBLE, 0.0, 0.0),
+        (0.25, 0, ADMISSIBLE, 1.0, 1.0),
+        (0.15, 0, ADMISSIBLE, 0.4, 0.6),
         (0.05, 0, 0.0, 1.0, 1.0),
-        (0.05, 120, HEARD, 0.0, 0.0),  # a lining: it faces away, and its anchor weights agree
-        (0.05, 20, UNHEARD, 0.0, 0.0),  # what it covers may contradict
-        (0.05, 120, UNHEARD, 0.7, 1.0),
-        (0.0, np.nan, UNHEARD, 0.0, 0.0),
+        (0.05, 120, ADMISSIBLE, 0.0, 0.0),  # a lining: it faces away, and its anchor weights agree
+        (0.05, 20, SCARCE, 0.0, 0.0),  # what it covers may contradict
+        (0.05, 120, SCARCE, 0.7, 1.0),
+        (0.0, np.nan, SCARCE, 0.0, 0.0),
     ],
 )
-def test_far_contradicted_and_unheard_vertices_take_the_anchor_weights(distance, degrees, heard, least, most):
-    lean = anchor_share(np.array([distance]), np.radians([degrees]), np.array([heard]), far=FAR)
-    assert least <= lean[0] <= most
+def test_far_contradicted_and_isolated_vertices_take_the_anchor_weights(distance, degrees, admissible, least, most):
+    share = anchor_share(np.array([distance]), np.radians([degrees]), np.array([admissible]), far=FAR)
+    assert least <= share[0] <= most
 
 
-def test_vertices_that_face_away_are_doubted_the_more_they_turn():
-    doubt = turned_away(np.radians([0.0, 15.0, 30.0, 45.0, 180.0, np.nan]))
-    assert (np.diff(doubt[:5]) >= 0).all()
-    assert doubt[[0, 3, 4, 5]].tolist() == [0.0, 1.0, 1.0, 0.0]
+def test_vertices_face_away_the_more_they_turn():
+    away = turned_away(np.radians([0.0, 15.0, 30.0, 45.0, 180.0, np.nan]))
+    assert (np.diff(away[:5]) >= 0).all()
+    assert away[[0, 3, 4, 5]].tolist() == [0.0, 1.0, 1.0, 0.0]
 
 
 def _strip(length: float = 1.0, count: int = 41) -> TriangleMesh:

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.transfer import TransferConfig, transfer_weights
-from smplxpp.transfer.laplacian import edge_lengths, laplacian_and_mass, mollify
-from smplxpp.transfer.repair import consistent_winding
+from smplxpp.transfer.checks import consistent_winding
+from smplxpp.transfer.inpaint import edge_lengths, laplacian_and_mass, mollify
 
 
 def sphere(radius: float = 1.0, center=(0.0, 0.0, 0.0), n: int = 16) -> TriangleMesh:

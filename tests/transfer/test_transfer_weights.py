@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.transfer import TransferConfig, transfer_weights
+from smplxpp.transfer.checks import extent
 from smplxpp.transfer.correspond import closest_points
-from smplxpp.transfer.repair import extent
 
 NAMES = ("hips", "left", "right", "hand")
 CONFIGS = {"default": TransferConfig(), "paper": TransferConfig.paper()}
@@ -141,7 +141,7 @@ def test_a_loose_skirt_blends_the_legs_where_the_nearest_point_tears(body, skirt
 def test_a_forbidden_limb_is_never_followed(body, skirt):
     mesh, weights = body
     assert closest_points(mesh, skirt).interpolate(mesh, weights)[:, 3].max() > 0.5  # the hand touches the skirt
-    assert transfer_weights(mesh, weights, skirt).dense()[:, 3].max() > 0.1  # without a label it is heard a little
+    assert transfer_weights(mesh, weights, skirt).dense()[:, 3].max() > 0.1  # without a label it counts a little
     config = TransferConfig(allowed_joints=("hips", "left", "right"), joint_names=NAMES)
     assert transfer_weights(mesh, weights, skirt, config=config).dense()[:, 3].max() == 0
 

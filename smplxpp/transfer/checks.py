@@ -1,4 +1,4 @@
-"""What the transfer needs of its meshes, and what it mends with a warning."""
+"""Check and repair the meshes and weights that a transfer takes: sizes, axes, winding, restricted sources."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import warnings
 
 import igl
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 
-_LARGEST, _SMALLEST = 3.0, 0.02  # a target's size against the source's
-_DOUBTFUL, _FARTHEST = 0.05, 0.25  # median distance of a target's vertices, against the source's size
+# Other choices of axes: their name, and the permutation and signs that bring them to +Y up.
 _AXES = (
     ("+Z up", [0, 2, 1], (1, 1, -1)),
     ("-Z up", [0, 2, 1], (1, -1, 1)),
@@ -23,13 +22,13 @@ _AXES = (
 
 
 def check_target(target: TriangleMesh) -> None:
-    """Raises InputError for a mesh without faces."""
+    """Raise InputError for a mesh without faces."""
     if not target.face_count:
         raise InputError("target mesh", expected="at least one face", received="none")
 
 
 def check_source(source: TriangleMesh, weights: Float[np.ndarray, "V J"]) -> Float64[np.ndarray, "V J"]:
-    """Checked (V, J) float64 weights, rows summing to 1 (zero where no face uses the vertex).
+    """Return the weights in float64, rows summing to 1 (zero where no face uses the vertex), after checking them.
 
     Raises:
         InputError: no faces; wrong shape; NaN; negative; a row that does not sum to 1 within 1e-4.
@@ -43,6 +42,7 @@ def check_source(source: TriangleMesh, weights: Float[np.ndarray, "V J"]) -> Flo
         raise InputError(
             "source weights", expected=f"shape ({source.vertex_count}, J)", received=f"shape {weights.shape}"
         )
+    # Check the rows that a face uses: finite, not negative, a sum of 1.
     used = source.referenced
     rows = weights[used]
     bad = ~np.isfinite(rows).all(axis=1)
@@ -68,34 +68,39 @@ def check_source(source: TriangleMesh, weights: Float[np.ndarray, "V J"]) -> Flo
 
 
 def extent(mesh: TriangleMesh) -> float:
-    """Size of a mesh: twice the largest distance from the area's centroid.
+    """Return the size of a mesh: twice the largest distance from the area's centroid.
 
-    It is the bounding box's diagonal for a box, but unlike that it does not change with the mesh's orientation.
+    For a box it equals the diagonal of the bounding box, but it does not change when the mesh is rotated.
     """
     centroid = (mesh.face_areas @ mesh.face_centers) / max(mesh.face_areas.sum(), np.finfo(float).tiny)
     return 2.0 * float(row_lengths(mesh.vertices[mesh.referenced] - centroid).max())
 
 
 def check_placement(source: TriangleMesh, target: TriangleMesh, distance: Float[np.ndarray, " N"]) -> None:
-    """Refuse a target that plainly does not lie on the source: other units, other axes, another place.
+    """Refuse a target that clearly does not lie on the source: other units, other axes, another place.
 
     Args:
-        distance: (N,) of each target vertex to the source.
+        source: the body.
+        target: the part.
+        distance: of each target vertex to the source.
 
     Raises:
         InputError: names the likely cause.
     """
+    # Sizes and the median distance, as multiples of the source's size.
     size = extent(source)
     ratio = extent(target) / size
     far = float(np.median(distance)) / size
     remedy = ""
-    if ratio > _LARGEST or ratio < _SMALLEST:
+    # No part is 3 times as large as the body, or 50 times smaller.
+    if ratio > 3.0 or ratio < 0.02:
         # The power of ten that makes the part at most a little larger than the body.
         power = int(np.ceil(np.log10(ratio / 1.5)))
         remedy = f"the units differ: multiply the target's coordinates by {10.0**-power:g}"
-    elif far > _DOUBTFUL:
+    # From 5 % on other axes may fit better; above 25 % the part is somewhere else even if none do.
+    elif far > 0.05:
         remedy = _axes_remedy(source, target.vertices[target.referenced], 0.5 * float(np.median(distance)))
-        if not remedy and far > _FARTHEST:
+        if not remedy and far > 0.25:
             remedy = "check units, axes (+Y up) and translation of both meshes"
     if remedy:
         points = target.vertices[target.referenced]
@@ -109,7 +114,7 @@ def check_placement(source: TriangleMesh, target: TriangleMesh, distance: Float[
 
 
 def _axes_remedy(source: TriangleMesh, points: np.ndarray, better: float) -> str:
-    """What to do about the axes if some other choice brings the points nearer than `better` (median), else ""."""
+    """Return a remedy if other axes bring the points nearer than `better` (median distance), else an empty string."""
     sample = points[:: max(1, len(points) // 500)]
     for name, axes, sign in _AXES:
         turned = np.ascontiguousarray(sample[:, axes] * sign)
@@ -120,24 +125,26 @@ def _axes_remedy(source: TriangleMesh, points: np.ndarray, better: float) -> str
 
 
 def consistent_winding(mesh: TriangleMesh, *, subject: str) -> TriangleMesh:
-    """The mesh with neighbouring faces wound alike; warns with the number of faces turned (the fewer).
+    """Wind neighbouring faces alike, flipping the fewer faces of each component; warns with their number.
 
     Two faces agree when they run along their common edge in opposite directions.
     """
+    # Winding is consistent where no directed edge occurs twice.
     f = mesh.faces
     directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
     _, counts = np.unique(directed[:, 0] * mesh.vertex_count + directed[:, 1], return_counts=True)
     if counts.max(initial=1) == 1:
         return mesh
+    # Orient each component by breadth-first search, then keep the orientation that most of its faces had.
     oriented, patch = igl.bfs_orient(f)
     flipped = _cyclic(oriented) != _cyclic(f)
     size = np.bincount(patch)
-    turned = np.bincount(patch, flipped) > 0.5 * size  # more than half turned: turn the others instead
+    turned = np.bincount(patch, flipped) > 0.5 * size
     flipped ^= turned[patch]
     if not flipped.any():
         return mesh
     warnings.warn(
-        f"{subject}: {int(flipped.sum())} of {len(f)} faces were wound against their neighbours; turned",
+        f"{subject}: {int(flipped.sum())} of {len(f)} faces were wound against their neighbours; flipped",
         GeometryWarning,
         stacklevel=4,
     )
@@ -146,8 +153,32 @@ def consistent_winding(mesh: TriangleMesh, *, subject: str) -> TriangleMesh:
     return TriangleMesh(mesh.vertices, faces)
 
 
+def restrict_source(
+    source: TriangleMesh, weights: Float[np.ndarray, "V J"], allowed: Bool[np.ndarray, " J"]
+) -> tuple[TriangleMesh, Float64[np.ndarray, "n J"]]:
+    """Restrict the source to faces that the allowed joints own (at least half of the weight at each corner).
+
+    Returns:
+        The submesh, and its weights with other joints' shares removed and rows normalised.
+
+    Raises:
+        InputError: no face is left.
+    """
+    share = weights @ allowed.astype(np.float64)
+    keep = (share >= 0.5)[source.faces].all(axis=1)
+    if not keep.any():
+        raise InputError(
+            "config allowed_joints",
+            expected="joints that own some faces of the source",
+            received=f"joints {np.flatnonzero(allowed).tolist()}, which own none",
+            remedy="check the joint names and their order",
+        )
+    mesh, used = source.submesh(keep)
+    return mesh, weights[used] * allowed / share[used, None]
+
+
 def _cyclic(faces: np.ndarray) -> np.ndarray:
-    """(M,) bool parity of each face: whether its corners, from the lowest index on, increase."""
+    """Return the parity of each face: whether its corners increase, starting from the lowest index."""
     start = faces.argmin(axis=1)
     rows = np.arange(len(faces))
     return faces[rows, (start + 1) % 3] < faces[rows, (start + 2) % 3]
