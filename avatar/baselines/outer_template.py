@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from avatar.gaussians.sampling import seen_faces
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import SKIN
+from smplxpp.core import SKIN, InputError
 from smplxpp.template.template import Template
 
 

@@ -13,9 +13,7 @@ from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
 from smplxpp.cloth.driver import LONGEST_STEP
 from smplxpp.cloth.following import SMOOTHING, followed
 from smplxpp.cloth.poses import resampled
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.core import BodyParams, GeometryWarning, InputError, require_at_least, require_positive
 from smplxpp.template.template import Template
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 from avatar.data.sequence import Item, MeasuredView
 from avatar.data.views import View
 from avatar.rig.rig import Pose, Rig
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.template.template import Template
 
 FRAME = 0

@@ -18,11 +18,8 @@ from avatar.data.cloth_motion import ClothMotions
 from avatar.data.views import View, read_view
 from avatar.rig.rig import Pose, Rig
 from smplxpp.capture import Capture
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera, InputError, require_at_least
 from smplxpp.core.spread import spread_inside
-from smplxpp.core.validation import require_at_least
 from smplxpp.template.template import Template
 
 

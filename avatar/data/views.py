@@ -13,8 +13,7 @@ from jaxtyping import Float, Float16, Float32, UInt8
 from torch import Tensor
 
 from smplxpp.capture import Capture
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core import Camera, GeometryWarning, InputError
 
 
 @dataclass(frozen=True, eq=False)

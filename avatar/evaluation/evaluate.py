@@ -40,10 +40,7 @@ from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
 from avatar.rig.rig import Pose, Rig
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least
+from smplxpp.core import BodyParams, InputError, ProgressCallback, TriangleMesh, ignore_progress, require_at_least
 
 
 @dataclass(frozen=True, kw_only=True)

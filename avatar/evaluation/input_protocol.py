@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, require_choice, require_known
 from smplxpp.core.files.json_file import shown
-from smplxpp.core.validation import require_choice, require_known
 
 NOT_KNOWN, EXACT, TRACKED, MIXED = "not known", "exact", "tracked", "mixed"
 PARAMETERS = (EXACT, TRACKED, MIXED, NOT_KNOWN)

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 
 from smplxpp.capture import Capture
 from smplxpp.capture.splits import Splits
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.spread import spread
-from smplxpp.core.validation import require_at_least, require_known
+from smplxpp.core import GeometryWarning, InputError, require_at_least, require_known, spread
 
 SETS: Mapping[str, str] = {
     "training": "training views",

@@ -13,8 +13,7 @@ from avatar.metrics.speed import Speed
 from avatar.metrics.surface_quality import SurfaceQuality, surface_spread
 from avatar.metrics.view_quality import ViewQuality, mean_quality, spread_over_frames
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import as_integer, as_number, as_object, as_text, jsonable, read_json
+from smplxpp.core.files import as_integer, as_number, as_object, as_text, atomic_write_text, jsonable, read_json
 from smplxpp.metrics.pose_error import PoseError
 
 SCHEMA = 1

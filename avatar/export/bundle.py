@@ -19,8 +19,7 @@ from avatar.models.student import Student
 from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, motion_tensors, save_bundle
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.garment_file import garments_to_arrays
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_positive
+from smplxpp.core import BodyParams, require_positive
 from smplxpp.template.template import Template
 
 

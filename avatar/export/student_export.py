@@ -17,8 +17,7 @@ from avatar.models.student import Student
 from avatar.runtime import AvatarBundle, AvatarPlayer, load_bundle
 from avatar.runtime.bundle import SUFFIX
 from smplxpp import __version__
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError
 
 _WRITERS = {
     ".ply": "avatar.formats.ply:write_splat_ply",

@@ -9,8 +9,7 @@ import numpy as np
 
 from avatar.formats.splats import REST_COUNTS, Splats
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_path
-from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files import atomic_path, read_bytes
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 _DC = tuple(f"f_dc_{k}" for k in range(3))

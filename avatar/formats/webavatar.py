@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from avatar.runtime.player import AvatarPlayer
 from avatar.runtime.splatting import WorldSplats
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.params import BodyParams
 
 NOT_FILLED = (
     "the displacement field is a network, or linear in more coefficients than 16: `ctrl_pt_basis` and "

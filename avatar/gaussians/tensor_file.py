@@ -12,8 +12,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.json_file import as_object, parse_json
-from smplxpp.core.files.paths import regular_file
+from smplxpp.core.files import as_object, parse_json, regular_file
 
 _DAMAGED = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError)
 """Exceptions that the library raises for a damaged file or a type that torch does not know."""

@@ -17,9 +17,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core import InputError, MissingExtraError, require_choice
 from smplxpp.core.files.paths import regular_file
-from smplxpp.core.validation import require_choice
 
 log = logging.getLogger(__name__)
 

@@ -14,9 +14,7 @@ from torch import nn
 from avatar.data.views import View
 from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, at_rest
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera, InputError
 
 CONVENTION = (
     "Every picture has a new pose, one after the other. Pose: joints to skinning transforms (numpy on the CPU). "

@@ -8,9 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import LABELS, InputError, TriangleMesh
 from smplxpp.metrics import CompareConfig, DirectedDistances, MeshComparison, directed_distances, summarize
 from smplxpp.metrics.conventions import DEFAULT, convention_named
 

@@ -15,8 +15,7 @@ from avatar.data.views import View
 from avatar.gaussians.sampling import head_faces
 from avatar.losses.image_similarity import psnr_from_mse, ssim
 from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 

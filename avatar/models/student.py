@@ -25,9 +25,7 @@ from avatar.models.networks.pose_dependence import PoseGate, PoseRegression, see
 from avatar.rig.posed import PosedAvatar
 from avatar.rig.rig import Pose, Rig
 from smplxpp.cloth.garment import Garment
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least
+from smplxpp.core import BodyParams, InputError, require_at_least
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,8 @@ from torch import Tensor
 from avatar.reconstruct.hash_grid import HashGrid
 from avatar.reconstruct.neural_surface import NeuralSurface
 from avatar.reconstruct.rays import Rays, opacities, rays_of, weights_of
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, ProgressCallback, TriangleMesh, ignore_progress, require_at_least, require_positive
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.reconstruct import PhotoView
 from smplxpp.reconstruct.hull import main_body, zero_surface
 from smplxpp.reconstruct.views import Box

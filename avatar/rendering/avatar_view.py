@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.rendering.api import rasterize
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 
 if TYPE_CHECKING:
     from avatar.data.views import View

@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar.rendering.memory import pooled_empty
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.native import address, native_library, thread_count
 from smplxpp.raster import MeshMaps
 

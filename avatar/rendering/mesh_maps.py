@@ -26,8 +26,7 @@ from avatar.rendering.barycentrics import (
     barycentrics_reference,
     interpolate_reference,
 )
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.native import thread_count
 from smplxpp.raster import MeshMaps, rasterize_triangles
 

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from avatar.runtime import AvatarPlayer
-from smplxpp.core.camera import Camera
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera
 
 if TYPE_CHECKING:
     from avatar.rig.posed import AvatarModel

@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from smplxpp.cloth.driver import ClothShape
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template
 
 THETA = 63

@@ -13,11 +13,10 @@ import numpy as np
 
 from avatar.runtime.layout import MAX_GAUSSIANS, NEEDED, PIECES, REMEDY, check_shapes, decode
 from smplxpp.body.layout import JOINT_NAMES
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, parse_json
 from smplxpp.core.files.package_file import read_package, write_package
 from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
-from smplxpp.core.params import BodyParams
 
 FORMAT, VERSION = "smplxpp-avatar", 2
 """Version 2 added a regression for poses without a code."""

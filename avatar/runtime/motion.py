@@ -9,8 +9,7 @@ import numpy as np
 from avatar.runtime.bundle import AvatarBundle
 from smplxpp.body.pose_range import PoseRange
 from smplxpp.cloth.poses import pose_between
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_positive
+from smplxpp.core import BodyParams, require_positive
 
 
 def resampled(params: BodyParams, fps: float, *, source_fps: float | None = None) -> BodyParams:

@@ -15,11 +15,8 @@ from avatar.runtime.networks import BlendShapes, DisplacementField
 from avatar.runtime.skeleton import LooseClothes, skeleton_body
 from avatar.runtime.splatting import Splatter, WorldSplats, facing_normals, relit_picture
 from smplxpp.cloth.driver import ClothShape, DriverConfig
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, Camera, InputError, TriangleMesh, normalize_rows
 from smplxpp.core.light import Relighting
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
-from smplxpp.core.params import BodyParams
 from smplxpp.native import thread_count
 
 PARTS = ("pose", "field", "blend", "world", "draw")

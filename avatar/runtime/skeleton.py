@@ -12,8 +12,7 @@ from avatar.runtime.bundle import AvatarBundle
 from smplxpp.body.model import BodyModel
 from smplxpp.cloth.driver import ClothDriver, ClothShape, DriverConfig
 from smplxpp.cloth.garment_file import garments_from_arrays
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, SkinWeights
 from smplxpp.template.template import Template
 
 

@@ -20,8 +20,7 @@ from scipy.spatial import cKDTree
 from avatar.speech.curves import ARKIT
 from smplxpp.body import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 _EYES = ("left_eye_smplhf", "right_eye_smplhf")
 

@@ -12,13 +12,10 @@ import numpy as np
 
 from avatar.speech.curves import ARKIT, FLAME_EXPRESSIONS, Curves
 from avatar.speech.pronunciation import EXTRA
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import read_arrays
-from smplxpp.core.files.json_file import as_list, as_number, as_numbers, as_object, as_text, read_json
+from smplxpp.core import DEFAULT_FPS, InputError
+from smplxpp.core.files import as_list, as_number, as_numbers, as_object, as_text, read_arrays, read_json, read_text
 from smplxpp.core.files.onnx_file import OnnxModel
-from smplxpp.core.files.paths import read_text
 from smplxpp.core.files.wave_file import Sound
-from smplxpp.core.params import DEFAULT_FPS
 
 _MAX_ROWS = 200_000  # of a table: 55 minutes at 60 frames a second
 _INDEX_OF_NAME = {name.lower(): k for k, name in enumerate(ARKIT)}

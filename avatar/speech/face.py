@@ -12,8 +12,7 @@ from avatar.speech.blendshape_transfer import transfer_blendshapes
 from avatar.speech.coarticulation import ARTICULATORS
 from avatar.speech.curves import ARKIT, BLINK
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 JAW_ANGLE = 0.15
 """Rotation of the jaw for an open vowel, radians, and its limit where the training did not open it further."""

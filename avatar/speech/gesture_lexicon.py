@@ -10,8 +10,7 @@ from jaxtyping import Float64
 
 from avatar.speech.standing_body import StandingBody
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
 MIRROR = np.array([1.0, -1.0, -1.0])
 """Factors that take a rotation vector of the left side to the mirrored one of the right side."""

@@ -10,8 +10,7 @@ from jaxtyping import Float64
 from avatar.speech.standing_body import StandingBody
 from avatar.speech.tracks import RandomTrack
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
 
 def blinks(times: Float64[np.ndarray, " T"], rng: np.random.Generator) -> Float64[np.ndarray, " T"]:

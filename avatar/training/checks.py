@@ -9,8 +9,7 @@ from avatar.training.loose_clothes import loose_names, why_none
 from avatar.training.recipe import Recipe
 from avatar.training.scene import TrainScene, normal_maps
 from smplxpp.capture import Capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_known
+from smplxpp.core import InputError, require_known
 
 log = logging.getLogger(__name__)
 

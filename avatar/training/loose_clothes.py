@@ -13,12 +13,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.models.tracked_surface import Track
 from smplxpp.cloth import Garment, GarmentConfig, cut_garment
 from smplxpp.cloth.calibrate import Calibration, CalibrationConfig, Followed, calibrate
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
-from smplxpp.core.validation import require_known
+from smplxpp.core import CLOTH_LABELS, BodyParams, InputError, TriangleMesh, require_known, spread
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import BODY_PART, Template
 

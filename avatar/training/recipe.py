@@ -15,8 +15,7 @@ from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.loose_clothes import ClothConfig
 from avatar.training.presets import TrainingPreset, training_preset, with_iterations, with_local_shapes
 from avatar.training.refinement.config import RefineConfig
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_choice
+from smplxpp.core import InputError, require_choice
 
 log = logging.getLogger(__name__)
 STEPS = ("refine", "fit", "teacher", "cloth", "bake", "compensate")

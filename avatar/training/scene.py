@@ -13,10 +13,7 @@ from avatar.data.capture_digests import capture_digests
 from avatar.data.views import View, read_views
 from smplxpp.capture import Capture, Splits
 from smplxpp.capture.recording import Problem
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
+from smplxpp.core import BodyParams, GeometryWarning, InputError, TriangleMesh, spread
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 

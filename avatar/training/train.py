@@ -40,12 +40,8 @@ from avatar.training.teacher.fit_teacher import fit_teacher
 from smplxpp.capture import Capture
 from smplxpp.capture.declared import has_estimated_params
 from smplxpp.cloth.garment_file import load_garments, save_garments
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.files.json_file import jsonable, read_json
-from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_choice
+from smplxpp.core import BodyParams, InputError, require_choice
+from smplxpp.core.files import atomic_folder, atomic_write_text, jsonable, read_bytes, read_json
 from smplxpp.template.template import Template
 
 log = logging.getLogger(__name__)

@@ -37,8 +37,7 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.build.observe import observe
 from smplxpp.build.scan_keypoints import ScanViews, facing, keypoints_of_scan
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.detect import load_detector
 from smplxpp.detect.mediapipe_detector import PersonSegmenter
 from smplxpp.detect.plates import PlateModel

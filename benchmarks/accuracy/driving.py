@@ -27,10 +27,7 @@ from benchmarks.support.capture_truth import CaptureTruth, TruePart, find_captur
 from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, GeometryWarning, SkinWeights, TriangleMesh
 from smplxpp.metrics import edge_stretch
 from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights

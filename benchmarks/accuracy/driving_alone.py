@@ -31,10 +31,8 @@ from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import TEMPLATE, VALIDATE_STAGE
 from smplxpp.body import load_body, load_params
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core.errors import GeometryWarning
+from smplxpp.core import BodyParams, GeometryWarning, TriangleMesh
 from smplxpp.core.files.array_file import read_arrays
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
 from smplxpp.raster import outer_visible_points
 from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.template.template import Template

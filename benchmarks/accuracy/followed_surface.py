@@ -41,9 +41,7 @@ from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GAUSSIANS
 from pipelines.stages.scene import TrainInputs, TrainScene, open_scene
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.spread import spread_inside
 
 SAMPLES = 30_000

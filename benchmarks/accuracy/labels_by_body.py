@@ -26,10 +26,7 @@ from pipelines.synth.patterns import smooth_noise
 from pipelines.synth.people import CAST, PersonScan, person
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
-from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import LABELS, BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.segment import label_by_body
 
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)

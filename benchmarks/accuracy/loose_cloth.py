@@ -38,9 +38,7 @@ from pipelines.synth.tracker import tracker_noise
 from smplxpp.cloth import ClothDriver, ClothShape, Garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.poses import CausalSmoother
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError, TriangleMesh
 
 SAMPLES = 50_000
 MOVED = 5e-4

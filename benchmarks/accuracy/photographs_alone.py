@@ -28,9 +28,8 @@ from pipelines.runs.layout import BUILD_STAGES, EVALUATION, MODEL_STAGES, REGIST
 from pipelines.runs.stage import read_manifest
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.capture import open_capture
-from smplxpp.core.labels import LABELS
+from smplxpp.core import LABELS, BodyParams
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
-from smplxpp.core.params import BodyParams
 from smplxpp.metrics.pose_error import pose_error
 from smplxpp.segment import read_labels
 

@@ -21,8 +21,7 @@ from benchmarks.support.results import store_results
 from pipelines.synth.people import CAST, PersonScan, person
 from pipelines.viewer.session import lies_within
 from smplxpp.body import BodyModel, load_body
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
+from smplxpp.core import BodyParams, spread
 from smplxpp.register import LandmarkModel, Observations, ScanObservation, register
 from smplxpp.register.locate import locate_body
 

@@ -25,8 +25,7 @@ from scipy import ndimage
 
 from benchmarks.support.results import store_results
 from smplxpp.capture import open_capture
-from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core import GeometryWarning, TriangleMesh, normalize_rows
 from smplxpp.metrics.distance import MM, point_to_surface
 from smplxpp.metrics.sampling import sample_surface
 from smplxpp.raster import rasterize_mesh

@@ -29,9 +29,7 @@ from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS, REFINED_PARAMS
 from pipelines.stages.build_config import RegisterInputs
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.build.observe import observe
-from smplxpp.core.labels import SKIN
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import SKIN, BodyParams, matrix_from_rotvec
 from smplxpp.metrics.pose_error import pose_error
 from smplxpp.register import BodyState, Observations, RegisterConfig, ScanObservation, register
 

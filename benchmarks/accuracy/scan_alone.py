@@ -24,8 +24,7 @@ from pipelines.synth.people import VARIANTS, PersonScan, people, person, variant
 from smplxpp.body import BodyModel, load_body
 from smplxpp.build.locate import certain_labels
 from smplxpp.clean import convert_points, find_scan_frame
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.register.locate import locate_body
 from smplxpp.segment import label_by_body
 

@@ -31,8 +31,7 @@ from benchmarks.support.results import store_results
 from pipelines.synth.garments.wardrobe import SHAPES, Case, cases
 from smplxpp.body import BodyModel, load_body
 from smplxpp.body.named_poses import stress_poses
-from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, TriangleMesh
 from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 

@@ -32,8 +32,7 @@ from benchmarks.support.results import ROOT
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE
 from smplxpp.capture import open_capture
 from smplxpp.core.camera import Camera
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import jsonable
+from smplxpp.core.files import atomic_write_text, jsonable
 from smplxpp.template.template import Template
 
 

@@ -24,8 +24,7 @@ from rich.table import Table
 
 from benchmarks.support.capture_truth import CaptureTruth, find_captures, read_capture_truth
 from benchmarks.support.results import store_results
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import SkinWeights, TriangleMesh, concatenate_meshes
 from smplxpp.transfer import TransferConfig, transfer_weights
 
 

@@ -43,8 +43,7 @@ from avatar.rendering import rasterize
 from benchmarks.support.results import FIXTURE, store_results
 from pipelines.runs import layout
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core.camera import Camera
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera
 from smplxpp.core.spherical_harmonics import C0
 from smplxpp.template.template import Template
 

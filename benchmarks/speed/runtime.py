@@ -39,8 +39,7 @@ from avatar.runtime import AvatarPlayer
 from avatar.runtime.player import PARTS
 from benchmarks.support.results import store_results
 from pipelines.runs import layout
-from smplxpp.core.camera import Camera
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera
 from smplxpp.template.template import Template
 
 SIDE, SAMPLED = 512, (15_000, 220_000)

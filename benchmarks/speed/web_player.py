@@ -29,9 +29,8 @@ from benchmarks.support.results import ROOT, store_results
 from pipelines.runs import layout
 from pipelines.web.page import PageContent, PageLight, single_page
 from smplxpp.cloth.garment_file import load_garments
-from smplxpp.core.camera import Camera
+from smplxpp.core import BodyParams, Camera
 from smplxpp.core.light import STUDIO, Irradiance, Relighting, panoramas
-from smplxpp.core.params import BodyParams
 from tests.web.chromium import Page, find_chromium
 
 WEB = ROOT / "web"

@@ -10,10 +10,8 @@ import numpy as np
 
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.clean import PartsConfig, clean_parts
-from smplxpp.core.labels import CLOTH_LABELS, LABEL_BY_NAME, UPPER
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import CLOTH_LABELS, LABEL_BY_NAME, UPPER, BodyParams, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
-from smplxpp.core.params import BodyParams
 
 _LABEL_OF_PART = {"hair": "hair", "shoes": "shoe", "upper": "upper", "lower": "lower"}
 

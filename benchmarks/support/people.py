@@ -20,10 +20,8 @@ from pipelines.synth.people import PersonScan, people, variant
 from pipelines.synth.people.bodies import FINGERS
 from pipelines.synth.people.person_scan import face_majority
 from smplxpp.body import load_body, load_params
-from smplxpp.core.errors import InputError
+from smplxpp.core import LABELS, InputError, TriangleMesh, display_colors
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.labels import LABELS, display_colors
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.raster import render_shaded

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.code import versions
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import jsonable
+from smplxpp.core.files import atomic_write_text, jsonable
 
 ROOT = Path(__file__).resolve().parents[2]
 FIXTURE = ROOT / "data" / "fixtures" / "person"

@@ -28,9 +28,8 @@ from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOpti
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.capture import Capture
 from smplxpp.core.errors import ProgressCallback, ignore_progress
-from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.core.files import atomic_write_bytes, atomic_write_text, jsonable
 from smplxpp.core.files.image_file import open_image
-from smplxpp.core.files.json_file import jsonable
 
 RESULTS_FILE = "results.json"
 COLUMNS = 7

@@ -27,10 +27,8 @@ from pipelines.stages.evaluate import surface_digest
 from pipelines.stages.evaluate_poses import of_held_out_poses, refined_digest, refined_poses
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.capture import Capture
-from smplxpp.core.errors import ProgressCallback, ignore_progress
-from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.json_file import as_integer, as_number
-from smplxpp.core.labels import CLOTH_LABELS
+from smplxpp.core import CLOTH_LABELS, ProgressCallback, ignore_progress
+from smplxpp.core.files import as_integer, as_number, atomic_write_bytes
 
 ROWS_FOLDER = f"{ABLATION}/rows"
 PLAYER_FILE, REPORT_FILE, PICTURES = "player.safetensors", "report.json", "pictures"

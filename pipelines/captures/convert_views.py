@@ -12,9 +12,8 @@ from smplxpp.capture import Capture
 from smplxpp.capture.window import Window
 from smplxpp.capture.writers.images import JPEG_SUFFIXES, encoded_image, normal_codes, view_path
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files import atomic_write_bytes, read_bytes
 from smplxpp.core.files.image_file import image_mode
-from smplxpp.core.files.paths import read_bytes
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 

@@ -21,10 +21,8 @@ from smplxpp.capture import Capture
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color
 from smplxpp.capture.writers.arrays import write_keypoints
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.files.array_file import read_arrays
-from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core import InputError, Keypoints2D, ProgressCallback, ignore_progress
+from smplxpp.core.files import read_arrays, read_bytes
 from smplxpp.detect import Box, DetectedPerson, Detector, mask_box
 
 _SAVE_EVERY_S = 20.0  # a file is written this often, so that a kill loses at most that much work

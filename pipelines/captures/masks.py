@@ -16,9 +16,7 @@ from smplxpp.capture.files import IMAGE_SUFFIXES, subfolders
 from smplxpp.capture.masks import write_mattes
 from smplxpp.capture.views import read_color
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import as_object, read_json
-from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files import as_object, atomic_write_text, read_bytes, read_json
 from smplxpp.detect.plates import PlateConfig, PlateModel
 
 MatteModel = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]

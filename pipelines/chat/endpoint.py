@@ -11,9 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, require_positive
 from smplxpp.core.files.json_file import as_list, as_object, parse_json
-from smplxpp.core.validation import require_positive
 
 SYSTEM_PROMPT = (
     "You speak aloud through an avatar. Answer in one to three short sentences of plain spoken English, "

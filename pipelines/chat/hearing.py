@@ -16,9 +16,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float32, Int16
 
-from smplxpp.core.errors import MissingExtraError
+from smplxpp.core import MissingExtraError, require_positive
 from smplxpp.core.files.onnx_file import OnnxModel
-from smplxpp.core.validation import require_positive
 
 # Sample rate (Hz) and block length (samples, 32 ms) of Silero's model; pocketsphinx takes the same rate.
 RATE = 16_000

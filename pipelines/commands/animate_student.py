@@ -15,10 +15,8 @@ from pipelines.commands.driving import Driving
 from pipelines.commands.options import ClothMode
 from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
 from smplxpp.cloth.following import ways
-from smplxpp.core.camera import Camera
+from smplxpp.core import BodyParams, Camera, spread
 from smplxpp.core.light import Relighting
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle, AvatarPlayer

@@ -12,9 +12,8 @@ import tyro
 from rich.console import Console
 
 from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
-from smplxpp.core.errors import MissingExtraError
+from smplxpp.core import MissingExtraError, require_at_least, require_between
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.validation import require_at_least, require_between
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle

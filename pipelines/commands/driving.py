@@ -15,8 +15,7 @@ from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.importers import UpAxis
 from smplxpp.body.retarget import Skeleton, retarget
 from smplxpp.cloth.poses import resampled
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, GeometryWarning, InputError
 from smplxpp.template.template import Template
 
 BVH = ".bvh"

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.commands.options import ClothMode
-from smplxpp.core.errors import InputError
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_folder
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
 
 SERIES = ""
 """Suffix of a folder with a file a frame."""

@@ -11,9 +11,7 @@ from rich.console import Console
 
 from pipelines.commands.templates import load_params_for, load_run_template
 from smplxpp.clean import SolidConfig, solid_of_parts
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_positive
+from smplxpp.core import InputError, TriangleMesh, require_positive
 from smplxpp.export.printing import check_solid_path, write_solid
 from smplxpp.metrics import self_intersections
 from smplxpp.metrics.distance import MM

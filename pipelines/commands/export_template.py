@@ -18,8 +18,7 @@ from pipelines.commands.templates import BUNDLE_SUFFIX, load_params_for, load_ru
 from pipelines.runs.layout import GARMENTS
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.export.amass import write_amass
 from smplxpp.export.bvh import write_bvh
 from smplxpp.template.template import Template

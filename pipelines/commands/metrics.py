@@ -22,11 +22,10 @@ from rich.progress import track
 from rich.table import Table
 
 from pipelines.commands.options import OptionalPath
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core import GeometryWarning, InputError, require_at_least
 from smplxpp.core.files.array_file import read_array, read_arrays
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.mesh_files.mesh_io import MeshFile, read_mesh
-from smplxpp.core.validation import require_at_least
 from smplxpp.metrics import CompareConfig, MeshComparison, compare, presets
 
 # A folder's frames are its geometry files; arrays (which also hold labels) only where there is nothing else.

@@ -9,10 +9,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core import InputError, MissingExtraError, require_positive
 from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.light import Irradiance, Relighting
-from smplxpp.core.validation import require_positive
 
 # Types of optional values; the help shows the plain type instead of a union with None.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(optional)")]

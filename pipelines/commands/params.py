@@ -13,8 +13,7 @@ from pipelines.commands.driving import BVH, Driving
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
 from smplxpp.body import load_body
 from smplxpp.body.importers import LayoutName, detect_layout, load_params
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 log = logging.getLogger(__name__)
 

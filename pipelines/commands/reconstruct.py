@@ -12,9 +12,8 @@ from rich.markup import escape
 
 from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText, require_avatar
 from pipelines.report.model import CheckRow
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, require_at_least, require_positive
 from smplxpp.core.files.json_file import as_object, read_json
-from smplxpp.core.validation import require_at_least, require_positive
 
 if TYPE_CHECKING:
     from pipelines.runs.stage import StageRecord

@@ -14,9 +14,8 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.report.model import CheckRow
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, require_at_least
 from smplxpp.core.files.json_file import as_object, read_json
-from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
     from pipelines.runs.stage import StageRecord

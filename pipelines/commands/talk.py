@@ -16,11 +16,9 @@ from pipelines.commands.options import ClothMode, OptionalPath, OptionalText
 from pipelines.commands.talking_page import check_page_path, live_lips, write_talking_page
 from pipelines.commands.templates import BUNDLE_SUFFIX, person_of_run
 from pipelines.figures.film import write_film
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError, require_at_least
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.wave_file import Sound, wave_bytes
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle

@@ -6,11 +6,9 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.paths import read_bytes
+from smplxpp.core import BodyParams, InputError
+from smplxpp.core.files import atomic_write_bytes, read_bytes
 from smplxpp.core.files.wave_file import Sound, wave_bytes
-from smplxpp.core.params import BodyParams
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.commands.driving import Driving, unshaped
 from pipelines.commands.options import require_avatar
 from pipelines.runs.layout import PARAMS, TEMPLATE
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template
 
 if TYPE_CHECKING:

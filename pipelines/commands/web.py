@@ -14,10 +14,8 @@ from rich.console import Console
 from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, Lighting, OptionalPath, OptionalText
 from pipelines.commands.talking_page import PAGES, live_lips
 from pipelines.commands.templates import BUNDLE_SUFFIX, export_bundle
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.validation import require_between
+from smplxpp.core import InputError, require_between
+from smplxpp.core.files import atomic_write_bytes, read_bytes
 
 if TYPE_CHECKING:
     from pipelines.web.page import PageLight

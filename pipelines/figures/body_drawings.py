@@ -9,9 +9,8 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
-from smplxpp.core.camera import Camera
+from smplxpp.core import Camera, TriangleMesh
 from smplxpp.core.colors import srgb8_from_linear
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster.shading import ShadeStyle, shade_layer
 
 LEFT, RIGHT, MIDDLE = (52, 130, 246), (232, 64, 52), (250, 205, 50)

@@ -7,9 +7,8 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from smplxpp.core import InputError, SkinWeights
 from smplxpp.core.colors import linear_from_oklab, linear_from_srgb, oklab_from_linear, srgb8_from_linear
-from smplxpp.core.errors import InputError
-from smplxpp.core.skin_weights import SkinWeights
 
 # Anchors from low to high. Every map is monotone in lightness, or symmetric about its middle, and keeps its meaning
 # for readers with a colour deficiency.

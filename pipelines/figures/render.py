@@ -9,10 +9,8 @@ from jaxtyping import Float, UInt8
 
 from pipelines.figures.colors import heat_colors
 from pipelines.figures.sheets import color_bar
-from smplxpp.core.camera import Camera
+from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import ShadeStyle, render_shaded
 from smplxpp.raster.shading import resolve, shade_layer
 

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Num
 
 from pipelines.runs.manifest import STATUSES, require_check
-from smplxpp.core.checks import Check
-from smplxpp.core.errors import InputError
+from smplxpp.core import Check, InputError
 
 _SIGNATURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 

@@ -23,13 +23,9 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import MANIFEST, StageRecord
 from smplxpp.body import BodyModel, load_params
 from smplxpp.build.data import LocatedInScan, Part, PosedFit, PreparedScan
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import read_arrays
-from smplxpp.core.files.json_file import as_integer, as_numbers
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, SkinWeights, TriangleMesh
+from smplxpp.core.files import as_integer, as_numbers, read_arrays
 from smplxpp.core.files.safe_pickle import safe_npz
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.skinning import Unposed
 
 LOCATED_FILES = ("params.npz", "labels.npz")

@@ -29,10 +29,8 @@ from typing import Any, Literal
 
 from pipelines.runs.code import GEOMETRY, code_of, sha256_file, versions
 from pipelines.runs.manifest import SCHEMA, read_record
-from smplxpp.core.checks import StageOutput
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.files.json_file import jsonable
+from smplxpp.core import InputError, StageOutput
+from smplxpp.core.files import atomic_folder, atomic_write_text, jsonable
 
 MANIFEST, STATE_RECORD = "manifest.json", "stage.json"
 DIFFERENCES_SHOWN = 3

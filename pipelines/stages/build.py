@@ -22,11 +22,8 @@ from pipelines.stages.reconstruct import reconstruct_capture
 from pipelines.stages.register_capture import register_capture
 from smplxpp.build.config import ReconstructInputs, RegisterInputs, resolved
 from smplxpp.build.inputs import check_inputs
-from smplxpp.core.checks import StageOutput
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import jsonable
-from smplxpp.core.validation import require_choice
+from smplxpp.core import InputError, StageOutput, require_choice
+from smplxpp.core.files import atomic_write_text, jsonable
 from smplxpp.detect import load_detector
 from smplxpp.register import read_landmarks
 from smplxpp.segment import Corrections

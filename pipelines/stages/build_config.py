@@ -16,8 +16,7 @@ from smplxpp.assemble import FillHolesConfig
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.clean import BridgeConfig
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, read_json
+from smplxpp.core.files import as_integer, as_list, as_object, as_text, atomic_write_text, read_json
 from smplxpp.core.files.paths import absolute
 
 log = logging.getLogger(__name__)

@@ -49,11 +49,8 @@ from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
-from smplxpp.core.checks import Check
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
+from smplxpp.core import CLOTH_LABELS, Check, InputError, ProgressCallback, ignore_progress, require_known
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.validation import require_known
 from smplxpp.metrics.distance import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
 from smplxpp.template.template import Template

@@ -19,9 +19,7 @@ from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.protocols import EXACT
 from smplxpp.capture.recording import ParamSource
 from smplxpp.capture.sources import StackedParams
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
+from smplxpp.core import BodyParams, InputError, spread
 from smplxpp.metrics import PoseError, mean_pose_error, pose_error
 from smplxpp.raster import outer_visible_points
 from smplxpp.template.template import Template

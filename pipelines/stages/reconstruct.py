@@ -31,10 +31,8 @@ from smplxpp.build.reconstruct import (
     write_surface,
 )
 from smplxpp.capture import Capture
-from smplxpp.core.checks import StageOutput
-from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
-from smplxpp.core.files.atomic import atomic_folder
-from smplxpp.core.files.json_file import as_object, jsonable, read_json
+from smplxpp.core import GeometryWarning, InputError, ProgressCallback, StageOutput, ignore_progress
+from smplxpp.core.files import as_object, atomic_folder, jsonable, read_json
 
 _SHARES = {"masks": 0.0, "hull": 0.1, "photographs": 0.2, "colours": 0.9}
 """Progress within a frame, from 0 to 1, at which each step begins."""

@@ -30,8 +30,7 @@ from pipelines.stages.run_inputs import params_in_use, params_to_begin_with, rec
 from pipelines.stages.scene import TrainInputs, of_protocol, open_scene, open_views
 from smplxpp.capture.declared import has_estimated_params
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import jsonable
+from smplxpp.core.files import atomic_write_text, jsonable
 
 log = logging.getLogger(__name__)
 

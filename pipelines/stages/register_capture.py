@@ -20,10 +20,8 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.build.observe import Observed, observe
 from smplxpp.build.register import register_observed, stacked_rows
 from smplxpp.capture import Capture
-from smplxpp.core.checks import StageOutput
-from smplxpp.core.errors import ProgressCallback, ignore_progress
+from smplxpp.core import ARRAY_NAMES, ProgressCallback, StageOutput, ignore_progress
 from smplxpp.core.files.json_file import jsonable
-from smplxpp.core.params import ARRAY_NAMES
 from smplxpp.register import Observations, RegisterConfig
 
 

@@ -19,10 +19,9 @@ from pipelines.runs.code import TRAINING, sha256_file
 from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import PARAMS, RELIGHT_STAGE, STUDENT, TEMPLATE
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.light import Relighting
-from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template
 
 HEIGHT = 560

@@ -17,9 +17,8 @@ from smplxpp.build.segment import label_source
 from smplxpp.capture import Capture
 from smplxpp.capture.declared import LABEL_WORDS, NOT_KNOWN, DeclaredInputs
 from smplxpp.capture.protocols import EXACT, TRACKED
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.paths import lies_in, same_place
-from smplxpp.core.params import BodyParams
 
 log = logging.getLogger(__name__)
 MADE_BY = {REGISTERED_PARAMS: "registered", REFINED_PARAMS: "refined"}

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from pipelines.synth.person import PART_NAMES, Person
 from pipelines.synth.scan_simulation import SimulatedScan
 from pipelines.synth.simulate import Take
-from smplxpp.core.mesh import TriangleMesh, row_lengths
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, TriangleMesh, row_lengths
 from smplxpp.core.signed_distance import SignedDistanceField
 
 _MM = 1e3

@@ -17,11 +17,8 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.writers.arrays import save_params_by_row
 from smplxpp.capture.writers.metadata import write_cameras_json, write_description
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
-from smplxpp.core.files.json_file import read_json
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least
+from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_at_least
+from smplxpp.core.files import atomic_folder, atomic_write_text, read_json
 
 _DESCRIPTIONS = ("capture.json", "manifest.json")
 

@@ -13,10 +13,8 @@ from pipelines.synth import textures
 from pipelines.synth.cloth_mesh import ClothMesh, clip, lift_outside, loop_subdivide, outer_faces, smooth, submesh
 from pipelines.synth.patterns import skirt_colors
 from smplxpp.body import BodyModel, load_body
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.files.array_file import read_arrays
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
 from smplxpp.skinning import skin
 
 PART_NAMES = ("body", "upper", "lower", "shoes", "hair")

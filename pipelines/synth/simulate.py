@@ -12,9 +12,7 @@ from pipelines.synth.garment_dynamics import ContactSurface, GarmentConfig, Garm
 from pipelines.synth.motion import Motion
 from pipelines.synth.patterns import ramp
 from pipelines.synth.person import PART_NAMES, Person, rest_joints
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
 
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from smplxpp.core.camera import Camera
+from smplxpp.core import Camera, TriangleMesh, require_positive
 from smplxpp.core.light import Irradiance, panorama_directions
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_positive
 from smplxpp.raster import rasterize_mesh, view_directions
 
 # Radiance of the stage from above and from below: brighter above, as lit stages are.

@@ -19,8 +19,7 @@ from scipy.interpolate import PchipInterpolator
 from avatar.speech.gesture_lexicon import ARM_JOINTS, ARM_POSES, MIRROR, ArmPose
 from pipelines.synth.motion import JAW_DEGREES, relaxed_pose, wander
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_positive
+from smplxpp.core import BodyParams, require_positive
 
 # Mouth shapes, and looks of the rest of the face, as weights of expressions.
 _VISEMES: tuple[dict[str, float], ...] = (

@@ -20,9 +20,7 @@ from smplxpp.capture.keypoints import moved_keypoints
 from smplxpp.capture.views import read_labels
 from smplxpp.capture.writers.arrays import write_keypoints
 from smplxpp.capture.writers.images import write_gray_png
-from smplxpp.core.camera import Camera
-from smplxpp.core.labels import BACKGROUND
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BACKGROUND, BodyParams, Camera
 from smplxpp.raster import rasterize_mesh
 from smplxpp.segment.labels import find_label_set
 

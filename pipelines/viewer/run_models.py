@@ -17,8 +17,7 @@ from jaxtyping import Float
 from pipelines.runs.layout import ALL_STAGES, BAKED, GARMENTS, GAUSSIANS, MODEL_STAGES, REFINE_STAGE, STUDENT, TEACHER
 from pipelines.runs.stage import STATE_RECORD
 from smplxpp.cloth.garment_file import load_garments
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from smplxpp.body import load_params
 from smplxpp.body.bvh_params import load_bvh
 from smplxpp.body.retarget import Skeleton
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError
 from smplxpp.template.template import Template
 
 log = logging.getLogger(__name__)

@@ -24,8 +24,7 @@ from pipelines.viewer.session import LabelledScan, LabelSession
 from smplxpp.build.prepare import GREY
 from smplxpp.build.scan import read_scan
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.files.array_file import read_arrays
-from smplxpp.core.files.json_file import as_numbers
+from smplxpp.core.files import as_numbers, read_arrays
 from smplxpp.register import read_landmarks
 from smplxpp.segment import Corrections
 

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.viewer.run_session import Coloring, Layer, RunSession
 from pipelines.viewer.scene import colored_glb
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh
 
 SPLATS, TRACKED, PHOTOGRAPHS = "/gaussians", "/followed", "/photographs"
 _FIELD = np.radians(40.0)

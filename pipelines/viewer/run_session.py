@@ -24,11 +24,8 @@ from pipelines.viewer.run_models import (
 from pipelines.viewer.run_motion import ShownMotion, capture_of_run, motion_of_run
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import Capture
-from smplxpp.core.labels import display_colors
+from smplxpp.core import POSE_BLOCKS, BodyParams, display_colors, matrix_from_rotvec, require_choice, rotvec_from_matrix
 from smplxpp.core.light import Relighting
-from smplxpp.core.params import POSE_BLOCKS, BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.core.validation import require_choice
 from smplxpp.template.template import Template
 
 if TYPE_CHECKING:

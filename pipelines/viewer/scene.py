@@ -11,8 +11,7 @@ from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from pipelines.figures.colors import heat_colors
 from pipelines.viewer.session import LabelSession, UncertainRegion, lies_within
-from smplxpp.core.labels import LABELS, display_colors
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import LABELS, TriangleMesh, display_colors
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
 from smplxpp.export.gltf_mesh import linear_rgba16
 

@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64, UInt8
 
 from pipelines.runs.layout import CORRECTIONS_FILE, LANDMARKS_FILE
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core import LABELS, InputError, TriangleMesh, normalize_rows
 from smplxpp.core.topology import component_labels
 from smplxpp.register import write_landmarks
 from smplxpp.segment import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection

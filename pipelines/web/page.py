@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.paths import read_bytes, read_text
+from smplxpp.core.files import atomic_write_bytes, read_bytes, read_text
 from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
 from smplxpp.core.light import Relighting
 

@@ -6,8 +6,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Int64, UInt8
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 
 
 def body_colors_from_scan(

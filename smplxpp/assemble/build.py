@@ -21,11 +21,8 @@ from smplxpp.assemble.layers import (
 )
 from smplxpp.assemble.push_out import PushConfig, flipped_faces, push_out, stand_off
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.labels import LAYER_ORDER, SKIN
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import SKIN, BodyParams, GeometryWarning, InputError, SkinWeights, TriangleMesh, concatenate_meshes
+from smplxpp.core.labels import LAYER_ORDER
 from smplxpp.template.template import BODY_PART, Template
 
 

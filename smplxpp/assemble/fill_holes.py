@@ -10,11 +10,8 @@ from jaxtyping import Int
 
 from smplxpp.assemble.build import CanonicalPart
 from smplxpp.assemble.patch import Patch, patch_loop
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import InputError, SkinWeights, TriangleMesh, require_at_least
 from smplxpp.core.topology import border_loops
-from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)

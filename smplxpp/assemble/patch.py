@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core import InputError, TriangleMesh, row_lengths
 from smplxpp.core.topology import edge_groups, half_edges
 
 MAX_LOOP = 400

@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from smplxpp.assemble.layers import TOUCHING, Obstacle, face_centers
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_at_least, require_between
+from smplxpp.core import TriangleMesh, require_at_least, require_between
 
 
 @dataclass(frozen=True)

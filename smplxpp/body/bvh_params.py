@@ -13,10 +13,8 @@ from jaxtyping import Float64
 from smplxpp.body.bvh import BvhMotion, read_bvh
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.retarget import FEET, Skeleton, held_feet
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError, rotvec_from_matrix
 from smplxpp.core.files.json_file import as_object, as_text, read_json
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import rotvec_from_matrix
 
 _FINGERS = SMPLX_JOINTS[25:]
 OURS = (*SMPLX_JOINTS[:22], *_FINGERS)

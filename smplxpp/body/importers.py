@@ -13,11 +13,9 @@ import numpy as np
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
 from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise, without_holes
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import safe_load, safe_npz
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 
 LayoutName = Literal["auto", "smplx", "amass", "easymocap", "avatarrex", "talkbody4d"]
 _SUFFIXES = (".npz", ".json", ".pkl")

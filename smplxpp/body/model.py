@@ -10,10 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 
 from smplxpp.body.layout import HAND_WIDTH, POSE_NAMES
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
-from smplxpp.core.rotations import Array, array_namespace, matrix_from_rotvec
+from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, InputError, TriangleMesh, matrix_from_rotvec
+from smplxpp.core.rotations import Array, array_namespace
 from smplxpp.skinning.linear_blend import forward_kinematics, skin
 
 _WIDTHS = {name: 3 * joints for name, joints in POSE_BLOCKS} | {"transl": 3}

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.body.layout import JOINT_NAMES, SMPLX_JOINTS
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
 _Rotations = Mapping[str, tuple[tuple[float, float, float], ...]]
 # Rotation vectors of the left side's joints, degrees, of which the first is applied last; the right side is the mirror

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, GeometryWarning, InputError
 from smplxpp.core.files.json_file import as_numbers
-from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
 
 _JOINTS = dict(POSE_BLOCKS)
 _EASYMOCAP_HAND_PCA = 6

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
 MARGIN = np.radians(10.0)
 """Angle in radians by which a joint may exceed the training and still count as inside its range."""

@@ -13,9 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, matrix_from_rotvec
 from smplxpp.skinning.linear_blend import forward_kinematics
 
 _LEG = ("hip", "knee", "ankle")

@@ -19,10 +19,7 @@ from smplxpp.assemble import (
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
-from smplxpp.core.checks import Check, StageOutput
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import SKIN
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Check, InputError, SKIN, StageOutput
 from smplxpp.metrics.distance import MM
 from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
 from smplxpp.template.template import Template

@@ -19,12 +19,7 @@ from smplxpp.build.limits import (
 from smplxpp.capture.cameras import read_lenses
 from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
-from smplxpp.core.camera import Camera
-from smplxpp.core.checks import Check
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import BACKGROUND, SKIN
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BACKGROUND, BodyParams, Camera, Check, InputError, SKIN, TriangleMesh
 from smplxpp.metrics import DirectedDistances, mirror_ratio, mirrored_by_views, point_to_surface
 from smplxpp.metrics.completeness import ENDS, TRUNK_AND_LIMBS, body_regions, far_patches, uncovered_body
 from smplxpp.metrics.distance import MM

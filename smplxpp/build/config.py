@@ -13,11 +13,7 @@ from smplxpp.assemble import FillHolesConfig
 from smplxpp.capture import Capture
 from smplxpp.clean import BridgeConfig
 from smplxpp.clean.scan_frame import AUTO
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import MeshLike
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least, require_between, require_choice
+from smplxpp.core import BodyParams, InputError, LABELS, MeshLike, require_at_least, require_between, require_choice
 
 STEPS = (
     *("reconstruct", "locate", "register"),

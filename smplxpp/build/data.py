@@ -8,10 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64, Integer, UInt8
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, InputError, SkinWeights, TriangleMesh
 
 
 @dataclass(frozen=True, eq=False)

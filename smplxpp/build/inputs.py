@@ -16,11 +16,8 @@ from smplxpp.capture.declared import DeclaredInputs
 from smplxpp.capture.protocols import TRACKED, choose_protocol, read_description
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.clean.scan_frame import AUTO
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError, MeshLike, spread
 from smplxpp.core.files.paths import same_place
-from smplxpp.core.mesh import MeshLike
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
 from smplxpp.segment import find_label_set
 
 log = logging.getLogger(__name__)

@@ -15,11 +15,8 @@ from smplxpp.build.data import LocatedInScan
 from smplxpp.build.scan import ScanFile
 from smplxpp.build.scan_keypoints import facing, keypoints_of_scan
 from smplxpp.clean import smooth_if_rough
-from smplxpp.core.checks import Check, StageOutput
+from smplxpp.core import BACKGROUND, BodyParams, Check, StageOutput, TriangleMesh
 from smplxpp.core.files.json_file import jsonable
-from smplxpp.core.labels import BACKGROUND
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
 from smplxpp.detect import load_detector
 from smplxpp.register import ScanObservation, bare_of_scan, read_landmarks
 from smplxpp.register.locate import LocatedBody, locate_body

@@ -17,11 +17,7 @@ from smplxpp.build.locate import landmark_points
 from smplxpp.build.observed_scans import observed_scans
 from smplxpp.build.opened import opened
 from smplxpp.capture import Capture, find_scans, scans_in
-from smplxpp.core.errors import InputError
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.labels import BACKGROUND
-from smplxpp.core.mesh import MeshLike
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BACKGROUND, BodyParams, InputError, Keypoints2D, MeshLike
 from smplxpp.register import LandmarkModel, Observations
 from smplxpp.segment import map_labels
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.sources import FrameParams
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 
 def with_params(capture: Capture, frames: tuple[int, ...], params: BodyParams, *, estimated: bool) -> Capture:

@@ -13,10 +13,7 @@ from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges
-from smplxpp.core.checks import Check, StageOutput
-from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import Check, LABELS, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
 from smplxpp.metrics.distance import MM
 from smplxpp.skinning import UnposeConfig, Unposed, unpose

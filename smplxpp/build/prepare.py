@@ -10,10 +10,7 @@ from smplxpp.build.data import PosedFit, PreparedScan
 from smplxpp.build.limits import ROUGHNESS
 from smplxpp.build.scan import ScanFile
 from smplxpp.clean import smooth_if_rough
-from smplxpp.core.checks import Check, StageOutput
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Check, InputError, StageOutput, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.metrics.distance import MM
 

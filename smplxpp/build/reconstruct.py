@@ -17,8 +17,7 @@ from smplxpp.build.limits import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
 from smplxpp.build.opened import opened
 from smplxpp.capture import Capture
 from smplxpp.clean import sanitize
-from smplxpp.core.checks import Check, StageOutput
-from smplxpp.core.errors import InputError, ProgressCallback
+from smplxpp.core import Check, InputError, ProgressCallback, StageOutput
 from smplxpp.core.files.json_file import as_number, as_numbers, as_object, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.reconstruct import (

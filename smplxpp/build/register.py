@@ -11,9 +11,7 @@ from jaxtyping import Float64
 
 from smplxpp.body import BodyModel
 from smplxpp.build.observe import Observed
-from smplxpp.core.checks import Check, StageOutput
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core import ARRAY_NAMES, BodyParams, Check, InputError, ProgressCallback, StageOutput, ignore_progress
 from smplxpp.register import BodyFit, LandmarkModel, Observations, RegisterConfig, follow, lost_frames, register
 
 CONFIDENT = 0.5

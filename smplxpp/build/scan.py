@@ -17,8 +17,7 @@ from jaxtyping import Int64, UInt8
 from smplxpp.clean import PointSurface, check_human_scale, convert_points, sanitize, surface_from_points
 from smplxpp.clean.repair import Sanitized
 from smplxpp.clean.scan_frame import AUTO, find_scan_frame
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import MeshLike, as_mesh
+from smplxpp.core import GeometryWarning, InputError, MeshLike, as_mesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes
 from smplxpp.segment import map_labels, read_labels

@@ -8,10 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_at_least
+from smplxpp.core import InputError, Keypoints2D, ProgressCallback, TriangleMesh, ignore_progress, require_at_least
 from smplxpp.detect import Detector
 from smplxpp.raster import ShadeStyle, render_shaded, turntable_cameras
 from smplxpp.register import Triangulation, TriangulationConfig, triangulate

@@ -14,13 +14,9 @@ from smplxpp.build.config import BuildInputs
 from smplxpp.build.data import PreparedScan
 from smplxpp.build.scan import ScanFile, scan_file_labels
 from smplxpp.capture import read_cameras
-from smplxpp.core.checks import Check, StageOutput
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.labels import SKIN
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import BodyParams, Check, GeometryWarning, InputError, SKIN, StageOutput, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh
-from smplxpp.core.params import BodyParams
 from smplxpp.segment import (
     Corrections,
     SegmentedScan,

@@ -38,10 +38,7 @@ from smplxpp.build.segment import label_faces
 from smplxpp.build.validate import validate_template
 from smplxpp.capture import Capture
 from smplxpp.clean.remesh import require_remesher
-from smplxpp.core.checks import StageOutput
-from smplxpp.core.errors import ignore_progress
-from smplxpp.core.mesh import MeshLike
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, MeshLike, StageOutput, ignore_progress
 from smplxpp.detect import load_detector
 from smplxpp.register import RegisterConfig
 from smplxpp.segment import Corrections

@@ -15,13 +15,8 @@ from smplxpp.build.completeness import completeness_checks, photograph_checks
 from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PreparedScan
 from smplxpp.clean import loop_lengths, thickened
-from smplxpp.core.checks import Check, StageOutput
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, CLOTH_LABELS, Check, InputError, LABELS, SKIN, StageOutput, TriangleMesh, spread
 from smplxpp.core.solids import closed_mesh
-from smplxpp.core.spread import spread
 from smplxpp.core.topology import border_loops
 from smplxpp.metrics import (
     CompareConfig,

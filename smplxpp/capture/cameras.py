@@ -11,11 +11,8 @@ import numpy as np
 
 from smplxpp.capture.distortion import OPENCV, Distortion
 from smplxpp.capture.readers.common import inverted, pinhole, required
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.json_file import as_integer, as_list, as_numbers, as_text, read_json
-from smplxpp.core.files.paths import read_text, regular_file
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import Camera, InputError, matrix_from_rotvec
+from smplxpp.core.files import as_integer, as_list, as_numbers, as_text, read_json, read_text, regular_file
 
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 

@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, require_choice
 from smplxpp.core.files.json_file import as_numbers
-from smplxpp.core.validation import require_choice
 from smplxpp.native import address, check_size, native_library
 
 OPENCV, FISHEYE, FOV = LENS_MODELS = ("opencv", "fisheye", "fov")

@@ -23,11 +23,9 @@ from smplxpp.capture.keypoint_people import (
     mmpose_people,
     openpose_people,
 )
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, Keypoints2D, require_choice
 from smplxpp.core.files.json_file import as_numbers, read_json
 from smplxpp.core.files.safe_pickle import safe_npz
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.validation import require_choice
 
 KeypointFormat = Literal["auto", "simple", "openpose", "openpose-25b", "easymocap", "mmpose", "coco", "mediapipe"]
 _HOLISTIC = ("pose", "face", "left_hand", "right_hand")

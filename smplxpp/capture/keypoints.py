@@ -13,9 +13,7 @@ from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.keypoint_files import KeypointFiles, KeypointFormat, KeypointOptions, find_places
 from smplxpp.capture.recording import Recording
 from smplxpp.capture.window import Window
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core import Camera, InputError, Keypoints2D
 
 
 def with_keypoints(recording: Recording, folder: Path, options: KeypointOptions | None = None) -> Recording:

@@ -11,8 +11,7 @@ import numpy as np
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.distortion import Distortion, RationalDistortion
 from smplxpp.capture.recording import Problem
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 
 
 def find_problems(capture: Capture, *, decode: bool = True) -> list[Problem]:

@@ -13,10 +13,7 @@ from jaxtyping import Int64
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.splits import Splits
-from smplxpp.core.camera import Camera
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera, Keypoints2D, TriangleMesh
 
 KINDS = ("image", "mask", "label", "normal")
 """Kinds of image files of a view."""

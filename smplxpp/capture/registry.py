@@ -26,8 +26,7 @@ from smplxpp.capture.readers import (
 from smplxpp.capture.readers.common import ReaderOptions
 from smplxpp.capture.splits import Splits
 from smplxpp.capture.window import Window
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_choice
+from smplxpp.core import InputError, require_choice
 
 _MODULES = (simple, actorshq, talkbody4d, avatarrex, thuman4, dress4d, neus2, easymocap, colmap)
 READERS = {reader.NAME: reader for reader in _MODULES}

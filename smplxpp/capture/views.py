@@ -11,8 +11,7 @@ from jaxtyping import Float32, UInt8
 
 from smplxpp.capture.distortion import Distortion, undistort
 from smplxpp.capture.window import Window
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.core.files.array_file import read_array
 from smplxpp.core.files.image_file import open_image
 

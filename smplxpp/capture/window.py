@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 
 if TYPE_CHECKING:
     from PIL.Image import Image

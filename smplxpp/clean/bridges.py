@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from smplxpp.clean.components import drop_specks
-from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core import TriangleMesh, require_at_least, row_lengths
 from smplxpp.core.topology import manifold_corners
-from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True)

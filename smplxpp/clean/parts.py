@@ -12,11 +12,8 @@ from jaxtyping import Int, Int64, UInt8
 from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.remesh import METHODS, remesh, require_remesher
 from smplxpp.clean.simplify import simplify
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABEL_BY_NAME, LABELS, SKIN
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
+from smplxpp.core import LABEL_BY_NAME, LABELS, SKIN, InputError, MeshLike, TriangleMesh, as_mesh, require_choice
 from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
-from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,8 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from smplxpp.clean.simplify import Simplified, opposed_faces, separate_doubled_vertices
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, MissingExtraError, TriangleMesh, require_at_least
 from smplxpp.core.topology import manifold_corners
-from smplxpp.core.validation import require_at_least
 
 METHODS = ("quadric", "isotropic")
 """Methods that bring a part to its face budget: `simplify`, or `remesh`."""

@@ -11,8 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh
 from smplxpp.core.topology import component_labels, half_edges, manifold_corners, paired_half_edges
 
 

@@ -9,12 +9,8 @@ from jaxtyping import Float, Float64, Int, Num
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import standing_poses
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec, require_choice
 from smplxpp.core.surface_points import SurfacePoints, truncated_distance
-from smplxpp.core.validation import require_choice
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 # Rotations from a frame with the named upward axis to one with +Y, both right-handed.

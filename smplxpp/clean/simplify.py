@@ -9,9 +9,8 @@ import igl
 import numpy as np
 from jaxtyping import Int64
 
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import TriangleMesh, require_at_least
 from smplxpp.core.topology import component_labels, edge_groups, manifold_corners
-from smplxpp.core.validation import require_at_least
 
 # Fraction of an edge. Vertices joined by an edge below this fraction of the mean edge coincide (0.09 mm on a garment of
 # 20,000 faces); doubled vertices are separated by this fraction of their distance to their neighbours.

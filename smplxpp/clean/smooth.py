@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
-from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core import GeometryWarning, TriangleMesh, row_lengths
 
 ROUGH = 0.3
 """Roughness (`roughness`) from which a scan is smoothed: more noise flips faces. Available scans have 0.04 to 0.09."""

@@ -13,13 +13,11 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from smplxpp.clean.thicken import slab_behind, thickened
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh, require_at_least, require_positive
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.solids import closed_mesh, mesh_of_solid, solid_of_mesh
 from smplxpp.core.surface_points import draw_on_surface
 from smplxpp.core.topology import component_labels, face_components
-from smplxpp.core.validation import require_at_least, require_positive
 
 # Edges shorter than this fraction of the size are collapsed: 17 um on an adult, 2 um on a figure of 180 mm.
 _SHORT = 1e-5

@@ -11,9 +11,7 @@ from jaxtyping import Float
 
 from smplxpp.cloth.driver import ClothDriver, DriverConfig
 from smplxpp.cloth.garment import Garment, GarmentConfig
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least, require_between
+from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_at_least, require_between
 from smplxpp.template.template import Template
 
 # Farther than this from the followed surface a particle says no more: it hangs in another fold.

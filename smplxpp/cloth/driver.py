@@ -14,9 +14,7 @@ from smplxpp.cloth.fabric import SolverConfig
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.cloth.thread import GarmentThread
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least, require_choice, require_positive
+from smplxpp.core import BodyParams, InputError, require_at_least, require_choice, require_positive
 from smplxpp.template.template import Template
 
 # Longest step that is simulated; a longer one is a cut.

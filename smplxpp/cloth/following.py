@@ -9,8 +9,7 @@ import numpy as np
 
 from smplxpp.cloth.driver import DriverConfig
 from smplxpp.cloth.poses import resampled, smoothed
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_positive
+from smplxpp.core import BodyParams, require_positive
 
 SLOWEST = 40.0
 """Poses a second at least that clothes follow: places that go straight from pose to pose cut the corners of limbs."""

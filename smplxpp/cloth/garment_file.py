@@ -14,11 +14,8 @@ from smplxpp.cloth.collider import ColliderMesh
 from smplxpp.cloth.embedding import Embedding
 from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.garment import Garment, GarmentConfig
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import read_arrays, write_arrays
-from smplxpp.core.files.json_file import as_list, as_number, as_object, as_text, parse_json
-from smplxpp.core.mesh import TriangleMesh, row_lengths
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError, TriangleMesh, row_lengths
+from smplxpp.core.files import as_list, as_number, as_object, as_text, parse_json, read_arrays, write_arrays
 from smplxpp.template.template import Template
 
 SCHEMA = 1

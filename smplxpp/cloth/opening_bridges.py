@@ -13,9 +13,7 @@ from smplxpp.cloth.cloth_mesh import (
     opening_axis,
     turned_over,
 )
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import CLOTH_LABELS, InputError, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.topology import border_loops, face_adjacency, face_components
 from smplxpp.template.template import BODY_PART, Template

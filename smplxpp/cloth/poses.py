@@ -9,9 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import POSE_BLOCKS, BodyParams
-from smplxpp.core.validation import require_at_least
+from smplxpp.core import POSE_BLOCKS, BodyParams, InputError, require_at_least
 
 # Blocks of axis-angle vectors; hands may be coefficients, which are mixed as numbers.
 _ROTATIONS = tuple(name for name, _ in POSE_BLOCKS)

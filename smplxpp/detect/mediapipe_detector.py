@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from smplxpp.body.layout import FACE, LEFT_HAND, MEDIAPIPE_FACE, MEDIAPIPE_POSE, RIGHT_HAND
-from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.validation import require_between
+from smplxpp.core import InputError, MissingExtraError, require_between
 from smplxpp.detect.detector import RELIABLE, Box, DetectedPerson, grown, inside, most_confident_first
 from smplxpp.detect.plates import cleaned
 

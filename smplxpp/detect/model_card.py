@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from smplxpp.body.layout import BODY_25B, BY_COUNT, COCO_17, VOCABULARY, Order
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, require_between, require_choice
 from smplxpp.core.files.json_file import as_list, as_number, as_numbers, as_object, as_text, read_json
-from smplxpp.core.validation import require_between, require_choice
 
 LAYOUTS: dict[str, Order] = {
     "coco-17": COCO_17,

@@ -9,8 +9,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float32, UInt8
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_between, require_positive
+from smplxpp.core import InputError, require_at_least, require_between, require_positive
 
 
 @dataclass(frozen=True)

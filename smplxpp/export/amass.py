@@ -9,11 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, matrix_from_rotvec, require_positive, rotvec_from_matrix
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.core.validation import require_positive
 
 _BETAS = 16
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

@@ -8,10 +8,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, require_positive
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
-from smplxpp.core.validation import require_positive
 
 UNITS_A_METRE = 100.0
 """BVH has no unit of its own; animation programs take it as centimetres."""

@@ -12,9 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
-from smplxpp.core.validation import require_positive
+from smplxpp.core import DEFAULT_FPS, BodyParams, GeometryWarning, InputError, require_positive
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.template.template import Template

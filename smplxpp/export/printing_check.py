@@ -8,10 +8,9 @@ from pathlib import Path
 import igl
 import numpy as np
 
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.files.package_file import zip_member
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.topology import half_edges
 

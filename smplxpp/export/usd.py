@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from smplxpp.core import DEFAULT_FPS, LABELS, BodyParams, GeometryWarning, require_positive
 from smplxpp.core.colors import decode_srgb
-from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.labels import LABELS
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
-from smplxpp.core.validation import require_positive
 from smplxpp.export.gltf_animation import joint_motion
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.export.usd_stage import open_usd, usd_modules

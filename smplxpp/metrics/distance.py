@@ -10,11 +10,8 @@ import numpy as np
 from jaxtyping import Float64, Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABELS
-from smplxpp.core.mesh import MeshLike, as_mesh
+from smplxpp.core import LABELS, InputError, MeshLike, as_mesh, require_at_least, require_positive
 from smplxpp.core.signed_distance import barycentric_coordinates
-from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.metrics.conventions import DEFAULT, Convention, convention_named
 from smplxpp.metrics.sampling import (
     SurfaceSamples,

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
+from smplxpp.core import InputError, MeshLike, TriangleMesh, as_mesh, require_at_least
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.core.validation import require_at_least
 from smplxpp.metrics.distance import MM
 
 # Nearer to the surface than this share of the mesh's size the sign of the distance is rounding.

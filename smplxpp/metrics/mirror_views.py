@@ -10,10 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.ndimage import binary_erosion, uniform_filter
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh, spread
 from smplxpp.core.rotations import rotation_between
-from smplxpp.core.spread import spread
 from smplxpp.metrics.mirror import aligned, reflected, search_tree
 from smplxpp.raster import rasterize_mesh
 

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float64
 
 from smplxpp.body import BodyModel
 from smplxpp.body.model import PosedBody
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.metrics.distance import MM
 
 CONVENTION = (

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64, Integer, Shaped
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh, normalize_rows
+from smplxpp.core import InputError, MeshLike, TriangleMesh, as_mesh, normalize_rows, require_at_least
 from smplxpp.core.surface_points import draw_on_surface
-from smplxpp.core.validation import require_at_least
 
 
 @dataclass(frozen=True, eq=False)

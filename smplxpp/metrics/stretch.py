@@ -7,9 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh, row_lengths
-from smplxpp.core.validation import require_positive
+from smplxpp.core import InputError, MeshLike, TriangleMesh, as_mesh, require_positive, row_lengths
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float, Float64, Integer, Num
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import InputError, SkinWeights
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from smplxpp.core.camera import Camera
+from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb, srgb8_from_linear
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh
 
 # In camera axes (x right, y down, z forward): from the surface to the light, above and left of the camera.

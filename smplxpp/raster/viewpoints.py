@@ -7,10 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_known
+from smplxpp.core import Camera, InputError, TriangleMesh, require_known
 
 # Directions from the body to the camera. The body stands along +y and faces +z; its left is +x.
 VIEWS: dict[str, tuple[float, float, float]] = {

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh
 from smplxpp.raster.zbuffer import rasterize_mesh
 
 

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer, Num
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.native import address, check_size, native_library, thread_count
 
 

@@ -9,8 +9,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.topology import face_components
 from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
 from smplxpp.reconstruct.views import Box

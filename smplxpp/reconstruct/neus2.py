@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.reconstruct.views import PhotoView, silhouette_agreement
 
 SPACES = ("world", "cube", "turned cube")

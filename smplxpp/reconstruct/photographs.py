@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core import Camera, TriangleMesh, normalize_rows
 from smplxpp.raster import rasterize_mesh
 from smplxpp.reconstruct.views import PhotoView
 

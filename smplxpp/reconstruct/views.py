@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core import Camera, InputError, TriangleMesh, normalize_rows
 from smplxpp.raster import rasterize_mesh
 
 INSIDE = 127.5

@@ -15,11 +15,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
 from smplxpp.body import BodyModel
-from smplxpp.core.camera import Camera
-from smplxpp.core.labels import SKIN
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
+from smplxpp.core import SKIN, BodyParams, Camera, TriangleMesh, spread
 from smplxpp.raster import rasterize_mesh
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics
 from smplxpp.register.landmarks import is_finger

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.spread import spread
+from smplxpp.core import InputError, ProgressCallback, ignore_progress, spread
 from smplxpp.register.clothing import bare_vertices, hand_vertices
 from smplxpp.register.keypoint_term import KeypointTerm, PreparedKeypoints, prepare_keypoints
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.camera import Camera
-from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core import Camera, Keypoints2D
 from smplxpp.register.keypoint_faults import exchanged, sides_are_exchanged
 from smplxpp.register.kinematics import Kinematics, Posture
 from smplxpp.register.landmarks import LandmarkModel, LandmarkPoints

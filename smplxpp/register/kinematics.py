@@ -20,8 +20,7 @@ from jaxtyping import Bool, Float, Float64, Integer
 
 from smplxpp.body import BodyModel
 from smplxpp.body.layout import POSE_NAMES
-from smplxpp.core.params import POSE_BLOCKS, BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import POSE_BLOCKS, BodyParams, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.skinning.linear_blend import forward_kinematics
 
 

@@ -13,8 +13,7 @@ from jaxtyping import Float, Float64, Int64
 
 from smplxpp.body import BodyModel
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import as_numbers, as_object, read_json
+from smplxpp.core.files import as_numbers, as_object, atomic_write_text, read_json
 from smplxpp.register.kinematics import BodyPoints, Kinematics, PointsMotion, Posture
 
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")

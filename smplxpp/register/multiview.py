@@ -12,8 +12,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import Camera, matrix_from_rotvec
 
 # Points that are solved at once, which bounds the memory.
 _CHUNK = 8192

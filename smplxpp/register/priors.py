@@ -22,8 +22,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from smplxpp.body.layout import JOINT_NAMES
-from smplxpp.core.params import DEFAULT_FPS
-from smplxpp.core.rotations import rotvec_from_matrix
+from smplxpp.core import DEFAULT_FPS, rotvec_from_matrix
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.normal_equations import Columns, NormalEquations
 from smplxpp.register.observations import RegisterConfig

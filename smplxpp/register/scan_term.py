@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
-from smplxpp.core.labels import SKIN
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import SKIN, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 from smplxpp.register.clothing import Gaps
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture

@@ -25,8 +25,7 @@ from jaxtyping import Bool, Float64, Int8, Int64, UInt8
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.register.clothing import Gaps
 from smplxpp.register.keypoint_term import projected

@@ -15,10 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.core import Camera, InputError, Keypoints2D, require_at_least, require_positive
 from smplxpp.register.keypoint_faults import (
     Table,
     find_camera_fault,

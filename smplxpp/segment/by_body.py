@@ -31,11 +31,8 @@ import numpy as np
 from jaxtyping import Float64, Num
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError, MeshLike, TriangleMesh, as_mesh, require_at_least, require_positive
 from smplxpp.core.topology import face_adjacency
-from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.raster import outer_visible_points
 from smplxpp.segment.by_body_chart import TRUNK, BodyChart, chart_of_scan
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs

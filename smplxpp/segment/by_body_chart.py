@@ -13,9 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, row_lengths
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError, TriangleMesh, row_lengths
 
 HEAD, NECK, TRUNK, ARM, HAND, LEG, FOOT = range(7)
 REGION_NAMES = ("head", "neck", "trunk", "arm", "hand", "leg", "foot")

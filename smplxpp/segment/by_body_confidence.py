@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.ndimage import maximum_filter1d
 
-from smplxpp.core.labels import LABELS, SKIN, UPPER
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import LABELS, SKIN, UPPER, TriangleMesh
 from smplxpp.segment.by_body_chart import LEG, TRUNK, BodyChart
 from smplxpp.segment.by_body_colors import SkinModel
 from smplxpp.segment.by_body_layers import Layers

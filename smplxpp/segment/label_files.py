@@ -10,13 +10,11 @@ import numpy as np
 from jaxtyping import Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import array_names, read_array, read_arrays
+from smplxpp.core import BACKGROUND, LABELS, InputError
+from smplxpp.core.files import as_numbers, read_arrays, regular_file
+from smplxpp.core.files.array_file import array_names, read_array
 from smplxpp.core.files.image_file import open_image
-from smplxpp.core.files.json_file import as_numbers
-from smplxpp.core.files.paths import regular_file
 from smplxpp.core.files.safe_pickle import safe_load
-from smplxpp.core.labels import BACKGROUND, LABELS
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.segment.labels import LabelSet, map_labels
 

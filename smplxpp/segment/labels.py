@@ -24,9 +24,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64, Num
 
-from smplxpp.core.errors import InputError
+from smplxpp.core import BACKGROUND, LABEL_BY_NAME, LABELS, InputError
 from smplxpp.core.files.json_file import read_json
-from smplxpp.core.labels import BACKGROUND, LABEL_BY_NAME, LABELS
 
 _OURS = {name: label.id for name, label in LABEL_BY_NAME.items()} | {"background": BACKGROUND}
 

@@ -8,9 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, Num
 from scipy.sparse import csr_matrix, identity
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import BACKGROUND, LABELS, OUTER, SKIN, UPPER
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
+from smplxpp.core import BACKGROUND, LABELS, OUTER, SKIN, UPPER, InputError, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.topology import face_adjacency
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors

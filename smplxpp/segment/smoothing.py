@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64, Num
 
+from smplxpp.core import LABELS, SKIN, InputError, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb, oklab_from_linear
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABELS, SKIN
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels
 
 COLOR_STEP = np.array([0.055, 0.022, 0.022])

@@ -10,10 +10,7 @@ from jaxtyping import Bool, Float64, Integer
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import BACKGROUND, LABELS
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import BACKGROUND, LABELS, Camera, InputError, TriangleMesh
 from smplxpp.raster import MeshMaps, rasterize_mesh
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64, Num
 
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import GeometryWarning, InputError, SkinWeights
 from smplxpp.skinning.linear_blend import blend_transforms, skin
 
 

@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera, TriangleMesh
 from smplxpp.core.rotations import rotation_between
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template

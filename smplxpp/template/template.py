@@ -13,13 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 
 from smplxpp.body.model import BodyModel, PosedBody
-from smplxpp.core.errors import InputError
+from smplxpp.core import CLOTH_LABELS, LABELS, BodyParams, InputError, SkinWeights, TriangleMesh, require_choice
 from smplxpp.core.files.array_file import read_arrays, write_arrays
-from smplxpp.core.labels import CLOTH_LABELS, LABELS, semantic_colors
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
-from smplxpp.core.validation import require_choice
+from smplxpp.core.labels import semantic_colors
 from smplxpp.skinning.linear_blend import skin
 from smplxpp.template import template_arrays
 from smplxpp.template.template_checks import check_arrays, metadata_of

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import InputError, SkinWeights
 
 # Raised when a reader of the older layout would misread the file.
 SCHEMA = 1

@@ -8,8 +8,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh, row_lengths
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh, row_lengths
 
 # Other choices of axes: their name, and the permutation and signs that bring them to +Y up.
 _AXES = (

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import MeshLike, SkinWeights, TriangleMesh, as_mesh
 from smplxpp.transfer.anchors import (
     anchor_share,
     anchor_weights,

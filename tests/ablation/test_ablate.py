@@ -13,8 +13,7 @@ from PIL import Image
 from benchmarks.accuracy.ablation import AblationBenchmark
 from benchmarks.support import results as store
 from pipelines.cli import main
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.dolls.swaying import ANGLES, HEIGHT, WIDTH, params, write_moving_capture, write_moving_run
 
 QUICK = (

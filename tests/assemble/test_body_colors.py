@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from smplxpp.assemble import body_colors_from_scan
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 
 
 @pytest.fixture(scope="module")

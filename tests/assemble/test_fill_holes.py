@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from smplxpp.assemble import CanonicalPart, FillHolesConfig, cut_holes, fill_holes
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import UPPER
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import UPPER, InputError, SkinWeights, TriangleMesh
 from smplxpp.core.topology import border_loops
 
 ROWS, COLUMNS, CELL = 21, 40, 0.01

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from smplxpp.assemble.patch import MAX_LOOP, patch_loop
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups
 from smplxpp.metrics import mesh_quality
 

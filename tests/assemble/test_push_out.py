@@ -8,8 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from smplxpp.assemble import Obstacle, PushConfig, flipped_faces, measure_penetration, push_out, stand_off
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 
 
 def ball(radius: float, subdivisions: int = 4) -> TriangleMesh:

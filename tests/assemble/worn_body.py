@@ -6,10 +6,7 @@ import numpy as np
 
 from smplxpp.assemble import CanonicalPart
 from smplxpp.body import BodyModel
-from smplxpp.core.labels import HAIR, UPPER
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import HAIR, UPPER, BodyParams, SkinWeights, TriangleMesh
 
 BETAS = np.array([0.8, -0.5, 0.3])
 

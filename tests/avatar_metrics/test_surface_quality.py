@@ -9,9 +9,7 @@ import pytest
 import trimesh
 
 from avatar.metrics.surface_quality import SurfaceQuality, mean_surface, surface_quality, surface_spread
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LOWER, SKIN, UPPER
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import LOWER, SKIN, UPPER, InputError, TriangleMesh, concatenate_meshes
 
 SAMPLES = 4000
 

@@ -11,8 +11,7 @@ import torch
 from avatar.data.views import View
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.metrics.view_quality import ViewQuality, eight_bit, head_shown, mean_quality, view_quality
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh
 from tests.dolls.standing import doll
 
 BLACK = torch.zeros(3)

@@ -8,8 +8,7 @@ from avatar.reconstruct import NeuralSurface, SurfaceConfig, fit_surface
 from avatar.reconstruct.fit_surface import hull_grid
 from avatar.reconstruct.hash_grid import HashGrid
 from avatar.reconstruct.rays import opacities, rays_of, weights_of
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.reconstruct.hull import solid_status, zero_surface
 from tests.reconstruct.scene import BOX, RADIUS, inside_ball, photograph, ring
 

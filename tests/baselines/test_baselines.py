@@ -20,8 +20,7 @@ from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
 from avatar.training.engine.resources import fixed_seed
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import SKIN
+from smplxpp.core import SKIN, InputError
 from tests.dolls.swaying import TORSO, open_moving, params, template
 
 SAMPLING = SamplingConfig(count=500)

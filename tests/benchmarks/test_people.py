@@ -16,8 +16,7 @@ from pipelines.synth.people.making import make_person
 from pipelines.synth.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
 from pipelines.synth.scan_simulation import ScanConfig
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABEL_BY_NAME
+from smplxpp.core import LABEL_BY_NAME, InputError
 
 NAME = "man shirt trousers short hair, arms down"
 COARSE = ScanConfig(cell=0.012, views=24, resolution=384, faces=12_000)

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.skinning import skin
 
 FIELDS = ("vertices", "joints", "rest_vertices", "rest_joints", "posed_from_rest")

@@ -9,9 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body import detect_layout, load_params
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import ARRAY_NAMES, BodyParams, GeometryWarning, InputError, matrix_from_rotvec
 
 FRAMES = 3
 

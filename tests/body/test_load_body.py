@@ -9,8 +9,7 @@ import pytest
 import scipy.sparse
 
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.body.synthetic_smplx import PARENTS
 
 

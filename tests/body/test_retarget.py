@@ -13,9 +13,7 @@ from smplxpp.body import load_body
 from smplxpp.body.bvh import BvhMotion, read_bvh
 from smplxpp.body.bvh_params import bvh_params, load_bvh, named_joints, read_joint_map
 from smplxpp.body.retarget import Skeleton, retarget
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from smplxpp.export.bvh import write_bvh
 from tests.body.walks import FPS, betas, rotation_z, shaped, slide, walk
 

@@ -17,9 +17,8 @@ from smplxpp.build import BuildConfig, build_template
 from smplxpp.build.config import STEPS
 from smplxpp.capture import open_capture
 from smplxpp.clean import simplify
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.files.json_file import read_json
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.template.template import Template
 

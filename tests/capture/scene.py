@@ -8,9 +8,7 @@ from functools import cache
 import numpy as np
 
 from smplxpp.body import load_body
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 
 WIDTH, HEIGHT = 192, 256

@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from smplxpp.capture import Problem, Splits, open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 W, H = 40, 60
 RED, BLUE = (200, 30, 40), (20, 40, 220)

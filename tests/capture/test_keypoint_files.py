@@ -21,8 +21,7 @@ from smplxpp.body.layout import (
     WHOLE_BODY_133,
 )
 from smplxpp.capture.keypoint_files import KeypointOptions, find_places, read_keypoints
-from smplxpp.core.errors import InputError
-from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core import InputError, Keypoints2D
 
 # Where each named point lies in frame 0: told by a number of the name, not by a place in any list.
 NAMES = sorted(VOCABULARY)

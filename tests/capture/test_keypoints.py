@@ -13,8 +13,7 @@ from smplxpp.body import load_body
 from smplxpp.capture import Problem, find_problems, open_capture
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.writers.arrays import write_keypoints
-from smplxpp.core.errors import InputError
-from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core import InputError, Keypoints2D
 from tests.capture.scene import LENS, Scene, make_scene
 from tests.capture.writers import write_easymocap, write_simple
 

@@ -13,8 +13,7 @@ from PIL import Image
 
 from smplxpp.capture import find_reference, open_capture
 from smplxpp.capture.protocols import ProtocolFiles, choose_protocol, read_description
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.capture.scene import make_scene
 from tests.capture.test_capture import H, W, write_capture
 from tests.capture.writers import write_actorshq

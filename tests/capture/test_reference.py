@@ -7,8 +7,7 @@ import pytest
 import trimesh
 
 from smplxpp.capture import find_reference, read_cameras
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from PIL import Image
 
 from smplxpp.body import load_body
 from smplxpp.capture import detect_format, find_problems, open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import InputError, matrix_from_rotvec
 from tests.capture.scene import make_scene
 from tests.capture.writers import write_talkbody4d
 

@@ -12,8 +12,7 @@ import numpy as np
 from PIL import Image
 
 from smplxpp.body import load_body
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
 VIEWS = [(camera, frame) for camera in "ABC" for frame in range(4)]
 

@@ -16,8 +16,7 @@ from pipelines.cli import main
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.check import check_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import ARRAY_NAMES
+from smplxpp.core import ARRAY_NAMES, InputError
 from tests.capture.scene import LENS, make_scene
 from tests.capture.writers import (
     WRITERS,

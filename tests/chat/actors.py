@@ -19,9 +19,8 @@ from avatar.speech.voice import SynthesizedSpeech
 from pipelines.chat.conversation import ChatParts
 from pipelines.chat.hearing import LoudnessActivity
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.wave_file import Sound
-from smplxpp.core.params import BodyParams
 from tests.dolls.dancing import dance
 from tests.web.avatars import write_avatar
 

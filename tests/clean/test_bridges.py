@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.clean import BridgeConfig, cut_bridges, find_bridges
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups
 
 TRUNK, ARM = 0.15, 0.05

@@ -10,9 +10,7 @@ import pytest
 import trimesh
 
 from smplxpp.clean import PartsConfig, clean_parts, drop_specks, fill_pinholes, loop_lengths, sanitize, simplify
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LOWER, SHOE, SKIN, UPPER
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import LOWER, SHOE, SKIN, UPPER, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.topology import border_loops, edge_groups, face_components
 

@@ -10,9 +10,7 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.clean.poisson import estimate_normals, point_spacing
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, TriangleMesh, matrix_from_rotvec
 from smplxpp.core.topology import face_components
 from smplxpp.metrics import sample_surface
 from smplxpp.raster import outer_visible_points

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.clean.poisson import FEWEST_POINTS, PoissonConfig, surface_from_points
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, MissingExtraError, TriangleMesh
 from smplxpp.metrics import mesh_quality, point_to_surface, sample_surface
 
 

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.clean import PartsConfig, clean_parts, loop_lengths, remesh
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
-from smplxpp.core.labels import UPPER
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import UPPER, GeometryWarning, InputError, MissingExtraError, TriangleMesh
 from smplxpp.core.topology import border_loops
 from smplxpp.metrics import point_to_surface
 from tests.clean.test_parts import tube

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from smplxpp.clean import check_human_scale, convert_points, sanitize
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh
 from smplxpp.core.topology import border_loops, half_edges
 
 

@@ -8,10 +8,7 @@ import pytest
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import standing_poses
 from smplxpp.clean.scan_frame import METRES_PER_UNIT, convert_points, find_scan_frame
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec
 
 
 @pytest.fixture(scope="module")

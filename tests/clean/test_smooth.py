@@ -9,8 +9,7 @@ import pytest
 import trimesh
 
 from smplxpp.clean import ROUGH, roughness, smooth_if_rough
-from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, TriangleMesh
 from tests.clean.test_parts import tube
 
 

@@ -10,8 +10,7 @@ import trimesh
 
 from smplxpp.clean.solid import SolidConfig, separate_touching_vertices, solid_of_parts, thickened, wall_thickness
 from smplxpp.clean.thicken import slab_behind
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.solids import closed_mesh, mesh_of_solid, solid_of_mesh
 from smplxpp.metrics import self_intersections
 

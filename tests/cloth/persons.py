@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 
 from smplxpp.body import load_body
-from smplxpp.core.labels import LOWER, UPPER
-from smplxpp.core.params import BodyParams
+from smplxpp.core import LOWER, UPPER, BodyParams
 from smplxpp.template.template import Template
 from tests.dolls.doll import Part, ball, make_template
 

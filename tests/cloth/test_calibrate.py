@@ -9,8 +9,7 @@ import pytest
 
 from smplxpp.cloth import ClothDriver, Garment
 from smplxpp.cloth.calibrate import CalibrationConfig, Followed, calibrate, with_values
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.cloth.persons import PART, person, standing
 from tests.cloth.test_driver import QUICK, garment
 

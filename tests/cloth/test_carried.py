@@ -10,8 +10,7 @@ import pytest
 from smplxpp.cloth.carried import CarriedVertices, SkinnedRows
 from smplxpp.cloth.embedding import embed
 from smplxpp.cloth.solver import Collider, move_before_collider
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from tests.cloth.persons import person, standing
 from tests.cloth.sheets import ball, bent, collider, hanging
 

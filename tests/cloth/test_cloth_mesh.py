@@ -15,8 +15,7 @@ from smplxpp.cloth.cloth_mesh import (
     opening_axis,
     turned_over,
 )
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from smplxpp.core.topology import border_loops
 from tests.cloth.sheets import ball, bent, grid, hanging
 

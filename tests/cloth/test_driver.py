@@ -10,9 +10,7 @@ import pytest
 
 from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment, GarmentConfig, cut_garment
 from smplxpp.cloth.play import play
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from tests.cloth.persons import PART, person, standing
 
 QUICK = DriverConfig(ramp=0.2, hold=0.1)

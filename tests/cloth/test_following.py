@@ -9,8 +9,7 @@ import pytest
 
 from smplxpp.cloth.following import SLOWEST, followed, ways
 from smplxpp.cloth.play import play
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.cloth.persons import person
 from tests.cloth.test_driver import QUICK, garment, swaying
 

@@ -11,8 +11,7 @@ import pytest
 from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
 from smplxpp.cloth.carriers import find_carriers
 from smplxpp.cloth.opening_bridges import find_opening_bridges
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh
 from smplxpp.template.template import BODY_PART
 from tests.cloth.persons import HEM, PART, WAIST, person, standing
 

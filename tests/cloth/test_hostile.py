@@ -9,8 +9,7 @@ import pytest
 
 from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from smplxpp.cloth import ClothDriver, GarmentConfig, cut_garment
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.cloth.persons import PART, person, standing
 from tests.cloth.test_driver import QUICK, driver, garment
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from smplxpp.cloth import ClothDriver, DriverConfig, Garment, GarmentConfig, cut_garment
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from tests.cloth.persons import OVER, PART, person, standing
 

@@ -8,8 +8,7 @@ import pytest
 from smplxpp.cloth.embedding import embed
 from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.model import build_model, shuffled
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from tests.cloth.sheets import bent, hanging, held
 
 TURN, SHIFT = matrix_from_rotvec(np.array([0.7, 0.2, -1.3])), np.array([0.4, -2.0, 1.0])

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from smplxpp.cloth.poses import CausalSmoother, pose_between, reference_facing_as, resampled, smoothed
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec, rotvec_from_matrix
 from tests.cloth.persons import standing
 
 

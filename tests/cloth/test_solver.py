@@ -16,9 +16,7 @@ from smplxpp.cloth import solver as solver_module
 from smplxpp.cloth.fabric import Fabric, SolverConfig
 from smplxpp.cloth.model import build_model
 from smplxpp.cloth.solver import GRAVITY, ClothState, move_before_collider
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
 from tests.cloth.oracle import substep
 from tests.cloth.sheets import PLAIN, Scene, ball, bent, collider, free, grid, hanging, held, hung, lying, permuted
 

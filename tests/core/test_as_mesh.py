@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, as_mesh
+from smplxpp.core import InputError, TriangleMesh, as_mesh
 from smplxpp.metrics import compare, mesh_quality
 
 

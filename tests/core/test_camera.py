@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 
 CAMERA = Camera(np.array([[210.3, 0.4, 81.7], [0, 205.1, 62.2], [0, 0, 1.0]]), np.eye(4), 160, 121, name="c")
 POINTS = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (50, 3))

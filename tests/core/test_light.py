@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from smplxpp.core import InputError, normalize_rows
 from smplxpp.core.colors import linear_from_srgb, srgb_from_linear
-from smplxpp.core.errors import InputError
 from smplxpp.core.light import Irradiance, Relighting, harmonics, panorama_directions
-from smplxpp.core.mesh import normalize_rows
 
 NORMALS = normalize_rows(np.random.default_rng(0).normal(size=(40, 3)))
 WHITE = Irradiance.uniform()

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import ARRAY_NAMES, POSE_BLOCKS, BodyParams
+from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, InputError
 
 
 def random_params(frames=3, seed=0, **changes) -> BodyParams:

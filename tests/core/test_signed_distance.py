@@ -8,8 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 
 

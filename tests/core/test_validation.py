@@ -4,14 +4,7 @@ import math
 
 import pytest
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import (
-    require_at_least,
-    require_between,
-    require_choice,
-    require_known,
-    require_positive,
-)
+from smplxpp.core import InputError, require_at_least, require_between, require_choice, require_known, require_positive
 
 
 def test_what_fits_passes():

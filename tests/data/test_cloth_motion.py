@@ -11,8 +11,7 @@ from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
 from smplxpp.capture import open_capture
 from smplxpp.cloth import ClothDriver, ClothShape
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, GeometryWarning, InputError
 from tests.cloth.persons import person, standing
 from tests.cloth.test_driver import QUICK, garment, in_the_world
 from tests.dolls.dancing import NOVEL_POSES, dance, template, write_dance

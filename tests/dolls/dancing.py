@@ -14,9 +14,7 @@ from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.camera import Camera
-from smplxpp.core.labels import LOWER
-from smplxpp.core.params import BodyParams
+from smplxpp.core import LOWER, BodyParams, Camera
 from smplxpp.template.template import Template
 from tests.dolls.doll import Doll, ball, make_template, place_camera
 

@@ -17,10 +17,7 @@ import trimesh
 from PIL import Image
 
 from smplxpp.body import load_body
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, Camera, SkinWeights, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 from tests.template.bodies import small_body

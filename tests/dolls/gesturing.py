@@ -10,10 +10,7 @@ import numpy as np
 from avatar.data.sequence import AvatarSequence, SequenceConfig
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
-from smplxpp.core.camera import Camera
-from smplxpp.core.labels import LOWER
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import LOWER, BodyParams, Camera, matrix_from_rotvec
 from smplxpp.register import BodyState
 from smplxpp.template.template import Template
 from tests.dolls.doll import Doll, Part, ball, make_template, place_camera

@@ -14,8 +14,7 @@ from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.labels import LOWER
-from smplxpp.core.params import BodyParams
+from smplxpp.core import LOWER, BodyParams
 from smplxpp.template.template import Template
 from tests.dolls.doll import Doll, ball, make_template, place_camera
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.labels import LOWER, SKIN
-from smplxpp.core.params import BodyParams
+from smplxpp.core import LOWER, SKIN, BodyParams
 from smplxpp.template.template import Template
 from tests.dolls.doll import Doll, Part, ball, make_template, place_camera
 

@@ -24,9 +24,7 @@ from avatar.metrics.speed import bytes_on_disk, fitted, measure_speed, parameter
 from avatar.metrics.view_quality import ViewQuality
 from avatar.rig.posed import at_rest
 from avatar.rig.rig import Rig
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera, InputError
 from tests.dolls.standing import OUT, Grown, doll, opened, still
 
 CONFIG = EvaluationConfig(

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from smplxpp.body import load_body
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, SkinWeights
 from smplxpp.template.template import Template
 from tests.template.bodies import small_body
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.export import write_glb, write_obj
 from smplxpp.template.template import Template
 from tests.export.templates import random_template

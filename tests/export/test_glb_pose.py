@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body.named_poses import stress_poses
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, GeometryWarning, InputError, SkinWeights
 from smplxpp.export import write_glb
 from tests.export.glb_reader import GlbReader
 from tests.export.templates import open_body_template, random_motion, random_template

@@ -9,9 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body import load_body, load_params
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from smplxpp.export.amass import write_amass
 from smplxpp.export.bvh import euler_zxy, write_bvh
 from tests.export.templates import random_motion

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.export.printing import write_solid
 from smplxpp.export.printing_check import check_written

@@ -25,11 +25,8 @@ from pipelines.figures import (
     row,
     turntable_cameras,
 )
-from smplxpp.core.camera import Camera
+from smplxpp.core import Camera, InputError, SkinWeights, TriangleMesh
 from smplxpp.core.colors import linear_from_oklab, linear_from_srgb, oklab_from_linear, srgb8_from_linear
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.skin_weights import SkinWeights
 
 FLAT = ShadeStyle(relief=0.0, occlusion=0.0)
 

@@ -17,12 +17,11 @@ from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color, read_normals
 from smplxpp.capture.views import read_labels as read_label_image
+from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
-from smplxpp.core.params import BodyParams
 from smplxpp.detect.model_card import load_card
 from smplxpp.register import read_landmarks, write_landmarks
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection

@@ -39,8 +39,7 @@ from pipelines.stages.build_config import (
 from smplxpp.body import load_body
 from smplxpp.build.reconstruct import unit_cube_of
 from smplxpp.cloth.garment_file import load_garments, save_garments
-from smplxpp.core.checks import Check
-from smplxpp.core.errors import GeometryWarning
+from smplxpp.core import Check, GeometryWarning
 from smplxpp.template import Template
 from tests.cloth.persons import person
 from tests.cloth.test_driver import garment

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from avatar.gaussians.binding import THICKNESS, topology_digest, world_from_local
 from avatar.gaussians.sampling import SamplingConfig, head_faces, sample_on_mesh, seen_faces
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.template.template import Template
 from tests.export.templates import open_body_template, random_template
 

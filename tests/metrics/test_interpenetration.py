@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
 from smplxpp.metrics import interpenetration
 
 

@@ -12,8 +12,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
 from smplxpp.metrics import CompareConfig, compare, directed_distances, point_to_surface, sample_surface
 
 

@@ -6,8 +6,7 @@ import igl
 import numpy as np
 import pytest
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
 from smplxpp.metrics import mesh_quality, self_intersections
 from smplxpp.metrics.quality import fan_counts
 

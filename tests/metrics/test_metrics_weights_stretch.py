@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import InputError, SkinWeights, TriangleMesh
 from smplxpp.metrics import edge_stretch, flipped_faces, stretch_report, total_variation, weight_report
 
 

@@ -9,8 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.metrics import PoseError, mean_pose_error, pose_error
 
 

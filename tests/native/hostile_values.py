@@ -19,9 +19,7 @@ from avatar.losses.image_similarity import ssim, ssim_map
 from avatar.rendering import rasterize
 from avatar.rendering.mesh_maps import mesh_maps
 from smplxpp.capture.distortion import RationalDistortion, undistort
-from smplxpp.core import GeometryWarning
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, GeometryWarning, InputError
 from smplxpp.raster import rasterize_triangles
 
 POISON = (np.nan, np.inf, -np.inf, 1e38, -1e38, 1e-38, 1e-45, 0.0, -1.0, 1e9)

@@ -12,9 +12,7 @@ import pytest
 import torch
 
 from smplxpp import native
-from smplxpp.core import TriangleMesh
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.raster import rasterize_mesh, rasterize_triangles
 
 ROOT = Path(__file__).parents[2]

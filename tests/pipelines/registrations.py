@@ -11,8 +11,7 @@ import numpy as np
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.build import register as register_step
 from smplxpp.capture import Capture
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Keypoints2D
 from smplxpp.register import BodyFit, Observations
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

@@ -15,9 +15,7 @@ from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, SEGMENT_STAGE
 from pipelines.runs.stage import require_stage
 from smplxpp.body import load_body, load_params
 from smplxpp.build import locate
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import BACKGROUND, SKIN
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import BACKGROUND, SKIN, InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.register.locate import Candidate, LocatedBody
 from smplxpp.segment import read_labels

@@ -13,9 +13,7 @@ from pipelines.cli import main
 from pipelines.commands.animate import Animate
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, InputError, MissingExtraError, SkinWeights
 from smplxpp.template.template import Template
 from tests.full_disk import file_size_limit
 

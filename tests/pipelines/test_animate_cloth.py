@@ -13,8 +13,7 @@ from pipelines.commands.animate import Animate
 from pipelines.commands.driving import Driving
 from pipelines.runs.layout import GARMENTS, PARAMS, TEMPLATE
 from smplxpp.cloth.garment_file import save_garments
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, GeometryWarning, InputError
 from tests.cloth.persons import PART, person, standing
 from tests.dolls.skirted import garment, pose
 

@@ -25,8 +25,7 @@ from smplxpp.assemble import FillHolesConfig
 from smplxpp.body import load_params
 from smplxpp.body.named_poses import stress_poses
 from smplxpp.clean import BridgeConfig, simplify
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
-from smplxpp.core.labels import CLOTH_LABELS, HAIR
+from smplxpp.core import CLOTH_LABELS, HAIR, GeometryWarning, InputError, MissingExtraError
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh
 from smplxpp.segment import BoxCorrection, Corrections, read_labels
 from smplxpp.template.template import Template

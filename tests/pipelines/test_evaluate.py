@@ -37,8 +37,7 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.evaluate_config import MODEL_FILES
 from pipelines.stages.evaluate_inputs import input_protocol
 from smplxpp.capture import open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template
 from tests.dolls.standing import FRAMES, HELD_OUT, doll, dressed, write_frames
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers

@@ -8,8 +8,7 @@ from pipelines.cli import main
 from pipelines.commands.inspect import Inspect, summarise_run
 from pipelines.runs.layout import BUILD_STAGES, TEMPLATE_STAGES
 from pipelines.runs.stage import StageOutput, run_stage
-from smplxpp.core.checks import Check
-from smplxpp.core.errors import InputError
+from smplxpp.core import Check, InputError
 from tests.runs.stages import stage_of
 
 

@@ -6,8 +6,7 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.params import ParamsConvert
 from smplxpp.body import load_params
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError
 
 
 @pytest.fixture

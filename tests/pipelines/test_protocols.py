@@ -25,8 +25,7 @@ from pipelines.stages.evaluate_poses import covered_vertices
 from pipelines.stages.run_inputs import chosen_protocol
 from pipelines.stages.scene import TrainInputs, open_frame, open_scene
 from smplxpp.capture import open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.dolls.standing import FRAMES, NOVEL, dressed, write_frames
 from tests.pipelines.test_evaluate import QUICK, write_dressed, write_models
 

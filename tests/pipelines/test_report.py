@@ -27,8 +27,7 @@ from pipelines.report import (
 from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
 from pipelines.report.sections.evaluation import talking_section
 from pipelines.runs.layout import TALKING_FILM
-from smplxpp.core.checks import Check
-from smplxpp.core.errors import InputError
+from smplxpp.core import Check, InputError
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
 

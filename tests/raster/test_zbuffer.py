@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import Camera, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.raster import outer_visible_faces, outer_visible_points, rasterize_mesh
 
 

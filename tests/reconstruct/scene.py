@@ -6,8 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.reconstruct.hull import zero_surface
 from smplxpp.reconstruct.views import Box, PhotoView

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.reconstruct.hull import main_body, pixel_footprint, soft_hull, solid_status, zero_surface
 from smplxpp.reconstruct.silhouettes import Silhouette

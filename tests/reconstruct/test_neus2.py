@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.reconstruct import adopt_surface
 from smplxpp.reconstruct.hull import zero_surface
 from smplxpp.reconstruct.neus2 import UnitCube, mesh_in_world, world_from_space

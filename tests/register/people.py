@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from smplxpp.body import BodyModel
-from smplxpp.core.camera import Camera
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, Camera, Keypoints2D, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.raster import rasterize_mesh
 
 JOINTS = 55

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.core.camera import Camera
-from smplxpp.core.keypoints import Keypoints2D
+from smplxpp.core import Camera, Keypoints2D
 from smplxpp.register import Observations, RegisterConfig, register
 from smplxpp.register.landmarks import LandmarkModel
 from tests.register.people import moving, ring

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import SKIN, UPPER
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import rotvec_from_matrix
+from smplxpp.core import SKIN, UPPER, BodyParams, InputError, TriangleMesh, rotvec_from_matrix
 from smplxpp.register import Observations, RegisterConfig, ScanObservation, register
 from tests.register.people import disturbed, keypoints, masks, moving, ring, vertex_error_mm
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from smplxpp.register import Observations, RegisterConfig, register
 from smplxpp.register.landmarks import LandmarkModel, read_landmarks, write_landmarks
 from tests.register.people import moving, vertex_error_mm

@@ -14,10 +14,7 @@ from pipelines.synth.person import PERSON_BETAS
 from pipelines.synth.tracker import DetectorConfig, detector_keypoints
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import Camera, InputError, Keypoints2D, matrix_from_rotvec
 from smplxpp.register.keypoint_faults import mirror_index, number_ranges
 from smplxpp.register.triangulate import Triangulation, TriangulationConfig, triangulate
 

@@ -7,8 +7,7 @@ import trimesh
 
 from avatar.rendering.barycentrics import barycentrics_reference
 from avatar.rendering.mesh_maps import MapFrame, front_back_maps, mesh_maps, vertex_normal_map, vertex_normals
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 
 
 def sphere(subdivisions: int = 2, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:

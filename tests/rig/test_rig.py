@@ -10,8 +10,7 @@ import torch
 from threadpoolctl import ThreadpoolController
 
 from avatar.rig.rig import Rig
-from smplxpp.core.errors import InputError
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import InputError, matrix_from_rotvec, rotvec_from_matrix
 from tests.dolls.dancing import FRAMES, dance, template
 from tests.export.templates import open_body_template, random_motion, random_template
 

@@ -23,9 +23,7 @@ from pipelines.runs.artefacts import (
 )
 from pipelines.runs.layout import CANONICAL, PARTS_WITHOUT_BRIDGES, SCAN, SCAN_LABELS, WEIGHTS
 from smplxpp.build.data import Part
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import InputError, SkinWeights, TriangleMesh
 
 GROUPS = {"shirt": {"vertices": np.eye(3), "label": np.array(2)}, "a/b": {}}
 

@@ -9,8 +9,7 @@ import pytest
 from pipelines.runs.code import sha256_file
 from pipelines.runs.folders import LOCK_NAME, own_run_folder
 from pipelines.runs.stage import StageOutput, decide, differences, read_manifest, require_stage, run_stage, standing
-from smplxpp.core.checks import Check
-from smplxpp.core.errors import InputError
+from smplxpp.core import Check, InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_write_text
 from tests.runs.stages import stage_of
 

@@ -10,9 +10,7 @@ import pytest
 from avatar.runtime import load_bundle
 from avatar.runtime.motion import pose_range, resampled
 from smplxpp.body.pose_range import MARGIN
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from tests.dolls.dancing import dance
 from tests.runtime.bundles import student, write
 

@@ -11,8 +11,7 @@ import torch
 from avatar.rendering.api import rasterize
 from avatar.runtime import AvatarPlayer
 from smplxpp.cloth import ClothDriver, ClothShape
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.cloth.persons import person
 from tests.cloth.test_driver import QUICK, garment, swaying
 from tests.dolls.dancing import cameras, dance

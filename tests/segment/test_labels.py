@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import BACKGROUND, LABELS, display_colors
+from smplxpp.core import BACKGROUND, LABELS, InputError, display_colors
 from smplxpp.segment import LABEL_SETS, labels_from_colors, map_labels, read_label_map, read_labels
 
 SIZES = {"lip": 20, "cihp": 20, "atr": 18, "sapiens": 28, "capture": 7, "4ddress": 7}

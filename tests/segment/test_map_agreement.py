@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LOWER, UPPER
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import LOWER, UPPER, InputError, TriangleMesh
 from smplxpp.segment import vote_in_agreement, vote_on_faces
 from tests.segment.views import halves, sphere, views_of
 

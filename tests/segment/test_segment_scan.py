@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LOWER, OUTER, SHOE, SKIN, UPPER
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import LOWER, OUTER, SHOE, SKIN, UPPER, Camera, InputError, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.segment import SegmentConfig, SegmentedScan, map_labels, segment_scan, vote_on_faces
 from tests.segment.views import halves, sphere, views_of

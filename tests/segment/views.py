@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from smplxpp.core.camera import Camera
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import Camera, TriangleMesh
 from smplxpp.raster import rasterize_mesh, view_directions
 
 

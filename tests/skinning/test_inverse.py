@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import stress_poses
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, GeometryWarning, InputError, SkinWeights
 from smplxpp.skinning import UnposeConfig, pose, unpose
 
 

@@ -13,8 +13,7 @@ from avatar.speech.curves import ARKIT
 from avatar.speech.face import MAX_UNOBSERVED_NUMBERED
 from smplxpp.body import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 BODY = load_body()
 ROWS = [BODY.expression_names.index(name) for name in ARKIT]

@@ -14,9 +14,8 @@ from avatar.speech.curves import ARKIT, Curves
 from avatar.speech.face import JAW_ANGLE
 from pipelines.commands.talk import Talk
 from smplxpp.body import load_body
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.wave_file import Sound
-from smplxpp.core.params import BodyParams
 
 BODY = load_body()
 FACE = Face.of(BODY.expression_names, BODY.joint_names)

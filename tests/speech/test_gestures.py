@@ -15,9 +15,7 @@ from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.pose_range import PoseRange
 from smplxpp.body.retarget import FEET, Skeleton
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec, rotvec_from_matrix
 
 BODY = load_body()
 SKELETON = Skeleton.of(BODY)

@@ -11,8 +11,7 @@ from avatar.speech import ARTICULATORS, Face, Phoneme, Speech, TalkConfig, artic
 from avatar.speech.coarticulation import Timing
 from avatar.speech.face import JAW_ANGLE, MARGIN, MAX_UNOBSERVED
 from avatar.speech.phonemes import CONSONANTS, VOWELS, arpabet_from_ipa, ipa_from_arpabet
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 
 SIDED = ("mouthLowerDown", "mouthPress", "mouthUpperUp", "mouthSmile", "mouthStretch", "eyeBlink")
 NAMES = tuple(f"{name}{side}" for name in SIDED for side in ("Left", "Right")) + (

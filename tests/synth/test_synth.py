@@ -25,8 +25,7 @@ from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.writers.arrays import save_compact
 from smplxpp.capture.writers.images import png16, write_normal_png
 from smplxpp.capture.writers.metadata import FACE, write_calibration_csv, write_cameras_json
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

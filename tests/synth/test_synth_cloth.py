@@ -12,8 +12,7 @@ from pipelines.synth.garment_dynamics import ContactSurface, GarmentConfig, Garm
 from pipelines.synth.motion import Performance
 from pipelines.synth.person import load_person
 from pipelines.synth.simulate import HairLag, SimulationConfig, simulate
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from tests.cloth.sheets import ball, hanging, held, lying
 
 TOPOLOGY = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person" / "geometry" / "topology.npz"

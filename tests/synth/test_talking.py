@@ -23,9 +23,7 @@ from pipelines.synth.views import Atlas, LitFrame, _cell_centers, paint_atlas, r
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

@@ -15,9 +15,7 @@ from pipelines.synth.tracker import DetectorConfig, detector_keypoints, estimate
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import find_problems, open_capture
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera, InputError
 from tests.capture.scene import LENS, make_scene
 from tests.capture.writers import write_simple
 

@@ -10,10 +10,7 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import stress_poses
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import SKIN, UPPER
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import SKIN, UPPER, BodyParams, InputError, SkinWeights
 from smplxpp.template.template import Template
 from tests.export.templates import random_template
 

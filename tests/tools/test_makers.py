@@ -14,8 +14,7 @@ from pipelines.synth.patterns import band
 from pipelines.synth.scan_simulation import ScanConfig, simulate_scan
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import load_body
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from smplxpp.core.signed_distance import SignedDistanceField
 from tools.anny_base import JOINT_NAMES, PARENTS
 

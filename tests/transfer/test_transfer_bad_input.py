@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.checks import consistent_winding
 from smplxpp.transfer.inpaint import edge_lengths, laplacian_and_mass, mollify

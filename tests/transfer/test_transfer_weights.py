@@ -10,8 +10,7 @@ import pytest
 import scipy.sparse as sp
 from scipy.spatial.transform import Rotation
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
+from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.checks import extent
 from smplxpp.transfer.correspond import closest_points

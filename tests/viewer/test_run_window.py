@@ -25,10 +25,9 @@ from pipelines.runs.layout import GAUSSIANS, STUDENT
 from pipelines.viewer.run_models import covariances, training_now
 from pipelines.viewer.run_session import open_run
 from pipelines.viewer.run_window import RunWindow, open_run_window
+from smplxpp.core import InputError, matrix_from_rotvec
 from smplxpp.core.colors import linear_from_srgb
-from smplxpp.core.errors import InputError
 from smplxpp.core.light import Irradiance, Relighting
-from smplxpp.core.rotations import matrix_from_rotvec
 from tests.dolls.dancing import dance, gaussians, template, varied, write_dance, write_dance_run
 from tests.runtime.bundles import student
 from tests.viewer.test_window import free_port

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.viewer.session import LabelledScan, LabelSession, uncertain_regions
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
-from smplxpp.core.mesh import concatenate_meshes
+from smplxpp.core import HAIR, LOWER, SHOE, SKIN, UPPER, InputError, concatenate_meshes
 from smplxpp.register import read_landmarks
 from smplxpp.segment import Corrections
 from smplxpp.segment.corrected_faces import ScanSurface

@@ -17,9 +17,7 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs, RegisterInpu
 from pipelines.viewer.run_scan import label_again, open_session
 from pipelines.viewer.session import LabelledScan, LabelSession
 from pipelines.viewer.window import LabelWindow, open_window
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import HAIR, LOWER, SHOE, UPPER
-from smplxpp.core.mesh import concatenate_meshes
+from smplxpp.core import HAIR, LOWER, SHOE, UPPER, InputError, concatenate_meshes
 from smplxpp.segment import Corrections
 from tests.pipelines.registrations import FIXTURE, use_keypoints, use_solver
 from tests.pipelines.test_build import Small, small, small_scan  # noqa: F401

@@ -17,8 +17,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
 from smplxpp.cloth import GarmentConfig, cut_garment
-from smplxpp.core.camera import Camera
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, Camera
 from tests.cloth.persons import OVER, PART, person, standing
 from tests.dolls.dancing import dance
 from tests.dolls.doll import place_camera

@@ -10,8 +10,7 @@ from jaxtyping import Float, Int, Int64
 from torch import Tensor, nn
 
 from avatar.models.networks.config_dict import MOST_LAYERS
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_between
+from smplxpp.core import InputError, require_at_least, require_between
 
 STORED_BYTES = 2
 """Bytes of a stored coefficient (half precision)."""

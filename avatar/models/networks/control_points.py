@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64, Shaped
 from scipy.spatial import cKDTree
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least
+from smplxpp.core import InputError, require_at_least
 from smplxpp.template.template import Template
 
 

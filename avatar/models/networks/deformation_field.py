@@ -14,8 +14,7 @@ from torch import Tensor, nn
 from avatar.models.networks.config_dict import MOST_LAYERS
 from avatar.models.networks.control_points import ControlPoints
 from avatar.models.networks.sparse_rows import SparseRows
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_between
+from smplxpp.core import InputError, require_at_least, require_between
 
 
 @dataclass(frozen=True)

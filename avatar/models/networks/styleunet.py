@@ -26,8 +26,7 @@ from avatar.models.networks.stylegan2_layers import (
     StyledConv,
     ToMaps,
 )
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_between
+from smplxpp.core import InputError, require_at_least, require_between
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.styleunet import Head, StyleUNet, StyleUNetConfig
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_between, require_choice, require_positive
+from smplxpp.core import InputError, require_between, require_choice, require_positive
 
 # Output channels: position, colour, and opacity (1) with tangential log scales (2) and quaternion (4).
 POSITION, COLOUR, OTHER = 3, 3, 1 + 2 + 4

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.json_file import as_integer, as_object, as_text, jsonable, parse_json
-from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files import as_integer, as_object, as_text, atomic_write_text, jsonable, parse_json, read_bytes
 
 log = logging.getLogger(__name__)
 _MOST_BYTES = 1 << 30  # 1 GiB; the lines of a million steps have some hundred megabytes

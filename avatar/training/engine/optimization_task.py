@@ -14,8 +14,7 @@ from torch import Tensor
 from avatar.gaussians.tensor_file import require_finite, require_like
 from avatar.training.engine.mean_of_steps import MeanOfSteps
 from avatar.training.engine.processes import Distributed
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
+from smplxpp.core import InputError, require_at_least, require_between, require_choice, require_positive
 
 Batch = TypeVar("Batch")
 _START_AGAIN = "delete the file of its state, or give --force, to start again"

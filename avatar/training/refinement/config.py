@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from avatar.gaussians.sampling import SamplingConfig
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.core import InputError, require_at_least, require_positive
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core import CLOTH_LABELS, matrix_from_rotvec
 from smplxpp.register import BodyState, Kinematics
 from smplxpp.skinning.linear_blend import forward_kinematics
 from smplxpp.template.template import Template

@@ -18,10 +18,7 @@ from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.nuisance import CameraCorrections
 from avatar.training.refinement.photometric import PhotometricLoss
 from avatar.training.refinement.posing import PosedTemplate, rigidity
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import rotvec_from_matrix
-from smplxpp.core.validation import require_known
+from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_known, rotvec_from_matrix
 from smplxpp.register import BodyState
 
 

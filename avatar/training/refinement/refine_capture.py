@@ -17,9 +17,8 @@ from avatar.training.scene import TrainScene, with_cameras
 from smplxpp.capture import Capture, read_cameras
 from smplxpp.capture.sources import find_params
 from smplxpp.capture.writers.metadata import write_plain_cameras_json
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import write_arrays
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
 from smplxpp.register import BodyState
 from smplxpp.template.template import Template
 

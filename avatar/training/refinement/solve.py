@@ -10,8 +10,7 @@ from scipy.linalg import solveh_banded
 
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.variables import Variables
-from smplxpp.core.params import DEFAULT_FPS
-from smplxpp.core.rotations import rotvec_from_matrix
+from smplxpp.core import DEFAULT_FPS, rotvec_from_matrix
 from smplxpp.register import BodyState
 
 

@@ -26,8 +26,7 @@ from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.student.init_blend_shapes import init_blend_shapes
 from avatar.training.tracking.surface_normals import with_surface_normals
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_between
+from smplxpp.core import InputError, require_at_least, require_between
 
 
 @dataclass(frozen=True, kw_only=True)

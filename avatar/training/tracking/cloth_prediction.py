@@ -15,9 +15,7 @@ from torch import Tensor
 
 from avatar.data.cloth_motion import ClothMotions
 from smplxpp.cloth import Garment, GarmentConfig, cut_garment
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
+from smplxpp.core import CLOTH_LABELS, DEFAULT_FPS, BodyParams, GeometryWarning, InputError
 from smplxpp.template.template import Template
 
 CORRECTION_DECAY = 0.3

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from avatar.losses.reconstruction import ReconstructionWeights
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least
+from smplxpp.core import InputError, require_at_least
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.data.views import View
 from avatar.models.tracked_surface import Track
 from avatar.training.engine.photometric_task import TaskContext
-from smplxpp.core.labels import CLOTH_LABELS
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import CLOTH_LABELS, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 
 

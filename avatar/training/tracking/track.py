@@ -27,8 +27,7 @@ from avatar.training.engine.session import BACK, Session
 from avatar.training.tracking.cloth_prediction import ClothPrediction, simulate_controls
 from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track_uncertainty import expected_errors, structure_tensors, unobserved_weight
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import DEFAULT_FPS
+from smplxpp.core import DEFAULT_FPS, InputError
 
 LEVEL_DECAY = 0.1
 """Learning rate at the end of a level, as a fraction of that at its start."""

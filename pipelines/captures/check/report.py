@@ -18,10 +18,8 @@ from smplxpp.capture.check.check import CaptureCheck
 from smplxpp.capture.check.findings import AREAS, grouped
 from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary, body_silhouette
 from smplxpp.capture.check.views import OPAQUE, ViewCheck
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.files.json_file import jsonable
-from smplxpp.core.spread import spread
+from smplxpp.core import InputError, spread
+from smplxpp.core.files import atomic_write_bytes, atomic_write_text, jsonable
 
 _BODY_COLOR, _MASK_COLOR = (255, 60, 140), (0, 210, 255)
 

@@ -18,11 +18,9 @@ from pipelines.runs.layout import RECONSTRUCT_STAGE
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import ReconstructInputs, load_reconstruct
 from smplxpp.build.reconstruct import open_photographs
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, TriangleMesh, spread
 from smplxpp.core.files.json_file import as_object, read_json
-from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
-from smplxpp.core.spread import spread
 from smplxpp.metrics.distance import MM
 from smplxpp.raster import rasterize_mesh
 

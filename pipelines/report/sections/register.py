@@ -25,12 +25,8 @@ from smplxpp.build.observe import open_inputs
 from smplxpp.build.register import BODY_JOINTS, RESIDUALS
 from smplxpp.build.scan import read_scan
 from smplxpp.capture import Capture, find_scans
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, Camera, InputError, TriangleMesh, spread
 from smplxpp.core.files.json_file import as_list, as_object, as_text, read_json
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
 
 HEIGHT = 560
 REFERENCE_VIEWS, WORST_FRAMES = 2, 3

@@ -17,8 +17,7 @@ from pipelines.synth.garments.mannequin import HAND_JOINTS, Mannequin, shares
 from pipelines.synth.patterns import smooth_noise
 from smplxpp.body import BodyModel
 from smplxpp.clean.simplify import simplify
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.skinning import skin
 
 SHAPES = ("mean", "heavy and tall", "slight")

@@ -13,11 +13,8 @@ from pipelines.synth.people.cast import CAST
 from pipelines.synth.people.making import make_person
 from pipelines.synth.people.person_scan import PersonScan
 from smplxpp.body import BodyModel, load_body
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import read_arrays, write_arrays
-from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, TriangleMesh
+from smplxpp.core.files import read_arrays, read_bytes, write_arrays
 
 CACHE_VARIABLE = "SMPLXPP_PEOPLE"
 

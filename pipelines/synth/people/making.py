@@ -20,9 +20,7 @@ from pipelines.synth.people.paint import cloth_paint, hair_paint, photographed, 
 from pipelines.synth.people.person_scan import PersonScan, face_majority
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from smplxpp.body import BodyModel, PosedBody
-from smplxpp.core.labels import LABEL_BY_NAME
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
-from smplxpp.core.params import BodyParams
+from smplxpp.core import LABEL_BY_NAME, BodyParams, TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.skinning import skin
 

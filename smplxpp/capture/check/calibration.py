@@ -12,8 +12,7 @@ from smplxpp.capture.check.findings import Finding
 from smplxpp.capture.check.mistakes import Mistake, Sample
 from smplxpp.capture.check.silhouettes import IOU_BAD, MIN_SHARE, OUTSIDE_BAD, FitSummary, SilhouetteFit, summary
 from smplxpp.capture.check.views import ViewCheck
-from smplxpp.core.camera import Camera
-from smplxpp.core.spread import spread
+from smplxpp.core import Camera, spread
 
 # A frame does not fit by itself if it is bad in this share of its cameras. Single frames and cameras are to blame if
 # they are this much worse than the median.

@@ -23,10 +23,7 @@ from smplxpp.capture.check.mistakes import Sample
 from smplxpp.capture.check.parameters import parameter_findings, read_parameters
 from smplxpp.capture.check.silhouettes import FitSummary
 from smplxpp.capture.check.views import OPAQUE, ViewCheck, check_view
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec
-from smplxpp.core.spread import spread
+from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, matrix_from_rotvec, spread
 
 # Frame offsets that are tried where images and parameters may not be synchronised.
 _SHIFTS = (-3, -2, -1, 1, 2, 3)

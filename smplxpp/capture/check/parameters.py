@@ -9,8 +9,7 @@ import numpy as np
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
 from smplxpp.capture.check.findings import Finding
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import POSE_BLOCKS, BodyParams
+from smplxpp.core import POSE_BLOCKS, BodyParams, InputError
 
 BETA_LIMIT = 5.0
 _BETAS_VARY = 0.01

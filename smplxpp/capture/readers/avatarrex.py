@@ -8,8 +8,7 @@ from pathlib import Path
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params, numbered_images, pinhole, required
 from smplxpp.capture.recording import Recording
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.core.files.json_file import as_numbers, read_json
 
 NAME = "avatarrex"

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from smplxpp.capture.distortion import FISHEYE, FOV, OPENCV, Distortion
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.json_file import as_numbers
-from smplxpp.core.files.paths import regular_file
+from smplxpp.core.files import as_numbers, regular_file
 
 T = TypeVar("T")
 

@@ -16,8 +16,7 @@ from smplxpp.body import BodyModel
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name
 from smplxpp.capture.recording import ParamSource
 from smplxpp.capture.sources import find_params
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.core.files.image_file import image_size
 from smplxpp.core.files.json_file import as_integer, as_numbers
 from smplxpp.core.files.paths import check_name

@@ -9,8 +9,7 @@ from smplxpp.capture.files import FileSeries, image_name
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params, pinhole, required, size_of_first_image
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.sources import MeshFiles, ParamFiles
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.core.files.json_file import as_numbers
 from smplxpp.core.files.safe_pickle import safe_load
 

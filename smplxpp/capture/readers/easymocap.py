@@ -22,9 +22,8 @@ from smplxpp.capture.readers.common import (
 )
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.sources import ParamFiles
-from smplxpp.core.errors import InputError
+from smplxpp.core import InputError, matrix_from_rotvec
 from smplxpp.core.files.paths import read_text
-from smplxpp.core.rotations import matrix_from_rotvec
 
 NAME = "easymocap"
 LOOKS_FOR = "intri.yml and extri.yml"

@@ -16,8 +16,7 @@ from smplxpp.capture.readers.transforms_camera import frame_camera
 from smplxpp.capture.readers.transforms_images import NamedImage, find_image, mask_beside, places, same_camera
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.splits import Splits
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.core.files.image_file import image_mode, image_size
 from smplxpp.core.files.json_file import as_list, as_number, as_object, as_text, read_json
 

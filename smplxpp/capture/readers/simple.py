@@ -25,8 +25,7 @@ from smplxpp.capture.readers.common import ReaderOptions
 from smplxpp.capture.recording import ParamSource, Problem, Recording
 from smplxpp.capture.sources import ParamFiles, PosedTopology, find_params
 from smplxpp.capture.splits import Splits
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 
 NAME = "simple"
 LOOKS_FOR = "capture.json, or cameras.json or calibration.csv beside rgbs/, or scans/ with params/"

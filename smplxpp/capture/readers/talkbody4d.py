@@ -22,10 +22,8 @@ from smplxpp.capture.readers.common import (
 )
 from smplxpp.capture.recording import ParamSource, Problem, Recording
 from smplxpp.capture.sources import ParamFiles
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError, require_choice
 from smplxpp.core.files.json_file import as_numbers, read_json
-from smplxpp.core.validation import require_choice
 
 NAME = "talkbody4d"
 LOOKS_FOR = "a JSON file with `cameras` and `camera_poses`, beside a folder with a folder of images for each camera"

@@ -15,8 +15,7 @@ from jaxtyping import Float64
 
 from smplxpp.capture.distortion import FISHEYE, OPENCV, Distortion
 from smplxpp.capture.readers.common import inverted, pinhole, required
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from smplxpp.core.files.json_file import as_integer, as_number, as_numbers, as_text
 
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")

@@ -9,11 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import write_arrays
-from smplxpp.core.files.atomic import atomic_path
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.params import ARRAY_NAMES, BodyParams
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, Keypoints2D
+from smplxpp.core.files import atomic_path, write_arrays
 
 QUANTUM = 2.0**-14
 """Metres (0.06 mm) to which coordinates of true meshes are rounded, because they then compress better."""

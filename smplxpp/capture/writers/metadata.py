@@ -14,9 +14,8 @@ from jaxtyping import Float
 
 from smplxpp.capture.recording import Recording
 from smplxpp.capture.splits import Splits
-from smplxpp.core.camera import Camera
+from smplxpp.core import Camera, rotvec_from_matrix
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.rotations import rotvec_from_matrix
 
 _CONVENTION = (
     "OpenCV: x_cam = R @ x_world + T, x right, y down, z forward; u = fx*x/z + cx in [0,w], pixel (i,j) has its centre "

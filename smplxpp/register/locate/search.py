@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.core.errors import ProgressCallback
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import rotvec_from_matrix
+from smplxpp.core import ProgressCallback, TriangleMesh, require_at_least, rotvec_from_matrix
 from smplxpp.core.surface_points import SurfacePoints
-from smplxpp.core.validation import require_at_least
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.dressed import Dressed, Misfit, OuterBody, misfit
 from smplxpp.register.locate.icp import IcpTerm, PinnedLandmarks, Term, gauss_newton_step

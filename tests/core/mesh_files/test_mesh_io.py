@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 
 

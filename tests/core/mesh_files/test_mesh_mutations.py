@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from tests.core.gltf_maker import make_glb, make_gltf
 from tests.core.mutations import mutations

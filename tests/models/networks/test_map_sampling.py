@@ -10,8 +10,7 @@ import trimesh
 
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.rendering.mesh_maps import MapFrame
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 
 FRAME = MapFrame((0.1, -0.2, 0.3), half_extent=0.8)

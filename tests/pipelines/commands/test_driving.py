@@ -15,8 +15,7 @@ from pipelines.commands.templates import load_run_template
 from pipelines.viewer.run_session import open_run
 from smplxpp.body import load_body
 from smplxpp.body.retarget import Skeleton, retarget
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.export.bvh import write_bvh
 from tests.body.walks import betas, shaped, walk
 from tests.dolls.dancing import template, write_dance_run

@@ -16,9 +16,7 @@ from pipelines.cli import main
 from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import STUDENT, TEMPLATE
 from smplxpp.body import load_body
-from smplxpp.core.errors import GeometryWarning
-from smplxpp.core.params import BodyParams
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core import BodyParams, GeometryWarning, SkinWeights
 from smplxpp.template.template import Template
 from tests.dolls.dancing import dance, write_dance_run
 from tests.runtime.bundles import student

@@ -18,8 +18,7 @@ from pipelines.cli import main
 from pipelines.commands.export_request import SUFFIXES, format_of
 from pipelines.runs.layout import STUDENT, TEMPLATE
 from smplxpp.body import load_params
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template
 from tests.cloth.test_driver import swaying
 from tests.dolls.dancing import dance, write_dance_run

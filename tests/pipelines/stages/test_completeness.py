@@ -12,8 +12,7 @@ from pipelines.runs.artefacts import load_params_of_run, load_scan, load_scan_la
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.build.completeness import completeness_checks
 from smplxpp.clean import sanitize
-from smplxpp.core.labels import LOWER, SKIN
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import LOWER, SKIN, TriangleMesh
 from smplxpp.metrics import CompareConfig, directed_distances
 from smplxpp.template.template import Template
 

@@ -17,8 +17,7 @@ from pipelines.stages.neural_surface import neural_method
 from pipelines.stages.reconstruct import reconstruct_capture
 from smplxpp.build.reconstruct import open_photographs, unit_cube_of, usable_cameras, usable_frames
 from smplxpp.capture import open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.reconstruct import ReconstructConfig
 from smplxpp.reconstruct.hull import solid_status

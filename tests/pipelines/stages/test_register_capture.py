@@ -16,9 +16,7 @@ from pipelines.stages.register_capture import register_capture
 from pipelines.stages.run_inputs import params_in_use
 from smplxpp.body import load_params
 from smplxpp.capture import Capture, open_capture
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import LABELS
-from smplxpp.core.params import BodyParams
+from smplxpp.core import LABELS, BodyParams, InputError
 from tests.pipelines.registrations import FIXTURE, HELD_OUT, exact, joints_in, use_keypoints, use_solver
 
 TRACKED = FIXTURE / "params" / "params_noisy.npz"

@@ -12,8 +12,7 @@ import pytest
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs
 from smplxpp.build.scan import read_scan
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, MissingExtraError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.metrics import point_to_surface, sample_surface
 from smplxpp.segment.label_files import read_labels

@@ -7,8 +7,7 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.build.scan_keypoints import ScanViews, facing, keypoints_of_scan
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.detect import DetectedPerson
 from tests.conftest import ROOT

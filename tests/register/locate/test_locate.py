@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body, load_params
-from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
 from smplxpp.core.mesh_files.mesh_io import read_mesh
-from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.register.locate import LocateConfig, locate_body
 
 PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"

@@ -18,8 +18,7 @@ from avatar.training.engine.optimization_task import DivergedError
 from avatar.training.engine.resources import choose_device
 from avatar.training.fit.config import FitConfig
 from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
-from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core import Camera, InputError
 from tests.dolls.standing import HELD_OUT, TRAIN, doll
 
 CONFIG = FitConfig(sampling=SamplingConfig(count=2500), iterations=60, evaluations=3, margin=4)

@@ -12,8 +12,7 @@ from avatar.gaussians.sampling import SamplingConfig
 from avatar.training.refinement.align import Alignment
 from avatar.training.refinement.config import Level, RefineConfig
 from avatar.training.refinement.refine import Refinement, refine_held_out, refine_poses
-from smplxpp.core.errors import InputError
-from smplxpp.core.params import BodyParams
+from smplxpp.core import BodyParams, InputError
 from tests.dolls.gesturing import NOVEL_POSES, disturbed, gestures, sequence, template, write_gestures
 from tests.pretended_cuda import pretended_cuda
 
