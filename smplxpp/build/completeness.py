@@ -121,7 +121,7 @@ def _body_side(body: TriangleMesh, region: np.ndarray, scan: TriangleMesh) -> tu
         ("hands and feet", ENDS_UNCOVERED, ENDS),
     ):
         order = sorted(among, key=lambda name: -shares[name])
-        # Name every region beyond the limit, and the worst one where all are within it.
+        # Name every region above the limit, and the worst one where all are within it.
         lost = [f"{name} {100 * shares[name]:.0f} %" for name in order if shares[name] > gate.warn] or [
             f"{order[0]} {100 * shares[order[0]]:.0f} %"
         ]

@@ -135,7 +135,7 @@ class BuildInputs:
         registers: whether the parameters come from a registration.
         motion: parameters of the capture's frames, for validation; may be None.
         body: SMPL-X-layout body file; None for the open body.
-        protocol: of the capture, by which these files were found; None without one.
+        protocol: protocol of the capture that names these files; None without one.
     """
 
     subject: str

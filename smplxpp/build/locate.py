@@ -79,7 +79,7 @@ def locate_in_scan(
         "candidates": found.candidates,
         "bare": float(bare.mean()),
     }
-    # Confidence is the lead over the best pose that faces another way; without a lead the person may stand turned by
+    # Confidence is the margin over the best pose with another facing; without a lead the person may stand turned by
     # 180 degrees.
     check = Check(
         "confidence of the body found",

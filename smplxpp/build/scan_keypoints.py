@@ -52,7 +52,7 @@ def keypoints_of_scan(
     """Find the landmarks that a detector knows on a scan that stands upright.
 
     Args:
-        mesh: metres, +Y up; it may face any way.
+        mesh: metres, +Y up; it may have any facing.
         colors: sRGB; None: drawn as grey clay.
         detector: see `smplxpp.detect`.
         config: how it is drawn.

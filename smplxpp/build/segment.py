@@ -206,7 +206,7 @@ def _taken(labels: np.ndarray, source: np.ndarray, name: str) -> np.ndarray:
     Raises:
         InputError: places that the file does not have.
     """
-    # An index beyond the file means that the prepared scan was made of another version of it.
+    # An index outside of the file means that the prepared scan was made of another version of it.
     if source.size and source.max() >= len(labels):
         raise InputError(
             f"scan: {name}", expected=f"places below {len(labels)} in its file", received=f"up to {int(source.max())}"

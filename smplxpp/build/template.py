@@ -106,7 +106,7 @@ def _path(value: str | _T) -> Path | _T:
 
 
 class _Build:
-    """One build under way: the plan, the body, and the checks, numbers and times of the steps so far."""
+    """One running build: the plan, the body, and the checks, numbers and times of the steps so far."""
 
     def __init__(self, request: BuildRequest, on_stage: OnStage) -> None:
         self.request, self.on_stage = request, on_stage

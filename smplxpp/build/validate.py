@@ -81,7 +81,7 @@ def validate_template(
     numbers["shared_volume"] = _shared_volumes(template)
     turned = _turned_faces(template, posed, parts)
     checks.append(Check("faces of the parts turned over against the cleaned scan", turned, "", 0, 0))
-    # Stretch under poses that nobody records, and under a dozen frames of what was recorded.
+    # Stretch under poses that are rarely recorded, and under a dozen recorded frames.
     motion_frames = 12
     poses = {"hard poses": stress_poses(params)}
     if motion is not None:

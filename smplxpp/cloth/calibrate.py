@@ -27,7 +27,7 @@ class CalibrationConfig:
         drag_prior: how far the garment's own drag is believed: the distance counts as larger by this share for each
             squared factor of two from it. Slow motion tells drags hardly apart, and what was followed there is stiffer
             than cloth; a motion that does tell finds the same drag with and without it.
-        least_motion: metres by which the followed surface leaves skinning, on average over a part, for it to be loose.
+        least_motion: mean distance, in metres, of the tracked surface to skinning from which a part is loose.
         most_share: of skinning's distance to the followed surface that the simulation's may have for what was fitted to
             be kept; else the surface was followed too badly to say anything, and the values stay what they were.
         blocks: of consecutive frames; each is left out once for the uncertainty.

@@ -34,9 +34,9 @@ def loop_length(mesh: TriangleMesh, loop: Int[np.ndarray, " n"]) -> float:
 def geodesics(
     mesh: TriangleMesh, sources: Int[np.ndarray, " S"]
 ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-    """Return the length of the shortest way along edges from the nearest source, metres, and that source.
+    """Return the length of the shortest path along edges from the nearest source, metres, and that source.
 
-    inf and -1 where no way leads there.
+    Vertices without a path have inf and -1.
     """
     distance, _, source = dijkstra(
         edge_graph(mesh), directed=False, indices=sources, min_only=True, return_predecessors=True
@@ -116,8 +116,8 @@ def lengths_along(mesh: TriangleMesh, ends: Int[np.ndarray, "E 2"], *, samples: 
     t = np.linspace(0.0, 1.0, samples + 1)[1:-1, None]
     chord = a[:, None] + (b - a)[:, None] * t
     laid = igl.point_mesh_squared_distance(chord.reshape(-1, 3), mesh.vertices, mesh.faces)[2].reshape(chord.shape)
-    way = np.concatenate([a[:, None], laid, b[:, None]], axis=1)
-    return np.linalg.norm(np.diff(way, axis=1), axis=2).sum(axis=1)
+    path = np.concatenate([a[:, None], laid, b[:, None]], axis=1)
+    return np.linalg.norm(np.diff(path, axis=1), axis=2).sum(axis=1)
 
 
 def _farthest(points: Float[np.ndarray, "N 3"], used: Int[np.ndarray, " U"], count: int) -> Int[np.ndarray, " count"]:

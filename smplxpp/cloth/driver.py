@@ -21,7 +21,7 @@ from smplxpp.template.template import Template
 LONGEST_STEP = 0.26
 # Step of the ramp of a cold start.
 _RAMP_STEP = 1.0 / 30.0
-# Metres of the root from what places are measured from, beyond which that follows it.
+# Distance, in metres, of the root from the origin of the particles' places above which the origin follows it.
 _FAR = 4.0
 
 
@@ -32,7 +32,7 @@ class DriverConfig:
     Attributes:
         ramp: seconds in which a cold start goes from the reference pose, where the cloth is at rest, to the first one.
         hold: seconds for which it then stays there.
-        teleport: metres a second of what holds the cloth; faster motion is a cut, and starts anew.
+        teleport: speed, in metres a second, of the cloth's attachments above which a motion is a cut and restarts.
         most_stretch: length of the longest edge over that at rest from which the cloth is taken to have exploded.
         solver: how time is stepped.
     """

@@ -30,7 +30,7 @@ class GarmentConfig:
     Attributes:
         spacing: of its particles, metres. collider_spacing: of the collider's vertices.
         pin_depth: metres along the cloth from where the body carries it up to which it follows the body exactly.
-        band: metres beyond, over which simulated displacements take over from skinning's.
+        band: width, in metres, of the transition from skinning to simulation next to the pins.
         skin_margin, sheet_margin: metres that cloth keeps from the skin and from other clothes.
         fabric: material.
     """
@@ -60,7 +60,7 @@ class Garment:
         particles: vertices of the template that the particles are.
         rest: the simulated mesh in the reference pose, metres.
         lengths: of `rest.edges`, along the cloth, metres.
-        depth: of particles along the cloth from what the body carries, metres; inf where no way leads there.
+        depth: of particles along the cloth from what the body carries, metres; inf without a path.
         vertices: of the template that it carries. vertex_depth: theirs. embedding: theirs.
         collider: what it may touch.
     """
@@ -90,7 +90,7 @@ class Garment:
         return build_model(self.rest, self.pinned * 1.0, self.config.fabric, lengths=self.lengths)
 
     def share(self) -> Float32[np.ndarray, " N"]:
-        """Return how much of each vertex's displacement is the simulation's: 0 at the pins, 1 beyond the band."""
+        """Return how much of each vertex's displacement is the simulation's: 0 at the pins, 1 outside of the band."""
         t = np.clip((self.vertex_depth - self.config.pin_depth) / self.config.band, 0.0, 1.0)
         return np.where(np.isfinite(self.vertex_depth), t * t * (3.0 - 2.0 * t), 0.0).astype(np.float32)
 

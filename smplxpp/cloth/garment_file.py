@@ -166,7 +166,7 @@ def _checked(found: Mapping[str, np.ndarray | None], template: Template, subject
                 raise InputError(
                     f"{subject}: {name}", expected=f"shape ({shape})", received=f"{value.shape}", remedy=_REMEDY
                 )
-        # Depth is infinite where no way leads to what holds the cloth.
+        # Depth is infinite without a path to an attachment.
         if value.dtype.kind == "f" and np.isnan(value).any():
             raise InputError(f"{subject}: {name}", expected="numbers", received="NaN", remedy=_REMEDY)
         if value.dtype.kind == "f" and not name.endswith("depth") and not np.isfinite(value).all():

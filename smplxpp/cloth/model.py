@@ -170,9 +170,10 @@ def _cotangents(
 def _tethers(
     rest: TriangleMesh, lengths: Float[np.ndarray, " e"], fixed: np.ndarray, slack: float
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Long-range attachments (Kim et al. 2012): the nearest fixed particle along the cloth, and the longest way to it.
+    """Return long-range attachments (Kim et al. 2012): the nearest fixed particle along the cloth, and its distance
+    bound.
 
-    A way along edges zigzags: where the straight one is much shorter, that and a little more is what holds.
+    A path along edges zigzags, so that the straight distance and a little more is the bound where it is shorter.
     """
     n = rest.vertex_count
     if not fixed.any():
@@ -187,6 +188,6 @@ def _tethers(
     held = np.isfinite(distance) & ~fixed
     anchor = np.where(held, source, -1)
     straight = row_lengths(rest.vertices - rest.vertices[np.maximum(source, 0)])
-    way = np.minimum(distance, 1.01 * straight + 1e-3) * (1.0 + slack)
+    bound = np.minimum(distance, 1.01 * straight + 1e-3) * (1.0 + slack)
     depth = np.where(np.isfinite(distance), distance, 0.0)
-    return anchor.astype(np.int32), np.where(held, way, 0.0).astype(np.float32), depth
+    return anchor.astype(np.int32), np.where(held, bound, 0.0).astype(np.float32), depth

@@ -43,7 +43,7 @@ def find_opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
     skin = template.part_mesh(BODY_PART)
     try:
         body = SignedDistanceField(skin, solid=True)
-    except InputError:  # where the body has no inside, nobody knows what is hollow
+    except InputError:  # without an inside of the body there are no hollows
         return out
     for part in parts:
         faces = template.part_faces(part)

@@ -16,7 +16,7 @@ _ROTATIONS = tuple(name for name, _ in POSE_BLOCKS)
 
 
 def pose_between(start: BodyParams, end: BodyParams, t: float) -> BodyParams:
-    """Return the pose at t in [0, 1] of the way from one frame to another, every joint along its shortest turn."""
+    """Return the pose at t in [0, 1] between one frame and another, every joint along its shortest rotation."""
     changes: dict[str, Any] = {}
     for name in (*_ROTATIONS, "expression", "transl"):
         a, b = getattr(start, name), getattr(end, name)
@@ -50,7 +50,7 @@ def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
         return params
     offsets = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (offsets / radius) ** 2)
-    # Beyond its ends a motion goes on as its mirror image about the end's own pose: the ends stay where they are.
+    # Outside of its ends a motion is continued by its mirror image about the end's pose, which keeps the ends in place.
     changes: dict[str, Any] = {}
     for name in (*_ROTATIONS, "expression", "transl"):
         value = getattr(params, name)
@@ -103,7 +103,7 @@ def resampled(params: BodyParams, times: Float[np.ndarray, " T"], wanted: Float[
         way = _step(value, step, step + 1, turning)
         came = -_step(value, step, before, turning) / np.where(first > 0, first, 1.0)
         goes = _step(value, step + 1, after, turning) / np.where(last > 0, last, 1.0)
-        # At an end there is no pose beyond: the tangent is that of the step.
+        # At an end the tangent is that of the last step.
         start = np.where(first > 0, (first * way + came) / (1.0 + first), way)
         end = np.where(last > 0, (last * way + goes) / (1.0 + last), way)
         t2, t3 = t * t, t * t * t
@@ -162,7 +162,7 @@ def _turns(name: str, a: np.ndarray, b: np.ndarray) -> bool:
 def _step(
     value: Float[np.ndarray, "T D"], start: np.ndarray, end: np.ndarray, turning: bool
 ) -> Float[np.ndarray, "K D"]:
-    """The way from rows to other rows: rotation vectors in the start's frame, or differences."""
+    """Return the step from rows to other rows: rotation vectors in the start's frame, or differences."""
     if not turning:
         return value[end] - value[start]
     first, second = (_rotation(value[rows]) for rows in (start, end))
@@ -177,11 +177,11 @@ def _moved(value: Float[np.ndarray, "T D"], step: Float[np.ndarray, "T D"], turn
 
 
 def _heading(rotation: Rotation) -> float:
-    """The angle about +Y by which a rotation turns where +Z looks, radians."""
+    """Return the heading of a rotation: the angle about +Y of the rotated +Z, radians."""
     ahead = rotation.apply([0.0, 0.0, 1.0])
     return float(np.arctan2(ahead[0], ahead[2]))
 
 
 def _rotation(vectors: Float[np.ndarray, "K D"]) -> Rotation:
-    # A copy: scipy refuses to look at arrays that nobody may write to.
+    # A copy, because scipy refuses read-only arrays.
     return Rotation.from_rotvec(np.array(vectors, dtype=np.float64).reshape(-1, 3))

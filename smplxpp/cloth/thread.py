@@ -52,7 +52,7 @@ class GarmentThread:
         self._places, self._surfaces = [places[self._particles]], [places[self._skin]]
 
     def way_to(self, places: Float32[np.ndarray, "R 3"]) -> float:
-        """Return the longest way, metres, of what holds the garment from the last moment to these places."""
+        """Return the largest displacement, metres, of the garment's attachments since the last step."""
         ways = row_lengths(places[self._particles[self._pinned]] - self._places[-1][self._pinned])
         return float(ways.max(initial=0.0))
 
@@ -89,7 +89,7 @@ class GarmentThread:
         self._state.position[:] = particles
 
     def shift(self, by: Float32[np.ndarray, " 3"]) -> None:
-        """Move all that is remembered, metres: what places are measured from has moved the other way."""
+        """Shift all stored places, metres, because their origin has moved by the opposite vector."""
         self._state.position[:] += by
         self._places = [places + by for places in self._places]
         self._surfaces = [surface + by for surface in self._surfaces]
@@ -122,7 +122,7 @@ class GarmentThread:
             return surface
         out = surface.copy()
         share = self._share[at[mine], None]
-        # Blend as the drawn surface does: near the pins skinning holds, beyond the band the simulation.
+        # Blend as the drawn surface does: near the pins skinning counts, outside of the band the simulation.
         out[mine] += share * (self.carried()[at[mine]] - out[mine])
         return out
 

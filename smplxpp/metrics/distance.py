@@ -29,7 +29,7 @@ MM = 1e3
 
 @dataclass(frozen=True)
 class CompareConfig:
-    """Options of `compare` beyond the usual ones.
+    """Less common options of `compare`.
 
     Attributes:
         threshold_mm: of precision, recall and F-score.
@@ -51,7 +51,7 @@ class DirectedDistances:
         samples: the points, their faces and normals.
         distance: (P,) float64 metres, unsigned.
         closest: (P, 3) float64 the target's point. face: (P,) int64 the target's face there.
-        angle: (P,) float64 degrees in [0, 180] between the normals; a target wound the other way gives 180.
+        angle: (P,) float64 degrees in [0, 180] between the normals; a target with reversed winding gives 180.
         label: (P,) int64, or None without labels.
     """
 

@@ -19,12 +19,12 @@ from smplxpp.raster import rasterize_mesh
 _BLUR = 3
 _INSIDE = 2
 _LEAST_PIXELS = 200
-# Share of an image's longer side by which a view may be off, the step of the search, and the pixels it looks at.
+# Largest shift of a view as a share of an image's longer side, the step of the search, and the pixels it looks at.
 _REACH = 0.03
 _STEP = 3
 _SEARCHED = 3_000
 _ALIGNED = 3_000
-# Pixels by which colours may be off beside that, and the window in which the least is looked for.
+# Largest local shift of colours in pixels, and the window in which the smallest difference is searched.
 _LOCAL = 2
 _WINDOW = 25
 # Least share of the photographs' variance that the scan or its image explains: below it they show something else.
@@ -42,7 +42,7 @@ def mirrored_by_views(
     center: Float64[np.ndarray, " 3"],
     across: Float64[np.ndarray, " 3"],
 ) -> float | None:
-    """Where photographs lie on the way from the colours of a scan (0) to those of its mirror image (1).
+    """Return the place of photographs between the colours of a scan (0) and those of its mirror image (1).
 
     Both are drawn into every view, given the gain and offset of each channel with which they come closest to the
     photograph, and moved by a few pixels, first as a whole and then locally: what a stripe is off by must not count.
@@ -70,9 +70,9 @@ def mirrored_by_views(
             continue
         here, there = _locally_moved(one), _locally_moved(two)
         both = np.isfinite(here[..., 0]) & np.isfinite(there[..., 0])
-        way = there[both] - here[both]
-        along += float(((one.photograph[both] - here[both]) * way).sum())
-        length += float((way**2).sum())
+        direction = there[both] - here[both]
+        along += float(((one.photograph[both] - here[both]) * direction).sum())
+        length += float((direction**2).sum())
         variance += one.variance
     return 0.5 if length <= _SAME * variance else along / length
 
@@ -132,7 +132,7 @@ def _view(mesh: TriangleMesh, colors: np.ndarray, camera: Camera, photograph: np
 
 
 def _offset(drawn: np.ndarray, photograph: np.ndarray, row: np.ndarray, col: np.ndarray) -> tuple[int, int]:
-    """Pixels down and to the right by which drawn colours fit a photograph best."""
+    """Return the shift, in pixels down and to the right, that fits drawn colours best to a photograph."""
     height, width = photograph.shape[:2]
     chosen = np.array(spread(range(len(row)), _SEARCHED))
     drawn, row, col = drawn[chosen], row[chosen], col[chosen]

@@ -24,7 +24,7 @@ class MeshQuality:
         components: pieces that share no vertex.
         euler: V - E + F over referenced vertices (2 for one closed piece, less 1 a border, less 2 a handle).
         nonmanifold_edges: edges with three or more faces. nonmanifold_vertices: whose faces form more than one fan.
-        inconsistent_edges: edges with two faces that run along them in the same direction (one is wound the wrong way).
+        inconsistent_edges: edges with two faces that run along them in the same direction (one has the wrong winding).
         flipped_faces: faces to turn so that each orientable patch is consistent, its majority kept.
         border_edges: with one face. border_loops: connected pieces of border. border_lengths_mm: longest first.
         zero_area_faces: with no area at all.
