@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from smplxpp.body.layout import JOINT_NAMES
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
+from smplxpp.core import InputError, require_at_least, require_between, require_choice, require_positive
 
 _BOTH = ("left_", "right_")
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3")

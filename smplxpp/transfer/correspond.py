@@ -11,8 +11,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
-from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
+from smplxpp.core import GeometryWarning, InputError, TriangleMesh, normalize_rows, row_lengths
 from smplxpp.core.topology import component_labels
 from smplxpp.transfer.config import TransferConfig
 
