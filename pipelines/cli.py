@@ -143,11 +143,11 @@ USER_ERROR, INTERRUPTED = 2, 130
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one subcommand.
+    """Run one subcommand and return its exit status.
 
     Returns:
         The exit status: 0, 1 for failed gates, 2 for the user's errors and the system's, 130 after an interrupt, 141
-        when nobody reads the output any more.
+        when the output is closed.
     """
     args = list(sys.argv[1:] if argv is None else argv)
     with standard_streams():
@@ -156,7 +156,7 @@ def main(argv: list[str] | None = None) -> int:
             try:
                 return _answer(args, console)
             finally:
-                sys.stdout.flush()  # what it refuses is told here, not at the interpreter's end
+                sys.stdout.flush()  # errors of the stream are reported here and not at the end of the interpreter
         except OutputError as error:
             return end_of_output(error, console)
 

@@ -360,7 +360,6 @@ SMALL_WITH_A_REASON = {
     "smplxpp.cloth.carriers": "a step of the method with a page section of its own",
     "smplxpp.detect.load": "the registry in which CONTRIBUTING asks to list a new detector",
     "smplxpp.export.by_suffix": "keeps the writers of formats out of the light room of templates",
-    "smplxpp.transfer.inpaint": "one operator a file",
 }
 SMALL_MODULE = 60
 

@@ -1,4 +1,4 @@
-"""A baseline from its configuration."""
+"""Make a baseline from its configuration and a template."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from smplxpp.core.validation import require_between
 
 @dataclass(frozen=True, kw_only=True)
 class PhotographConfig(PhotometricConfig):
-    """Choices of a baseline's training.
+    """Options of a baseline's training on photographs.
 
     Attributes:
         null_share: share of the poses that are shown with the null code.

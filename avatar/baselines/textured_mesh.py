@@ -63,7 +63,7 @@ class TexturedMeshAvatar(Baseline):
 
     @property
     def gaussians(self) -> LearnedGaussians:  # type: ignore[override]  # a part of the student here
-        """The texels."""
+        """Return the texels of the texture, as Gaussians."""
         return self.student.gaussians
 
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:

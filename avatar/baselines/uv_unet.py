@@ -62,7 +62,7 @@ class UNet(nn.Module):
         nn.init.zeros_(self.last.bias)
 
     def forward(self, x: Float[Tensor, "1 I S S"]) -> Float[Tensor, "1 O S S"]:
-        """Apply the network."""
+        """Apply the network to a map of positions."""
         scales = [self.first(x)]
         for layer in self.down:
             scales.append(layer(scales[-1]))

@@ -34,7 +34,7 @@ class View:
 
     @property
     def name(self) -> str:
-        """Name of the view's camera."""
+        """Return the name of the view's camera."""
         return self.camera.name
 
     @cached_property

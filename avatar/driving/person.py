@@ -19,7 +19,7 @@ def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, StandingBody]:
     """Return the face of a bundle's person and how the body stands.
 
     Raises:
-        InputError: expressions by which no mouth can be moved.
+        InputError: expressions that cannot move a mouth.
     """
     standing = StandingBody.of(
         Skeleton.of(skeleton_body(bundle)),
@@ -34,7 +34,7 @@ def face_of_bundle(bundle: AvatarBundle) -> Face:
     """Return the face of a bundle's person.
 
     Raises:
-        InputError: expressions by which no mouth can be moved.
+        InputError: expressions that cannot move a mouth.
     """
     about = bundle.about
     # Numbered expressions have no meaning by name: what they do to the surface is measured.
@@ -50,7 +50,7 @@ def person_of_template(template: Template, seen: BodyParams | None = None) -> tu
         seen: parameters of frames that show how the person stands; None: the T-pose.
 
     Raises:
-        InputError: expressions by which no mouth can be moved.
+        InputError: expressions that cannot move a mouth.
     """
     body = template.body
     face = Face.of(body.expression_names, body.joint_names, seen, body=body)

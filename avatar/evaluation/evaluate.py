@@ -45,7 +45,7 @@ from smplxpp.core import BodyParams, InputError, ProgressCallback, TriangleMesh,
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationConfig:
-    """What is measured.
+    """Options of an evaluation: views, surfaces, speed and metrics.
 
     Attributes:
         protocol: which views.
@@ -116,7 +116,7 @@ def evaluate_models(
 
 
 class _Run:
-    """An evaluation under way, with what was found so far."""
+    """A running evaluation with its results so far."""
 
     def __init__(
         self,

@@ -36,7 +36,7 @@ class ShownView:
 
 @dataclass(frozen=True, eq=False)
 class ShownSurface:
-    """Meshes of one frame.
+    """Posed meshes of one frame for pictures.
 
     Attributes:
         set: "training" or "held_out". truth: the true surface.

@@ -59,7 +59,7 @@ class InputProtocol:
         Raises:
             InputError: another word than those known.
         """
-        # The name is said beside the fields and follows from them.
+        # The name follows from the fields.
         known = {f.name for f in fields(InputProtocol)} | {"name"}
         require_known("inputs of an evaluation", values, known)
         for field in fields(InputProtocol):

@@ -53,7 +53,7 @@ class ProtocolConfig:
 
 @dataclass(frozen=True)
 class ViewSet:
-    """Views that are measured together.
+    """Set of views that are measured together.
 
     Attributes:
         name: among `SETS`. views: (camera, frame), frame by frame.

@@ -52,7 +52,7 @@ class Surfaces:
 
 @dataclass(frozen=True)
 class ModelFigures:
-    """Everything measured on one model.
+    """All figures that were measured on one model.
 
     Attributes:
         views: set -> view -> its figures.
@@ -162,7 +162,7 @@ class EvalReport:
 
     @staticmethod
     def load(path: Path) -> EvalReport:
-        """Read what `save` wrote.
+        """Read a report that `save` wrote, with checks.
 
         Raises:
             InputError: missing, damaged or foreign file.

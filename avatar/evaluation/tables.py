@@ -22,7 +22,7 @@ _LATEX = {
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of every row.
+    """Column of a table: one figure of every row.
 
     Attributes:
         key: in the rows' figures. title: over the column, unit included. group: over the titles of its neighbours.

@@ -169,7 +169,7 @@ def _surface(template: Template, cut: _Cut, config: BundleConfig) -> Tensors:
     at, body = cut.vertices, template.body
     skin = at[at < body.vertex_count]
     index, weights = template.weights.joint_indices[at], template.weights.joint_weights[at]
-    # The heaviest first, and no slots that nobody uses.
+    # The heaviest first, without unused slots.
     order = np.argsort(-weights, axis=1, kind="stable")
     used = max(1, int((weights > 0).sum(axis=1).max()))
     index, weights = (np.take_along_axis(array, order, axis=1)[:, :used] for array in (index, weights))

@@ -36,7 +36,7 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class ViewQuality:
-    """Figures of one view.
+    """Image quality of one view, by named conventions.
 
     Attributes:
         psnr: dB over the person: the union of the silhouettes, mask or rendered opacity above 0.02.

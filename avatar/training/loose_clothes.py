@@ -56,7 +56,7 @@ class Outlines:
 
     @property
     def better(self) -> bool:
-        """Whether the simulation is nearer."""
+        """Return whether the simulation is nearer to the masks."""
         return self.simulated < self.skinned
 
 

@@ -29,7 +29,7 @@ def with_local_shapes(shapes: BlendShapeConfig) -> BlendShapeConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingPreset:
-    """Configurations of all stages.
+    """Configurations of all stages of a training.
 
     Attributes:
         networks: sizes of the teacher and the field.

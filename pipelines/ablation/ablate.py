@@ -59,7 +59,7 @@ class AblationRun:
 
 @dataclass(frozen=True)
 class AblationOutcome:
-    """Result of a call.
+    """Result of a call of `ablate`.
 
     Attributes:
         folder: `RUN/ablation`.

@@ -24,7 +24,7 @@ OPEN = "open"
 
 @dataclass(frozen=True)
 class Driving:
-    """Options of a motion."""
+    """Options of a motion that drives an avatar."""
 
     retarget_from: OptionalPath = None
     """Body that the motion was recorded for, if it is another one: a body model file (with the motion's betas), a run,

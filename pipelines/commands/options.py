@@ -41,7 +41,7 @@ def require_avatar(purpose: str) -> None:
 
 @dataclass(frozen=True)
 class Lighting:
-    """Options of another light."""
+    """Options of the light in which a person is shown."""
 
     environment: OptionalPath = None
     """Show the person in the light of this panorama: equirectangular, Radiance (.hdr) or OpenEXR (.exr, extra

@@ -78,7 +78,7 @@ REFINED_CAMERAS = f"{REFINE_STAGE}/cameras.json"
 EVALUATION = f"{EVALUATE_STAGE}/metrics.json"
 
 BUILD_FILE = "build.json"
-"""What a run was built from, so that later stages can write its report anew."""
+"""What a run was built from, so that later stages can rewrite its report."""
 REGISTER_FILE = "register.json"
 """What a run's registration was made from."""
 LANDMARKS_FILE = "landmarks.json"

@@ -95,7 +95,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """A stage in its folder.
+    """A finished or stopped stage in its folder.
 
     Attributes:
         folder: folder of the stage.

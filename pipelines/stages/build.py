@@ -42,7 +42,7 @@ _READERS: dict[str, Callable[[Path], object]] = {
 
 @dataclass(frozen=True)
 class _Part:
-    """A stage of the build.
+    """A stage of the build with its inputs and settings.
 
     Attributes:
         work: `work(folder, build)` writes the stage's files.

@@ -77,7 +77,7 @@ class StageConfig(Protocol):
 
     @property
     def iterations(self) -> int:
-        """Steps of the training."""
+        """Return the number of steps of the training."""
 
 
 @dataclass(frozen=True, kw_only=True)

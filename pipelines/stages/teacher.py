@@ -17,7 +17,7 @@ from pipelines.stages.train_results import training_output, write_model
 
 @dataclass(frozen=True, kw_only=True)
 class TeacherStage(ModelStage):
-    """A teacher on fitted Gaussians.
+    """Stage that trains a teacher on fitted Gaussians.
 
     Attributes:
         gaussians: stage of the fit.

@@ -32,7 +32,7 @@ def _default_budgets() -> dict[str, int]:
 
 @dataclass(frozen=True)
 class BuildConfig:
-    """Choices of one build.
+    """Choices of a build that change its result.
 
     Attributes:
         units: units of the scan, one of `UNITS`. "auto": found from the person's height where the scan comes alone,

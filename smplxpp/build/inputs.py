@@ -74,7 +74,7 @@ class BuildRequest:
 
 @dataclass(frozen=True, eq=False)
 class BuildPlan:
-    """What a build takes, decided.
+    """Inputs of a build, with every choice decided.
 
     Attributes:
         inputs: what is read and which steps make the rest.

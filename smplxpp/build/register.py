@@ -49,7 +49,7 @@ RESIDUALS: dict[str, Residual] = {
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A body registered to observations.
+    """Result of a registration of the body to observations.
 
     Attributes:
         fit: parameters, confidence and residuals of the frames that could be registered.

@@ -33,12 +33,12 @@ class BuildReport:
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """The checks of all steps."""
+        """Return the checks of all steps of the build."""
         return tuple(check for output in self.steps.values() for check in output.checks)
 
     @property
     def failed(self) -> tuple[Check, ...]:
-        """The checks outside their limits."""
+        """Return the checks that are outside of their limits."""
         return tuple(check for check in self.checks if check.status == "fail")
 
     @property
@@ -66,7 +66,7 @@ class BuildReport:
 
 @dataclass(frozen=True, eq=False)
 class BuildResult:
-    """What `build_template` returns.
+    """Result of `build_template`: template, parts, report and capture.
 
     Attributes:
         template: the clothed body.

@@ -20,7 +20,7 @@ _SEEN = 0.3
 
 @dataclass(frozen=True)
 class ScanViews:
-    """How a scan is drawn.
+    """How a scan is drawn for a detector of keypoints.
 
     Attributes:
         count: number of pictures, on one turn about the scan's upright axis.

@@ -125,7 +125,7 @@ class _Build:
         return self.plan.config
 
     def run(self) -> BuildResult:
-        """Run the steps in order."""
+        """Run the steps of the build in their order."""
         config, inputs, body = self.config, self.inputs, self.body
         # Ask for optional programs and read small files first: a missing one would be noticed only after minutes.
         require_remesher(config.remesh)

@@ -34,7 +34,7 @@ _SUFFIXES = (".npz", ".json")
 
 @dataclass(frozen=True)
 class KeypointOptions:
-    """Options for reading keypoint files.
+    """Options for reading files of detected keypoints.
 
     Attributes:
         format: "auto" recognises the format by the content, except OpenPose's BODY_25B, which has as many points as

@@ -13,7 +13,7 @@ from smplxpp.core.topology import face_components
 
 # Metres: shorter borders are holes.
 SHORTEST_OPENING = 0.15
-# Faces that are asked which way they look.
+# Samples of faces whose orientation is tested.
 _LOOKS = 2000
 
 

@@ -43,7 +43,7 @@ class ColliderMesh:
 
     @property
     def native(self) -> Collider:
-        """The collider for the solver."""
+        """Return the collider as arrays for the solver."""
         return Collider(self.faces, self.margin, self.deepest)
 
 

@@ -27,7 +27,7 @@ _FAR = 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class DriverConfig:
-    """How motions are followed.
+    """Options of a cloth driver: cold starts, cuts and the solver.
 
     Attributes:
         ramp: seconds in which a cold start goes from the reference pose, where the cloth is at rest, to the first one.
@@ -108,7 +108,7 @@ class ClothDriver:
 
     @property
     def garments(self) -> tuple[Garment, ...]:
-        """What is simulated."""
+        """Return the garments that are simulated."""
         return tuple(thread.garment for thread in self._threads)
 
     def particles(self, part: str) -> Float32[np.ndarray, "n 3"]:
@@ -138,7 +138,7 @@ class ClothDriver:
         self._last = None
 
     def step(self, params: BodyParams | None, seconds: float, *, posed: PosedBody | None = None) -> ClothShape:
-        """Go on to a pose.
+        """Step the clothes to the next pose.
 
         The first one, one that lies `LONGEST_STEP` or more after the last, and one that what holds the cloth could not
         have reached start cold: a ramp leads there from the reference pose.

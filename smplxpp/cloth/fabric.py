@@ -9,7 +9,7 @@ from smplxpp.core.validation import require_at_least, require_positive
 
 @dataclass(frozen=True, kw_only=True)
 class Fabric:
-    """A material, in SI units.
+    """Parameters of a cloth material, in SI units.
 
     Attributes:
         density: kg a square metre.
@@ -43,7 +43,7 @@ class Fabric:
 
 @dataclass(frozen=True, kw_only=True)
 class SolverConfig:
-    """How time is stepped.
+    """Options of the time integration of the solver.
 
     Attributes:
         substep: seconds at most. Longer ones leave the cloth softer: corrections travel an edge a substep.

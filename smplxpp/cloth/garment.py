@@ -25,7 +25,7 @@ from smplxpp.template.template import BODY_PART, Template
 
 @dataclass(frozen=True, kw_only=True)
 class GarmentConfig:
-    """Choices of a garment.
+    """Options of cutting a garment from a template.
 
     Attributes:
         spacing: of its particles, metres. collider_spacing: of the collider's vertices.

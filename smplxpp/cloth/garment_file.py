@@ -77,7 +77,7 @@ def garments_to_arrays(garments: Sequence[Garment]) -> tuple[dict[str, np.ndarra
 
 
 def load_garments(path: str | Path, template: Template) -> list[Garment]:
-    """Read what `save_garments` wrote.
+    """Read the garments that `save_garments` wrote, with checks.
 
     Raises:
         InputError: missing, damaged or foreign file, one of a newer version, or one of another template.

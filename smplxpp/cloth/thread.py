@@ -23,7 +23,7 @@ _BURIED = 0.005
 
 
 class GarmentThread:
-    """A garment that is stepped.
+    """State of one garment while it is simulated.
 
     Args:
         garment: what it is. rows: (R,) vertices of the template whose places it is given, increasing.

@@ -34,7 +34,7 @@ class Check:
 
     @property
     def gate(self) -> str:
-        """The gate in words."""
+        """Return the limits of the gate as text."""
         sign = ">=" if self.higher_is_better else "<="
         if self.warn == self.fail:
             return f"{sign} {self.fail:g} {self.unit}".strip()
@@ -53,12 +53,12 @@ class Check:
 
 @dataclass(frozen=True)
 class Gate:
-    """Limits of a measured number.
+    """Limits of a measured number: warn and fail.
 
     Attributes:
         unit: of number and limits.
         warn: the number passes up to here; where higher is better, from here on.
-        fail: the number fails beyond.
+        fail: the number fails above (below where higher is better).
         higher_is_better: the limits are lower ones.
     """
 

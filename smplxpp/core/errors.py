@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 ProgressCallback: TypeAlias = Callable[[str, float], None]
-"""Receives the name of the step under way and the share of it that is done, 0 to 1."""
+"""Receives the name of the running step and its share that is done, 0 to 1."""
 
 
 def ignore_progress(step: str, share: float) -> None:

@@ -1,4 +1,4 @@
-"""A motion in AMASS's layout."""
+"""Write a motion in the layout of AMASS."""
 
 from __future__ import annotations
 

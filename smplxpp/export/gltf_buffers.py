@@ -35,7 +35,7 @@ class BufferBuilder:
         normalized: bool = False,
         bounds: bool = False,
     ) -> int:
-        """Store an array.
+        """Store an array in the buffer and return its accessor.
 
         Args:
             array: (N, ...) uint8, uint16, uint32 or float32; matrices as (N, 4, 4) in rows, stored in columns.

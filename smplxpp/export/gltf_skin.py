@@ -77,6 +77,6 @@ def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) 
 
 
 def rest_offsets(template: Template) -> Float64[np.ndarray, "J 3"]:
-    """The way to each rest joint from its parent, to a root from the origin; metres."""
+    """Return the offset of each rest joint from its parent, of a root from the origin; metres."""
     joints, parents = template.joints, template.body.parents
     return joints - np.where(parents[:, None] >= 0, joints[parents], 0.0)

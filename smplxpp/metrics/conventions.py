@@ -160,7 +160,7 @@ def presets() -> dict[str, Convention]:
 
 
 def convention_named(name: str) -> Convention:
-    """The convention of that name.
+    """Return the convention with the given name.
 
     Raises:
         InputError: no such preset.

@@ -78,7 +78,7 @@ class DirectionStats:
 
 @dataclass(frozen=True)
 class MeshComparison:
-    """Two surfaces compared.
+    """Distances between two surfaces, in both directions.
 
     Attributes:
         convention, unit: what `p2s` and `chamfer` mean and their unit; everything else is in mm whatever the preset.
@@ -103,7 +103,7 @@ class MeshComparison:
     labels: dict[str, MeshComparison] = field(default_factory=dict)
 
     def as_dict(self) -> dict:
-        """Plain nested dictionaries, for JSON."""
+        """Return the figures as plain nested dictionaries for JSON."""
         return asdict(self)
 
 

@@ -13,7 +13,7 @@ CM3 = 1e6
 
 @dataclass(frozen=True)
 class Interpenetration:
-    """What two solids share.
+    """Volume and surface that two solids share.
 
     Attributes:
         volume_cm3: of what lies in both.
@@ -27,7 +27,7 @@ class Interpenetration:
     volume_b_cm3: float
 
     def as_dict(self) -> dict:
-        """The numbers, for JSON."""
+        """Return the numbers as a dictionary for JSON."""
         return asdict(self)
 
 

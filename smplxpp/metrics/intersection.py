@@ -36,7 +36,7 @@ class PenetrationReport:
     penetrating: Bool[np.ndarray, " N"]
 
     def as_dict(self) -> dict:
-        """The scalars, for JSON."""
+        """Return the scalar figures as a dictionary for JSON."""
         names = ("count", "fraction", "depth_mean_mm", "depth_max_mm", "clearance_mm")
         return {name: getattr(self, name) for name in names}
 

@@ -16,7 +16,7 @@ from smplxpp.metrics.self_intersection import self_intersections
 
 @dataclass(frozen=True)
 class MeshQuality:
-    """What `mesh_quality` found.
+    """Figures of a mesh's quality, as `mesh_quality` measures them.
 
     Attributes:
         vertices, faces: counts. unreferenced_vertices: in no face.
@@ -59,16 +59,16 @@ class MeshQuality:
 
     @property
     def manifold(self) -> bool:
-        """No edge with three faces, no vertex with two fans."""
+        """Return whether no edge has three faces and no vertex two fans."""
         return not self.nonmanifold_edges and not self.nonmanifold_vertices
 
     @property
     def closed(self) -> bool:
-        """No border."""
+        """Return whether the mesh has no border edge."""
         return not self.border_edges
 
     def as_dict(self) -> dict:
-        """Plain numbers, for JSON."""
+        """Return the figures as plain numbers for JSON."""
         return {**asdict(self), "manifold": self.manifold, "closed": self.closed}
 
 

@@ -13,7 +13,7 @@ from smplxpp.core.surface_points import draw_on_surface
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """P points on a mesh.
+    """P points on the surface of a mesh.
 
     Attributes:
         points: (P, 3) float64 metres.

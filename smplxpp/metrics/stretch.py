@@ -33,7 +33,7 @@ class StretchReport:
     flipped_faces: int
 
     def as_dict(self) -> dict:
-        """Plain numbers, for JSON."""
+        """Return the figures as plain numbers for JSON."""
         return asdict(self)
 
 

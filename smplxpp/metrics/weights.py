@@ -22,7 +22,7 @@ class VariationStats:
 
 @dataclass(frozen=True)
 class WeightReport:
-    """What `weight_report` found.
+    """Figures of skin weights, as `weight_report` measures them.
 
     Attributes:
         vertex_count, joint_count: N, J.
@@ -50,7 +50,7 @@ class WeightReport:
         return self.row_sum_error <= 1e-9 and not self.negative and not self.zero_rows
 
     def as_dict(self) -> dict:
-        """Plain numbers, for JSON."""
+        """Return the figures as plain numbers for JSON."""
         return {**asdict(self), "valid": self.valid}
 
 

@@ -47,7 +47,7 @@ LEVELS = (
 
 @dataclass(frozen=True)
 class ReconstructConfig:
-    """Options of a reconstruction.
+    """Options of a reconstruction from photographs and masks.
 
     Attributes:
         cell: size of the grid's cells, metres; None for two pixels, within 3 to 6 mm.
@@ -115,7 +115,7 @@ def reconstruct(
     Args:
         views: at least four of one moment, from all around.
         config: options.
-        progress: called with the work under way and its share done.
+        progress: called with the running step and its share done.
 
     Raises:
         InputError: too few views, views from one side only, masks of nothing or of the background, or masks that

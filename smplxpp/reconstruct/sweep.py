@@ -71,7 +71,7 @@ class PatchConfig:
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """The result of one sweep.
+    """Result of one sweep along the normals.
 
     Attributes:
         vertices: of the moved surface, metres.

@@ -43,7 +43,7 @@ def register(
         body: the body model.
         observed: cameras and everything seen through them, without held-out cameras.
         config: options.
-        progress: called with the work under way and its share done.
+        progress: called with the running step and its share done.
 
     Raises:
         InputError: nothing to register to, or nothing to start from.
@@ -60,7 +60,7 @@ def register(
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Frames that are solved together.
+    """Frames of a motion that are solved together.
 
     Attributes:
         rows: of the frames in the whole sequence.

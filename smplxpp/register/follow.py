@@ -38,7 +38,7 @@ def follow(
         known: one row, of frame `at`.
         at: number of the known frame.
         config: options of each registration; eight steps on surfaces are enough from one frame to the next.
-        progress: called with the work under way and its share done.
+        progress: called with the running step and its share done.
 
     Returns:
         One row for each of `observed.frames`.

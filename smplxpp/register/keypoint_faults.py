@@ -29,7 +29,7 @@ class FaultBounds:
         left_over: largest share of the squared distances that may remain after the exchange.
         whole_view: share of the frames that can be judged, from which a view is exchanged in all frames.
         least_sightings: sightings that a view needs to be judged for another person or a wrong calibration.
-        far: multiple of the threshold beyond which a sighting contradicts the others.
+        far: multiple of the threshold above which a sighting contradicts the others.
         other_person: a view shows another person if a smaller share of its sightings agrees.
         moved: a new pose of a camera counts if it moves the projections by more than this share of the threshold.
         better: the new pose must leave less than this share of the old distance ...

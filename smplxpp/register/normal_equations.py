@@ -49,12 +49,12 @@ class Columns:
 
     @property
     def transl(self) -> slice:
-        """The columns of the translation."""
+        """Return the columns of the translation in the system."""
         return slice(3 * len(self.joints), 3 * len(self.joints) + 3)
 
     @property
     def expression(self) -> slice:
-        """The columns of the expression."""
+        """Return the columns of the expression in the system."""
         return slice(3 * len(self.joints) + 3, self.count)
 
     def jacobian(self, motion: PointsMotion) -> Float64[np.ndarray, "N 3 _"]:

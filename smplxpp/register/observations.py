@@ -23,7 +23,7 @@ ViewMap = Callable[[str, int], "UInt8[np.ndarray, 'H W'] | None"]
 
 @dataclass(frozen=True, eq=False)
 class ScanObservation:
-    """A scan of one frame.
+    """Scan of one frame with its labels.
 
     Attributes:
         mesh: in world coordinates, metres.

@@ -38,7 +38,7 @@ _FACING = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ScanSample:
-    """Points drawn from one scan.
+    """Points drawn from the surface of one scan.
 
     Attributes:
         points: in world coordinates, metres.

@@ -33,7 +33,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class TriangulationConfig:
-    """Options of a triangulation.
+    """Options of a triangulation of keypoints from several views.
 
     Attributes:
         threshold: largest reprojection error of an inlier, as a share of the image's height.

@@ -159,7 +159,7 @@ class Template:
 
     @cached_property
     def joints(self) -> Float64[np.ndarray, "J 3"]:
-        """Rest joints, metres."""
+        """Return the joints of the rest pose, metres."""
         return self.body.joint_regressor @ self.body.v_template
 
     @cached_property
@@ -178,7 +178,7 @@ class Template:
         return semantic_colors(self.vertex_labels)
 
     def part_faces(self, name: str) -> Bool[np.ndarray, " F"]:
-        """The faces of a part.
+        """Return the faces of one part of the template.
 
         Raises:
             InputError: no such part.
@@ -209,7 +209,7 @@ class Template:
         return self.weights.dense()
 
     def pose(self, params: BodyParams) -> Float64[np.ndarray, "T V 3"]:
-        """The template in T poses.
+        """Return the vertices of the template in T poses.
 
         The body takes expression and pose correctives as its model does, `x = sum_j w_j G_j (v + E psi + P vec(R - I))
         + t`; the parts are skinned with the same G. The identity is the template's own: the betas in `params` are not

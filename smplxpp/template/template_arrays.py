@@ -120,7 +120,7 @@ def weights_from_arrays(arrays: Mapping[str, np.ndarray]) -> SkinWeights:
 
     Raises:
         KeyError: one that is missing.
-        InputError: indices beyond 32 bits.
+        InputError: indices of more than 32 bits.
     """
     return SkinWeights(
         joint_indices=_int32(arrays, f"{_WEIGHTS}joint_indices"),

@@ -57,8 +57,9 @@ def extend_weights(
         W(x) = integral of W(y) g(x, y) |x - y|^-p dA(y) / integral of g(x, y) |x - y|^-p dA(y)
 
     with p = `falloff` and g = (1 + cos of the normals' angle) / 2. Over a plane at distance d the kernel is about d
-    wide. On the body the value is the body's own, half-way between two legs it is the mean of both, smooth between.
-    (p = 3 is Poisson's kernel of the half-space, the harmonic extension; a larger p keeps far limbs out.) The integral
+    wide. On the body the value is the body's own, in the middle between two legs it is the mean of both, smooth
+    between. (p = 3 is Poisson's kernel of the half-space, the harmonic extension; a larger p keeps far limbs out.) The
+    integral
     is split at the samples' radius rho: the closest point stands for the disc around it, in closed form, and the
     samples, with |x - y|^2 + rho^2 for |x - y|^2, for the rest. The two parts add up to the whole over a plane.
 

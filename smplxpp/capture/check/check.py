@@ -49,7 +49,7 @@ class CheckConfig:
 
 @dataclass(frozen=True, eq=False)
 class CaptureCheck:
-    """What was found.
+    """Findings of a check with their figures.
 
     Attributes:
         capture: as opened.
@@ -74,7 +74,7 @@ class CaptureCheck:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Frames whose images were opened."""
+        """Return the frames whose images were opened."""
         return tuple(dict.fromkeys(view.frame for view in self.views))
 
     def cameras(self) -> dict[str, FitSummary]:

@@ -115,7 +115,7 @@ class Finding:
 
     @property
     def remedy(self) -> str:
-        """What to do."""
+        """Return the remedy of the finding."""
         return self.advice or KINDS[self.kind][2]
 
     def as_dict(self) -> dict[str, object]:

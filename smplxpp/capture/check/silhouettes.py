@@ -36,7 +36,7 @@ class SilhouetteFit:
 
     @property
     def verdict(self) -> Verdict:
-        """What the figures say."""
+        """Return the verdict that follows from the figures."""
         if self.outside > OUTSIDE_BAD or self.iou < IOU_BAD:
             return "bad"
         return "doubtful" if self.outside > OUTSIDE_DOUBTFUL else "good"

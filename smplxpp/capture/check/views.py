@@ -56,7 +56,7 @@ def check_view(
     frame: int,
     body: tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]] | None,
 ) -> ViewCheck:
-    """Open everything of one view.
+    """Open image, mask, labels and normals of one view.
 
     Args:
         capture: at the size at which silhouettes are compared.

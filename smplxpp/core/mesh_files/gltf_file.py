@@ -186,7 +186,7 @@ def _triangles(indices: Int64[np.ndarray, " n"], mode: int) -> Int64[np.ndarray,
 
 def _world_nodes(document: GltfDocument) -> list[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
     """Return the nodes of the scene, depth first, with their transforms to the world."""
-    # The default scene; without scenes every node that is nobody's child is a root.
+    # The default scene; without scenes every node without a parent is a root.
     scenes = document.items(document.json, "scenes")
     if scenes:
         roots = document.items(document.entry("scenes", document.json.get("scene", 0)), "nodes")

@@ -110,7 +110,7 @@ def locate_body(
         landmarks: known positions of points of the body (`smplxpp.register.landmarks`), from a detector or by hand.
         labeller: labels the surface once the body is known; the body is then fitted again with what is skin.
         config: options.
-        progress: called with the work under way and its share done.
+        progress: called with the running step and its share done.
 
     Raises:
         InputError: a surface that is no person or far from a person's size, or landmarks that the body does not have.

@@ -101,7 +101,7 @@ class Search:
         mesh: the surface, metres, +Y up, faces outwards.
         config: options.
         pinned: landmarks of known position; None without any.
-        progress: called with the work under way and its share done.
+        progress: called with the running step and its share done.
     """
 
     def __init__(
