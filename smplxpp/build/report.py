@@ -73,6 +73,11 @@ class BuildResult:
         parts: the loose parts by name: in the scan's pose, their weights, their vertices in the T-pose.
         report: checks, numbers and times by step.
         capture: the capture with the parameters that the build used or registered; None without a capture.
+
+    Example:
+        >>> result = smplxpp.BuildResult(template=None, parts={}, report=BuildReport({}, {}))  # as build_template does
+        >>> result.report.failed, result.capture
+        ((), None)
     """
 
     template: Template
