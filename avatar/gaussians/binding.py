@@ -199,12 +199,15 @@ def world_from_frames(bound: BoundGaussians, frames: TriangleFrames) -> WorldGau
 
 def world_from_frames_reference(bound: BoundGaussians, frames: TriangleFrames) -> WorldGaussians:
     """Return `world_from_frames` in plain torch: the oracle of the native kernel, used for other types and devices."""
+    # Rows of the frames for each Gaussian: (..., N, 3, 3) rotations R and corners v1, v2, v3.
     rotations = frames.rotations[..., bound.face_index, :, :]
     corners = frames.corners[..., bound.face_index, :, :]
     weights = corner_weights(bound.barycentric)
+    # gamma acts along the normal, the first axis of the frame; then u_w = sum of weighted corners + R (gamma n + du).
     normal, median, binormal = bound.offset.unbind(-1)
     local = torch.stack([normal + bound.normal_offset, median, binormal], -1)
     means = (weights[:, :, None] * corners).sum(-2) + (rotations * local[:, None, :]).sum(-1)
+    # Compose the Gaussian's rotation in the frame with the frame's own; scales are in edges, so e makes them metres.
     quats = multiply_quats(frames.quats[..., bound.face_index, :], bound.quats)
     scales = frames.lengths[..., bound.face_index, None] * bound.scales
     return WorldGaussians(means, quats, scales, bound.opacities, _first_axes(quats))
@@ -234,6 +237,7 @@ def offset_penalty(bound: BoundGaussians, frames: TriangleFrames) -> Float[Tenso
 
     It keeps Gaussians near their triangles: offsets up to one edge are free. 0.01 weights it against `scale_penalty`.
     """
+    # The full offset in the frame, metres: gamma joins the first component, which lies along the normal.
     total = torch.cat([bound.offset[:, :1] + bound.normal_offset[:, None], bound.offset[:, 1:]], 1)
     lengths = gather_rows(frames.lengths, bound.face_index)
     return 0.01 * torch.relu(total.norm(dim=-1) / lengths - 1.0).mean()
@@ -241,6 +245,7 @@ def offset_penalty(bound: BoundGaussians, frames: TriangleFrames) -> Float[Tenso
 
 def _first_axes(quats: Tensor) -> Tensor:
     """Return the unit x axes rotated by quaternions of any length: (..., 4) -> (..., 3)."""
+    # First column of the rotation matrix; division by |q|^2 makes it a unit vector for quaternions of any length.
     w, x, y, z = quats.unbind(-1)
     ww, xx, yy, zz = w * w, x * x, y * y, z * z
     axes = torch.stack([ww + xx - yy - zz, 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)

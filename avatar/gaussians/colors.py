@@ -25,6 +25,7 @@ def sh_color(
         sh: coefficients of degree 1 and up.
         directions: of length 1, in the frame of the coefficients.
     """
+    # Colours below 0 have no meaning in sRGB; 3DGS clamps them in the same way, and values above 1 are kept.
     degree = degree_of(sh)
     if not degree:
         return dc.clamp_min(0.0).expand(torch.broadcast_shapes(dc.shape, directions.shape))
@@ -82,6 +83,7 @@ def view_colors_reference(
     camera_positions: Float[Tensor, "C 3"],
 ) -> Float[Tensor, "C N 3"]:
     """Return `view_colors` in plain torch: the oracle of the native kernel, used for other types and devices."""
+    # (C, N, 3) unit vectors from each camera to each Gaussian, in the world.
     directions = torch.nn.functional.normalize(means - camera_positions[:, None], dim=-1)
     rotations = frames.rotations[bound.face_index]
     # R^T d, so the sum runs over rows.

@@ -99,6 +99,7 @@ def triangle_frames_reference(
 
     It is the oracle of the native kernel, and is used for other types and devices.
     """
+    # |cross| is twice the area; `median` runs from the first corner to the middle of the opposite edge, in the plane.
     corners = vertices[..., faces, :]
     v1, v2, v3 = corners.unbind(-2)
     to_second, to_third = v2 - v1, v3 - v1
@@ -109,14 +110,17 @@ def triangle_frames_reference(
         # Corners a metre from the origin carry an error of one epsilon: about 1e-4 of a 1 mm edge in float32.
         tolerance = 100.0 * torch.finfo(cross.dtype).eps
         degenerate = cross.norm(dim=-1) <= tolerance * lengths.clamp_min(MIN_EDGE) ** 2
+        # A direction to keep for a triangle without area: its median, else an edge, else the x axis if it is a point.
         along = torch.where((median.norm(dim=-1) > tolerance * lengths)[..., None], median, to_second)
         short = along.norm(dim=-1, keepdim=True) <= tolerance * MIN_EDGE
         along = torch.where(short, along.new_tensor([1.0, 0.0, 0.0]), along)
         # The axis that is farthest from `along`, so that the cross product is long.
         axis = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along)
         across = torch.linalg.cross(along, axis)
+    # `torch.where` passes no gradient to the branch that was not taken, so the substitutes act as constants.
     cross = torch.where(degenerate[..., None], across, cross)
     median = torch.where(degenerate[..., None], along, median)
+    # Columns of R: unit normal, unit median, and their cross product; orthonormal because the median is in the plane.
     n = cross / cross.norm(dim=-1, keepdim=True)
     q = median / median.norm(dim=-1, keepdim=True)
     rotations = torch.stack([n, q, torch.linalg.cross(n, q)], -1)

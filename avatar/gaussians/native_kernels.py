@@ -49,6 +49,7 @@ class FramesFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, ...]:
         vertices, faces = vertices.contiguous(), faces.contiguous()
+        # Outputs in the order of `TriangleFrames`: corners, rotations, quaternions, mean edge lengths.
         batch, V, F = vertices.shape[:-2], vertices.shape[-2], len(faces)
         out = [vertices.new_empty((*batch, F, *tail)) for tail in ((3, 3), (3, 3), (4,), ())]
         degenerate = ctypes.c_int64()
@@ -60,6 +61,7 @@ class FramesFunction(torch.autograd.Function):
             ctypes.byref(degenerate),
             _threads(),
         )
+        # The backward pass needs the rotations (out[1]) again. Outputs without a gradient stay None instead of zeros.
         count = torch.tensor(degenerate.value)
         ctx.mark_non_differentiable(count)
         ctx.save_for_backward(vertices, faces, out[1])
@@ -71,6 +73,7 @@ class FramesFunction(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor, None]:
         vertices, faces, rotations = ctx.saved_tensors
         batch, V = vertices.shape[:-2], vertices.shape[-2]
+        # Triangles share vertices, so the kernel adds to zeros.
         given = _contiguous(gradients[:4])
         out = torch.zeros_like(vertices)
         native_library().smplxpp_frames_backward(
@@ -93,6 +96,7 @@ class WorldFunction(torch.autograd.Function):
         lengths = inputs[-1]
         _check_frames(dict(zip(_FRAMES, inputs[len(_LOCAL) :], strict=True)))
         batch = lengths.shape[:-1]
+        # Means, quaternions, scales, normals.
         out = [lengths.new_empty((*batch, len(face), width)) for width in (3, 4, 3, 3)]
         native_library().smplxpp_world_forward(
             ctypes.byref(_binding(thickness, face, inputs)), *map(address, out), _threads()
@@ -150,6 +154,7 @@ class ColorsFunction(torch.autograd.Function):
         to_dc, to_sh, to_means = (
             torch.empty_like(t) if want else None for t, want in zip((dc, sh, means), wanted[1:4], strict=True)
         )
+        # All Gaussians add to the few cameras: each thread has its own row, and the rows are added in a fixed order.
         to_cameras = cameras.new_zeros((threads, *cameras.shape)) if wanted[4] else None
         gradient = gradient.contiguous()
         native_library().smplxpp_colors_backward(

@@ -103,6 +103,7 @@ def sample_on_mesh(
             raise InputError(
                 f"sampling: {name}", expected="faces with some area", received="none", remedy="change head_share"
             )
+        # Faces of the other region have weight 0 and get no sample.
         regions.append(_stratified(inside, count, rng))
         expected += inside * (count / inside.sum())
     face, barycentric = (np.concatenate(arrays) for arrays in zip(*regions, strict=True))
@@ -132,17 +133,21 @@ def head_faces(template: Template) -> Bool[np.ndarray, " F"]:
             received=f"{len(template.body.joint_names)} other names",
             remedy="set head_share to None",
         )
+    # All descendants of the head: a pass over the joints adds one more generation, so joint_count passes reach every
+    # depth of the tree. The root has the parent -1.
     head = template.body.joint_names.index("head")
     subtree = np.zeros(template.body.joint_count, dtype=bool)
     subtree[head] = True
     for _ in range(template.body.joint_count):
         subtree |= np.where(template.body.parents >= 0, subtree[template.body.parents], False)
+    # Skinning weight of the subtree at each vertex (V,), then its mean over the corners of each face.
     weight = template.weights.dense()[:, subtree].sum(1)
     return weight[template.faces].mean(1) > 0.5
 
 
 def seen_faces(mesh: TriangleMesh) -> Bool[np.ndarray, " F"]:
     """Return a mask of the faces visible from outside, and their neighbours, because small faces may cover no pixel."""
+    # Faces that share a corner with a visible one count as visible.
     touched = np.zeros(mesh.vertex_count, dtype=bool)
     touched[mesh.faces[outer_visible_faces(mesh)]] = True
     return touched[mesh.faces].any(1)
@@ -150,6 +155,8 @@ def seen_faces(mesh: TriangleMesh) -> Bool[np.ndarray, " F"]:
 
 def _stratified(weights: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draw (count,) faces in proportion to `weights`, and (count, 2) barycentric u, v uniform inside them."""
+    # One random number in each of `count` equal strata of the total weight; the face whose interval contains it is
+    # hit.
     cumulative = np.cumsum(weights)
     share = (np.arange(count) + rng.random(count)) * (cumulative[-1] / count)
     face = np.searchsorted(cumulative, share, side="right")
@@ -168,9 +175,12 @@ def _stratified(weights: np.ndarray, count: int, rng: np.random.Generator) -> tu
 def _initial_gaussians(
     template: Template, face: np.ndarray, barycentric: np.ndarray, density: np.ndarray, config: SamplingConfig
 ) -> BoundGaussians:
+    # Mean edge length of each face, metres, clamped as in `triangle_frames`.
     corners = template.mesh.triangles
     edges = np.maximum(sum(row_lengths(corners[:, k] - corners[:, k - 1]) for k in range(3)) / 3.0, MIN_EDGE)
+    # Samples of density d are about 1 / sqrt(d) metres apart; scales are stored in edges of the face.
     scale = config.touch / (np.sqrt(density[face]) * edges[face])
+    # Colours in [0, 1], interpolated from the 8-bit colours of the corners.
     weights = np.column_stack([barycentric, 1.0 - barycentric.sum(1)])
     colors = np.einsum("nk,nkc->nc", weights, template.vertex_colors[template.faces[face]] / 255.0)
     N = len(face)

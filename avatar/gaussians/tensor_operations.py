@@ -13,12 +13,15 @@ def quat_from_matrix(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 4"]:
     `4 q q^T` is linear in the matrix. The row of its largest diagonal entry, normalised, is q. That entry is at
     least 1, so value and gradient are well conditioned everywhere (Shepperd 1978, without the branches).
     """
+    # Matrix [[a, b, c], [d, e, f], [g, h, i]]: differences across the diagonal give 4 w (x, y, z), sums 4 xy, 4 xz, 4
+    # yz.
     a, b, c, d, e, f, g, h, i = matrix.flatten(-2).unbind(-1)
     wx, wy, wz, xy, xz, yz = h - f, c - g, d - b, b + d, c + g, f + h
     diagonal = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
     ww, xx, yy, zz = diagonal
     rows = ((ww, wx, wy, wz), (wx, xx, xy, xz), (wy, xy, yy, yz), (wz, xz, yz, zz))
     outer = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    # The diagonal of 4 q q^T holds 4 w^2, 4 x^2, 4 y^2, 4 z^2; the largest keeps the division away from 0.
     best = torch.stack(diagonal, -1).argmax(-1)
     row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
     return row / row.norm(dim=-1, keepdim=True)

@@ -45,6 +45,8 @@ class DisplacementLoss:
             displacements: of the vertices, metres.
             teacher: its maps, metres.
         """
+        # Rasterise the displacements of the vertices to the maps' pixels, (2, S, S, 3); |.| is the L1 norm over x, y,
+        # z.
         difference = (self.maps.interpolate(displacements) - teacher).abs().sum(-1)
         return difference[self.mask].mean() / self.unit
 
@@ -60,6 +62,7 @@ def semantic_labels(rig: Rig, gaussians: BoundGaussians, *, tau: float = TAU) ->
     Args:
         tau: radians a metre; v are the corners in the T-pose, c their semantic colours in [0, 1].
     """
+    # (N, 3, 3): the labels of the three corners of each Gaussian's triangle.
     corners = vertex_labels(rig, tau=tau)[rig.faces[gaussians.face_index]]
     return on_triangles(corners, gaussians.barycentric)
 
@@ -86,12 +89,15 @@ class Coherence:
     """
 
     def __init__(self, rig: Rig, gaussians: BoundGaussians, start: Float[Tensor, "N 3 n"]) -> None:
+        # Distances are taken in the T-pose, where folds of cloth that only touch in a pose are far apart.
         faces = gaussians.face_index
         with torch.no_grad():
             frames = triangle_frames(rig.vertices, rig.faces)
             axes, self._start = frames.rotations[faces], start.detach().clone()
             places = world_from_frames(gaussians, frames).means.double().cpu().numpy()
         part = rig.template.vertex_part[rig.template.faces[faces.cpu().numpy(), 0]]
+        # Indices of the neighbours, (N, k). dU is given in a triangle's axes, so comparing two needs the turn between
+        # them.
         self._near = _neighbours(places, part)
         near = torch.as_tensor(self._near, device=axes.device)
         # (N, k, 3, 3): R_i^T R_j
@@ -99,6 +105,8 @@ class Coherence:
 
     def __call__(self, shapes: Float[Tensor, "N 3 n"], random: np.random.Generator) -> Float[Tensor, ""]:
         """Return the penalty of shapes, estimated on a random sixteenth of the Gaussians with one neighbour each."""
+        # Draw Gaussians without repetition, and one of its k neighbours for each: an unbiased estimate of the full
+        # mean.
         count, near = self._near.shape
         rows = random.choice(count, size=max(1, round(SHARE * count)), replace=False)
         which = random.integers(near, size=len(rows))
@@ -114,6 +122,7 @@ class _PairDistance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, shapes: Tensor, start: Tensor, pairs: Tensor, turn: Tensor) -> Tensor:
+        # a = U - U_start at both ends of all pairs, (2 P, 3, n); then the other's, turned to the own axes.
         learned = shapes.index_select(0, pairs.flatten()) - start.index_select(0, pairs.flatten())
         own, other = learned.unflatten(0, (2, -1))
         apart = own - _rotated(turn, other)
@@ -125,6 +134,8 @@ class _PairDistance(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None, None, None]:
         pairs, turn, apart = ctx.saved_tensors
+        # d/da_i = 2 (a_i - Q a_j) / P and d/da_j = -Q^T d/da_i. A Gaussian may be in several pairs, so the rows are
+        # added.
         own = (2.0 / len(apart) * slope) * apart
         both = torch.cat([own, -_rotated(turn.mT, own)])
         index = pairs.flatten()[:, None, None].expand_as(both)
@@ -138,6 +149,7 @@ def _rotated(turn: Float[Tensor, "P 3 3"], values: Float[Tensor, "P 3 n"]) -> Te
 
 def _neighbours(places: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Return the nearest others of the same part (N, k), filled with the Gaussian itself if the part has too few."""
+    # The nearest point of a query is the Gaussian itself, so one more is asked for, and the first column is dropped.
     near = np.repeat(np.arange(len(places))[:, None], NEIGHBOURS, axis=1)
     for one in np.unique(part):
         own = np.flatnonzero(part == one)

@@ -102,6 +102,7 @@ def ssim_map_reference(
 
     x, y = x.permute(0, 3, 1, 2), y.permute(0, 3, 1, 2)
     mu_x, mu_y = blur(x), blur(y)
+    # Biased moments, E[x^2] - E[x]^2; rounding may leave a variance slightly below 0, which C2 covers.
     var_x, var_y, cov = blur(x * x) - mu_x**2, blur(y * y) - mu_y**2, blur(x * y) - mu_x * mu_y
     value = (2 * mu_x * mu_y + _C1) * (2 * cov + _C2) / ((mu_x**2 + mu_y**2 + _C1) * (var_x + var_y + _C2))
     value = value.permute(0, 2, 3, 1)
@@ -122,6 +123,8 @@ class _SsimMean(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, y: Tensor, mask: Tensor | None, border: int, differentiate: bool) -> Tensor:
         B, H, W, C = x.shape
+        # The kernel scales each pixel's term by 1 / (C times the sum of weights), so that its sum is the mean
+        # already.
         weight: float
         if mask is None:
             weight = B * (H - 2 * border) * (W - 2 * border)
@@ -155,6 +158,8 @@ class _SsimMap(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         x, y = ctx.saved_tensors
         b = ctx.border
+        # The chain rule weights each pixel's SSIM by the incoming gradient; pixels outside of a "valid" map have
+        # weight 0.
         weight = F.pad(grad, (0, 0, b, b, b, b)).contiguous()
         want_x, want_y = ctx.needs_input_grad[:2]
         _, _, grad_x, grad_y = _call(x, y, weight, b, grad_x=want_x, grad_y=want_y)
@@ -265,6 +270,7 @@ def _total_weight(mask: Shaped[Tensor, "... H W"], shape: tuple[int, ...]) -> Sh
     Raises:
         InputError: the sum is not positive.
     """
+    # A mask (H, W) over a batch counts once for each image.
     total = mask.sum() * (shape[0] if len(shape) > mask.dim() + 1 else 1)
     if not total > 0:
         raise InputError("mask of an image loss", expected="some weight above 0", received=f"a sum of {float(total)}")

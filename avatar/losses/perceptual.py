@@ -65,6 +65,7 @@ class PerceptualDistance(nn.Module, ABC):
                 expected=f"two of shape (B, H, W, 3), H and W at least {MIN_SIZE}",
                 received=f"shapes {tuple(image.shape)} and {tuple(reference.shape)}",
             )
+        # Channels first and [-1, 1], as the networks were trained.
         x, y = (2.0 * pixels.permute(0, 3, 1, 2) - 1.0 for pixels in (image, reference))
         return self.distance(x, y)
 
@@ -109,6 +110,8 @@ class ShiftTolerantLPIPS(PerceptualDistance):
         Raises:
             InputError: weights of another network.
         """
+        # Collect the authors' tensors under our names, then copy them only if the sizes agree; a layer's weights are
+        # stored as a 1 x 1 convolution, hence the reshape.
         metric = ShiftTolerantLPIPS()
         state = {"shift": stored.get("scaling_layer.shift"), "scale": stored.get("scaling_layer.scale")}
         for k, conv in enumerate(STORED_CONVS):
@@ -131,6 +134,7 @@ class ShiftTolerantLPIPS(PerceptualDistance):
 
     def distance(self, x: Float[Tensor, "B 3 H W"], y: Float[Tensor, "B 3 H W"]) -> Float[Tensor, " B"]:
         """Return the distance of each pair of images in [-1, 1]."""
+        # Features of unit length a pixel; squared differences weighted by channel, averaged over the layer's pixels.
         total = x.new_zeros(len(x))
         for weight, f, g in zip(self.layer_weights, self.features(x), self.features(y), strict=True):
             difference = (_unit(f) - _unit(g)).square()
@@ -140,6 +144,9 @@ class ShiftTolerantLPIPS(PerceptualDistance):
     def features(self, x: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
         """Return the activations of the five layers for images in [-1, 1]."""
         conv1, conv2, conv3, conv4, conv5 = self.convs
+        # AlexNet with each stride of 2 replaced by a step of 1 and a filtered reduction: sampling without a low-pass
+        # filter
+        # would make the features change when the image moves by a pixel.
         first = F.relu(self._reduced(conv1((x - self.shift) / self.scale)))
         second = F.relu(conv2(self._reduced(F.max_pool2d(first, 3, stride=1))))
         third = F.relu(conv3(self._reduced(F.max_pool2d(second, 3, stride=1))))
@@ -148,6 +155,7 @@ class ShiftTolerantLPIPS(PerceptualDistance):
 
     def _reduced(self, x: Tensor) -> Tensor:
         channels = x.shape[1]
+        # The 3x3 binomial filter (1, 2, 1) / 4 along each axis, then every second pixel.
         padded = F.pad(x, (2, 2, 2, 2), mode="reflect")
         return F.conv2d(padded, self.binomial.expand(channels, -1, -1, -1), stride=2, groups=channels)
 
@@ -166,6 +174,7 @@ class PackagedLPIPS(PerceptualDistance):
 
 
 def _unit(features: Tensor) -> Tensor:
+    # Both small terms keep the quotient, and the slope of the square root, finite where all features are 0.
     return features / (features.square().sum(1, keepdim=True).clamp_min(1e-20).sqrt() + 1e-10)
 
 
@@ -180,6 +189,7 @@ def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
         InputError: another kind of file.
     """
     if weights is None:
+        # Find the folder without importing the package, so that what it depends on need not be installed.
         found = importlib.util.find_spec("stlpips_pytorch")
         if found is None or not found.submodule_search_locations:
             raise MissingPackageError(
@@ -188,6 +198,7 @@ def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
         weights = Path(found.submodule_search_locations[0]) / WEIGHT_FILE
     weights = regular_file(weights)
     try:
+        # `weights_only` refuses pickled code.
         stored = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:
         raise InputError(

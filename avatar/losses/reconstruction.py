@@ -84,15 +84,18 @@ def reconstruction_loss(
         terms["alpha"] = (rendering.alpha - target.alpha).abs().mean()
         total = total + weights.alpha * terms["alpha"]
     if weights.perceptual and perceptual is not None and min(target.alpha.shape) >= MIN_SIZE:
+        # The networks were trained on images in [0, 1]; colours of spherical harmonics may exceed 1.
         image = rendering.image.clamp(0.0, 1.0)
         terms["perceptual"] = perceptual(image[None], target.image[None])[0]
         total = total + weights.perceptual * terms["perceptual"]
     if weights.normal and rendering.normals is not None and target.normals is not None:
+        # A zero vector marks a pixel without a normal; the L1 norm is taken over x, y, z.
         known = (target.normals != 0).any(-1)
         if bool(known.any()):
             apart = (rendering.normals - target.normals.float()).abs().sum(-1)
             terms["normal"] = apart[known].mean()
             total = total + weights.normal * terms["normal"]
+    # PSNR of the crop for the log alone, on clamped colours as a display shows them.
     with torch.no_grad():
         square = float((rendering.image.clamp(0.0, 1.0) - target.image).square().mean())
     return total, {

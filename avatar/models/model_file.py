@@ -113,6 +113,7 @@ def load_avatar(path: str | Path, rig: Rig) -> TeacherAvatar | Student:
         named = {name: getattr(error, name) for name in ("expected", "received", "remedy")}
         raise InputError(f"{subject}: {error.subject}", **named) from None
     state: Mapping[str, Tensor] = model.state_dict()
+    # The model's own state is the list of tensors that a file must have: all of them, in their shapes, and no others.
     require_like(tensors, state, subject=subject, remedy=_REMEDY)
     unknown = sorted(set(tensors) - set(state))
     if unknown:  # ignoring them would load another avatar than the file's
@@ -145,6 +146,7 @@ def _teacher(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Teache
     teacher = TeacherAvatar(config, rig, gaussians)
     if "track_controls" in stored.tensors:
         frames, controls = stored.track(rig.template.vertex_count)
+        # Rows of the controls by frame; the cage follows from the template and the number of control points.
         row = {frame: k for k, frame in enumerate(frames)}
         errors = stored.track_errors(*controls.shape[:2])
         teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1]), **errors))

@@ -119,6 +119,8 @@ def _student(path: Path, template: Template, device: str) -> Student:
 def _origin(folder: Path, files: StudentFiles, template: Template, student: Path) -> StudentOrigin:
     garments, reference = folder / files.garments, folder / files.reference
     digests = {"student": student, "template": folder / files.template}
+    # Digests name the files exactly, so that whoever reads a bundle can tell which training it came from. The
+    # reference's shape is removed because the template has it in its vertices.
     return StudentOrigin(
         name=folder.resolve().name,
         garments=tuple(load_garments(garments, template)) if garments.is_file() else (),

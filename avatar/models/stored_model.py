@@ -56,6 +56,7 @@ class StoredModel:
         Raises:
             InputError: a missing tensor, or one of another shape or type.
         """
+        # A tensor on the device "meta" has a shape and a type, and takes no memory.
         require_like(self.tensors, {name: torch.empty(shape, dtype=dtype, device="meta")}, subject=self.subject)
         return self.tensors[name]
 

@@ -124,6 +124,8 @@ class Student(nn.Module):
         """Return the field's displacements in a pose, metres, the regression's in a new one; None without a field."""
         if self.field is None or self.codes is None:
             return None
+        # A training frame uses its own code. Another pose is predicted by the regression, or by the field's null
+        # code.
         frame = pose.frame if pose.frame in self.codes.row else None
         if frame is None and self.regression is not None:
             return self.field.spread(self.regression(pose.body_pose[None]))[0]
@@ -134,6 +136,7 @@ class Student(nn.Module):
         bound = self.gaussians()
         if self.blend_shapes is None:
             return bound
+        # Coefficients z (1, n) of this pose: the first `head_shapes` belong to the head, the rest to the body.
         jaw = pose.jaw[None] if self.blend_shapes.config.jaw else None
         z = self.blend_shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)
         # Body shapes fade in unseen poses and under simulated clothes; head shapes do not.
@@ -159,9 +162,12 @@ class Student(nn.Module):
 
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the student as cameras with these centres, metres, see it."""
+        # The field's displacements in the rest pose, with a simulation's where there is one; then linear blend
+        # skinning.
         displacements = self.rig.displaced(pose, self.displacements(pose))
         vertices = self.rig.skin(pose.without_cloth(), displacements)
         frames = triangle_frames(vertices, self.rig.faces)
+        # Gaussians in the frames of the posed triangles, then in the world.
         bound = self.compensated(pose)
         world = world_from_frames(bound, frames)
         # Viewing directions are constants: a colour's gradient must not move its Gaussian.
@@ -230,11 +236,14 @@ def make_blend_shapes(config: BlendShapeConfig, rig: Rig, gaussians: BoundGaussi
     """Make blend shapes at zero for Gaussians on a template: parts by place, head weights by the head's faces."""
     part = head_weight = None
     if config.parts > 1:
+        # Parts are the regions nearest to control points, chosen on the triangles' centres (metres, T-pose) of one
+        # body part.
         centers = rig.template.mesh.triangles.mean(axis=1)[gaussians.face_index.cpu().numpy()]
         groups = rig.template.vertex_part[rig.template.faces[gaussians.face_index.cpu().numpy(), 0]]
         control = choose_control_points(centers, groups, count=config.parts, neighbour_count=1)
         part = torch.tensor(control.neighbours[:, 0])
     if config.gated:
+        # 1 for Gaussians on the head, which the head's shapes may move, 0 for all others.
         on_head = head_faces(rig.template)[gaussians.face_index.cpu().numpy()]
         head_weight = torch.tensor(on_head, dtype=torch.float32)
     return BlendShapes(config, len(gaussians), part=part, head_weight=head_weight)

@@ -68,6 +68,8 @@ class TeacherAvatar(nn.Module):
         self.gaussians.normalise_quats()
 
         self.frame = map_frame(rig)
+        # Frames in the T-pose: their rotations turn residuals dU of the maps, in canonical axes, to the triangles'
+        # axes.
         canonical = triangle_frames(rig.vertices, rig.faces)
         # Look the maps up at the Gaussians' places on their triangles. Offsets, which are learned, are left out, so
         # that one lookup serves the whole training.
@@ -75,6 +77,7 @@ class TeacherAvatar(nn.Module):
         points = on_triangles(canonical.corners[face], gaussians.barycentric.to(rig.device))
         sides = assign_front_back(rig, self.frame, config.out_size, points, canonical.rotations[face, :, 0])
         self.sampler = MapSampler(self.frame, config.out_size, points, sides.front)
+        # Maps of the inputs have their own size; semantic colours are an input that is the same in every pose.
         self.maps = front_back_maps(rig.vertices, rig.faces, self.frame, size=config.in_size)
         self.register_buffer("canonical_from_local", canonical.rotations[face], persistent=False)
         self.register_buffer("semantics", self.maps.interpolate(rig.semantic_colors)[None], persistent=False)
@@ -103,6 +106,9 @@ class TeacherAvatar(nn.Module):
         count = 0
         total = torch.zeros_like(self.mean_positions, dtype=torch.float64)
         squares = torch.zeros_like(total)
+        # Variance as E[x^2] - E[x]^2 in float64, averaged over the pixels of the body and over x, y, z: one scale for
+        # all,
+        # so that directions are not distorted. The clamp removes negative rounding errors.
         for pose in poses:
             _, positions = self._root_positions(pose)
             count, total, squares = count + 1, total + positions.double(), squares + positions.double().square()
@@ -134,12 +140,16 @@ class TeacherAvatar(nn.Module):
     def inputs(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> TeacherMaps:
         """Return all inputs of the networks for a pose and camera centres, metres, without gradients."""
         with self._exact():
+            # Everything is relative to the root, so that the inputs do not depend on where the person stands or
+            # faces.
             to_root = pose.root_from_world
             vertices, positions = self._root_positions(pose)
             if not self.config.sees_view:
                 return TeacherMaps(self._shown(positions), None)
             normals = self.maps.interpolate(vertex_normals(vertices, self.rig.faces))
             from_root = camera_centers @ to_root[:3, :3].T + to_root[:3, 3]
+            # (C, 2, S, S): cosine of the angle between the posed normal and the direction to each camera, 0 off the
+            # body.
             directions = F.normalize(from_root[:, None, None, None] - positions, dim=-1)
             cosines = (F.normalize(normals, dim=-1) * directions).sum(-1)
             return TeacherMaps(self._shown(positions), cosines * self.maps.mask)
@@ -174,6 +184,7 @@ class TeacherAvatar(nn.Module):
         vertices = self.rig.skin(pose)
         frames = triangle_frames(vertices, self.rig.faces)
         world = world_from_frames(bound, frames)
+        # Viewing directions are constants: a colour's gradient must not move its Gaussian.
         means = world.means.detach()
         color = residuals.colour.expand(len(camera_centers), -1, -1)
         # Colours of each camera; its residual is added to dc before the clamp.
@@ -229,8 +240,10 @@ def assign_front_back(
     for is_front in (True, False):
         side = torch.full((len(points),), is_front, device=points.device)
         height, weight = MapSampler(frame, size, points, side)(table)[0].unbind(-1)
+        # Height of the surface above the point: along +z on the front map, along -z on the back map.
         below = (height / weight.clamp(min=1e-6) - points[:, 2]) * (1.0 if is_front else -1.0)
         seen = weight > 1e-3
+        # A map without a surface at the point is infinitely far, so that the other one wins.
         distances.append(below.abs().masked_fill(~seen, torch.inf))
         belows.append(below.masked_fill(~seen, 0.0))
     nothing = torch.isinf(distances[0]) & torch.isinf(distances[1])

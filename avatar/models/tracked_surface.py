@@ -45,6 +45,7 @@ class ControlCage(nn.Module):
         control = template_control_points(rig.template, count)
         neighbours = torch.tensor(control.neighbours, device=rig.device)
         self.count = len(control.vertices)
+        # Interpolation as a sparse matrix (V, K).
         weights = torch.tensor(control.weights, dtype=torch.float32, device=rig.device)
         self.rows = SparseRows(neighbours, weights, self.count)
         self.register_buffer("vertices", torch.tensor(control.vertices, device=rig.device))
@@ -76,9 +77,11 @@ class ControlCage(nn.Module):
         """
         rounding, saturation = 1e-3, 5e-3  # metres: e and S
         count = max(int(self.off_clothes.sum()), 1)
+        # Pseudo-Huber of the length: quadratic below e, so that its gradient at 0 exists, linear above.
         moved = (controls.square().sum(-1) + rounding**2).sqrt() - rounding
         total = moved[self.off_clothes].sum() / count
         if reach > 0.0:
+            # Weight of each control point: 1 on clothes at the skin, 0 from `reach` on, and 0 off the clothes.
             tight = (~self.off_clothes).float() * (1.0 - self.from_body / reach).clamp(min=0.0)
             total = total + (tight * saturation * moved / (saturation + moved)).sum() / count
         return total
@@ -116,11 +119,13 @@ class TrackedAvatar(nn.Module):
 
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar with the current displacements of its control points."""
+        # Zero the still control points before interpolation; a skinned mesh then carries the Gaussians.
         displacements = self.cage(self.moves * self.controls)
         vertices = self.rig.skin(pose, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.gaussians()
         world = world_from_frames(bound, frames)
+        # Viewing directions are constants: a colour's gradient must not move its Gaussian.
         colors = view_colors(bound, frames, world.means.detach(), camera_centers)
         return PosedAvatar(vertices, world, colors, bound, displacements)
 

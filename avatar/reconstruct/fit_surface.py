@@ -121,6 +121,7 @@ def fit_surface(
     for k in range(config.iterations):
         if k % 50 == 0:
             progress("surface", k / config.iterations)
+        # Rays of this step, drawn on the CPU so that the draws do not depend on the device.
         rows = torch.randint(len(rays), (config.rays,), generator=generator).to(device)
         # Gradients are differences over cells that shrink from 2 cm to twice the final cell: coarse shape first.
         share = k / max(config.iterations - 1, 1)
@@ -146,6 +147,7 @@ def surface_loss(
     count, samples = len(rays), config.samples
     jitter = torch.rand((count, samples + 1), generator=generator).to(rays.enter.device)
     along = (torch.arange(samples + 1, device=jitter.device) + jitter) / (samples + 1)
+    # (R, S + 1) samples from `before` in front of the hull to `behind` inside it; (R, S) intervals between them.
     depth = rays.enter[:, None] - config.before + (config.before + config.behind) * along
     points = rays.origin[:, None] + depth[..., None] * rays.direction[:, None]
     distance = model.distance(points.reshape(-1, 3)).reshape(count, samples + 1)
@@ -160,8 +162,11 @@ def surface_loss(
     opacity = weights.sum(dim=1)
     seen = (weights[..., None] * colors).sum(dim=1)
     person = (rays.opacity > 0.99).float()
+    # L1 over the pixels that the mask gives wholly to the person, because the background's colour is not modelled.
     color = (person[:, None] * (seen - rays.color).abs()).sum() / (3 * person.sum()).clamp(min=1)
+    # The clamp bounds the cross-entropy's slope where a ray is nearly opaque or clear.
     mask = torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), rays.opacity)
+    # A signed distance has a gradient of length 1; the residual term keeps f near the hull where no photograph tells.
     eikonal = ((gradient.norm(dim=1) - 1) ** 2).mean()
     residual = (distance - model.hull_distance(points.reshape(-1, 3)).reshape(distance.shape)).abs().mean()
     return color + config.mask * mask + config.eikonal * eikonal + config.residual * residual

@@ -60,6 +60,7 @@ class HashGrid(nn.Module):
         for size, table in zip(self.sizes, self.tables, strict=True):
             # Trilinear weights of the eight corners of the cell.
             place = points.clamp(0, 1) * size
+            # The index has no gradient; points on the far side belong to the last cell.
             cell = place.detach().floor().clamp(max=size - 1)
             part = (place - cell)[:, None]
             weights = torch.where(self.corners.bool(), part, 1 - part).prod(dim=-1)
@@ -68,6 +69,8 @@ class HashGrid(nn.Module):
         return torch.cat(found, dim=1)
 
     def _rows(self, corner: Int[Tensor, "N 8 3"], size: int, entries: int) -> Int[Tensor, "N 8"]:
+        # A dense level has one row a corner. Otherwise XOR of the coordinates times large primes, modulo the table's
+        # size: where corners collide, the gradients of points at the surface dominate the shared row (Mueller et al.).
         x, y, z = corner.unbind(dim=-1)
         if (size + 1) ** 3 <= self.entries:
             return (x * (size + 1) + y) * (size + 1) + z

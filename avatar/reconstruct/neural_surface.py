@@ -61,6 +61,7 @@ class NeuralSurface(nn.Module):
 
     def hull_distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         """Return the hull's signed distance, metres; outside the grid that of its nearest side."""
+        # `grid_sample` wants coordinates in [-1, 1] in the order z, y, x: the last axis of the grid comes first.
         place = 2 * (points - self.low) / (self.high - self.low) - 1
         sampled = nn.functional.grid_sample(
             self.hull[None, None],
@@ -76,12 +77,16 @@ class NeuralSurface(nn.Module):
 
     def _learned(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 16"], Float[Tensor, "N W"]]:
         """Return the residual with its features, and the features of the grid."""
+        # One scale for all axes, so that cells of the hash grid are cubes; the box's longest side has length 1.
         unit = (points - self.low) / (self.high - self.low).max()
         features = self.grid(unit)
         return self.residual(torch.cat([features, 2 * unit - 1], dim=1)), features
 
     def gradient(self, points: Float[Tensor, "N 3"], *, step: float) -> Float[Tensor, "N 3"]:
         """Return the gradient of the distance by central differences over neighbouring cells (Li et al. 2023)."""
+        # A step as long as a cell spreads the gradient over neighbouring cells, so that the eikonal term smooths them
+        # all;
+        # the analytic gradient of trilinear features reaches the corners of a single cell alone.
         offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
         ends = [self.distance(points + offset) - self.distance(points - offset) for offset in offsets]
         return torch.stack(ends, dim=1) / (2 * step)
@@ -90,5 +95,6 @@ class NeuralSurface(nn.Module):
         self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
         """Return the colours of points in viewing directions, sRGB in [0, 1]."""
+        # The network of the colour sees the features that the distance's network shares, without the distance itself.
         learned, features = self._learned(points)
         return torch.sigmoid(self.color(torch.cat([features, learned[:, 1:], normals, directions], dim=1)))

@@ -51,9 +51,13 @@ def rays_of(views: Sequence[PhotoView], hull: TriangleMesh, device: torch.device
         # Pixels of the hull, their directions in the world, and the distance along the ray to the hull.
         depth = rasterize_mesh(hull, view.camera).depth
         row, column = np.nonzero(np.isfinite(depth))
+        # Homogeneous pixel centres (R, 3); K^-1 turns them into directions with z = 1 in camera axes (OpenCV's).
         pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
         in_camera = pixels @ np.linalg.inv(view.camera.K).T
         length = np.linalg.norm(in_camera, axis=1)
+        # Rows times R is R^T times columns: the inverse of the camera's rotation. Depths are along z, so metres along
+        # the
+        # ray are depth times the length of its direction with z = 1.
         parts["direction"].append(in_camera / length[:, None] @ view.camera.cam_from_world[:3, :3])
         parts["origin"].append(np.broadcast_to(view.camera.position, (len(row), 3)))
         parts["enter"].append(depth[row, column] * length)
@@ -72,12 +76,16 @@ def opacities(distance: Float[Tensor, "R S"], sharpness: Float[Tensor, ""]) -> F
 
     Wang et al. (2021), "NeuS": unbiased at the zero of the distance f.
     """
+    # s falls from 1 outside to 0 inside; the drop between samples, relative to s, is the opacity. Rising s (a ray
+    # that
+    # leaves the body) is clamped to 0, and the lower bound keeps the quotient finite deep inside.
     at = torch.sigmoid(distance * sharpness)
     return ((at[:, :-1] - at[:, 1:]) / at[:, :-1].clamp(min=1e-6)).clamp(0, 1)
 
 
 def weights_of(opacity: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
     """Return the weight of each interval in the pixel: its opacity times the transmittance before it."""
+    # Transmittance behind each interval; the small term keeps the product's gradient finite at an opacity of 1.
     through = torch.cumprod(1 - opacity + 1e-7, dim=1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], dim=1)
     return opacity * before

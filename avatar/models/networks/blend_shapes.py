@@ -168,6 +168,7 @@ class BlendShapes(nn.Module):
                 raise InputError(
                     f"parameters of the {name}", expected=f"shape (B, {size})", received=f"shape {tuple(value.shape)}"
                 )
+        # (B, P, n_h) from H and (B, P, n_b) from B, side by side: the first n_h columns of z are the head's.
         parts = (self.config.parts, -1)
         return torch.cat([self.head(of_head).unflatten(1, parts), self.body(pose).unflatten(1, parts)], dim=-1)
 
@@ -178,6 +179,7 @@ class BlendShapes(nn.Module):
     def _blend(self, basis: Tensor, z: Tensor) -> Tensor:
         # Coefficients of each Gaussian's part, or one set for all, gated by the head's weight.
         B, M = len(z), len(basis)
+        # Parts: gather z by part, (B, M, n), and contract with the basis (M, 3, n).
         if self.part is not None:
             of_gaussian = z[:, self.part[self.active]]
             if self.head_weight is not None:
@@ -191,13 +193,16 @@ class BlendShapes(nn.Module):
             w = self.head_weight[self.active][:, None]
             out = w * of_head + (1 - w) * of_body
         else:
+            # One set of coefficients and no gate: a plain matrix product.
             out = self._product(basis, z[:, 0])
         if M == self.count:
             return out
+        # Pruned Gaussians have no row in the basis and residual 0.
         return out.new_zeros(B, self.count, 3).index_copy(1, self.active, out)
 
     @staticmethod
     def _product(basis: Float[Tensor, "M 3 n"], z: Float[Tensor, "B n"]) -> Float[Tensor, "B M 3"]:
+        # (B, n) times (n, 3 M): one matrix product is much faster than a batch of small ones.
         return (z @ basis.flatten(0, 1).T).unflatten(1, (-1, 3))
 
     def _gate(self, head_weight: Tensor) -> Tensor:
@@ -219,9 +224,11 @@ class BlendShapes(nn.Module):
         Args:
             coefficient_std: standard deviations of the coefficients over the training frames.
         """
+        # (M, n) deviations of the coefficients that reach each Gaussian, gated as in `_blend`.
         sigma = coefficient_std[self.part[self.active]] if self.part is not None else coefficient_std
         if self.head_weight is not None:
             sigma = sigma * self._gate(self.head_weight)
+        # Mean of the two shares, each with sum 1; the clamp leaves 0 where a basis is still zero everywhere.
         shares = torch.zeros(self.count, dtype=self.U.dtype, device=self.U.device)
         for basis in (self.U.detach(), self.C.detach()):
             energy = (basis * sigma[:, None]).square().sum((1, 2))

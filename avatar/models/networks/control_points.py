@@ -70,6 +70,8 @@ def choose_control_points(
     weights = np.zeros((len(vertices), neighbour_count))
     before, shares = 0, _shares(np.bincount(group), np.bincount(group, weights=importance), count)
     for k in range(len(names)):
+        # Where a group has fewer control points than neighbours, the columns left over repeat the nearest with weight
+        # 0.
         members = np.flatnonzero(group == k)
         share = shares[k]
         controls = members[_farthest_points(vertices[members], share)]
@@ -109,6 +111,7 @@ def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
         more = left * open_wishes / open_wishes.sum()
         whole = np.minimum(np.floor(more).astype(np.int64), sizes - shares)
         if not whole.any():
+            # All quotas are below one: give single points to the largest remainders that still have room.
             rest = np.argsort(-(more - whole), kind="stable")
             whole[rest[shares[rest] < sizes[rest]][:left]] = 1
         shares += whole
@@ -117,6 +120,7 @@ def _shares(sizes: np.ndarray, wishes: np.ndarray, count: int) -> np.ndarray:
 
 def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     """Return the indices of `count` points by farthest-point sampling."""
+    # Start at the point farthest from the centroid, then take the point farthest from all chosen before.
     picked = np.empty(count, dtype=np.int64)
     picked[0] = np.argmax(np.linalg.norm(points - points.mean(0), axis=1))
     distance = np.full(len(points), np.inf)
@@ -132,6 +136,7 @@ def _local_weights(points: np.ndarray, controls: np.ndarray, count: int) -> tupl
     # One neighbour more than is used: its distance is where the weights fade to zero.
     asked = min(count + 1, len(controls))
     distance, nearest = cKDTree(controls).query(points, k=np.arange(1, asked + 1))
+    # A vertex that is itself a control point has distance 0; 1e-9 m gives it nearly all of the weight.
     distance = np.maximum(distance, 1e-9)
     # Where there is no next nearest control point, a distance twice the largest keeps every weight above zero.
     limit = (distance[:, -1] if asked > count else 2.0 * distance[:, -1])[:, None]

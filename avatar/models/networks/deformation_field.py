@@ -58,6 +58,7 @@ def positional_encoding(points: Float[Tensor, "*P 3"], frequencies: int) -> Floa
         points: metres.
         frequencies: L; E is 3 + 6 L.
     """
+    # Frequencies pi 2^l, outer product with x, y, z: (..., 3 L) angles.
     bands = math.pi * 2.0 ** torch.arange(frequencies, dtype=points.dtype, device=points.device)
     angles = (points[..., None, :] * bands[:, None]).flatten(-2)
     return torch.cat([points, torch.sin(angles), torch.cos(angles)], dim=-1)
@@ -91,6 +92,8 @@ class FieldNetwork(nn.Module):
 
     def forward(self, encodings: Tensor, frames: Tensor, member: Tensor | None) -> Tensor:
         """Map (V, E) encodings, (B, U, pose + code) and a (V, U) one-hot, or None where U is 1, to (B, V, 3)."""
+        # W [phi; theta; z] = W_p phi + W_f [theta; z]: points (V, width) plus frames (B, U, width), picked by set of
+        # joints.
         of_frame = self.of_frame(frames)
         x = F.relu(self.of_point(encodings) + (of_frame if member is None else member @ of_frame))
         for layer in self.hidden:
@@ -232,6 +235,7 @@ def _evaluated(
     if control is None:
         if still is None:
             return every, None
+        # Each vertex interpolates from itself alone.
         where, neighbours, weights = every, every[:, None], torch.ones_like(vertices[:, :1])
     else:
         where = torch.as_tensor(control.vertices, device=vertices.device)
@@ -284,6 +288,7 @@ class FrameCodes(nn.Module):
                 received=", ".join(map(str, unknown)),
                 remedy="drive new frames with the null code, or fit codes to them",
             )
+        # None takes row 0, which is z_0, and is multiplied by 0 where training has shown the zero vector.
         rows = torch.tensor([0 if frame is None else self.row[frame] for frame in frames], device=self.codes.device)
         coded = [frame is not None or not self.null_code_shown for frame in frames]
         known = torch.tensor(coded, device=self.codes.device)

@@ -48,9 +48,11 @@ class MapSampler(nn.Module):
             )
         # Bilinear weights of the four pixel centres around each point, as rows of a sparse matrix.
         self.size = size
+        # Upper left of the four pixels; the clamps make points outside the outermost centres take the border's value.
         corner = (pixels - 0.5).floor().clamp(0, size - 2)
         right, down = (pixels - 0.5 - corner).clamp(0.0, 1.0).unbind(-1)
         column, row = corner.long().unbind(-1)
+        # Flat index in (2, S, S): side 0 is the front map, side 1 the back map.
         first = (~front * size + row) * size + column
         rows = torch.stack([first, first + 1, first + size, first + size + 1], dim=1)
         weights = [(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down]

@@ -32,11 +32,14 @@ def joint_steps(template: Template) -> Int64[np.ndarray, "V 21"]:
     near = np.eye(len(parents), dtype=bool)
     children = np.flatnonzero(parents >= 0)
     near[children, parents[children]] = near[parents[children], children] = True
+    # (V, J) joints that carry each vertex have distance 0; all others start at a bound that no skeleton exceeds.
     seen = template.weights.dense() > MIN_SKIN_WEIGHT
     steps = np.where(seen, 0, len(parents))
     for count in range(1, len(parents)):
+        # Boolean matrix product: joints one step further from the set.
         seen = seen @ near
         steps = np.where(seen, np.minimum(steps, count), steps)
+    # theta leaves out the root (joint 0) and the joints of face and hands.
     return steps[:, 1 : BODY_JOINTS + 1].astype(np.int64)
 
 
@@ -56,6 +59,7 @@ class PoseGate(nn.Module):
     def __init__(self, poses: Float[Tensor, "T 63"]) -> None:
         super().__init__()
         self.register_buffer("poses", poses.detach().clone())
+        # Distances between the vectors theta, radians; a pose is not its own neighbour.
         apart = torch.cdist(poses.double(), poses.double())
         apart.fill_diagonal_(float("inf"))
         nearest = apart.min(dim=1).values
@@ -67,6 +71,7 @@ class PoseGate(nn.Module):
     def forward(self, pose: Float[Tensor, " 63"]) -> Float[Tensor, ""]:
         """Return the weight g of a pose, in [0, 1]."""
         distance = (self.poses - pose).norm(dim=1).min()
+        # Half a Gaussian: 1 up to d_0, then falling with deviation d_0.
         over = ((distance - self.scale) / self.scale).clamp(min=0.0)
         return torch.exp(-0.5 * over.square())
 
@@ -114,5 +119,6 @@ class PoseRegression(nn.Module):
 
     def forward(self, pose: Float[Tensor, "B 63"]) -> Float[Tensor, "B K 3"]:
         """Return displacements of the points in B poses, metres."""
+        # (B, 63) clamped angles about the centre, then two products of rank r: (B, r) and (B, 3 K).
         turned = torch.minimum(torch.maximum(pose, self.low), self.high) - self.center
         return self.level + (turned @ self.rows.T @ self.basis.flatten(0, 1).T).unflatten(1, (-1, 3))

@@ -15,6 +15,7 @@ class _Bags(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, *matrices: Tensor) -> Tensor:
+        # The first three tensors are the matrix, the last three its transpose; each sum of weighted rows is one bag.
         ctx.save_for_backward(*matrices)
         rows, offsets, weights = matrices[:3]
         return F.embedding_bag(rows, table.to(weights.dtype), offsets, mode="sum", per_sample_weights=weights)
@@ -22,6 +23,7 @@ class _Bags(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         rows, offsets, weights = ctx.saved_tensors[3:]
+        # d/dtable = W^T d/dout: the same kind of sum, with a fixed order of additions.
         gradient = gradient.to(weights.dtype)
         summed = F.embedding_bag(rows, gradient, offsets, mode="sum", per_sample_weights=weights)
         return summed, *(None for _ in ctx.saved_tensors)
@@ -52,6 +54,7 @@ class SparseRows(nn.Module):
             "rows": flat,
             "offsets": offsets,
             "weights": weights,
+            # Entry e of the flat matrix belongs to point e // k.
             "transposed_rows": order // per_point,
             "transposed_offsets": counts.cumsum(0) - counts,
             "transposed_weights": weights[order],

@@ -38,6 +38,8 @@ class _SymmetricFilter(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (kernel,) = ctx.saved_tensors
+        # A symmetric kernel is its own mirror image, so the adjoint is a convolution too; its padding restores the
+        # size.
         complementary = kernel.shape[-1] - 1 - ctx.padding
         return _SymmetricFilter.apply(gradient, kernel, complementary), None, None
 
@@ -54,6 +56,7 @@ class FirFilter(nn.Module):
     def __init__(self, *, gain: float = 1.0) -> None:
         super().__init__()
         taps = torch.tensor(FIR_TAPS)
+        # The outer product of the taps with themselves, normalised to sum `gain`.
         kernel = torch.outer(taps, taps) * (gain / sum(FIR_TAPS) ** 2)
         self.register_buffer("kernel", kernel[None, None], persistent=False)
 
@@ -108,11 +111,14 @@ class ConvLayer(_EqualizedConv):
 
     def forward(self, x: Float[Tensor, "B I H W"]) -> Float[Tensor, "B O h w"]:
         """Apply the layer; h and w are H and W, or half of them with `down`."""
+        # Equalised learning rate: stored weights have unit variance, used ones 2 / fan in (He), with the gain's
+        # square 2.
         weight = self.weight * self.scale
         reach = weight.shape[-1] // 2
         if self.filter is None:
             x = F.conv2d(x, weight, self.bias, padding=reach)
         else:
+            # Low-pass filter, then a convolution with stride 2; the filter's padding makes the output half the side.
             x = F.conv2d(self.filter(x, padding=reach + 1), weight, self.bias, stride=2)
         return F.leaky_relu(x, SLOPE, inplace=True)
 
@@ -186,10 +192,12 @@ class StyledConv(nn.Module):
 
     def forward(self, x: Float[Tensor, "B I H W"], style: Float[Tensor, " S"]) -> Float[Tensor, "B O h w"]:
         """Apply the layer; h and w are H and W, or twice as much with `up`."""
+        # Filters of unit norm keep the features' variance whatever the style, in the place of a normalisation layer.
         weight = demodulate(self.modulated(style))
         if self.filter is None:
             x = F.conv2d(x, weight * GAIN, self.bias, padding=1)
         else:
+            # Zeros in between, convolved; the filter then removes the copies of the spectrum that the zeros cause.
             x = F.conv_transpose2d(x, weight.transpose(0, 1), stride=2)
             x = self.filter(x, padding=1) + self.bias[:, None, None].to(x.dtype)
         if self.noise is not None:

@@ -157,6 +157,7 @@ def local_offsets(
         canonical_offsets: metres along the canonical axes.
         canonical_from_local: rotation of each Gaussian's triangle in the canonical pose.
     """
+    # Summing over i, the canonical axes, applies the transpose of R.
     return torch.einsum("nij,...ni->...nj", canonical_from_local, canonical_offsets)
 
 
@@ -222,10 +223,12 @@ class Teacher(nn.Module):
 
     def _image(self, positions: Tensor, semantics: Tensor) -> Tensor:
         """Return the input of the StyleUNets, (B, channels, S, S)."""
+        # "sum": positions and colours in the same three channels; the semantic colours tell parts apart that touch.
         if self.config.semantics == "sum":
             image = positions + semantics
         else:
             image = torch.cat([positions, semantics.expand_as(positions)], dim=-1)
+        # Front and back map side by side in the channels: (B, 2, S, S, C) to (B, 2 C, S, S).
         return image.permute(0, 1, 4, 2, 3).flatten(1, 2)
 
     def _position(self, image: Tensor) -> Tensor:

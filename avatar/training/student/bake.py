@@ -124,6 +124,8 @@ class BakeTask(PhotometricTask):
                 sequence.rig, teacher.frame, teacher_config.out_size, teacher_config.position_scale
             )
             self.of_mesh = config.semantic_map == "mesh"
+            # Labels e = c + sin(tau v) of what is drawn: the mesh's vertices (V, 3) or the student's Gaussians (N,
+            # 3).
             self.labels = (
                 vertex_labels(sequence.rig, tau=config.tau)
                 if self.of_mesh
@@ -167,10 +169,14 @@ class BakeTask(PhotometricTask):
 
     def _shown(self, pose: Pose, frame: int) -> Pose:
         """Return the pose that the field sees: a share of them as new ones, with noise on theta."""
+        # Random numbers depend on seed, iteration and frame alone, so that a continued training draws the same
+        # ones.
         noise = self.generator(frame)
         if self.config.null_share and noise.random() < self.config.null_share:
             pose = self.sequence.as_new_pose(frame)
         if self.config.pose_noise:
+            # Noise on theta regularises the field like a penalty on its slope with the pose; skinning keeps the true
+            # pose.
             moved = torch.tensor(noise.normal(size=len(pose.body_pose)) * self.config.pose_noise)
             pose = replace(pose, body_pose=pose.body_pose + moved.to(pose.body_pose))
         return pose

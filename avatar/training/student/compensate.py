@@ -111,9 +111,11 @@ class CompensateTask(PhotometricTask):
         pose = self.sequence.pose(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
             pose = self.sequence.as_new_pose(item.frame)
+        # L_rec on all views; the gradients reach the blend shapes, and the attributes by their own rates.
         posed = self.student(pose, camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
         if self.coherence is not None:
+            # The coherence has its own random stream, so that it does not change which poses are shown as new.
             apart = self.coherence(self.shapes.U, self.generator(item.frame, 1))
             total = total + self.config.coherence * apart
             terms["coherence"] = float(apart.detach())
@@ -144,6 +146,8 @@ def compensate(
         The student and the progress of its training.
     """
     with fixed_seed(config.seed):
+        # Poses near which the body's shapes keep their full weight (`PoseGate`); initial values come from a fixed
+        # seed.
         known = torch.stack([sequence.pose(frame).body_pose for frame in sequence.train_frames])
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:

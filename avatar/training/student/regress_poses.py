@@ -86,6 +86,7 @@ def regress_poses(student: Student, sequence: AvatarSequence) -> PoseRegression:
     poses = torch.stack([sequence.pose(frame).body_pose for frame in frames])
     # Displacements of the field's points in the training frames, with their codes.
     surfaces = [field.at_points(pose[None], codes([frame]))[0] for frame, pose in zip(frames, poses, strict=True)]
+    # Regress each point from the joints near it, separately for each label (body, hair, each garment).
     points = field.points.cpu().numpy()
     made, chosen = fit_pose_regression(
         poses.cpu().numpy(),
@@ -130,6 +131,7 @@ def fit_pose_regression(
         The regression in a low-rank form, and the hyperparameters of each part.
     """
     poses, surfaces, places = (np.asarray(array, np.float64) for array in (poses, surfaces, places))
+    # Centre both sides, so that the regression needs no intercept: with W = 0 it gives the mean surface.
     center, level = poses.mean(axis=0), surfaces.mean(axis=0)
     weights = np.zeros((*level.shape, len(center)))
     chosen = {}
@@ -143,6 +145,8 @@ def fit_pose_regression(
         away = smooth[best.reach](away)
         for points, scale in _feature_groups(steps[own], best.fade):
             at = own[points]
+            # Features (T, 63) of these points and their targets (T, 3 P); W then takes in the factors, because F =
+            # scale theta.
             x, y = (poses - center) * scale, away[:, points].reshape(len(poses), -1)
             solved = np.linalg.solve(x.T @ x + best.ridge * np.eye(len(center)), x.T @ y)
             weights[at] = (scale[:, None] * solved).T.reshape(len(at), 3, -1)

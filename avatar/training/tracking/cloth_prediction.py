@@ -167,6 +167,8 @@ class ClothPrediction:
         """
         if self.simulated is None:
             return torch.zeros_like(next(iter(solved.values()))[0])
+        # In the recent frames: the error of skinning is the whole displacement, that of the simulation the difference
+        # to it.
         own, errors = self.simulated.displacements, []
         for one in self._recent(frame, solved):
             found, observed = solved[one]

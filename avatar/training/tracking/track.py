@@ -120,6 +120,8 @@ class TrackTask(PhotometricTask):
     def micro_batches(self, iteration: int) -> Sequence[Item]:
         """Return the frame that is being tracked, with the cameras of this step."""
         self.iteration = iteration
+        # Iterations count through the frames: each has the steps of all levels. The next step's photographs load
+        # ahead.
         place, step = divmod(iteration, self.track_config.steps)
         now = self._item(place, step)
         if iteration + 1 < self.config.iterations:
@@ -132,6 +134,7 @@ class TrackTask(PhotometricTask):
 
     def lr_factor(self, iteration: int, group: ParameterGroup) -> float:
         """Return the learning rate: it starts at the level's and falls exponentially within it."""
+        # From 1 at the level's first step towards LEVEL_DECAY at its end, times the level's own rate.
         level, step = self._level(iteration)
         return level.lr * LEVEL_DECAY ** (step / level.steps)
 
@@ -206,6 +209,8 @@ class TrackTask(PhotometricTask):
         for other in (*self.ends, *self.order[: self.order.index(frame)]):
             row = self.row[other]
             solved[other] = (self.solved[row], self._unit - unobserved_weight(self.structure[row], self._normals))
+        # Structure tensors of this frame are taken about its predicted start, where its photographs are compared
+        # first.
         start = self.prediction.start(frame, solved) if solved else torch.zeros_like(self.avatar.controls)
         own = self.structure[self.row[frame]]
         own.copy_(self._structure(frame, start))
@@ -220,6 +225,7 @@ class TrackTask(PhotometricTask):
 
     def _structure(self, frame: int, controls: Tensor) -> Tensor:
         """Return the structure tensors of a frame's photographs by all training cameras, about given displacements."""
+        # Use photographs of a size that the levels load anyway.
         sizes = [level.halvings for level in self.track_config.levels]
         halvings = min(sizes, key=lambda size: abs(size - STRUCTURE_HALVINGS))
         names = self.sequence.cameras(frame, 0, len(self.sequence.train_cameras), self.track_config.seed)
@@ -272,6 +278,7 @@ class TrackTask(PhotometricTask):
         # The filter runs in the order in which the frames were solved.
         structure = {frame: self.structure[self.row[frame]] for frame in self.order}
         seconds, known = 1.0 / (self.sequence.capture.fps or DEFAULT_FPS), self.track_config.reference is not None
+        # (K,) RMS displacement over the frames, to which the expected error of an unobserved point tends.
         moved = solved.square().sum(-1).mean(0).sqrt()
         found = expected_errors(self.order, seconds, structure, moved, known=known)
         return torch.stack([found[frame] for frame in self.row])
@@ -285,6 +292,7 @@ class TrackTask(PhotometricTask):
 
 def _prediction(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig) -> ClothPrediction:
     """Return the predictor, with simulated clothes where the configuration and the capture allow them."""
+    # A simulation needs time between frames, and a reference frame in which the garment's shape is known.
     simulated, fps = None, sequence.capture.fps
     if config.simulate and config.reference is not None and fps is not None:
         poses = {frame: sequence.params(frame) for frame in sequence.train_frames}
