@@ -82,6 +82,7 @@ def rasterize(
         >>> image, alpha, meta = rasterize(means, quats, scales, opacities, colors, viewmats, Ks, 512, 512)
         >>> (image - photograph).abs().mean().backward()
     """
+    # Named arguments, so that errors can name the one that is at fault; their order is that of the backends' signature.
     settings = checked_settings(RasterSettings(width, height, near, far, eps2d, camera_gradients))
     tensors = dict(
         zip(
@@ -98,10 +99,12 @@ def rasterize(
     if check:
         check_values(tensors, background)
 
+    # Poses are constants unless asked for, which saves their backward pass.
     if not camera_gradients:
         tensors["viewmats"] = viewmats.detach()
     if background is not None:
         background = background.expand(len(viewmats), -1)
+    # Depth is blended as one more channel with the same weights alpha_i T_i, and 0 on the background.
     if depth is not None:
         tensors["features"], background = _with_depth_channel(tensors, background)
     # The kernels need at least one Gaussian and one camera.
@@ -113,6 +116,7 @@ def rasterize(
         image, alpha, meta = draw(*tensors.values(), background, settings)
     if depth is None:
         return image, alpha, meta
+    # Take the channel of depth off again; "expected" divides by the sum of the weights, which is alpha.
     image, blended = image[..., :-1], image[..., -1:]
     return image, alpha, dataclasses.replace(meta, depth=blended if depth == "accumulated" else _divide(blended, alpha))
 
@@ -123,6 +127,7 @@ def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[...
         raise InputError("backend", expected=f"None or one of {', '.join(BACKENDS)}", received=repr(name))
     if name == "reference":
         return rasterize_reference
+    # CUDA tensors go to gsplat, all others to the CPU's kernels; both take float32 alone.
     chosen = name or ("gsplat" if means.is_cuda else "cpu")
     device = "cuda" if chosen == "gsplat" else "cpu"
     if means.device.type != device or means.dtype != torch.float32:
@@ -150,6 +155,7 @@ def _choose_backend(name: str | None, means: Tensor, Ks: Tensor) -> Callable[...
 
 def _with_depth_channel(tensors: dict[str, Tensor], background: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Return features with the Gaussians' z as one more channel, and the background with 0 there."""
+    # Depth differs from camera to camera: features that all cameras share are then repeated for each camera.
     features, depths = tensors["features"], camera_depths(tensors["means"], tensors["viewmats"])
     cameras = len(depths)
     if cameras == 1 and features.ndim == 2:
@@ -163,6 +169,7 @@ def _draw_nothing(
     tensors: dict[str, Tensor], background: Tensor | None, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, RasterMeta]:
     """Return the background alone, for no Gaussians or no cameras; a result with (zero) gradients."""
+    # Zero times the sum of all inputs keeps the graph, so that a backward pass gives zeros instead of an error.
     cameras, count, features = len(tensors["viewmats"]), len(tensors["means"]), tensors["features"]
     nothing = torch.stack([tensor.sum() for tensor in tensors.values()]).sum() * 0
     image = nothing.expand(cameras, settings.height, settings.width, features.shape[-1])
@@ -175,5 +182,6 @@ def _draw_nothing(
 
 def _divide(blended: Tensor, alpha: Tensor) -> Tensor:
     """Return `blended / alpha`, and 0 with gradient 0 where alpha is 0."""
+    # The inner `where` keeps a division by 0 out of the graph: its NaN gradient would pass the outer one.
     seen = alpha > 0
     return torch.where(seen, blended / torch.where(seen, alpha, 1.0), 0.0)

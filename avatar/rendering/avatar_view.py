@@ -63,8 +63,10 @@ def render_view(
         features.append(world.normals)
     if extra is not None:
         features.append(extra)
+    # The background's colour fills the first three channels; further channels are 0 there.
     channels = torch.cat(features, dim=-1) if len(features) > 1 else features[0]
     behind = torch.nn.functional.pad(background, (0, channels.shape[-1] - 3))
+    # Values are not checked here: the model and the capture have been, and a training draws many views a second.
     image, alpha, _ = rasterize(
         world.means,
         world.quats,
@@ -79,6 +81,7 @@ def render_view(
         eps2d=eps2d,
         check=False,
     )
+    # Split the channels again, in the order in which they were joined.
     image = image[0]
     return Rendering(
         image[..., :3],

@@ -34,17 +34,22 @@ def barycentrics_reference(
     are `w / sum(w)`: the point `sum(w p) / sum(w)` lies on the ray. For parallel rays r and the corners have 1 for z.
     Computed in float64 and returned in the vertices' type; differentiable in the vertices.
     """
+    # Corners of the visible face of each covered pixel, in the camera's frame, metres.
     hit = face_id >= 0
     pose = torch.from_numpy(camera.cam_from_world).to(vertices.device)
     cam = vertices.double() @ pose[:3, :3].T + pose[:3, 3]
     corners = cam[faces[face_id[hit].long()]]
+    # The ray through each pixel's centre, which lies at +0.5.
     rows, cols = hit.nonzero(as_tuple=True)
     pixels = torch.stack([cols + 0.5, rows + 0.5, torch.ones_like(cols)], dim=-1).double()
     ray = pixels @ torch.from_numpy(ray_from_pixel(camera)).to(pixels.device).T
     points = torch.cat([corners[..., :2], torch.ones_like(corners[..., 2:])], -1) if camera.orthographic else corners
+    # Scalar triple products r . (b x c) are six times the signed volumes of tetrahedra from the camera's centre; their
+    # ratios are the barycentrics of the point in which the ray meets the plane of the face, correct in perspective.
     a, b, c = points.unbind(1)
     weights = torch.stack([(ray * torch.cross(p, q, dim=-1)).sum(-1) for p, q in ((b, c), (c, a), (a, b))], dim=-1)
     weights = weights / weights.sum(-1, keepdim=True)
+    # Depth is linear in the barycentrics. Background pixels get weight 0 and an infinite depth.
     z = (weights * corners[..., 2]).sum(-1)
     barycentric = vertices.new_zeros((*face_id.shape, 3)).index_put((rows, cols), weights.to(vertices.dtype))
     return barycentric, vertices.new_full(face_id.shape, torch.inf).index_put((rows, cols), z.to(vertices.dtype))
@@ -77,6 +82,7 @@ class BarycentricFunction(torch.autograd.Function):
     def backward(ctx: Any, grad_barycentric: Tensor | None, grad_depth: Tensor | None) -> tuple[Tensor | None, ...]:
         (vertices,) = ctx.saved_tensors
         faces, face_id, camera = ctx.constants
+        # The kernel differentiates in the camera's frame and in float64, since volumes of thin triangles cancel.
         pose = torch.from_numpy(camera.cam_from_world)
         points = vertices.double() @ pose[:3, :3].T + pose[:3, 3]
         gradients = [None if g is None else g.contiguous() for g in (grad_barycentric, grad_depth)]
@@ -93,6 +99,7 @@ class BarycentricFunction(torch.autograd.Function):
             address(grad_points, "float64"),
             thread_count(torch.get_num_threads()),
         )
+        # Back to the world: x_cam = R x + t, so that the gradient by x is R^T g, here with points as rows.
         return (grad_points @ pose[:3, :3]).to(vertices.dtype), None, None, None
 
 
@@ -105,6 +112,7 @@ class InterpolateFunction(torch.autograd.Function):
             raise InputError(
                 "barycentrics", expected=f"shape {(*face_id.shape, 3)}", received=f"shape {tuple(barycentric.shape)}"
             )
+        # The kernel reads plain row-major arrays; the same contiguous tensors are kept for the backward pass.
         inputs = [t.contiguous() for t in (values, faces, face_id, barycentric)]
         ctx.save_for_backward(*inputs)
         out = pooled_empty(*face_id.shape, values.shape[1])
@@ -121,6 +129,7 @@ class InterpolateFunction(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         values, _, face_id, barycentric = inputs
+        # The kernel skips the gradients whose address is null, because no leaf of the graph needs them.
         grad_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
         grad_barycentric = pooled_empty(*barycentric.shape) if ctx.needs_input_grad[1] else None
         native_library().smplxpp_interpolate_backward(

@@ -52,6 +52,7 @@ def rasterize_cpu(
         InputError: not float32.
         MemoryError: the lists of Gaussians by tile do not fit.
     """
+    # Limits of the kernels: single precision and 32-bit indices.
     if means.dtype != torch.float32:
         raise InputError(
             "means", expected="float32", received=str(means.dtype), remedy='use backend="reference" for float64'
@@ -84,17 +85,20 @@ class _Rasterize(torch.autograd.Function):
         background: Tensor | None,
         settings: RasterSettings,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        # Outputs are allocated here, since autograd owns them; the kernels overwrite every entry.
         cameras, count, channels = len(viewmats), len(means), features.shape[-1]
         image = pooled_empty(cameras, settings.height, settings.width, channels)
         alpha = pooled_empty(cameras, settings.height, settings.width, 1)
         means2d, radii = means.new_empty(cameras, count, 2), means.new_empty(cameras, count, 2)
         depths = means.new_empty(cameras, count)
         inputs = (means, quats, scales, opacities, features, viewmats, Ks, background)
+        # A backward pass needs its camera's own workspace; without gradients one serves all cameras in turn.
         needed = any(ctx.needs_input_grad)
         ctx.workspaces = [Workspace() for _ in range(cameras if needed else 1)]
         for camera, view in enumerate(_views(inputs, settings)):
             outputs = (image[camera], alpha[camera], means2d[camera], radii[camera], depths[camera])
             ctx.workspaces[camera if needed else 0].forward(view, outputs)
+        # Radii decide in the backward pass which Gaussians were visible, so that they are saved beside the inputs.
         ctx.settings = settings
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(means2d, radii, depths)
@@ -106,10 +110,12 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         *inputs, radii = ctx.saved_tensors
         *gaussians, features, viewmats, _, background = inputs
+        # Neither image nor alpha enters the loss: there is nothing to propagate.
         if grad_image is None and grad_alpha is None:
             return (None,) * 9
         grad_image = None if grad_image is None else grad_image.contiguous()
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
+        # The first camera writes these gradients, so that they need no zeros; poses are added to, so that theirs do.
         grads = [torch.empty_like(tensor) for tensor in (*gaussians, features)]
         poses = viewmats.new_zeros(len(viewmats), 3, 4, dtype=torch.float64) if ctx.needs_input_grad[5] else None
         grad_background = torch.empty_like(background) if ctx.needs_input_grad[7] else None
@@ -129,6 +135,7 @@ class _Rasterize(torch.autograd.Function):
                 ),
                 (camera > 0, camera > 0 and not own_features),
             )
+        # The last row of a pose is constant (0, 0, 0, 1) and gets gradient 0.
         grad_viewmats = None
         if poses is not None:
             grad_viewmats = torch.zeros_like(viewmats)

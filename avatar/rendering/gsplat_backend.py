@@ -38,6 +38,8 @@ def rasterize_gsplat(
         MissingExtraError: gsplat is not installed.
         InputError: the machine has no GPU that torch can use, or gsplat's version or its compiled kernels do not fit.
     """
+    # Options that make gsplat follow the common rules: all Gaussians kept whatever their radius, no packing, colours as
+    # they are (no harmonics), and no compensation of the blur in the opacity ("classic").
     gsplat = _load_gsplat()
     image, alpha, found = gsplat.rasterization(
         means,

@@ -40,6 +40,7 @@ def pooled_empty(*shape: int) -> Float32[Tensor, "*S"]:
     count = math.prod(shape)
     if 4 * count < POOLED_BYTES:
         return torch.empty(shape)
+    # An array of the same length is reused, the latest first; otherwise the longest idle ones are freed to make room.
     with _lock:
         place = next((i for i in reversed(range(len(_idle))) if len(_idle[i]) == count), None)
         array = None if place is None else _idle.pop(place)
@@ -75,6 +76,7 @@ def list_bytes() -> int:
     Raises:
         InputError: the environment variable is not a positive number.
     """
+    # A share of the free memory by default, so that the picture, gradients and other programs keep theirs.
     given = os.environ.get(VARIABLE)
     if given is None:
         return max(_GIB // 2, min(4 * _GIB, _free_bytes() // 4))

@@ -111,6 +111,7 @@ class MeshMapsTensor:
             )
         if values.device != self.face_id.device:
             raise InputError("vertex values", expected=f"device {self.face_id.device}", received=str(values.device))
+        # float32 on the CPU takes the native kernel; other dtypes and devices take the same sums in torch.
         if is_native(values, self.barycentric):
             return InterpolateFunction.apply(values, self.barycentric, self.faces.int(), self.face_id)
         return interpolate_reference(values, self.barycentric, self.faces, self.face_id)
@@ -139,6 +140,8 @@ def mesh_maps(
     Raises:
         InputError: shapes, types, NaN, indices out of range, cameras of several sizes.
     """
+    # Visibility is a constant for gradients: the z-buffer runs in float64 on detached vertices, and only barycentrics
+    # and depth at the faces that it found are differentiable functions of the vertices.
     cameras = [camera] if isinstance(camera, Camera) else list(camera)
     _check(vertices, faces, cameras)
     points, corners = vertices.detach().double().cpu().numpy(), faces.int().cpu().contiguous()
@@ -146,6 +149,7 @@ def mesh_maps(
     for c in cameras:
         seen = rasterize_triangles(points, corners.numpy(), c, near=near, threads=thread_count(torch.get_num_threads()))
         views.append(_view(vertices, corners, seen, c))
+    # A single camera gives maps without the leading axis of cameras.
     stacked = views[0] if isinstance(camera, Camera) else [torch.stack(maps) for maps in zip(*views, strict=True)]
     maps = MeshMapsTensor(faces.to(vertices.device).long(), len(vertices), *stacked)
     return maps if attributes is None else replace(maps, attributes=maps.interpolate(attributes))
@@ -169,6 +173,8 @@ def front_back_maps(
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
     """Return unit normals, faces weighted by their area; zero at a vertex without any. Differentiable."""
+    # The cross product of two edges is the face normal times twice the area; its sum over the faces of a vertex is
+    # therefore the mean normal weighted by area.
     a, b, c = gather_rows(vertices, faces).unbind(1)
     cross = torch.cross(b - a, c - a, dim=-1)
     total = torch.zeros_like(vertices).index_add(0, faces.flatten(), cross.repeat_interleave(3, dim=0))
@@ -194,6 +200,7 @@ def _view(vertices: Tensor, faces: Tensor, seen: MeshMaps, camera: Camera) -> tu
 
 
 def _check(vertices: Tensor, faces: Tensor, cameras: list[Camera]) -> None:
+    # Shapes and types first, because the checks of values below index the tensors.
     for name, tensor, kind in (("vertices", vertices, "floating-point"), ("faces", faces, "integer")):
         right = tensor.is_floating_point() if kind != "integer" else tensor.dtype in (torch.int32, torch.int64)
         if tensor.dim() != 2 or tensor.shape[1] != 3 or not right:
@@ -208,9 +215,11 @@ def _check(vertices: Tensor, faces: Tensor, cameras: list[Camera]) -> None:
             raise InputError(
                 "mesh faces", expected=f"indices in [0, {len(vertices)})", received=f"indices in [{low}, {high}]"
             )
+    # Maps of several cameras are stacked, which needs one image size.
     sizes = {(c.width, c.height) for c in cameras}
     if len(sizes) != 1:
         raise InputError("cameras of mesh maps", expected="one or more of one image size", received=f"sizes {sizes}")
+    # Rays need the inverse of K: a focal length of 0 makes it singular.
     for c in cameras:
         if c.K[0, 0] * c.K[1, 1] - c.K[0, 1] * c.K[1, 0] == 0:
             raise InputError(

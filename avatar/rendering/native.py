@@ -86,6 +86,7 @@ class Workspace:
             InputError: the lists of Gaussians by tile would exceed their memory limit.
             MemoryError: no memory is left.
         """
+        # A workspace holds one pass at a time; the lock serialises callers from several threads.
         with self._lock:
             most = list_bytes()
             try:
@@ -118,9 +119,11 @@ class Workspace:
         The last two may be None. `accumulate` says whether to add to the first four, and to the features', what is
         otherwise written; the pose's is always added to.
         """
+        # The pose is summed over all Gaussians, in float64; the other gradients are float32 as the tensors are.
         *to_tensors, to_pose, to_background = gradients
         addresses = [*map(address, to_tensors), address(to_pose, "float64"), address(to_background)]
         target = _Gradients(*addresses, *accumulate)
+        # The library still holds the projected Gaussians and tile lists of the forward pass, which are not built again.
         with self._lock:
             self._library.gaussian_backward(
                 self._handle,
@@ -149,6 +152,7 @@ class _Pool:
         self._idle: list[tuple[ctypes.CDLL, int, int]] = []
 
     def take(self, library: ctypes.CDLL) -> int:
+        # Last in, first out: the few workspaces that are in use at a time stay the same ones.
         with self._lock:
             for position in reversed(range(len(self._idle))):
                 if self._idle[position][0] is library:

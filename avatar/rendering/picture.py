@@ -42,6 +42,7 @@ def render(
     Example:
         >>> image = avatar.render(student, capture.params(0), capture.cameras["Cam005"], background=(1, 1, 1))
     """
+    # A player poses and draws without torch; a trained model needs torch and its rasteriser.
     if isinstance(avatar, AvatarPlayer):
         avatar.pose(params, frame=frame)
         drawn, _ = avatar.draw(camera, background=background)
@@ -51,6 +52,7 @@ def render(
     from avatar.rendering.avatar_view import render_view
     from avatar.rig.posed import at_rest
 
+    # Colours depend on the view, so that the model is posed for the camera's centre of projection.
     device = avatar.rig.device
     center = torch.tensor(camera.position, dtype=torch.float32, device=device)
     behind = torch.tensor(background, dtype=torch.float32, device=device)

@@ -51,6 +51,7 @@ def rasterize_reference(
     Returns:
         Images, their alpha, and the `RasterMeta`.
     """
+    # Cameras are independent: each is projected and blended alone, and the results are stacked along the axis C.
     views = [
         _render_view(
             _project(means, quats, scales, opacities, viewmat, K, settings),
@@ -61,6 +62,7 @@ def rasterize_reference(
         for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True))
     ]
     image, transmittance = (torch.stack(parts) for parts in zip(*(view[:2] for view in views), strict=True))
+    # What is left of the light after all Gaussians passes through to the background: image + T B.
     if background is not None:
         image = image + transmittance * background[:, None, None, :]
     means2d, radii, depths = (torch.stack(parts) for parts in zip(*(view[2] for view in views), strict=True))
@@ -101,17 +103,24 @@ def _project(
     index = near_to_far.nonzero()[:, 0]
     index = index[torch.argsort(depths[index], stable=True)]
 
+    # Covariance in the image by EWA splatting: S = J W R diag(s)^2 R^T W^T J^T + eps2d I, computed as half half^T with
+    # half = J W R diag(s), so that it is symmetric and positive semi-definite by construction.
     axes = matrix_from_quat(quats[index]) * scales[index, None, :]
     half = _projection_jacobian(centers[index], K, settings) @ cam_from_world @ axes
     covariance = half @ half.mT + settings.eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    # Centres by the pinhole model, in pixels: f x / z + c.
     focal, principal = K.diagonal()[:2], K[:2, 2]
     means2d = focal * centers[index, :2] / depths[index, None] + principal
 
+    # A covariance of rounded determinant 0 or less has no inverse,
+    # so such a splat (seen edge-on, without blur) is dropped.
     determinant = xx * yy - xy * xy
     # alpha = o exp(-sigma) reaches ALPHA_MIN where sigma = ln(o / ALPHA_MIN); its box has these half sides.
     reach = (2 * torch.log(opacities[index].detach() / ALPHA_MIN)).sqrt()
     radii = reach[:, None] * torch.stack([xx, yy], -1).detach().sqrt()
+    # The box of half sides reach sqrt(xx) and reach sqrt(yy) encloses
+    # the ellipse; splats whose box misses the image are dropped.
     size = means2d.new_tensor([settings.width, settings.height])
     seen = (determinant > 0) & ((means2d + radii > 0) & (means2d - radii < size)).all(-1)
     conics = torch.stack([yy[seen], -xy[seen], xx[seen]], -1) / determinant[seen, None]
@@ -122,6 +131,9 @@ def _projection_jacobian(centers: Tensor, K: Tensor, settings: RasterSettings) -
     """Return the (M, 2, 3) derivative of pixels by points in camera space, at `centers` clamped to a wider frustum."""
     size = centers.new_tensor([settings.width, settings.height])
     focal, principal = K.diagonal()[:2], K[:2, 2]
+    # Far outside of the image the affine approximation of the projection grows without
+    # bound; the point at which it is taken is therefore clamped in x / z and y / z.
+    # Pixels are u = f x / z + c, so du/dx = f / z and du/dz = -(f / z) (x / z).
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     z = centers[:, 2:]
     slope = torch.clamp(centers[:, :2] / z, -principal / focal - margin, (size - principal) / focal + margin)
@@ -132,6 +144,7 @@ def _render_view(
     splats: _Splats, opacities: Tensor, features: Tensor, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Return blended features (H, W, D), what is left of the light (H, W, 1), and (means2d, radii, depths) of all N."""
+    # Blocks bound the memory: a block holds 256 pixels times the Gaussians that reach it.
     rows = []
     for top in range(0, settings.height, BLOCK):
         bottom = min(top + BLOCK, settings.height)
@@ -142,6 +155,7 @@ def _render_view(
         rows.append([torch.cat(parts, dim=1) for parts in zip(*blocks, strict=True)])
     image, transmittance = (torch.cat(parts, dim=0) for parts in zip(*rows, strict=True))
 
+    # Scatter from the M visible Gaussians, sorted by depth, back to the order of the caller; culled ones stay 0.
     means2d = torch.zeros(len(opacities), 2, dtype=features.dtype, device=features.device)
     radii = torch.zeros_like(means2d)
     means2d[splats.index] = splats.means2d.detach()
@@ -153,11 +167,14 @@ def _blend_block(
     splats: _Splats, opacities: Tensor, features: Tensor, box: tuple[int, int, int, int]
 ) -> tuple[Tensor, Tensor]:
     """Blend a block of pixels (left, top, right, bottom): features (h, w, D) and transmittance (h, w, 1)."""
+    # Only Gaussians whose box overlaps the block; their order by depth is kept.
     left, top, right, bottom = box
     low, high = splats.means2d.new_tensor([left, top]), splats.means2d.new_tensor([right, bottom])
     reaching = ((splats.means2d + splats.radii > low) & (splats.means2d - splats.radii < high)).all(-1)
     index = splats.index[reaching]
 
+    # Pixel centres lie at +0.5; sigma = d^T S^-1 d / 2 is half
+    # the squared Mahalanobis distance to the projected centre.
     x = torch.arange(left, right, dtype=low.dtype, device=low.device) + 0.5
     y = torch.arange(top, bottom, dtype=low.dtype, device=low.device) + 0.5
     dx = x[None, :, None] - splats.means2d[reaching, 0]
@@ -170,6 +187,7 @@ def _blend_block(
     # A Gaussian that would leave TRANSMITTANCE_MIN or less is not blended, nor is any behind it: the running product
     # over all Gaussians never grows again, so one comparison says both.
     blended = torch.where(torch.cumprod(1 - alpha, dim=-1) > TRANSMITTANCE_MIN, alpha, 0.0)
+    # T_i = prod_{j<i} (1 - alpha_j), the light that reaches Gaussian i; the last entry is what passes all of them.
     behind = torch.cumprod(torch.cat([sigma.new_ones(*sigma.shape[:2], 1), 1 - blended], dim=-1), dim=-1)
     weights = blended * behind[..., :-1]
     return weights @ features[index], behind[..., -1:]

@@ -42,6 +42,7 @@ def checked_settings(settings: RasterSettings) -> RasterSettings:
     Raises:
         InputError: one of them cannot be used.
     """
+    # Each setting alone first, then the relations between them.
     for name in ("width", "height"):
         value = getattr(settings, name)
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not 1 <= int(value) <= MOST_SIDE:
@@ -69,6 +70,7 @@ def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
     Raises:
         InputError: names the first argument that does not fit the ones before it.
     """
+    # Types first, because the shapes below are read from tensors; `means` defines N, and `viewmats` defines C.
     given = dict(tensors) if background is None else {**tensors, "background": background}
     for name, value in given.items():
         if not isinstance(value, Tensor):
@@ -79,6 +81,7 @@ def check_layout(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
     _check_shape(tensors, "opacities", (count,))
     cameras = _check_shape(tensors, "viewmats", ("C", 4, 4))["C"]
     _check_shape(tensors, "Ks", (cameras, 3, 3))
+    # Features are (N, D) for all cameras or (C, N, D) for each, and D is free.
     received = tuple(tensors["features"].shape)
     if received[:-1] not in ((count,), (cameras, count)) or received[-1] == 0:
         raise InputError(
@@ -107,6 +110,7 @@ def check_values(tensors: Mapping[str, Tensor], background: Tensor | None) -> No
     values = {name: tensor.detach() for name, tensor in tensors.items()}
     if background is not None:
         values["background"] = background.detach()
+    # A quick test of all arguments in one transfer from the device; only those that fail it are examined exactly.
     for name in _suspects(values):
         _check_exactly(name, values[name])
     _check_viewmats(values["viewmats"].cpu().double().numpy())
@@ -143,12 +147,15 @@ def _suspects(values: Mapping[str, Tensor]) -> list[str]:
     A sum is finite unless a term is not (or it overflows, which the exact look then clears), and is several times
     cheaper than `isfinite`; minimum and maximum hand a NaN on.
     """
+    # Minimum and maximum where a range is required, else a sum. Quaternions also get the smallest |w|, because one
+    # whose w is not 0 has a length.
     filled = {name: value for name, value in values.items() if value.numel() > 0}
     looks: dict[str, tuple[Tensor, ...]] = {
         name: tuple(torch.aminmax(value)) if name in _RANGES else (value.sum(),) for name, value in filled.items()
     }
     if "means" in filled:
         looks["quats"] += (filled["quats"][:, 0].abs().min(),)
+    # One transfer for all statistics: on a GPU every `.item()` would wait for the device.
     flat = [stat for stats in looks.values() for stat in stats]
     answers = iter(torch.stack(flat).tolist() if flat else [])
     found = {name: [next(answers) for _ in stats] for name, stats in looks.items()}
@@ -166,6 +173,7 @@ def _is_clear(name: str, stats: list[float]) -> bool:
 
 
 def _check_exactly(name: str, value: Tensor) -> None:
+    # NaN first, because comparisons below are false for it.
     finite = torch.isfinite(value)
     if not finite.all():
         count = int((~finite).sum())
@@ -190,6 +198,7 @@ def _raise_if_any(name: str, bad: Tensor, expected: str, fault: str, remedy: str
 
 
 def _check_viewmats(viewmats: np.ndarray) -> None:
+    # A rotation satisfies R R^T = I and has determinant 1; a determinant of -1 is a reflection.
     rotations = viewmats[:, :3, :3]
     off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)
     for camera in np.flatnonzero((off > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0))[:1]:
