@@ -94,6 +94,7 @@ def save_bundle(
     Returns:
         Bytes of each piece in the file, and of the whole file as "total".
     """
+    # The manifest records size and digest of every piece, so that a reader finds damage before it decodes anything.
     data = {f"{name}.safetensors": pack_tensors(tensors, metadata) for name, (tensors, metadata) in pieces.items()}
     packed = write_package(path, {_MANIFEST: _manifest(asdict(about), data), **data})
     return {**{file.split(".")[0]: size for file, size in packed.items()}, "total": Path(path).stat().st_size}
@@ -105,6 +106,7 @@ def save_with_motion(path: str | Path, bundle: str | Path, motion: BodyParams) -
     Raises:
         InputError: as `load_bundle`.
     """
+    # Check the source first; then copy its pieces as bytes, and replace the motion alone.
     load_bundle(bundle)
     data = read_package(bundle, subject="avatar", expected=_EXPECTED, remedy=REMEDY)
     manifest = parse_json(data[_MANIFEST], subject=f"avatar {bundle}: manifest")
@@ -136,6 +138,7 @@ def load_bundle(path: str | Path) -> AvatarBundle:
         InputError: a missing, damaged, changed or foreign file, a newer version, more than half a GiB
             unpacked, numbers that are not finite or inconsistent.
     """
+    # The manifest first: format and version decide whether the rest can be read at all.
     subject = f"avatar {path}"
     data = read_package(path, subject="avatar", expected=_EXPECTED, remedy=REMEDY)
     if _MANIFEST not in data:
@@ -145,6 +148,7 @@ def load_bundle(path: str | Path) -> AvatarBundle:
     )
     _check_version(manifest, subject)
     raw = _checked_pieces(manifest, data, subject)
+    # Quantised tensors become floats, and shapes define the sizes (J, V, N ...) that all pieces must share.
     about = _about(as_object(manifest.get("model"), subject=f"{subject}: model"), f"{subject}: model")
     tensors: dict[str, np.ndarray] = {}
     there = tuple(piece for piece in PIECES if piece in raw or piece in NEEDED)
@@ -153,6 +157,7 @@ def load_bundle(path: str | Path) -> AvatarBundle:
         tensors |= {f"{piece}.{name}": value for name, value in own.items()}
     sizes = check_shapes(tensors, there, subject)
     _check_consistency(about, tensors, sizes, subject)
+    # Garments and motion have checks of their own, in the modules that use them.
     garments, garments_about = raw.get(GARMENTS, ({}, {}))
     return AvatarBundle(about, tensors, sizes, garments, garments_about, raw.get(MOTION, ({}, {}))[0])
 
@@ -197,6 +202,7 @@ def _checked_pieces(
                 remedy="the file was changed or damaged: use the original",
             )
         out[name] = unpack_tensors(content, subject=f"{subject}: {name}", remedy=REMEDY)
+    # A file without an entry has no digest, so that it cannot be trusted.
     if set(data) - files:
         raise InputError(
             subject,
@@ -218,6 +224,7 @@ def _about(stored: Mapping[str, Any], subject: str) -> AboutAvatar:
         values = as_object(stored.get(name), subject=f"{subject}: {name}")
         return {key: as_text(value, subject=f"{subject}: {name}") for key, value in values.items()}
 
+    # The description comes from JSON, so that every field is checked for its type; unknown fields are ignored.
     for name in ("null_code_shown", "jaw"):
         if not isinstance(stored.get(name), bool):
             raise InputError(f"{subject}: {name}", expected="true or false", received=repr(stored.get(name))[:80])
@@ -249,6 +256,7 @@ def _check_consistency(
     # Skeleton, then Gaussians, surface, field, regression and blend shapes.
     parents, faces, count = tensors["skeleton.parents"], tensors["gaussians.per_face"], sizes["N"]
     require(sizes["J"] in JOINT_NAMES, "joints", f"{' or '.join(map(str, JOINT_NAMES))} of them", sizes["J"])
+    # Forward kinematics goes through the joints once, and needs each parent before its children.
     ordered = parents[0] == -1 and bool((parents[1:] >= 0).all() and (parents[1:] < np.arange(1, sizes["J"])).all())
     require(ordered, "skeleton.parents", "the root first, every parent before its children", parents.tolist())
     for what, names, letter in (
@@ -260,10 +268,12 @@ def _check_consistency(
     require(
         bool((faces >= 0).all()) and int(faces.sum()) == count, "gaussians.per_face", f"counts of {count}", "others"
     )
+    # Spherical harmonics of degree 1 to d have (d + 1)^2 - 1 coefficients.
     require(sizes["K"] in (0, 3, 8, 15), "gaussians.sh", "0, 3, 8 or 15 coefficients", sizes["K"])
     require(
         bool((np.square(tensors["gaussians.quats"]).sum(1) > 1e-6).all()), "gaussians.quats", "lengths above 0", "0"
     )
+    # Weights are stored in 16 bits, and may miss a sum of 1 by rounding.
     opacity, weights = tensors["gaussians.opacities"], tensors["surface.joint_weights"]
     require(bool((opacity >= 0).all() and (opacity <= 1).all()), "gaussians.opacities", "values in [0, 1]", "others")
     sums = weights.sum(1)
@@ -277,15 +287,18 @@ def _check_consistency(
             f"values in [0, {most})",
             "others",
         )
+    # The skin's vertices come first, since expressions and pose correctives index them alone.
     body_first = bool((np.diff(tensors["surface.parts"]) >= 0).all())
     require(body_first, "surface.parts", "the parts one after the other", "another order")
     if "P" in sizes:
         require(sizes["P"] == 9 * (sizes["J"] - 1), "surface.pose", f"{9 * (sizes['J'] - 1)} directions", sizes["P"])
+    # A positional encoding has 3 + 6 L numbers: the point, and L sines and cosines of three coordinates.
     if "field.points" in tensors:
         bands, inputs = sizes["X"] - 3, 63 + sizes["Z"]
         require(bands % 6 == 0 and 0 <= bands <= 96, "field", "bands of sines and cosines", f"{bands} inputs")
         require(sizes["Y"] == inputs, "field of_frame", f"{inputs} inputs", sizes["Y"])
         require(sizes["T"] == len(about.frames) > 0, "field.codes", f"{len(about.frames)} codes", sizes["T"])
+    # Angles are clamped to [low, high], which has to be an interval.
     if "regression.level" in tensors:
         require("field.points" in tensors, "regression", "a field whose points it moves", "none")
         low, high = tensors["regression.low"], tensors["regression.high"]
@@ -295,6 +308,7 @@ def _check_consistency(
 
 
 def _check_blend(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], require: Any) -> None:
+    # The head is driven by the expression, or by it and the jaw's three angles; the body by 63 pose angles.
     part = tensors.get("blend.part")
     parts = 1 if part is None else int(part.max()) + 1
     require(part is None or part.min() >= 0, "blend.part", "no negative number", "one")
@@ -304,6 +318,7 @@ def _check_blend(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: M
     for side in ("head", "body"):
         shapes, rows = sizes[f"{side}_n"], tensors.get(f"blend.{side}.rows")
         outputs, values = sizes[f"{side}_o"], tensors[f"blend.{side}.values"]
+        # The network gives all shapes' coefficients for each part, one part after the other.
         fits = outputs % max(shapes, 1) == 0 and outputs >= parts * shapes
         require(fits, f"blend.{side}", f"{parts} x {shapes} coefficients", outputs)
         require(sizes[f"{side}_i"] == inputs[side], f"blend.{side}", f"{inputs[side]} inputs", sizes[f"{side}_i"])
@@ -311,6 +326,8 @@ def _check_blend(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: M
             require(sizes[f"{side}_m"] == sizes["N"], f"blend.{side}", f"{sizes['N']} rows", sizes[f"{side}_m"])
         else:
             require(bool((np.diff(rows) > 0).all()), f"blend.{side}.rows", "increasing numbers", "others")
+        # Integers need steps to become numbers again; an exponent
+        # of at most 24 keeps 127 * 2^24 steps well within float32.
         steps = tensors.get(f"blend.{side}.step")
         require((values.dtype == np.int8) == (steps is not None), f"blend.{side}.step", "steps of integers", "others")
         exponents = tensors.get(f"blend.{side}.exponent")

@@ -20,6 +20,7 @@ class _Struct(ctypes.Structure):
     """A structure of the kernels that keeps the arrays alive that it points to."""
 
     def point(self, **arrays: tuple[np.ndarray | None, str]) -> None:
+        # The structure holds bare addresses: numpy would free the arrays without these references.
         self.kept = {
             name: None if array is None else np.ascontiguousarray(array) for name, (array, _) in arrays.items()
         }
@@ -68,6 +69,8 @@ def joint_transforms(
         transl: metres.
         features: whether to return the features of pose correctives.
     """
+    # A pose corrective is driven by the 9 entries of R_j - I for
+    # every joint but the root (SMPL), hence 9 (J - 1) features.
     count = len(parents)
     out = np.empty((count, 3, 4), np.float32)
     driving = np.empty(9 * (count - 1), np.float32) if features else None
@@ -112,6 +115,8 @@ class FieldKernel:
         member: Int32[np.ndarray, " C"],
         at: Int32[np.ndarray, " C"] | None = None,
     ) -> None:
+        # The first layer is linear in the encoded point and in the inputs of the frame, so that the point's part, W_p
+        # phi(v), is computed once here, and only the frame's part remains for every pose.
         width = len(tensors["of_frame.bias"])
         self._member, self._at = np.ascontiguousarray(member), None if at is None else np.ascontiguousarray(at)
         self._native = _Network(
@@ -151,6 +156,7 @@ class SurfaceKernel:
         weights: Float32[np.ndarray, "V n"] | None,
         controls: int,
     ) -> None:
+        # Without a field there are no control points, and the kernel skips the interpolation.
         count, influences = joint_indices.shape
         self._native = _Surface(count, joints, influences, controls, 0 if neighbours is None else neighbours.shape[1])
         self._native.point(
@@ -205,6 +211,7 @@ class BlendKernel:
         padded = np.zeros((-(-held // LANES) * LANES, shapes, CHANNELS), values.dtype)
         padded[:held] = values.transpose(2, 0, 1)
         blocks = padded.reshape(-1, LANES, shapes, CHANNELS).transpose(0, 2, 3, 1)
+        # Row i stores integers q_i with the value q_i step 2^exponent_i; floats have step 1 and exponent 0.
         scale = np.ones(len(padded), np.float32)
         if exponent is not None:
             scale[:held] = np.exp2(exponent)
@@ -227,6 +234,7 @@ class BlendKernel:
         threads: int,
     ) -> None:
         """Add the shapes times their coefficients; `keep` is a factor of each Gaussian, None: 1."""
+        # The steps are multiplied into the coefficients once a pose, instead of into every stored number.
         if self._native.rows:
             scaled = np.ascontiguousarray(coefficients[:, :, None] * self._steps, dtype=np.float32)
             native_library().smplxpp_runtime_blend(
@@ -271,6 +279,7 @@ class WorldKernel:
 
 def in_lanes(rows: Float32[np.ndarray, "C W"]) -> Float32[np.ndarray, "b W 16"]:
     """Return rows in blocks of sixteen side by side, the last block padded with zeros."""
+    # Transposed within a block, the same channel of sixteen rows is contiguous and fills a vector register.
     blocks = -(-len(rows) // LANES)
     padded = np.zeros((blocks * LANES, rows.shape[1]), np.float32)
     padded[: len(rows)] = rows

@@ -116,6 +116,8 @@ def decode(tensors: Mapping[str, np.ndarray], piece: str, subject: str) -> dict[
         # Steps and offsets of quantised floats are tensors beside them.
         kind = spec[0]
         step, start = (left.pop(f"{name}.{word}", None) for word in ("step", "start")) if kind == "f" else (None, None)
+        # Indices stay integers; int8 blend shapes stay quantised,
+        # because the kernel reads them so; all else becomes float32.
         if kind == "i":
             wrong = value.dtype.kind not in "iu"
         else:
@@ -133,6 +135,7 @@ def decode(tensors: Mapping[str, np.ndarray], piece: str, subject: str) -> dict[
             out[name] = value
         else:
             out[name] = _floats(value, step, start, f"{subject}: {name}")
+    # A tensor without a specification is refused: a newer version may have given it a meaning.
     if left:
         raise InputError(
             subject, expected="the tensors of its version", received=", ".join(sorted(left))[:200], remedy=REMEDY
@@ -159,6 +162,7 @@ def check_shapes(tensors: Mapping[str, np.ndarray], pieces: tuple[str, ...], sub
     bounds: list[tuple[str, str]] = []
     for piece in pieces:
         for name, spec in PIECES[piece].items():
+            # A specification is a kind and one size for each axis, with a bound of indices last.
             kind, *letters = spec.split()
             full = f"{piece}.{name}"
             if letters and letters[-1].startswith("<"):
@@ -168,6 +172,7 @@ def check_shapes(tensors: Mapping[str, np.ndarray], pieces: tuple[str, ...], sub
                 if not kind.endswith("?"):
                     raise InputError(subject, expected=f"a tensor {full}", received="none", remedy=REMEDY)
                 continue
+            # A number is a fixed size; a letter that an earlier tensor defined must have the same size here.
             wanted = tuple(int(one) if one.isdigit() else sizes.get(one) for one in letters)
             if len(wanted) != value.ndim or any(a not in (None, b) for a, b in zip(wanted, value.shape, strict=True)):
                 raise InputError(
@@ -190,6 +195,7 @@ def check_shapes(tensors: Mapping[str, np.ndarray], pieces: tuple[str, ...], sub
 
 
 def _indices(value: np.ndarray, subject: str) -> np.ndarray:
+    # The native kernels take 32-bit indices; a larger one would wrap round.
     out = value.astype(np.int32)
     if (out != value).any():
         raise InputError(subject, expected="indices of 32 bits", received="others", remedy=REMEDY)
@@ -197,6 +203,7 @@ def _indices(value: np.ndarray, subject: str) -> np.ndarray:
 
 
 def _floats(value: np.ndarray, step: np.ndarray | None, start: np.ndarray | None, subject: str) -> np.ndarray:
+    # A quantised float is q step + start, with one step and start for all, or one for each entry of the last axes.
     out = value.astype(np.float32)
     for word, other in (("step", step), ("start", start)):
         if other is None:

@@ -29,6 +29,7 @@ def resampled(params: BodyParams, fps: float, *, source_fps: float | None = None
     for name, value in (("frames a second", fps), ("frames a second of the motion", rate)):
         require_positive(name, value)
     # Interpolate between the two neighbouring frames of each new time.
+    # The 1e-9 keeps the last frame where the duration is a whole number of new frames up to rounding.
     last = len(params) - 1
     frames = []
     for k in range(int(np.floor(last / rate * fps + 1e-9)) + 1):

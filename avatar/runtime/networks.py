@@ -18,8 +18,11 @@ class DisplacementField:
 
     def __init__(self, bundle: AvatarBundle) -> None:
         t = bundle.tensors
+        # Each control point depends on a set of joints: a mask over the
+        # 21 joints, repeated for the three numbers of an axis-angle.
         self._sets = np.repeat(t["field.sets"], 3, axis=1).astype(np.float32)
         self._codes, about = t["field.codes"], bundle.about
+        # A pose that training did not have takes the zero code where training showed it, else the first frame's code.
         self._row = {frame: row for row, frame in enumerate(about.frames)}
         self.null_code = np.zeros_like(self._codes[0]) if about.null_code_shown else self._codes[0]
         """Code of poses outside of the training."""
@@ -38,6 +41,7 @@ class DisplacementField:
         self.regression = regression or None
         """Tensors of the piece `regression`; None: poses without a code use the null code."""
         self._points = np.arange(bundle.sizes["C"], dtype=np.int32)
+        # Quantised interpolation weights no longer sum to 1 exactly, so that they are normalised again.
         weights = t["field.weights"]
         self.interpolation: tuple[Int32[np.ndarray, "V n"], Float32[np.ndarray, "V n"]] = (
             t["field.neighbours"],
@@ -49,10 +53,13 @@ class DisplacementField:
         self, theta: Float32[np.ndarray, " 63"], frame: int | None, threads: int
     ) -> Float32[np.ndarray, "C 3"]:
         """Return the control points' displacements, metres; the next call overwrites them."""
+        # The regression replaces the networks for every pose without a code of its own.
         row = None if frame is None else self._row.get(frame)
         if row is None and self.regression is not None:
             return self._regress(theta, **self.regression)
         code = self.null_code if row is None else self._codes[row]
+        # Inputs of each set: the angles of its joints (others 0), and the frame's code. The body's network writes all
+        # control points, then the cloth's adds to those of clothes.
         frames = np.concatenate([theta * self._sets, np.broadcast_to(code, (len(self._sets), len(code)))], axis=1)
         frames = np.ascontiguousarray(frames, dtype=np.float32)
         self._body(frames, self._moved, threads)
@@ -70,6 +77,7 @@ class DisplacementField:
         low: Float32[np.ndarray, " 63"],
         high: Float32[np.ndarray, " 63"],
     ) -> Float32[np.ndarray, "C 3"]:
+        # Clamping the angles to the range of the training bounds the extrapolation, which is linear in them.
         self._moved[:] = level
         add_basis(self._moved, self._points, basis, rows @ (np.clip(theta, low, high) - center))
         return self._moved
@@ -77,6 +85,8 @@ class DisplacementField:
 
 def positional_encoding(points: Float32[np.ndarray, "C 3"], frequencies: int) -> Float32[np.ndarray, "C X"]:
     """Return `phi(v) = (v, sin(2^l pi v), cos(2^l pi v) for l < L)`."""
+    # Frequencies double from band to band, as in NeRF (Mildenhall
+    # et al. 2020), so that a smooth network can represent detail.
     bands = np.float32(np.pi) * 2.0 ** np.arange(frequencies, dtype=np.float32)
     angles = (points[:, None, :] * bands[:, None]).reshape(len(points), -1).astype(np.float32)
     return np.concatenate([points, np.sin(angles), np.cos(angles)], axis=1).astype(np.float32)
@@ -91,6 +101,8 @@ class BlendShapes:
     """
 
     def __init__(self, bundle: AvatarBundle, side: str) -> None:
+        # A multilayer perceptron: a first layer, hidden layers with ReLU, and
+        # a linear last one, whose outputs are the coefficients of every part.
         prefix = f"blend.{side}."
         own = {name.removeprefix(prefix): value for name, value in bundle.tensors.items() if name.startswith(prefix)}
         self._side, self._shapes = side, own["values"].shape[0]
@@ -100,6 +112,7 @@ class BlendShapes:
             *hidden,
             (own["last.weight"], own["last.bias"]),
         ]
+        # `rows` are the Gaussians that this side moves; each part of the Gaussians has coefficients of its own.
         rows, part = own.get("rows"), bundle.tensors.get("blend.part")
         if part is not None and rows is not None:
             part = part[rows]

@@ -57,6 +57,8 @@ class AvatarPlayer:
         self.threads = thread_count(threads)
         self.seconds: dict[str, float] = {}
         self._clock = clock
+        # Skeleton in float64, since errors add up along the chains
+        # of joints; field, blend shapes and clothes are optional.
         about, t, sizes = self.bundle.about, self.bundle.tensors, self.bundle.sizes
         self._body = skeleton_body(self.bundle)
         self._parents = np.ascontiguousarray(t["skeleton.parents"], dtype=np.int32)
@@ -65,6 +67,8 @@ class AvatarPlayer:
         self._sides = [BlendShapes(self.bundle, side) for side in ("head", "body")] if "blend" in self.bundle else []
         self._clothes = LooseClothes(self.bundle, cloth) if self.bundle.garments else None
         # Kernels, prepared once: skinning, and Gaussians to the world.
+        # Rounded to 16 bits, skinning weights may miss a sum of
+        # 1, and the surface would then shrink towards the origin.
         weights = t["surface.joint_weights"] / t["surface.joint_weights"].sum(axis=1, keepdims=True)
         neighbours, shares = (None, None) if self._field is None else self._field.interpolation
         self._surface = SurfaceKernel(
@@ -77,6 +81,7 @@ class AvatarPlayer:
         )
         self._rest = t["surface.vertices"]
         self._posed = np.empty_like(self._rest)
+        # Gaussians are sorted by face, so that `first[f] .. first[f + 1]` are those of face f.
         first = np.concatenate([[0], np.cumsum(t["gaussians.per_face"])]).astype(np.int32)
         self._face_of = np.repeat(np.arange(sizes["F"]), t["gaussians.per_face"])
         own = {name: t[f"gaussians.{name}"] for name in ("barycentric", "offset", "quats", "dc")}
@@ -200,6 +205,7 @@ class AvatarPlayer:
             InputError: as `Splatter.draw`.
         """
         begin = self._clock()
+        # Draw the colours; a relit picture also needs the normals, which the same splats blend in a second pass.
         image, alpha = self._splatter.draw(
             self._splats, camera, background=background, eps2d=self._eps2d, threads=self.threads
         )
@@ -215,6 +221,7 @@ class AvatarPlayer:
     @property
     def normals(self) -> Float32[np.ndarray, "N 3"]:
         """The unit normals of the posed surface at the Gaussians, interpolated from the vertices."""
+        # Interpolate the area-weighted vertex normals at each Gaussian's barycentrics (u, v, 1 - u - v), and normalise.
         t = self.bundle.tensors
         faces = t["surface.faces"]
         smooth = TriangleMesh(self._posed, faces).vertex_normals
@@ -234,6 +241,7 @@ class AvatarPlayer:
         """Return the joints' transforms, the features of pose correctives (None without them), and the expression."""
         if len(params) != 1:
             raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
+        # Coefficients that the avatar does not have may be 0: they would change nothing.
         size, given = self.bundle.sizes["E"], params.expression.shape[1]
         if given > size and np.abs(params.expression[0, size:]).max() > 0.0:
             raise InputError(
@@ -244,6 +252,7 @@ class AvatarPlayer:
             )
         expression = np.zeros(size, np.float32)
         expression[: min(size, given)] = params.expression[0, :size]
+        # Expressions move joints too (the jaw's, for example): rest = J + B e.
         rest: Float64[np.ndarray, "J 3"] = self._joints
         if expression.any():
             rest = rest + self._joint_basis @ expression
@@ -260,6 +269,7 @@ class AvatarPlayer:
         self, expression: Float32[np.ndarray, " E"], features: Float32[np.ndarray, " P"] | None
     ) -> Float32[np.ndarray, "V 3"]:
         """Return the T-pose with expression and pose correctives."""
+        # Neutral frames need no copy: with no expression and no correctives the T-pose is used as it is.
         t = self.bundle.tensors
         drives = [("expression", expression)] if expression.any() else []
         drives += [] if features is None else [("pose", features)]
@@ -269,6 +279,7 @@ class AvatarPlayer:
         return rest
 
     def _spread_cloth(self, cloth: ClothShape) -> tuple[Float32[np.ndarray, "V 3"], Float32[np.ndarray, " V"]]:
+        # Scatter from the vertices of garments to all; elsewhere the share is 0 and the field's displacement stays.
         displacements, share = np.zeros_like(self._rest), np.zeros(len(self._rest), np.float32)
         displacements[cloth.vertices], share[cloth.vertices] = cloth.displacements, cloth.share
         return displacements, share
@@ -289,6 +300,7 @@ class AvatarPlayer:
         if displaced is not None:
             unsimulated = 1.0 - displaced[1][self.bundle.tensors["surface.faces"]].mean(axis=1)
             keep = np.ascontiguousarray(unsimulated[self._face_of], dtype=np.float32)
+        # The head's shapes depend on the face alone, so that they count fully in any pose of the body.
         head, body = self._sides
         of_head = np.concatenate([expression, jaw]) if self.bundle.about.jaw else expression
         added = np.zeros((self.bundle.sizes["N"], 6), np.float32)
@@ -298,6 +310,8 @@ class AvatarPlayer:
 
     def pose_similarity(self, theta: Float32[np.ndarray, " 63"], frame: int | None = None) -> float:
         """Return the similarity of a pose to the training's poses, in [0, 1]: 1 within their usual distance."""
+        # The excess x = (d - s) / s of the distance d to the nearest training pose (radians, over 63 angles) gives
+        # exp(-x^2 / 2): 1 up to the usual distance s, and 0.14 at three times it.
         poses = self.bundle.tensors.get("poses.known")
         if poses is None or frame in self.bundle.about.frames:
             return 1.0

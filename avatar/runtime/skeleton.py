@@ -37,6 +37,7 @@ def clothed_template(bundle: AvatarBundle) -> tuple[Template, Int64[np.ndarray, 
     total = len(vertices) + J
     joints = slice(skin, skin + J)
 
+    # Spread values of the bundle's vertices and of the joints over all vertices of the template.
     def over_all(values: np.ndarray, of_joints: object, dtype: type) -> np.ndarray:
         out = np.zeros((total, *values.shape[1:]), dtype=dtype)
         out[at], out[joints] = values, of_joints
@@ -47,9 +48,12 @@ def clothed_template(bundle: AvatarBundle) -> tuple[Template, Int64[np.ndarray, 
     rows = np.repeat(at, t["surface.joint_indices"].shape[1])
     np.add.at(dense, (rows, t["surface.joint_indices"].ravel()), t["surface.joint_weights"].ravel())
     dense[joints] = np.eye(J)
+    # Every joint is the vertex that stands for it, so that the regressor selects that vertex alone.
     expression, pose = (_dense_basis(bundle, name, skin) for name in ("expression", "pose"))
     regressor = np.zeros((J, skin + J))
     regressor[:, joints] = np.eye(J)
+    # The body model has skin and joints; clothes follow in the template, bound by their own skin weights. A player
+    # renders none of this: scan indices and shape coefficients are empty.
     places = over_all(vertices, t["skeleton.joints"], np.float64)
     body = _body(bundle, places[: skin + J], expression, pose, regressor, dense[: skin + J])
     template = Template(
@@ -127,6 +131,8 @@ class LooseClothes:
             name: value.astype(np.float64) if value.dtype == np.float32 and _is_wide(name) else value
             for name, value in bundle.garments.items()
         }
+        # Garments index the bundle's vertices; shift them to the
+        # template's, where the joints lie between skin and clothes.
         for name, value in wide.items():
             if name.split(".")[-1] in ("particles", "vertices", "collider_vertices"):
                 inside = value.size == 0 or (value.dtype.kind in "iu" and 0 <= value.min() <= value.max() < len(at))
@@ -143,6 +149,8 @@ class LooseClothes:
 
     def step(self, params: BodyParams, seconds: float, path: Sequence[BodyParams] = ()) -> ClothShape:
         """Simulate to a pose, along a path of poses if there is one; see `ClothDriver.step` and `follow`."""
+        # Along a path the clothes pass through all its poses, evenly
+        # in time; without one a single step leads to the pose.
         driver = self._driver
         shape = driver.follow(path, seconds, params) if path else driver.step(params, seconds)
         return replace(shape, vertices=self._place[shape.vertices])

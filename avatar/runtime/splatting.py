@@ -118,6 +118,7 @@ class Splatter:
         if camera.orthographic:
             raise InputError(f"camera {camera.name!r}", expected="a pinhole", received="an orthographic one")
         check_size(camera.width, camera.height, "picture")
+        # Colours depend on the direction from the eye; features (such as normals) are drawn as they are.
         count, size = len(splats.means), (camera.height, camera.width)
         colors = features
         if colors is None:
@@ -128,6 +129,7 @@ class Splatter:
         gaussians = (splats.means, splats.quats, splats.scales, splats.opacities, colors)
         scene = SceneCall(count, 3, 0, *(address(array) for array in gaussians))
         call = CameraCall(camera.width, camera.height, 0.01, 1e10, eps2d, 0, *map(address, (view, K, behind)))
+        # The kernel also writes projected centres, radii and depths, which a player does not need.
         image, alpha = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
         scratch = tuple(np.empty(shape, np.float32) for shape in ((count, 2), (count, 2), (count,)))
         try:
@@ -158,6 +160,7 @@ def facing_normals(
     A cosine above 0.35 counts as facing away. Nearer to the outline the normal stays, because the outer side is seen
     there.
     """
+    # The cosine between the normal and the direction of view is positive where the surface faces away.
     towards = splats.means - np.asarray(eye, dtype=np.float32)
     cosine = np.einsum("nx,nx->n", normals, towards) / np.maximum(np.linalg.norm(towards, axis=1), 1e-9)
     return normals * np.where(cosine > 0.35, np.float32(-1.0), np.float32(1.0))[:, None]
@@ -179,6 +182,8 @@ def relit_picture(
         relighting: the other light.
         background: sRGB.
     """
+    # Alpha blending gave I = a C + (1 - a) B: recover the person's own colour C = (I - (1 - a) B) / a, shade it, and
+    # composite again. Below an opacity of 1e-3 the division would amplify rounding to visible noise.
     out = image.copy()
     seen = alpha > 1e-3
     share, behind = alpha[seen][:, None], np.asarray(background, dtype=np.float32)
