@@ -68,7 +68,7 @@ class AvatarPlayer:
         self._clothes = LooseClothes(self.bundle, cloth) if self.bundle.garments else None
         # Kernels, prepared once: skinning, and Gaussians to the world.
         # Rounded to 16 bits, skinning weights may miss a sum of
-        # 1, and the surface would then shrink towards the origin.
+        # 1, and the surface would then be scaled about the origin.
         weights = t["surface.joint_weights"] / t["surface.joint_weights"].sum(axis=1, keepdims=True)
         neighbours, shares = (None, None) if self._field is None else self._field.interpolation
         self._surface = SurfaceKernel(
