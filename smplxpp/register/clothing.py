@@ -139,11 +139,13 @@ def _has_map(observed: Observations, frame: int) -> bool:
 def _votes_of_scan(mesh: TriangleMesh, scan: ScanObservation) -> Float64[np.ndarray, "V 2"]:
     """Return two votes a vertex for what the scan shows within 3 cm of it, facing alike."""
     assert scan.labels is not None
+    # Points without a label do not vote.
     known = np.flatnonzero(np.asarray(scan.labels) >= 0)
     votes = np.zeros((mesh.vertex_count, 2))
     distance, nearest = cKDTree(scan.mesh.vertices[known]).query(mesh.vertices, distance_upper_bound=0.03)
     near = np.flatnonzero(np.isfinite(distance))
     index = known[nearest[near]]
+    # A surface that faces elsewhere is another layer, or another limb that touches.
     facing = np.einsum("nx,nx->n", mesh.vertex_normals[near], scan.mesh.vertex_normals[index]) > _FACING
     near, index = near[facing], index[facing]
     votes[near, np.where(np.asarray(scan.labels)[index] == SKIN.id, 0, 1)] += 2.0
@@ -153,6 +155,7 @@ def _votes_of_scan(mesh: TriangleMesh, scan: ScanObservation) -> Float64[np.ndar
 def _votes_of_map(mesh: TriangleMesh, camera: Camera, labels: np.ndarray) -> Float64[np.ndarray, "V 2"]:
     """Return one vote a vertex for what a label map shows where the body without clothes would be visible."""
     votes = np.zeros((mesh.vertex_count, 2))
+    # Render the body without clothes: where it is visible, the map shows either its skin or what covers it.
     maps = rasterize_mesh(mesh, camera)
     screen = camera.screen_from_world(mesh.vertices)
     with np.errstate(invalid="ignore"):

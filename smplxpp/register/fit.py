@@ -79,6 +79,8 @@ class _Registration:
     ) -> None:
         self.body, self.observed, self.config, self.progress = body, observed, config, progress
         self.kinematics, self.frames = Kinematics(body), np.array(observed.frames)
+        # All vertices with their shape, expression and skinning weights: masks and scans share them and their
+        # derivatives.
         self.points = BodyPoints.of_vertices(body, np.arange(body.vertex_count))
         self.seen: PreparedKeypoints | None = prepare_keypoints(body, observed, config)
         self.placed = PlacedLandmarks.of(body, observed.landmarks, observed.frames)
@@ -87,6 +89,7 @@ class _Registration:
         self.tells_shape = np.isin(self.frames, shape_frames)
         self.outlines = self._outlines()
         self.columns = self._columns()
+        # No vertex counts as bare before labels were looked up on an approximate body.
         self.bare = np.zeros(body.vertex_count, dtype=bool)
 
     def fit(self) -> BodyFit:
@@ -103,6 +106,7 @@ class _Registration:
             state, confidence = self._solve_windows(state)
         residuals = self._measure(state)
         self.notes += self._far_landmarks(state)
+        # The same residuals of the fit that was given show how much the registration improved on it.
         before = self._measure(initial) if self.observed.initial is not None else {}
         params = state.to_params(self.body, fps=self.observed.fps)
         return BodyFit(tuple(self.observed.frames), params, confidence, residuals, before, tuple(self.notes))
@@ -119,9 +123,11 @@ class _Registration:
         given = self.observed.initial is not None
         free = np.full(len(names), True)
         free[[is_finger(name) for name in names]] = sees_fingers or given
+        # No term observes the direction of gaze, so that the eyes keep their rotations.
         free[["eye" in name for name in names]] = False
         free[names == "jaw"] = face or given
         E = self.body.num_expressions
+        # Without points of the face no coefficient of the expression is free.
         return Columns(np.flatnonzero(free), len(names), E if face else 0, E, self.body.num_betas)
 
     def _outlines(self) -> dict[tuple[str, int], Outline]:
@@ -140,6 +146,7 @@ class _Registration:
                 else:
                     missing.setdefault(name, []).append(frame)
             self.progress("masks", (row + 1) / len(self.frames))
+        # A capture without any mask needs no note, because masks are then not among its observations.
         for name, frames in missing.items():
             if len(frames) < len(self.frames) or out:
                 self.notes.append(
@@ -174,6 +181,8 @@ class _Registration:
 
     def _solve_shape(self, state: BodyState) -> BodyState:
         """Return the state with the shape that evenly spread frames determine."""
+        # Frames spread over the take show the body in many poses, which separates shape from pose. Only the shape of
+        # this solution is kept.
         rows = np.array(spread(np.flatnonzero(self.tells_shape).tolist(), self.config.shape_frames))
         solved, _ = self._solve(state.select(rows), _Window(rows, np.ones(len(rows), dtype=bool)), True)
         return replace(state, betas=solved.betas)
@@ -188,6 +197,7 @@ class _Registration:
             inner = np.arange(first, min(first + length, count))
             rows = np.arange(max(0, first - overlap), min(count, first + length + overlap))
             window = _Window(rows, np.isin(rows, inner))
+            # The overlap is solved with the window, so that the smoothness term acts across both of its ends.
             solved, equations = self._solve(state.select(rows), window, False)
             rotations[inner] = solved.rotations[window.kept]
             transl[inner] = solved.transl[window.kept]
@@ -215,6 +225,7 @@ class _Registration:
         terms = replace(terms, silhouettes=self._silhouettes(state, rows), scans=self._scans(rows))
         if terms.surfaces():
             state, equations = self._step("surfaces", state, terms, config.surface_steps, solve_shape, None)
+        # An initial fit alone: smoothness and priors filter it, and it enters as a measurement of itself.
         elif not terms.points():
             state, equations = self._step("priors", state, terms, config.surface_steps, solve_shape, None)
         return state, equations
@@ -248,8 +259,9 @@ class _Registration:
         )
 
     def _terms(self, state: BodyState, rows: np.ndarray) -> Terms:
-        frames, anatomy = self.frames[rows], Anatomy.of(self.body.joint_count)
         """Return the priors and the terms of named points for some rows."""
+        frames, anatomy = self.frames[rows], Anatomy.of(self.body.joint_count)
+        # The initial fit counts as a measurement, with the noise that is stated or that its jitter shows.
         start = None
         if self.observed.initial is not None:
             start = start_of(
@@ -299,6 +311,7 @@ class _Registration:
 
     def _measure(self, state: BodyState) -> dict[str, Float64[np.ndarray, " T"]]:
         """Return the residuals of a state in all frames; gaps are not known, so all cloth counts as it is."""
+        # All frames at once, because residuals need no linear system and windows would only divide the result.
         rows = np.arange(len(self.frames))
         terms = replace(self._terms(state, rows), silhouettes=self._silhouettes(state, rows), scans=self._scans(rows))
         return terms.residuals(self.kinematics, state)
@@ -307,6 +320,7 @@ class _Registration:
         """Return notes about landmarks far from the fitted body: misplaced ones, or a fit that failed."""
         out = []
         for row in range(len(self.frames) if self.placed is not None else 0):
+            # A term of this frame alone, whose row is therefore 0.
             term = self._landmark_term(np.array([row]))
             assert term is not None
             posture = self.kinematics.posture(state, row)

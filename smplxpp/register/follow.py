@@ -55,12 +55,16 @@ def follow(
         )
     config = replace(config or RegisterConfig(), surface_steps=8)
     place = frames.index(at)
+    # Converted to a state and back, so that this row has the same number of coefficients and the same hand convention
+    # as the rows of all other frames, with which it is concatenated.
     known = BodyState.of_params(body, known).to_params(body, fps=observed.fps)
     found: dict[int, BodyParams] = {at: known}
     # Forwards from the known frame to the end, then backwards to the beginning.
     for later in (frames[place + 1 :], frames[:place][::-1]):
         past = [known]
         for frame in later:
+            # Beside the known frame there is no velocity yet, hence one start; later there are two, for limbs that
+            # swing on and for limbs that stop.
             starts = [predicted(body, past, momentum) for momentum in (0.8, 0.3)[: len(past)]]
             fits = [_registered(body, observed, frame, start, config) for start in starts]
             fit = min(fits, key=lambda found: disagreement(body, observed, frame, found))
@@ -76,6 +80,8 @@ def predicted(body: BodyModel, past: Sequence[BodyParams], momentum: float) -> B
     if len(past) == 1:
         return last
     before, now = (BodyState.of_params(body, row) for row in past[-2:])
+    # Constant-velocity extrapolation with the share m of the motion, joint by joint in the frame of the parent:
+    #   R_next = exp(m log(R_now R_before^T)) R_now,    t_next = t_now + m (t_now - t_before)
     turn = rotvec_from_matrix(now.rotations @ before.rotations.transpose(0, 1, 3, 2))
     rotations = matrix_from_rotvec(momentum * turn) @ now.rotations
     moved = now.transl + momentum * (now.transl - before.transl)
@@ -89,6 +95,7 @@ def _registered(
     # Errors of a prediction from the last two frames; the shape is known.
     noise = StartNoise(pose=np.radians(8.0), transl=0.05, shape=1e-3)
     seen = {frame: observed.scans[frame]} if frame in observed.scans else {}
+    # The frame is its own frame for the shape, which the small deviation of `noise.shape` holds at the known one.
     one = replace(
         observed,
         frames=(frame,),
@@ -115,6 +122,8 @@ def lost_frames(body: BodyModel, observed: Observations, params: BodyParams, *, 
     """
     frames = observed.frames
     wrong = [disagreement(body, observed, frame, params.frame(row)) for row, frame in enumerate(frames)]
+    # Relative to the known frame, because loose clothes make the disagreement large even there; the constant covers
+    # masks that are nearly perfect, for which a quarter of almost nothing would flag every frame.
     bound = 1.25 * wrong[frames.index(at)] + 0.03
     lost = [frame for frame, share in zip(frames, wrong, strict=True) if share > bound]
     if not lost:
@@ -139,9 +148,13 @@ def disagreement(body: BodyModel, observed: Observations, frame: int, params: Bo
         if mask is None:
             continue
         step = max(1, camera.height // 240)
+        # Render at the reduced size, and take from the mask the pixel at the middle of each block: both then sample the
+        # same rays up to half a pixel.
         small = camera.resized(camera.width // step, camera.height // step)
         drawn = rasterize_mesh(mesh, small, threads=1).face_id >= 0
         person = mask[step // 2 :: step, step // 2 :: step][: small.height, : small.width] > 127
+        # Symmetric difference of rendered body and mask. Sums over cameras, not means, let the views that show more
+        # count more.
         wrong += float((drawn[: person.shape[0], : person.shape[1]] != person).sum())
         all_of_them += float(person.sum())
     return wrong / max(all_of_them, 1.0)

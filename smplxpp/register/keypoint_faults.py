@@ -124,6 +124,8 @@ def find_swapped(table: Table, points: Float64[np.ndarray, "N 3"]) -> Bool[np.nd
     def far_better(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return one.sum(axis=2) < _BOUNDS.left_over * other.sum(axis=2)
 
+    # A frame is exchanged, or fine, if clearly more points agree one way round and little of the squared distance
+    # remains. Side views are neither and take the verdict of their camera's other frames.
     swapped = enough & (mended >= _BOUNDS.least_mended) & far_better(swapped_sides, as_given)
     fine = enough & (mended <= -_BOUNDS.least_mended) & far_better(as_given, swapped_sides)
     judged = swapped.sum(axis=1) + fine.sum(axis=1)
@@ -137,6 +139,8 @@ def find_other_people(table: Table, points: Float64[np.ndarray, "N 3"]) -> Bool[
     length = np.linalg.norm(s.residuals(points), axis=2)
     known = (s.weight > 0) & np.isfinite(points).all(axis=1)
     agree = known & (length < _BOUNDS.far * s.threshold[:, None])
+    # Counts by camera and frame: a detector that followed somebody else contradicts nearly all points of a view at
+    # once.
     known, agree = table.by_frame(known).sum(axis=2), table.by_frame(agree).sum(axis=2)
     return (known >= _BOUNDS.least_sightings) & (agree < _BOUNDS.other_person * known)
 
@@ -157,6 +161,9 @@ def find_camera_fault(table: Table, points: Float64[np.ndarray, "N 3"]) -> tuple
     typical = float(np.median(list(before.values()))) if enough else 0.0
     # Resection: where would the camera have to be, to see the points where it says?
     for k in enough:
+        # The points follow the other cameras. A calibration fault is one that a rigid motion of this camera repairs:
+        # its error falls to what is typical, or to a fraction of what it was. If no motion does, the view is of another
+        # person.
         found = resection(s, k, points)
         as_well = found.median < min(_BOUNDS.as_well * typical, _BOUNDS.better * before[k])
         if found.moved > _BOUNDS.moved and (as_well or found.median < min(1.0, _BOUNDS.far_better * before[k])):
@@ -171,6 +178,7 @@ def number_ranges(numbers: Sequence[int]) -> str:
     parts, values = [], sorted(numbers)
     start = 0
     for k in range(len(values)):
+        # A range ends where the next number does not follow.
         if k + 1 == len(values) or values[k + 1] != values[k] + 1:
             first, last = values[start], values[k]
             parts.append(str(first) if first == last else f"{first} to {last}")
@@ -181,6 +189,7 @@ def number_ranges(numbers: Sequence[int]) -> str:
 def pose_difference(given: Float64[np.ndarray, "3 4"], found: Float64[np.ndarray, "3 4"]) -> tuple[float, float]:
     """Return the angle between two poses of a camera, degrees, and the distance of its centres, metres."""
     turn = given[:, :3] @ found[:, :3].T
+    # trace(R) = 1 + 2 cos(angle); the clip keeps round-off inside the domain of the arc cosine. The centre is -R^T t.
     angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
     centres = [-pose[:, :3].T @ pose[:, 3] for pose in (given, found)]
     return float(angle), float(np.linalg.norm(centres[0] - centres[1]))

@@ -136,15 +136,19 @@ class KeypointTerm:
         for k, camera in enumerate(self.cameras):
             residual, jacobian, seen = projected(camera, points)
             residual = residual - self.points[k, row]
+            # Geman-McClure weight by the pixel distance, times the detector's confidence; 0 for points behind the
+            # camera.
             scale = self.noise[k] * self.scale
             squared = (residual**2).sum(axis=1) / (self.cutoff * scale) ** 2
             weight = seen * self.confidence[k, row] / (scale**2 * (1.0 + squared) ** 2)
             information += np.einsum("n,nax,nay->nxy", weight, jacobian, jacobian)
             vector += np.einsum("n,nax,na->nx", weight, jacobian, residual)
+        # Landmarks that no camera sees carry no information.
         kept = np.flatnonzero(np.einsum("nxx->n", information) > 0)
         # With information H = V L V^T and gradient g, the three rows `L^1/2 V^T` with the residuals `L^-1/2 V^T g` give
         # the same normal equations as all cameras' rows, which saves multiplying the body's Jacobian once a camera.
         values, axes = np.linalg.eigh(information[kept])
+        # With one camera the depth is not observed and its eigenvalue is 0; the floor only avoids the division by it.
         values = np.maximum(values, 1e-12 * values[:, -1:])
         root = np.sqrt(values)[:, :, None] * axes.transpose(0, 2, 1)
         target = (axes.transpose(0, 2, 1) @ vector[kept, :, None])[..., 0] / np.sqrt(values)
@@ -159,6 +163,7 @@ class KeypointTerm:
             there, _, seen = projected(camera, points)
             use = seen & (self.confidence[k, row] > 0)
             found.append(np.linalg.norm(there - self.points[k, row], axis=1)[use])
+        # The median over all cameras together, because a single camera may see few points.
         every = np.concatenate(found)
         return float(np.median(every)) if len(every) else float("nan")
 
@@ -176,6 +181,8 @@ def projected(
     seen = depth > 0.05
     safe = np.where(seen, depth, 1.0)
     pixels = inside[:, :2] / safe[:, None] @ K[:2, :2].T + K[:2, 2]
+    # Derivative of the pinhole projection u = K (X / Z, Y / Z): K / Z by X and Y, -K (X, Y) / Z^2 by Z, and the
+    # rotation of the camera for world coordinates.
     by_camera = np.zeros((len(points), 2, 3))
     by_camera[:, :, :2] = K[:2, :2] / safe[:, None, None]
     by_camera[:, :, 2] = -(inside[:, :2] / safe[:, None] ** 2) @ K[:2, :2].T

@@ -113,6 +113,9 @@ class BodyPoints:
     @staticmethod
     def of_joints(body: BodyModel, index: Integer[np.ndarray, " N"]) -> BodyPoints:
         """Take some of a body's joints as points; each is skinned to its parent, the root to itself."""
+        # A joint is a mean of vertices (row of the regressor), so that its shape directions are the same mean of
+        # theirs. Its own rotation does not move it: it is rigid with its parent. Expression and pose correctives do not
+        # move joints.
         carrier = np.where(body.parents[index] < 0, index, body.parents[index])
         regressor = body.joint_regressor[index]
         return BodyPoints(
@@ -216,6 +219,7 @@ class Kinematics:
         self.joint_dirs = np.einsum("jv,vxb->jxb", body.joint_regressor, body.shapedirs)
         count = body.joint_count
         descends_from = np.eye(count, dtype=bool)
+        # Walk from each joint to the root and mark every joint on the path as its ancestor.
         for joint in range(count):
             above = joint
             while self.parents[above] >= 0:
@@ -235,6 +239,8 @@ class Kinematics:
     def points(self, points: BodyPoints, posture: Posture) -> Float64[np.ndarray, "N 3"]:
         """Return the posed positions of points, metres."""
         rest = self._rest(points, posture)
+        # Linear blend skinning, x = sum_k w_k (R_k x_rest + t_k): blend the upper 3 x 4 parts, then apply them to the
+        # points.
         flat = points.weights @ posture.transforms[:, :3].reshape(-1, 12)
         blended = flat.reshape(-1, 3, 4)
         return np.einsum("nxy,ny->nx", blended[..., :3], rest) + blended[..., 3]
@@ -278,6 +284,7 @@ class Kinematics:
     ) -> BodyState:
         """Return the state after an update, in which the rotation of joint j becomes `exp(d_j) R_j`."""
         return BodyState(
+            # Multiplied on the left instead of added, so that rotations stay in SO(3) and the Jacobians above hold.
             matrix_from_rotvec(rotvecs) @ state.rotations,
             state.transl + transl,
             state.betas + betas,

@@ -65,6 +65,7 @@ class PlacedLandmarks:
             notes = (f"landmarks that the body {body.name!r} does not have are left out: {shown}",)
         if not landmarks.names:
             return None
+        # One table over frames and names; NaN marks points that were not placed in a frame.
         points = np.full((len(frames), len(landmarks.names), 3), np.nan)
         for row, frame in enumerate(frames):
             for k, name in enumerate(landmarks.names):
@@ -92,6 +93,8 @@ class LandmarkTerm:
     def __init__(self, body: BodyModel, placed: PlacedLandmarks, sigma: float) -> None:
         self.names, self.points = placed.landmarks.names, placed.points
         self.landmarks = LandmarkPoints.of(body, placed.landmarks)
+        # Joints and the COCO points, which name joints, lie inside limbs, where a person who places them can only guess
+        # depth.
         within = (placed.landmarks.joint_index >= 0) | [name.startswith("coco_") for name in self.names]
         self.sigma = sigma * np.where(within, 3.0, 1.0)
         self.scale = 1.0
@@ -106,6 +109,8 @@ class LandmarkTerm:
         motion, points = self.landmarks.motion(kinematics, posture)
         residual = points[there] - self.points[row, there]
         sigma = self.scale * self.sigma[there]
+        # Residual and Jacobian are scaled by the root of the robust weight over sigma, so that their square is GM r^2 /
+        # s^2.
         weight = np.sqrt(geman_mcclure(np.linalg.norm(residual, axis=1), self.cutoff * sigma)) / sigma
         scaled = weight[:, None, None] * self.landmarks.combined(equations.columns.jacobian(motion))[there]
         equations.add(row, scaled.reshape(-1, scaled.shape[-1]), (weight[:, None] * residual).reshape(-1), shape=shape)

@@ -107,6 +107,8 @@ class LandmarkPoints:
             BodyPoints.of_vertices(body, used),
             BodyPoints.of_joints(body, landmarks.joint_index[joints]),
         ]
+        # One row a landmark: its weights over the vertices, or a single 1 in the column of its joint. The columns of
+        # the joints follow those of the vertices, in the order of the carriers.
         columns = np.concatenate([place.reshape(-1), len(used) + np.arange(len(joints))])
         rows = np.concatenate([np.repeat(made, landmarks.vertex_index.shape[1]), joints])
         values = np.concatenate([landmarks.vertex_weight[made].reshape(-1), np.ones(len(joints))])
@@ -124,6 +126,7 @@ class LandmarkPoints:
 
     def combined(self, jacobian: Float64[np.ndarray, "N 3 P"]) -> Float64[np.ndarray, "K 3 P"]:
         """Return the landmarks' derivatives from those of their carriers."""
+        # The combination is constant, so that the derivatives of landmarks combine as their carriers do.
         flat = self.matrix @ jacobian.reshape(len(jacobian), -1)
         return np.asarray(flat).reshape(-1, *jacobian.shape[1:])
 
@@ -140,6 +143,7 @@ def visible_vertices(body: BodyModel) -> Int64[np.ndarray, " n"]:
 
 
 def _place(body: BodyModel, joints: dict[str, int], name: str) -> int | _Mean | None:
+    # From exact to approximate: a joint, a landmark of the body's file, a fingertip, and last a substitute.
     if name in joints:
         return joints[name]
     if name in body.landmarks:
@@ -162,6 +166,7 @@ def _sparsified(body: BodyModel, index: Int64[np.ndarray, " n"], weight: Float64
     points, kept = body.v_template[index[heavy]], weight[heavy]
     A = np.concatenate([np.ones((1, len(heavy))), points.T])
     target = np.concatenate([[1.0], weight @ body.v_template[index]])
+    # With W = diag(w), minimise sum dw_i^2 / w_i so that A (w + dw) = target: dw = W A^T (A W A^T)^-1 (target - A w).
     scaled = A * kept
     kept = kept + scaled.T @ np.linalg.lstsq(scaled @ A.T, target - A @ kept, rcond=None)[0]
     return index[heavy], kept / kept.sum()
@@ -176,6 +181,7 @@ def _fingertip(body: BodyModel, joint: int | None) -> _Mean | None:
     own = np.flatnonzero(body.weights[:, joint] > own_weight)
     if not len(own):
         return None
+    # Coordinate along the direction from the parent's joint to this one, which the last bone continues.
     along = (body.v_template[own] - rest[0]) @ (rest[0] - rest[1])
     far = np.sort(own[np.argsort(-along, kind="stable")[:count]])
     return far.astype(np.int64), np.full(len(far), 1.0 / len(far))

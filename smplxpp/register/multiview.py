@@ -66,6 +66,8 @@ class Sightings:
         cam = _in_cameras(self.cam_from_world, points)
         with np.errstate(invalid="ignore"):
             seen = cam[..., 2] > _NEAR
+        # Pinhole projection u = K (X / Z, Y / Z). Infinite residuals keep points behind a camera from ever being
+        # inliers.
         plane = cam[..., :2] / np.where(seen, cam[..., 2], 1.0)[..., None]
         uv = plane @ self.K[:, :2, :2].transpose(0, 2, 1) + self.K[:, None, :2, 2]
         return np.where(seen[..., None], self.pixels - uv, np.inf)
@@ -208,6 +210,7 @@ def pixel_noise(
     common = normal_mad * float(np.median(everything)) if len(everything) else 1.0
     counts = usable.sum(axis=(1, 2))
     own = [normal_mad * np.median(size[c][usable[c]]) if n >= least_residuals else common for c, n in enumerate(counts)]
+    # The floor of 4 % of the unit keeps weights finite for sightings without noise, as synthetic ones are.
     return np.maximum(np.clip(own, 0.5 * common, 4.0 * common), 0.04) * unit
 
 
@@ -251,10 +254,13 @@ def _resection(s: Sightings, camera: int, points: Float64[np.ndarray, "N 3"], *,
         residual = own.residuals(known)[0]
         seen = np.isfinite(residual[:, 0])
         residual = np.where(seen[:, None], residual, 0.0)
+        # Cauchy weights with a scale that falls: a grossly wrong pose is pulled first, and other people's points drop
+        # out later.
         weight = own.weight[0] / (1.0 + (residual**2).sum(axis=1) / scale**2)
         J = _pose_jacobian(own.K[0], _in_cameras(own.cam_from_world, known)[0], seen)[..., :unknowns]
         weighted = (J * weight[:, None, None]).reshape(-1, unknowns).T
         normal = weighted @ J.reshape(-1, unknowns) + 1e-9 * np.eye(unknowns)
+        # A rotation alone leaves the last three unknowns at 0.
         step = np.concatenate([np.linalg.solve(normal, weighted @ residual.ravel()), np.zeros(6 - unknowns)])
         turn, pose = matrix_from_rotvec(step[:3]), own.cam_from_world[0]
         shifted = np.concatenate([turn @ pose[:, :3], (turn @ pose[:, 3] + step[3:])[:, None]], axis=1)
@@ -286,6 +292,7 @@ def _projection_jacobian(K: np.ndarray, cam: np.ndarray, seen: np.ndarray) -> np
 
 def _normal_matrix(J: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return (N, 3, 3) sums over cameras of weighted `J^T J`."""
+    # The root of the weights scales the rows; stacked over cameras, one batched product sums over all of them.
     rows = (J * np.sqrt(weight)[..., None, None]).transpose(1, 0, 2, 3).reshape(J.shape[1], -1, 3)
     return rows.transpose(0, 2, 1) @ rows
 

@@ -88,6 +88,8 @@ class Step:
     def limited(self, *, angle: float, length: float) -> Step:
         """Return the step with each frame shortened until no joint rotates by more than `angle` radians and the body
         moves by at most `length` metres; the shape is shortened as much as the most shortened frame."""
+        # One factor a frame scales all unknowns of that frame, which keeps the direction of its step. The shape belongs
+        # to all frames and takes the smallest factor.
         turn = np.linalg.norm(self.rotvecs, axis=2).max(axis=1)
         move = np.linalg.norm(self.transl, axis=1)
         share = 1.0 / np.maximum(1.0, np.maximum(turn / angle, move / length))
@@ -125,6 +127,8 @@ class NormalEquations:
         Args:
             shape: whether the term may change the shape; else the columns of the shape are ignored.
         """
+        # H += J^T J and g += J^T r, split into the frame's own block, the coupling C of frame and shape, and the block
+        # of the shape. A frame that must not tell the shape contributes only the first.
         P = self.columns.count
         self.gradient[frame] += rows[:, :P].T @ residuals
         self.blocks[frame] += rows[:, :P].T @ rows[:, :P]
@@ -138,6 +142,8 @@ class NormalEquations:
     ) -> None:
         """Add `w |a + x_t - 2 x_{t+1} + x_{t+2}|^2` for each unknown, with t = `first` and a its present value."""
         kernel = (1.0, -2.0, 1.0)
+        # J^T J of one row (1, -2, 1) is the outer product of the kernel with itself. It is stored by the distance of
+        # the two frames, 0 to 2; H is symmetric, so that only the later frame of a pair is kept.
         for k, value in enumerate(kernel):
             self.gradient[first + k] += value * weight * second_difference
             for later in range(k, 3):
@@ -155,9 +161,11 @@ class NormalEquations:
         width = 2 * P if T > 1 else P - 1
         banded = np.zeros((width + 1, T * P))
         view = banded.reshape(width + 1, T, P)
+        # Entry (i, j) of a frame's block goes to row i - j of the band, in the column of unknown j.
         for column in range(P):
             view[: P - column, :, column] = blocks[:, column:, column].T
         if T > 1:
+            # An unknown of frame t and the same one of frame t + 1 lie P apart, those of t and t + 2 lie 2 P apart.
             view[P] += self.smooth[1]
             view[2 * P] += self.smooth[2]
         factor = cholesky_banded(banded, lower=True, overwrite_ab=True, check_finite=False)
@@ -177,11 +185,14 @@ class NormalEquations:
 
     def covariance(self, frame: int) -> Float64[np.ndarray, "P P"]:
         """Return the covariance of a frame's unknowns with all others held fixed, which is the inverse of its block."""
+        # The small ridge makes unobserved unknowns invertible; their variance is then so large that their confidence is
+        # 0.
         block = self.blocks[frame] + np.diag(self.smooth[0, frame] + 1e-9)
         return np.linalg.inv(block)
 
     def _step(self, x: np.ndarray, betas: np.ndarray) -> Step:
         c = self.columns
+        # Joints and coefficients that are not unknowns get a step of zero.
         rotvecs = np.zeros((self.frames, c.joint_count, 3))
         rotvecs[:, c.joints] = x[:, : 3 * len(c.joints)].reshape(self.frames, -1, 3)
         expression = np.zeros((self.frames, c.expression_count))

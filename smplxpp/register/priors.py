@@ -86,6 +86,8 @@ def _of_joint(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     finger = _JOINTS["thumb" if "thumb" in name else "finger"]
     spread, lowest, highest = (np.asarray(v, dtype=np.float64) for v in _JOINTS.get(left, finger))
     if side == "right":
+        # Reflection at the sagittal plane (x -> -x) negates the y and z components of a rotation vector. Negated bounds
+        # change places, hence minimum and maximum.
         mirror = np.array([1.0, -1.0, -1.0])
         ends = np.stack([lowest * mirror, highest * mirror])
         lowest, highest = ends.min(axis=0), ends.max(axis=0)
@@ -150,6 +152,8 @@ class Priors:
         prior = 0.0 if believed else self.config.pose_prior
         weight = prior / self.spread**2 + (over != 0) / soft**2
         gradient = prior * vector / self.spread**2 + over / soft**2
+        # Chain rule: an update d changes the axis-angle vector by J_l^-1 d, so that each joint gets a 3 x 3 block J^T W
+        # J.
         for k, jacobian in enumerate(inverse):
             part = slice(3 * k, 3 * k + 3)
             equations.blocks[row, part, part] += jacobian.T @ (weight[part, None] * jacobian)
@@ -181,6 +185,7 @@ class Priors:
                 equations.blocks[row, part, part] += weight[k] * each.T @ each
                 equations.gradient[row, part] += weight[k] * each.T @ vector
         if np.isfinite(start.transl):
+            # The translation has no robust kernel; its residual is linear in the unknowns.
             rows = np.zeros((3, P + self.columns.betas))
             rows[:, transl] = np.eye(3) / start.transl
             difference = (state.transl[row] - start.state.transl[row]) / start.transl
@@ -218,6 +223,7 @@ class Priors:
             difference[: 3 * len(joints)] = turn.reshape(-1)
             weight[self.columns.transl] = 1.0 / (length**2 * (1.0 + (moved**2).sum() / (2 * length) ** 2))
             difference[self.columns.transl] = moved
+            # A loose scale of 100 coefficients a second squared, because faces move fast; no robust kernel.
             weight[self.columns.expression] = 1.0 / (100.0 * seconds**2) ** 2
             difference[self.columns.expression] = face
             equations.add_smoothness(first, weight, difference)
@@ -230,6 +236,7 @@ def _left_jacobian_inverse(vectors: Float64[np.ndarray, "*N 3"]) -> Float64[np.n
     x, y, z = np.moveaxis(vectors, -1, 0)
     cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -z, y, -x
     cross -= np.swapaxes(cross, -1, -2).copy()
+    # J_l^-1 = I - [v]_x / 2 + (1 / a^2 - (1 + cos a) / (2 a sin a)) [v]_x^2 with the angle a; the factor tends to 1/12.
     small = angle < 1e-3
     safe = np.where(small, 1.0, angle)
     factor = np.where(small, 1.0 / 12.0, 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe)))

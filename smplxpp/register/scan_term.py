@@ -58,6 +58,8 @@ class ScanSample:
     def of(scan: ScanObservation, samples: int, seed: int) -> ScanSample:
         """Draw vertices of a scan with probabilities in proportion to their area, without replacement."""
         mesh = scan.mesh
+        # A vertex stands for a third of the area of each of its faces, so that dense regions of a scan count no more
+        # than coarse ones. Vertices without any area cannot be drawn.
         area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas / 3, 3), minlength=mesh.vertex_count)
         rng = np.random.default_rng(seed)
         count = min(samples, int((area > 0).sum()))
@@ -93,7 +95,9 @@ class ScanTerm:
         self.samples = {row: ScanSample.of(scan, config.scan_samples, config.seed) for row, scan in scans.items()}
         rng = np.random.default_rng(config.seed)
         index = np.flatnonzero(bare)
+        # At most half as many points of the body as of the scan, drawn at random.
         self.bare_index = np.sort(rng.permutation(index)[: config.scan_samples // 2])
+        # A vertex belongs to the limb of the joint with its largest skinning weight.
         self.limb = np.argmax(self.body.weights, axis=1)
         self.gaps = Gaps.unknown(_GROUPS * self.body.joint_count)
         self.reach = self.first_reach = config.scan_reach_m
@@ -106,6 +110,8 @@ class ScanTerm:
         if row not in self.samples:
             return
         index, weight_of, direction, residual, weight = self._residuals(row, kinematics, posture)
+        # The closest point is held at its place on its face while the body moves: dd = direction . J dx (point to
+        # plane).
         points = self.body_points.mixed(index, weight_of)
         jacobian = equations.columns.jacobian(kinematics.motion(points, posture))
         rows, root = np.einsum("nx,nxp->np", direction, jacobian, optimize=True), np.sqrt(weight)
@@ -124,6 +130,7 @@ class ScanTerm:
             return float("nan"), float("nan")
         sample = self.samples[row]
         mesh = TriangleMesh(kinematics.points(self.body_points, posture), self.body.faces)
+        # Skin is compared with the surface on both sides; all other labels only with its inside, where no cloth can be.
         found = SignedDistanceField(mesh, solid=True).query(sample.points)
         skin = sample.labels == SKIN.id
         close = float(1e3 * np.abs(found.distance[skin]).mean()) if skin.any() else float("nan")
@@ -181,6 +188,7 @@ class ScanTerm:
         facing = np.einsum("nx,nx->n", mesh.vertex_normals[index], normal) > _FACING
         residual = np.einsum("nx,nx->n", vertices - sample.points[nearest], normal)
         weight = facing * geman_mcclure(residual, self.reach) / self.config.scan_m**2 / self._crowding(sample)
+        # A vertex is written as a face with three equal corners, so that both directions have one format.
         corners = np.repeat(index[:, None], 3, axis=1)
         bary = np.tile([1.0, 0.0, 0.0], (len(index), 1))
         return corners, bary, normal, residual, weight

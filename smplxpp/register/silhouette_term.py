@@ -92,6 +92,7 @@ class Outline:
             Distances in pixels of the full image, their unit gradients, and where both are known: inside the window,
             and nearer than the largest distance that the field stores.
         """
+        # Coordinates in which integers are the centres of reduced pixels of the window.
         place = pixels / self.factor - 0.5 - np.asarray(self.corner)
         h, w = self.field.shape
         known = (place > 0).all(axis=1) & (place[:, 0] < w - 1) & (place[:, 1] < h - 1)
@@ -143,6 +144,7 @@ class Surface:
 
     def posed(self, kinematics: Kinematics, posture: Posture) -> tuple[np.ndarray, np.ndarray]:
         """Return posed vertices, and normals rotated by the blended rotation (shorter than 1 where it shrinks)."""
+        # Normals turn with the blended rotation. That is exact for rigid parts and close enough elsewhere to find rims.
         blended = (self.points.weights @ posture.rotations.reshape(len(posture.rotations), 9)).reshape(-1, 3, 3)
         return kinematics.points(self.points, posture), np.einsum("nxy,ny->nx", blended, self.normals)
 
@@ -183,6 +185,7 @@ class SilhouetteTerm:
         index, direction, residual, weight = self._residuals(row, kinematics, posture, collect=True)
         if not len(index):
             return
+        # A vertex may be at the rim of several cameras; its derivative by the pose is the same and computed once.
         used, place = np.unique(index, return_inverse=True)
         points = self.surface.points.select(self.index[used])
         jacobian = equations.columns.jacobian(kinematics.motion(points, posture))

@@ -64,6 +64,7 @@ class Terms:
             contours = self.silhouettes
             out["silhouette_px"] = np.array([contours.residual_px(r, kinematics, p) for r, p in enumerate(postures)])
         if self.scans is not None:
+            # Means over the points of a scan in millimetres: skin to the body, and cloth that is inside of it.
             both = np.array([self.scans.residual_mm(r, kinematics, p) for r, p in enumerate(postures)])
             out["skin_mm"], out["inside_mm"] = both[:, 0], both[:, 1]
         return out
@@ -116,6 +117,7 @@ def assemble(
     """Return the normal equations of all terms at a state."""
     equations = NormalEquations(columns, len(state))
     used = [*terms.points(), *terms.surfaces()]
+    # A frame that may not tell the shape, such as a held-out one, still determines its own pose.
     for row in range(len(state)):
         posture = kinematics.posture(state, row)
         for term in used:
@@ -137,6 +139,8 @@ def joint_confidence(
     joints = BodyPoints.of_joints(body, np.arange(body.joint_count))
     out = np.zeros((len(rows), body.joint_count))
     for k, row in enumerate(rows):
+        # Positions depend on the shape, too; its columns are cut off because the shape is known from all frames
+        # together.
         motion = kinematics.motion(joints, kinematics.posture(state, int(row)))
         jacobian = columns.jacobian(motion)[..., : columns.count]
         covariance = equations.covariance(int(row))

@@ -74,9 +74,11 @@ def white_noise(state: BodyState, frames: Int64[np.ndarray, " T"]) -> tuple[floa
     The second difference of white noise has six times its variance. The median of absolute values, times 1.4826, is a
     robust standard deviation: it ignores the real accelerations of few joints in few frames.
     """
+    # Second differences need three frames at equal distances.
     triples = np.flatnonzero(np.diff(frames)[1:] == np.diff(frames)[:-1]) if len(frames) > 2 else np.zeros(0, int)
     if len(triples) < 6:
         return None
+    # Relative rotations of consecutive frames stand for differences, so that their difference is a second difference.
     speed = rotvec_from_matrix(state.rotations[1:] @ state.rotations[:-1].transpose(0, 1, 3, 2))
     turn = (speed[1:] - speed[:-1])[triples]
     moved = np.diff(state.transl, n=2, axis=0)[triples]
@@ -91,6 +93,7 @@ def joined_points(
     landmarks = LandmarkModel.of(body, tuple(dict.fromkeys(name for names, _ in tables for name in names)))
     points = np.full((len(tables[0][1]), len(landmarks.names), 3), np.nan)
     for names, found in tables:
+        # Finite values overwrite; NaN leaves what an earlier table has.
         place = [landmarks.names.index(name) for name in names]
         points[:, place] = np.where(np.isfinite(found), found, points[:, place])
     return landmarks, points
@@ -144,6 +147,7 @@ def _determine_rotation(points: Float64[np.ndarray, "n 3"]) -> bool:
     """Return whether there are at least four points, and their second singular value exceeds 5 cm (no line)."""
     if len(points) < 4:
         return False
+    # Points on a line leave the rotation about that line open.
     off_line = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
     return bool(off_line > 0.05)
 

@@ -208,6 +208,7 @@ def _with_thresholds(table: Table, points: Float64[np.ndarray, "N 3"], config: T
     for k, pose in enumerate(s.cam_from_world):
         depth = points[known[k]] @ pose[2, :3] + pose[2, 3]
         if (depth > 0).any():
+            # Pixels a metre at the median depth: the geometric mean of the focal lengths over the depth.
             scale = np.sqrt(abs(np.linalg.det(s.K[k, :2, :2]))) / float(np.median(depth[depth > 0]))
             threshold[k] = max(threshold[k], config.threshold_metres * scale)
     return replace(table, sightings=replace(s, threshold=threshold))
