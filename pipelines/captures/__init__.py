@@ -1,1 +1,1 @@
-"""Captures: reports of their checks, conversion, and keypoints and masks of their images."""
+"""Write reports of a capture's check, and keypoints and masks of its images."""

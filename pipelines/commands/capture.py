@@ -125,10 +125,10 @@ class CaptureConvertCommand:
 
     def run(self) -> dict:
         """Convert; exit status 1 if something had to be left out."""
-        from pipelines.captures.convert import ConvertConfig, convert_capture
         from pipelines.commands.progress import shared_progress
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
+        from smplxpp.capture.convert import ConvertConfig, convert_capture
 
         # Make the mattes first: the capture is opened with them.
         body = None if self.body is None else load_body(self.body)

@@ -1,4 +1,4 @@
-"""What of a run the browser shows in space: layers, Gaussians, the followed surface, photographs."""
+"""Draw a run in the browser's 3D scene: layers, Gaussians, the tracked surface, photographs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipelines.viewer.run_session import Coloring, Layer, RunSession
 from pipelines.viewer.scene import colored_glb
 from smplxpp.core import Camera, TriangleMesh
 
-SPLATS, TRACKED, PHOTOGRAPHS = "/gaussians", "/followed", "/photographs"
+SPLATS, TRACKED, PHOTOGRAPHS = "/gaussians", "/tracked", "/photographs"
 _FIELD = np.radians(40.0)
 _PICTURE = 220  # pixels of a photograph's longer side
 _GREY = (205, 205, 212)
@@ -84,7 +84,7 @@ class RunScene:
         )
 
     def draw_tracked(self, session: RunSession, *, shown: bool) -> None:
-        """Draw the surface that was followed, in grey."""
+        """Draw the tracked surface in grey."""
         vertices = session.tracked_vertices() if shown else None
         if vertices is None:
             self._hide(TRACKED)

@@ -165,7 +165,7 @@ class RunSession:
         return self.template.pose(self.params)[0]
 
     def tracked_vertices(self) -> Float[np.ndarray, "V 3"] | None:
-        """The followed surface of the frame; None where it was not followed."""
+        """The tracked surface of the frame; None where the teacher did not track it."""
         return None if self.tracked is None else self.tracked(self.frame, self.motion.params.frame(self.at))
 
     def colors(self, coloring: Coloring, joint: str | None = None) -> UInt8[np.ndarray, "V 3"]:

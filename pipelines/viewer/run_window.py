@@ -85,7 +85,7 @@ class RunWindow:
             self._cloth = gui.add_checkbox("loose clothes simulated", session.simulated, visible=session.dressed)
             for layer in session.layers:
                 self._layers[layer.name] = gui.add_checkbox(layer.name, not has_splats)
-            self._tracked = gui.add_checkbox("followed surface", False, disabled=session.tracked is None)
+            self._tracked = gui.add_checkbox("tracked surface", False, disabled=session.tracked is None)
             photographed = session.capture is not None and session.motion.photographed
             self._photographs = gui.add_checkbox("photographs", False, disabled=not photographed)
         with gui.add_folder("Colours of the layers"):

@@ -221,7 +221,7 @@ def cloth_section(record: StageRecord) -> Section:
             Table(
                 columns,
                 rows,
-                "mm: to the followed surface, vertex by vertex; outline: 1 - IoU with masks; +-: leaving frames out",
+                "mm: to the tracked surface, vertex by vertex; outline: 1 - IoU with masks; +-: leaving frames out",
             ),
         ),
         checks=tuple(CheckRow.of(check, stage=record.folder.name) for check in record.manifest["checks"]),

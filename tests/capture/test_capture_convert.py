@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.captures.convert import ConvertConfig, convert_capture
 from pipelines.cli import main
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.check import check_capture
+from smplxpp.capture.convert import ConvertConfig, convert_capture
 from smplxpp.core import ARRAY_NAMES, InputError
 from tests.capture.scene import LENS, make_scene
 from tests.capture.writers import (

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from smplxpp.capture import Capture
+from smplxpp.capture.capture import Capture
 from smplxpp.capture.window import Window
 from smplxpp.capture.writers.images import JPEG_SUFFIXES, encoded_image, normal_codes, view_path
 from smplxpp.core.errors import InputError

@@ -1,4 +1,4 @@
-"""convert_capture: write any capture that can be opened in our layout or in ActorsHQ's.
+"""Write any capture that can be opened in our layout or in ActorsHQ's.
 
 Images become those of pinhole cameras. Files without changes are copied byte for byte. Every file appears whole or not
 at all, and an interrupted conversion continues where it stopped.
@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from pipelines.captures.convert_views import ViewOutcome, ViewWriter
-from smplxpp.capture import Capture
+from smplxpp.capture.capture import Capture
+from smplxpp.capture.convert_views import ViewOutcome, ViewWriter
 from smplxpp.capture.sources import PosedTopology
 from smplxpp.capture.writers.arrays import save_params_by_row, write_keypoints
 from smplxpp.capture.writers.metadata import (
