@@ -111,10 +111,14 @@ class Encoder(nn.Module):
         """Return the feature maps, by their side in pixels."""
         x = self.first(image)
         features = {x.shape[-1]: x}
+        # The input is halved beside the features and joins them by a 1 x 1 convolution, so that exact positions reach
+        # every
+        # scale.
         for from_image, block in zip(self.from_image, self.blocks, strict=True):
             image = self.filter.halve(image)
             x = block(x + from_image(image))
             features[x.shape[-1]] = x
+        # One more convolution at the coarsest side; its output is where both decoders start.
         features[x.shape[-1]] = self.last(x)
         return features
 
@@ -165,6 +169,7 @@ class DecoderStep(nn.Module):
         self, x: Float[Tensor, "B I S S"], style: Float[Tensor, " Z"]
     ) -> tuple[Float[Tensor, "B O R R"], Float[Tensor, "B C T T"]]:
         """Return features of twice the side, and their part of the output, of four times the side."""
+        # Double the side, convolve, then read the maps off the features.
         x = self.conv(self.up(x, style), style)
         return x, self.to_maps(x, style)
 
@@ -228,8 +233,11 @@ class ViewEncoder(nn.Module):
 
     def forward(self, cosines: Float[Tensor, "V 2 S S"]) -> tuple[Float[Tensor, "V D Q Q"], Float[Tensor, "V D Q Q"]]:
         """Take cosines of front and back to their features, Q a quarter of the output's side."""
+        # Two convolutions with stride 2, a quarter of the input's side, then brought to the side of the finest
+        # features.
         features = self.second(self.first(cosines.flatten(0, 1)[:, None]))
         features = F.interpolate(features, size=(self.side, self.side), mode="bilinear")
+        # Front and back alternate along the batch axis, because (V, 2) was flattened.
         return features[0::2], features[1::2]
 
 
@@ -259,6 +267,8 @@ class StyleUNet(nn.Module):
 
     def style(self) -> Float[Tensor, " Z"]:
         """Return the style, which modulates every convolution of the decoders."""
+        # A mapping network of a constant input: it trains one style vector, at a rate that is a hundredth of the
+        # others'.
         w = self.style_seed
         for layer in self.mapping:
             w = F.leaky_relu(layer(w), SLOPE) * GAIN

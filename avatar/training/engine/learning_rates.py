@@ -73,6 +73,7 @@ def attribute_groups(
 
 def pixel_size(sequence: FrameSequence) -> float:
     """Return the size of a pixel at the person, metres: the median of `distance / f` over the training cameras."""
+    # A pixel at distance d has the size d / f, f the focal length in pixels.
     center = sequence.person_center()
     cameras = [sequence.camera(name) for name in sequence.train_cameras]
     return float(np.median([np.linalg.norm(c.position - center) / c.K[0, 0] for c in cameras]))

@@ -64,6 +64,7 @@ class OptimiserConfig:
 
     def lr_factor(self, iteration: int, lr_final_factor: float) -> float:
         """Return the share of a rate that is left at a step counted from 0."""
+        # Share of the training that is done; the warm-up multiplies whatever the schedule gives.
         at = iteration / self.iterations
         rising = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
         if self.schedule == "cosine":
@@ -114,6 +115,7 @@ class OptimizationTask(ABC, Generic[Batch]):
     ) -> None:
         self.groups, self.optimiser_config = tuple(groups), config
         self.distributed = distributed or Distributed()
+        # Keys of the checkpoint. Two tensors with one key would overwrite each other there.
         keyed = [(f"{group.name}.{name}", value) for group in groups for name, value in group.parameters.items()]
         self.learned = dict(keyed)
         assert len(self.learned) == len(keyed) > 0, "parameters need keys of their own"
@@ -215,6 +217,7 @@ class OptimizationTask(ABC, Generic[Batch]):
 
     def _backward(self, item: Batch, count: int) -> Mapping[str, float] | None:
         """Backpropagate a micro-batch's share of the loss; return its figures, None if anything is not finite."""
+        # Divided by the number of micro-batches, so that the sum of all gradients is that of the mean loss.
         loss, figures = self.loss(item)
         (loss / count).backward()
         gradients = (value.grad for value in self.learned.values() if value.grad is not None)

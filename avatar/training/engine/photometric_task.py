@@ -180,6 +180,7 @@ class PhotometricTask(OptimizationTask[Item]):
     def micro_batches(self, iteration: int) -> Sequence[Item]:
         """Return the step's frames and cameras, and start to read those of the next step in the background."""
         self.iteration = iteration
+        # Each process reads ahead its own items alone, every world_size-th.
         now, soon = (
             self.sequence.items(k, count=self.config.poses_per_step, views=self.config.views, seed=self.config.seed)
             for k in (iteration, iteration + 1)
@@ -194,6 +195,7 @@ class PhotometricTask(OptimizationTask[Item]):
     def views(self, item: Item) -> list[View]:
         """Return the item's photographs with all normals; at half their size in the coarse part of the training."""
         views = [self.sequence.view(camera, item.frame) for camera in item.cameras]
+        # Half the size makes a displacement half as many pixels, within reach of the image's gradients.
         coarse = self.iteration < self.config.coarse * self.config.iterations
         views = [view.halved() for view in views] if coarse else views
         if self.surface is None:

@@ -62,6 +62,7 @@ class PretrainTask(OptimizationTask[tuple[int, ...]]):
 
     def micro_batches(self, iteration: int) -> Sequence[tuple[int, ...]]:
         """Return the numbers of a step's poses, each at most once an epoch; a remainder waits for the next one."""
+        # The permutation follows from seed and epoch alone, so that a resumed training draws the same batches.
         per_epoch = self.count // self.batch
         epoch, place = divmod(iteration, per_epoch)
         order = np.random.default_rng((self.seed, 3, epoch)).permutation(self.count)

@@ -36,6 +36,7 @@ def _faces_of_shut_mouth(sequence: FrameSequence) -> Bool[np.ndarray, " F"]:
     inside = inside_of_mouth(rig.template)
     shown = np.zeros_like(inside)
     if inside.any():
+        # A vertex that any of the frames shows is trained by its photographs.
         for frame in spread_inside(sequence.train_frames, most_frames):
             shown |= shown_mouth(rig.template, inside, rig.skin_to_numpy(sequence.pose(frame).without_cloth()))
     faces = rig.template.faces
@@ -62,6 +63,9 @@ def _hidden_clothes(sequence: FrameSequence) -> Bool[np.ndarray, " V"]:
                 return hidden
             x, y, depth = camera.screen_from_world(places[todo]).T[:3]
             inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+            # The farthest depth among a pixel's neighbours, which errs on the side of visible. A background pixel is
+            # infinitely
+            # far, so that silhouettes count as visible too.
             front = maximum_filter(rasterize_mesh(mesh, camera).depth, 3)
             before = np.full(len(todo), -np.inf)
             before[inside] = front[y[inside].astype(int), x[inside].astype(int)]

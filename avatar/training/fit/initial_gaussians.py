@@ -57,6 +57,7 @@ def _shown(
 ) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
     """Return the colours of Gaussians on a template at `vertices` in the views, and whether any view shows each."""
     mouth_tolerance = 0.002  # metres behind the z-buffer: teeth are a centimetre behind the lips
+    # Centres and normals of the Gaussians in the world, on the mesh in the frame's pose.
     gaussians = gaussians.to(device=rig.device)
     placed = world_from_frames(gaussians, triangle_frames(rig.pose_from_vertices(vertices).rest, rig.faces))
     return colors_from_views(
@@ -190,5 +191,6 @@ def density_of_detail(
         known = known if known.any() else seen
         places = cKDTree(centers[face_index[known]])
         _, nearest = places.query(centers[of_face == one], k=[*range(1, min(neighbours, places.n) + 1)])
+        # sqrt of the mean square is the RMS g; G makes the factor free of units.
         weight[of_face == one] += detail * np.sqrt(square[known][nearest].mean(1)) / usual
     return weight

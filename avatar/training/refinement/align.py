@@ -160,6 +160,7 @@ class Alignment:
     ) -> tuple[Linearization, Float64[np.ndarray, " P"], Float64[np.ndarray, "P P"]]:
         """Return the linearised loss of a frame, and gradient and Gauss-Newton matrix of its unknowns."""
         posed, cameras = self.scene.posed, self.scene.cameras
+        # Pose the template with leaves at zero steps, then linearise the photographs about it.
         placed = posed.place(self.state, row)
         linear = self.scene.photometric.linearize(
             self.gaussians,
@@ -170,6 +171,7 @@ class Alignment:
         )
         if cameras is not None:
             cameras.add(linear, self._jacobian.rigidity)
+        # The chain rule takes the gradient of the vertices to the steps; the Gauss-Newton matrix is J^T M J.
         gradient = self.variables.packed(*posed.gradient(placed, linear.vertex_gradient))
         return linear, gradient, self._jacobian.curvature(placed, linear)
 
@@ -178,12 +180,16 @@ class Alignment:
         cached_bytes = 1 << 30  # bound of the cached photographs
         key = (row, halvings)
         if key not in self._cached:
+            # Halved photographs are kept until the bound, then all are dropped: passes read the frames in one order,
+            # so that
+            # dropping the oldest alone would save nothing.
             views = list(halved(self._views(self.frames[row]), halvings))
             self._bytes += sum(view.foreground.numel() + view.alpha.numel() for view in views)
             if self._bytes > cached_bytes:
                 self._cached, self._bytes = {}, 0
             self._cached[key] = views
         views = self._cached[key]
+        # Corrections change after each pass, so the cache holds views without them.
         corrections = self.scene.cameras
         return views if corrections is None else [corrections.corrected(view) for view in views]
 

@@ -68,6 +68,7 @@ class AppearanceUpdate:
         step = torch.where(seen[:, None], self.gradient / torch.where(seen, self.mass, 1.0)[:, None], 0.0)
         # Gauss-Newton step of the depths with a Gaussian prior about 0.
         prior = frames / depth_sigma**2
+        # The current depth of each group: all its Gaussians have the same, so any of them gives it.
         depth = torch.zeros_like(self._depth_gradient).index_copy_(0, self.groups, gaussians.normal_offset.double())
         depth = depth - (self._depth_gradient + prior * depth) / (self._depth_curvature + prior)
         depth = depth.clamp(deepest, highest)
@@ -97,6 +98,7 @@ class CameraCorrections:
     def matrix(self, name: str) -> Float64[np.ndarray, "4 4"]:
         """Return X of a camera as a matrix."""
         motion = self.motions[self.names.index(name)]
+        # x -> R (x - c) + c + t: the rotation leaves the centre in place.
         out = np.eye(4)
         out[:3, :3] = matrix_from_rotvec(motion[:3])
         out[:3, 3] = self.center - out[:3, :3] @ self.center + motion[3:]
@@ -131,6 +133,7 @@ class CameraCorrections:
         sigma = np.repeat([np.radians(self.config.camera_rotation_sigma), self.config.camera_translation_sigma], [3, 3])
         prior = np.diag(1.0 / sigma**2)
         for row in range(len(self.names)):
+            # Damped by the prior alone: (J^T M J + 1 / sigma^2) step = -(J^T g + motion / sigma^2).
             right = gradient[row] + self.motions[row] / sigma**2
             self.motions[row] -= np.linalg.solve(curvature[row] + prior, right)
         self.motions -= self.motions.mean(axis=0)  # the gauge

@@ -140,6 +140,8 @@ class PhotometricLoss:
             for view in views:
                 image, alpha = self._draw(world, features, view)
                 q, _, _ = self._difference(image, alpha, view)
+                # The fourth channel is the rigidity, blended like a colour: how much of the pixel shows rigid
+                # surface.
                 share = image[..., 3]
                 total += float((share * q / (q + self.config.robust**2)).sum())
                 weight += float(share.sum())
@@ -186,6 +188,7 @@ class PhotometricLoss:
 
     def _difference(self, image: Tensor, alpha: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor]:
         """Return the squared difference q of a pixel, and the differences of colours and of opacities."""
+        # Residuals of sRGB on the same background, and of opacity against the mask.
         color = image[..., :3] - view.composited(self.background)
         opacity = alpha - view.opacity()
         return color.square().sum(-1) + self.config.alpha * opacity.square(), color, opacity

@@ -60,6 +60,7 @@ class RigiditySkinning(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rest: Tensor, transforms: Tensor, weights: Tensor, rigidity: Tensor) -> Tensor:
+        # The weighted sum of the joints' 3 x 4 transforms at each vertex, applied to [x, y, z, 1].
         blended = (weights @ transforms.reshape(len(transforms), 12)).view(-1, 3, 4)
         ctx.save_for_backward(rest, blended, weights, rigidity)
         x, y, z = rest.split(1, dim=-1)

@@ -167,6 +167,7 @@ def _finish(
     body = scene.posed.body
     refined = alignment.state.to_params(body, fps=start.fps)
     complete = alignment.start.to_params(body, fps=start.fps)
+    # A row a frame; betas are not refined, so they are the start's.
     rows = [(complete if bad else refined).frame(row) for row, bad in enumerate(worse)]
     params = replace(BodyParams.concatenate(rows), betas=start.betas)
     # Figures: degrees a joint and millimetres.

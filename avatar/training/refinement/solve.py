@@ -29,6 +29,7 @@ class Normal:
 
 def changes(variables: Variables, start: BodyState, state: BodyState) -> Float64[np.ndarray, "F P"]:
     """Return the change since the start: rotation vectors in the parents' frames, translation, expression."""
+    # exp(d) R_start = R, so d is the logarithm of R R_start^T.
     turned = rotvec_from_matrix(state.rotations @ start.rotations.swapaxes(-1, -2))
     return variables.packed(turned, state.transl - start.transl, state.expression - start.expression)
 
@@ -124,6 +125,9 @@ def solve(normal: Normal, smooth: Smoothness, damping: Float64[np.ndarray, " F"]
     diagonal = np.arange(F * P).reshape(F, P)
     coupling = {1: np.zeros((F, P)), 2: np.zeros((F, P))}
     for t in np.flatnonzero(smooth.triple):
+        # The term 1/2 w a^2 with a = d_{t-1} - 2 d_t + d_{t+1} touches three frames: gradient w a (1, -2, 1),
+        # curvature on
+        # the diagonal w (1, 4, 1), and couplings -2 w between neighbours and w between the two outer ones.
         w, a = smooth.weight[t], smooth.acceleration[t]
         for offset, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
             gradient[t + offset] += factor * w * a

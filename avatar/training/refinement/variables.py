@@ -74,6 +74,7 @@ class Variables:
 
     def packed(self, turns: np.ndarray, transl: np.ndarray, expression: np.ndarray) -> Float64[np.ndarray, "*T P"]:
         """Pack (..., J, 3) turns, (..., 3) translations and (..., E) coefficients into vectors of unknowns."""
+        # Only the joints and coefficients that are unknowns; all others stay at their start.
         chosen = turns[..., self.joints, :]
         flat = chosen.reshape(*chosen.shape[:-2], -1)
         return np.concatenate([flat, transl, expression[..., : self.expressions]], axis=-1)
@@ -111,6 +112,7 @@ class CentreJacobian:
         corners = posed.faces[gaussians.face_index]
         weight = corner_weights(gaussians.barycentric)
         skin = (weight[..., None] * posed.weights[corners]).sum(1)
+        # (J, K) whether joint i moves when joint k turns; its product with skin weights (N, J) is `descends`.
         hangs = torch.tensor(posed.kinematics.descends_from[:, variables.joints], dtype=torch.float32)
         self.descends = skin @ hangs
         self.rigidity = (weight * posed.rigidity[corners]).sum(1)
@@ -148,11 +150,13 @@ class CentreJacobian:
         # Blocks of the expression, over the Gaussians that it moves.
         if P > at:
             facial = torch.isin(self.facial, rows)
+            # Rows of M that belong to these Gaussians: both index lists are ascending, so a binary search finds them.
             own = self.facial_jacobian(placed, facial)
             place = torch.searchsorted(rows, self.facial[facial])
             out[:at, at:] = _product(moved[place], own)
             out[at:, :at] = out[:at, at:].T
             out[at:, at:] = _product(own, M[place] @ own)
+        # Exactly symmetric, as the banded Cholesky solver expects; rounding leaves small differences.
         return 0.5 * (out + out.T)
 
     def jacobian(
@@ -183,6 +187,8 @@ class CentreJacobian:
 
     def facial_jacobian(self, placed: Placed, chosen: Bool[Tensor, " M"]) -> Float32[Tensor, "n 3 E"]:
         """Return the derivatives of chosen centres of `facial` by the expression, metres a unit."""
+        # Skinning's rotation of each Gaussian, the weighted sum of its joints' rotations, turns the derivative of the
+        # T-pose.
         turned = torch.tensor(placed.turned, dtype=torch.float32).reshape(-1, 9)
         return (self.facial_skin[chosen] @ turned).view(-1, 3, 3) @ self.facial_dirs[chosen]
 

@@ -100,6 +100,7 @@ class DistillationTargets:
         assert seen.extra is not None
         tensors = [seen.image, seen.alpha, seen.extra]
         if seen.normals is not None:
+            # Normals of pixels that are mostly background mix with it; 0 marks a pixel without a normal.
             tensors.append(seen.normals * (seen.alpha > 0.5)[..., None])
         return tuple(tensor.half() for tensor in tensors)
 

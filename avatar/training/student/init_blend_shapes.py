@@ -45,6 +45,7 @@ def init_blend_shapes(student: Student, sequence: AvatarSequence, track: Track) 
             if moved is not None:
                 left = left - moved
             at_gaussians = on_triangles(left[rig.faces[bound.face_index]], bound.barycentric)
+            # R^T times the residual at each Gaussian that has blend shapes, metres.
             residuals.append(torch.einsum("nij,ni->nj", local, at_gaussians)[shapes.active])
             poses.append(pose.body_pose)
         # Principal components of the residuals, and their coefficients as targets of B.
@@ -68,6 +69,9 @@ def _components(shapes: BlendShapes, residuals: Float[Tensor, "T M 3"]) -> Float
         own = own.flatten(1).double()
         # T is small beside 3 M, so that the Gram matrix of the frames is decomposed: its eigenvectors are coefficients.
         _, vectors = torch.linalg.eigh(own @ own.T)
+        # The largest eigenvalues come last. Coefficients of T frames with mean square 1 have the length sqrt(T), and
+        # the
+        # basis is then the mean of r z.
         vectors = vectors[:, -count:].flip(1) * frames**0.5
         basis = own.T @ vectors / frames
         shapes.U[rows, :, head : head + count] = basis.view(-1, 3, count).to(shapes.U.dtype)
@@ -85,6 +89,7 @@ def _fit(
     size = shapes.U.detach()[..., shapes.config.head_shapes :].square().sum((0, 1)).sqrt()
     weight = size / size.max().clamp(min=1e-12)
     optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=weight_decay)
+    # Fresh noise on theta in each step: the fit is a smooth function about each pose, not a value at it alone.
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     noise = torch.Generator().manual_seed(0)
     for _ in range(steps):

@@ -79,6 +79,7 @@ class PretrainFieldTask(PretrainTask):
         # A share of the poses is shown with the null code.
         draws = np.random.default_rng((self.seed, 4, self.iteration)).random(len(item))
         shown = [frames[k] if draw >= self.null_share else None for k, draw in zip(item, draws, strict=True)]
+        # (B, 63), (B, K, 3) and (B, K); the L1 distance over x, y, z, weighted by the confidence of the track.
         pose, known, weight = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
         apart = (self.field.at_points(pose, self.codes(shown)) - known).abs().sum(-1)
         loss = (weight * apart).sum() / weight.sum() / self.teacher.config.position_scale
@@ -109,6 +110,7 @@ class _MapLookup:
     def __init__(self, teacher: TeacherAvatar, points: Tensor) -> None:
         rig, size = teacher.rig, teacher.config.out_size
         vertices, normals = rig.vertices[points], vertex_normals(rig.vertices, rig.faces)[points]
+        # The lookup of a Gaussian's map, at the points of the field instead.
         sides = assign_front_back(rig, teacher.frame, size, vertices, normals)
         self.sampler = MapSampler(teacher.frame, size, vertices, sides.front)
         hidden = 0.01  # metres behind the surface of the maps

@@ -26,6 +26,7 @@ def coefficient_std(student: Student, sequence: AvatarSequence) -> Float[Tensor,
     rows = []
     with torch.no_grad():
         for frame in sequence.train_frames:
+            # The coefficients (P, n) of each frame, as the player computes them.
             pose = sequence.pose(frame)
             jaw = pose.jaw[None] if shapes.config.jaw else None
             rows.append(shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)[0])
@@ -71,6 +72,7 @@ def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> t
         )
     if keep == 1.0:
         return student, 1.0
+    # Round down to whole Gaussians, so that the file is never larger than allowed.
     keep = math.floor(keep * count) / count
     return student.with_blend_shapes(shapes.pruned(coefficient_std(student, sequence), keep=keep)).eval(), keep
 

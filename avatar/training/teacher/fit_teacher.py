@@ -75,10 +75,12 @@ class TeacherTask(PhotometricTask):
         """Return the loss of one frame; the networks run once for all its cameras."""
         views = self.views(item)
         pose, camera_centers = self.sequence.pose(item.frame), camera_centers_of(views)
+        # Residual maps of the pose; one colour map for each camera.
         maps = self._maps(item, camera_centers)
         posed = self.teacher.posed(pose, camera_centers, maps)
         total, terms, _ = self.compared(posed, views)
         if self.config.displacement:
+            # Penalty of large displacements: where photographs determine nothing, Gaussians stay on the skinned mesh.
             moved = maps.shape[..., :3].square().mean()
             total = total + self.config.displacement * moved
         return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
@@ -86,10 +88,12 @@ class TeacherTask(PhotometricTask):
     def _maps(self, item: Item, camera_centers: Tensor) -> Residuals:
         """Return the residual maps of a frame, with noise on the camera centres of the colour network."""
         pose = self.sequence.pose(item.frame)
+        # Few cameras train the colour network; noise on their places makes it smooth between them.
         noise = self.generator(item.frame).normal(size=camera_centers.shape) * self.config.view_jitter
         center = pose.root_from_world.inverse()[:3, 3]
         away = (camera_centers - center).norm(dim=-1, keepdim=True)
         jittered = camera_centers + away * torch.tensor(noise, dtype=camera_centers.dtype, device=camera_centers.device)
+        # The networks alone run in half precision; rasteriser and losses need float32.
         with self.autocast():
             maps = self.teacher.residual_maps(pose, jittered)
         return Residuals(maps.shape.float(), maps.colour.float(), maps.position_scale)

@@ -81,6 +81,7 @@ class PretrainTeacherTask(PretrainTask):
 
     def _all_residuals(self, frame: int) -> Residuals:
         """Return all residual maps of a frame, seen by one of its cameras."""
+        # The colour network needs a viewpoint; any camera serves, because the target is zero for all of them.
         cameras = self.sequence.cameras(frame, 0, 1, self.seed)
         positions = np.stack([self.sequence.capture.cameras[name].position for name in cameras])
         camera_centers = torch.tensor(positions, dtype=torch.float32, device=self.sequence.device)

@@ -91,6 +91,8 @@ def unobserved_weight(structure: Float[Tensor, "K 3 3"], normals: Float[Tensor, 
         structure: G of the control points.
         normals: n, unit normals of the surface in the T-pose; 0 where there is none.
     """
+    # (I + S^2)^-1, which falls from 1 to a half where S = G / OBSERVED_GRADIENT^2 is 1, and applied twice to a
+    # quarter.
     scaled = structure / OBSERVED_GRADIENT**2
     share = torch.linalg.inv(_unit(structure) + scaled @ scaled)
     in_plane = _unit(structure) - normals[:, :, None] * normals[:, None, :]
@@ -123,6 +125,7 @@ def expected_errors(
         moved: RMS displacement of the points from skinning over the frames, metres.
         known: whether the template is the surface in the first of them.
     """
+    # a^2, the variance at the steady state, (K, 1, 1).
     covariance: dict[int, Tensor] = {}
     steady = (SIMULATION_SHARE * moved + REFERENCE_SIGMA)[:, None, None] ** 2
     for frame in order:
