@@ -41,6 +41,7 @@ def speech_level(sound: Sound) -> float:
     shortest, longest = 0.1, 1200.0  # seconds
     if not shortest <= sound.seconds <= longest:
         raise InputError("sound", expected=f"{shortest:g} to {longest:g} seconds", received=f"{sound.seconds:.2f}")
+    # Root mean square relative to full scale: 1e-3 is -60 dB.
     level = float(np.sqrt(np.mean(np.square(sound.samples))))
     if level < 1e-3:
         raise InputError("sound", expected="a recording of speech", received="silence")
@@ -84,6 +85,8 @@ def clear_pauses(phonemes: Sequence[Phoneme], pauses: Float64[np.ndarray, "N 2"]
         reach = closure if phoneme.name in _STOPS else 0.0
         one = phoneme
         for start, end in pauses if phoneme.name != SILENCE else ():
+            # The pause shrinks by the closure of a stop on both sides; phonemes outside of what is left are not
+            # touched.
             into, out_of = start + reach, end - reach
             if into >= out_of or one.end <= into or one.start >= out_of:
                 continue
@@ -102,6 +105,7 @@ def clear_pauses(phonemes: Sequence[Phoneme], pauses: Float64[np.ndarray, "N 2"]
 def mel_filters() -> Float64[np.ndarray, "257 32"]:
     """Return the weight of each frequency of the Fourier transform in each mel band, 60 to 7600 Hz."""
     lowest, highest = (1127.0 * np.log1p(one / 700.0) for one in (60.0, 7600.0))
+    # BANDS + 2 edges, evenly spaced in mel; band k rises from edge k to edge k + 1 and falls to edge k + 2.
     edges = np.linspace(lowest, highest, BANDS + 2)
     hertz = 700.0 * np.expm1(edges / 1127.0)
     at = np.arange(_FFT_SIZE // 2 + 1)[:, None] * RATE / _FFT_SIZE
@@ -120,6 +124,7 @@ def log_mel(samples: Float32[np.ndarray, " N"]) -> Float32[np.ndarray, "T 32"]:
     quietest = -50.0  # dB of full scale: lower bound of the loudness that levels are relative to
     decay = 4.0  # dB a second, decay of the reference loudness
     rows_at_once = 4096  # bounds the memory of the Fourier transforms
+    # A row ends with its hop, so the zeros before the first sample make the windows causal.
     count = len(samples) // HOP
     whole = np.concatenate([np.zeros(WINDOW - HOP), samples[: count * HOP].astype(np.float64)])
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(WINDOW) / WINDOW)

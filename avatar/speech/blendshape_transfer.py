@@ -56,6 +56,7 @@ class FaceSurface:
                 expected="expressions, a jaw and eyes",
                 received=f"no {', '.join(missing)}" if missing else "no expressions",
             )
+        # The distance between the eyes is the unit of all sizes, so that heads of any size are cut alike.
         joints = np.asarray(body.rest_joints(BodyParams.rest(betas=0, expressions=0)))[0]
         eyes = joints[[names.index(name) for name in _EYES]]
         eye_distance = float(np.linalg.norm(eyes[0] - eyes[1]))
@@ -99,6 +100,8 @@ class FaceSurface:
     @property
     def mouth(self) -> Float64[np.ndarray, " 3"]:
         """The centre of the lips, metres."""
+        # Middle of the box around the pairs, because dense triangulation would pull a mean of the vertices to one
+        # side.
         points = self.vertices[self.lips].reshape(-1, 3)
         return 0.5 * (points.min(axis=0) + points.max(axis=0))
 
@@ -156,6 +159,8 @@ def solve_blendshapes(target: FaceSurface, source: FaceSurface, names: tuple[str
     for k, name in enumerate(ARKIT):
         if name not in names:
             continue
+        # |A c - b|^2 with A = Q R has the minimum of |R c - Q^T b|^2 within the same bounds, a system of E rows
+        # alone.
         goal = wanted[..., names.index(name)]
         parts = goal[pairs[:, 1], 1] - goal[pairs[:, 0], 1]
         right = [(goal * weight[:, None]).ravel(), share * parts / np.sqrt(len(pairs)), np.zeros(len(size))]
@@ -185,6 +190,7 @@ def _align_faces(
         eyes = face.eyes.mean(axis=0)
         frames.append((eyes, np.array([face.eye_distance, eyes[1] - face.mouth[1]])))
     (here, size), (there, goal) = frames
+    # Width scales by the eyes' distance, height by the distance of eyes and mouth, depth by their geometric mean.
     across, up = goal / size
     scale = np.array([across, up, np.sqrt(across * up)])
     mouth = source.mouth
@@ -197,6 +203,7 @@ def _vertex_weights(face: FaceSurface) -> Float64[np.ndarray, " N"]:
     """Return weights of the vertices: Gaussians about mouth and eyes, 0.2 elsewhere."""
     out = np.full(len(face.vertices), 0.2)
     for place, reach in ((face.mouth, 1.0), *((eye, 0.45) for eye in face.eyes)):
+        # Distance in the frontal plane (x, y), in units of the eyes' distance.
         away = np.linalg.norm((face.vertices - place)[:, :2], axis=1) / (reach * face.eye_distance)
         out = np.maximum(out, np.exp(-0.5 * (away / 0.6) ** 2))
     return out

@@ -103,6 +103,7 @@ def articulate(
     reach = 12.0 * max(timing.before, timing.after)  # exp(-12) is negligible
     for row, t in enumerate(times):
         low, high = np.searchsorted(ends, t - reach), np.searchsorted(starts, t + reach)
+        # Time from each phoneme's interval in units of its time constant, 0 inside; D decays as exp(-time).
         near = slice(low, high)
         away = np.maximum(np.maximum((starts[near] - t) / timing.before, (t - ends[near]) / timing.after), 0.0)
         weight = dominance[near] * np.exp(-away)[:, None]

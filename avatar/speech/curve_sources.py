@@ -112,6 +112,7 @@ def _json(path: Path, fps: float) -> Curves:
     stored = as_object(read_json(path, subject="curves"), subject=subject)
     names = [as_text(one, subject=f"{subject}: facsNames") for one in as_list(stored.get("facsNames"), subject=subject)]
     where = _columns([name.lower() for name in names], subject)
+    # A row a frame; columns in the order of `facsNames`.
     matrix = as_numbers(stored.get("weightMat"), (None, len(names)), subject=f"{subject}: weightMat")
     if "exportFps" in stored:
         fps = as_number(stored["exportFps"], subject=f"{subject}: exportFps")

@@ -82,10 +82,12 @@ def recognised_words(sound: Sound, recogniser: Any) -> list[str]:
     Raises:
         InputError: silence, no words, more than 20 minutes.
     """
+    # Recognition wants the best path through the lattice, where the language model weighs whole sentences.
     recogniser.config["bestpath"] = True
     recogniser.activate_search()
     _process(recogniser, _samples(sound))
     words = [one.word.split("(")[0] for one in recogniser.seg() or ()]
+    # Fillers such as <sil> and [NOISE] are not words; numbers in brackets mark a word's alternative pronunciations.
     words = [word for word in words if word[0] not in "<["]
     if not words:
         raise _no_words_heard()

@@ -52,6 +52,7 @@ class ArmPose:
         def rotation(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
             return matrix_from_rotvec(angle * np.eye(3)[axis])
 
+        # From right to left: about the arm's own axis x, down about z, then to the front about x of the body.
         shoulder = rotation(0, -forward) @ rotation(2, -down) @ rotation(0, inward)
         return np.stack([rotvec_from_matrix(shoulder), [0.0, -bend, 0.0], [palm, 0.0, 0.0]])
 
@@ -175,6 +176,7 @@ def _limit_to_observed(body: StandingBody, side: str, pose: ArmPose) -> Float64[
     away = _relative_rotvec(observed, matrix_from_rotvec(wanted))
     size = np.linalg.norm(away, axis=2)
     best = int(np.argmin((size**2) @ joint_weights))
+    # Each joint is rotated from the observed pose towards the wanted one, by MAX_DEVIATION at most.
     held = away[best] * np.minimum(1.0, MAX_DEVIATION / np.maximum(size[best], 1e-9))[:, None]
     return rotvec_from_matrix(observed[best] @ matrix_from_rotvec(held))
 
@@ -193,6 +195,7 @@ def _raise_until_clear(
         if _is_path_clear(body, rest, state, rest):
             return state
         state = np.array(state)
+        # State entries 0 and 9 begin the shoulders' rotation vectors; abduction is about z, mirrored on the right.
         for k, sign in ((0, 1.0), (9, -1.0)):
             lift = matrix_from_rotvec(np.array([0.0, 0.0, sign * step]))
             state[k : k + 3] = rotvec_from_matrix(lift @ matrix_from_rotvec(state[k : k + 3]))
@@ -206,6 +209,7 @@ def _is_path_clear(
     rest: Float64[np.ndarray, " 22"],
 ) -> bool:
     """Test seven states: hands keep 2 cm of clearance, or at most 5 mm less than hanging arms have."""
+    # The last row is the person at rest, whose clearance is the reference: wide clothes may leave less than 2 cm.
     path = start + np.linspace(0.0, 1.0, 7)[:, None] * (end - start)
     distance = body.hand_clearance(pose_arms(body.standing, np.concatenate([path, rest[None]]), rest))
     return bool((distance[:-1] >= min(0.02, float(distance[-1]) - 0.005)).all())

@@ -102,6 +102,7 @@ def find_beats(speech: Speech, rng: np.random.Generator) -> list[Beat]:
         if all(abs(one.start - other.start) >= MIN_BEAT_INTERVAL for other in chosen):
             chosen.append(one)
     chosen.sort(key=lambda one: one.start)
+    # Strokes: the first beat of a phrase, and the first beat after a random interval.
     starts = _phrase_starts(speech.phonemes)
     out: list[Beat] = []
     last, wait, phrase = -np.inf, 0.0, -1
@@ -119,6 +120,7 @@ def find_beats(speech: Speech, rng: np.random.Generator) -> list[Beat]:
 
 def _phrase_starts(phonemes: Sequence[Phoneme], pause: float = 0.2) -> list[float]:
     """Return when phrases begin: after silences of at least `pause` seconds."""
+    # A phrase begins with the first phoneme after a long enough silence, and with the first of all.
     out: list[float] = []
     quiet_since = -np.inf
     for one in phonemes:
@@ -160,6 +162,7 @@ class GesturePlanner:
         self.discard_from(start)
         if not self._size or not self.lexicon.pairs:
             return
+        # Beats in the planner's own time; strokes are reached `lead` ahead of theirs.
         rhythm = [Beat(one.time + start, one.weight, one.stroke) for one in find_beats(speech, self._rng)]
         self._beats += rhythm
         strokes = [one.time for one in rhythm if one.stroke]
@@ -184,6 +187,8 @@ class GesturePlanner:
         away = largest_rotation(self._arms.target, self.lexicon.rest)
         if away < 1e-6:
             return
+        # A slightly different rest each time, because people never return to the same pose. The forearms stop marking
+        # beats.
         jitter = self._size * 0.5 * _TIMING.jitter * self._rng.normal(size=18).clip(-1.5, 1.5)
         rest = self.lexicon.rest + np.concatenate([jitter, np.zeros(4)])
         end = start + max(_TIMING.retraction * away / _TIMING.speed, 0.8)
@@ -222,6 +227,7 @@ class GesturePlanner:
         """Return a smooth curve that dips before a beat, is its weight at the beat, and falls to 0 after it."""
         out = np.zeros(len(times))
         for one in self._beats:
+            # Each beat is a short pulse: a quintic rise with a dip before it, then (1 - u^2)^3.
             before, after = (times - one.time) / _TIMING.rise, (times - one.time) / _TIMING.fall
             rise = np.where((before > -1.0) & (before <= 0.0), _anticipation(before), 0.0)
             fall = np.where((after > 0.0) & (after < 1.0), (1.0 - after**2) ** 3, 0.0)
@@ -244,6 +250,7 @@ class GesturePlanner:
                 break
         if chosen < 0:
             return
+        # Start as late as the speed allows, so that the hands rest or hold until then.
         start = max(free, arrival - max(largest_rotation(now, goal) / _TIMING.speed, _TIMING.min_move))
         self._arms.move(goal, start, arrival)
         far = [np.linalg.norm((goal - rest)[9 * k : 9 * k + 9]) > _TIMING.raised for k in (0, 1)]

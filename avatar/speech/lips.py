@@ -172,6 +172,7 @@ def recognise_phonemes(sound: Sound) -> Speech:
 
 def _convolve(h: Float32[np.ndarray, "I T"], weight: Float32[np.ndarray, "O I W"], dilation: int) -> np.ndarray:
     """Return a causal dilated convolution, with zeros before the start."""
+    # Pad on the left alone: row t sees rows t - (W - 1) dilation to t. One matrix product for each tap of the kernel.
     width = weight.shape[2]
     padded = np.pad(h, ((0, 0), ((width - 1) * dilation, 0)))
     pieces = (weight[:, :, k] @ padded[:, k * dilation : k * dilation + h.shape[1]] for k in range(width))

@@ -74,6 +74,7 @@ class Speech:
     seconds: float
 
     def __post_init__(self) -> None:
+        # Phonemes are sorted and do not overlap; 1e-6 s absorbs rounding of frame times.
         last = 0.0
         for k, one in enumerate(self.phonemes):
             if one.name not in VOWELS | CONSONANTS | {SILENCE}:
@@ -108,6 +109,7 @@ def ipa_from_arpabet(phones: Sequence[str]) -> str:
     """Write a word's ARPAbet phones, with or without stress digits, in IPA as espeak-ng does."""
     out = ""
     for phone in phones:
+        # The stress mark stands before the vowel; three vowels without stress have IPA symbols of their own.
         name, stress = phone.rstrip("012"), phone[-1:]
         mark = {"1": "ˈ", "2": "ˌ"}.get(stress, "")
         out += mark + (_UNSTRESSED.get(name, _TO_IPA[name]) if stress == "0" else _TO_IPA[name])

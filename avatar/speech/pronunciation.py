@@ -161,6 +161,7 @@ def cmu_dictionary() -> dict[str, str]:
         raise MissingExtraError(
             "pocketsphinx (or the program espeak-ng)", extra=EXTRA, purpose="the pronunciation of words"
         )
+    # One word a line, followed by its phones; alternative pronunciations have names such as "word(2)".
     path = Path(str(files("pocketsphinx"))) / "model" / "en-us" / "cmudict-en-us.dict"
     rows = (line.split(None, 1) for line in read_text(path, subject="dictionary").splitlines())
     return {row[0]: row[1].strip() for row in rows if len(row) == 2}
@@ -196,6 +197,7 @@ def _add_stress(phones: str) -> list[str]:
 
     AH, ER, IH and a final IY are counted as reduced vowels.
     """
+    # ARPAbet's vowels are the phones that begin with a vowel letter.
     out = phones.split()
     vowels = [k for k, one in enumerate(out) if one[0] in "AEIOU"]
     full = [k for k in vowels if out[k] not in ("AH", "ER", "IH") and (k, out[k]) != (len(out) - 1, "IY")]
@@ -240,6 +242,8 @@ def _by_dictionary(text: str) -> Pronunciation:
 def _tokens(text: str) -> list[str]:
     """Return words in lower case without accents, numbers spelled out, and pauses."""
     out: list[str] = []
+    # NFKD splits accented letters into letter and accent, which is dropped: "cafe" is in the dictionary, "café" is
+    # not.
     plain = "".join(one for one in unicodedata.normalize("NFKD", text) if not unicodedata.combining(one))
     for token in re.findall(rf"[a-z]+(?:'[a-z]+)?|\d+|[{re.escape(PAUSES)}]", plain.lower().replace("’", "'")):
         out += _spell_number(token) if token.isdigit() else [token]
@@ -248,6 +252,7 @@ def _tokens(text: str) -> list[str]:
 
 def _spell_number(digits: str) -> list[str]:
     """Spell a number below a million in words; spell larger ones, and those with leading zeros, digit by digit."""
+    # Larger numbers are not parsed at all.
     value = int(digits) if len(digits) < 7 else 10**6
     if value >= 10**6 or (len(digits) > 1 and digits[0] == "0"):
         return [_ONES[int(one)] for one in digits]

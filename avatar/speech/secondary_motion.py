@@ -24,6 +24,8 @@ def blinks(times: Float64[np.ndarray, " T"], rng: np.random.Generator) -> Float6
     at = float(rng.uniform(min_interval, mean_interval))
     while len(times) and at < times[-1]:
         since = times - at
+        # Closing and opening are ramps in time; their product is a trapezoid, and overlapping blinks take the larger
+        # one.
         falls = np.clip(since / closing, 0.0, 1.0)
         rises = np.clip((since - closing - closed) / opening, 0.0, 1.0)
         out = np.maximum(out, falls * (1.0 - rises))
@@ -39,6 +41,7 @@ def gaze(times: Float64[np.ndarray, " T"], rng: np.random.Generator) -> Float64[
     at, now, away = 0.0, np.zeros(3), True
     while len(times) and at < times[-1]:
         at += 0.3 + float(rng.exponential(mean_fixation - 0.3))
+        # Alternate between a glance aside and the viewer (zero); each saccade adds its step as a short ramp.
         goal = rng.normal(size=3).clip(-2.0, 2.0) * spread if away else np.zeros(3)
         out += np.clip((times - at) / saccade, 0.0, 1.0)[:, None] * (goal - now)
         now, away = goal, not away
@@ -50,6 +53,7 @@ def head_motion(times: Float64[np.ndarray, " T"], rng: np.random.Generator) -> F
     amplitude = np.radians([1.6, 2.0, 0.8])  # about x, y and z
     out = np.zeros((len(times), 3))
     for hertz, share in ((0.13, 0.6), (0.31, 0.3), (0.73, 0.15)):
+        # The value at time 0 is subtracted, so that the motion starts without a jump.
         phase = rng.uniform(0.0, 2.0 * np.pi, 3)
         speed = 2.0 * np.pi * hertz * rng.uniform(0.85, 1.15, 3)
         out += share * amplitude * (np.sin(times[:, None] * speed + phase) - np.sin(phase))
@@ -62,6 +66,7 @@ def nods(times: Float64[np.ndarray, " T"], rng: np.random.Generator) -> Float64[
     out = np.zeros(len(times))
     at = float(rng.uniform(*interval))
     while len(times) and at < times[-1]:
+        # A second nod has 0.6 of the first one's depth.
         for k in range(int(rng.integers(1, 3))):
             u = np.clip((times - at - k * duration) / duration, 0.0, 1.0)
             out += depth * 0.6**k * np.sin(np.pi * u) ** 2
@@ -87,6 +92,7 @@ class PosturalSway:
             return (0.6 * rng.normal(size=3)).clip(-1.0, 1.0)
 
         def draw_weight(rng: np.random.Generator) -> Float64[np.ndarray, " 3"]:
+            # Side of the leg that bears the weight, then yaw and fore shift, all in [-1, 1].
             side = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 1.0)
             return np.array([side, *draw_trunk(rng)[:2]])
 
@@ -111,12 +117,14 @@ class PosturalSway:
         chest_size, collar_size = np.radians([0.5, 0.7])
         for one in (self._weight, self._trunk):
             one.discard_before(float(times[0]) - 60.0)
+        # Random curves in [-1, 1], scaled to the amplitudes above; the trunk moves less while the person is silent.
         side, yaw, fore = (self._size * self._weight(times)).T
         trunk = self._size * activity[:, None] * trunk_size * self._trunk(times)
         # The hips turn and shift over the feet.
         turn = np.stack([0.0 * yaw, yaw_size * yaw, roll_size * side], axis=1)
         root = matrix_from_rotvec(np.asarray(frames.global_orient)) @ matrix_from_rotvec(turn)
         shift = np.stack([side_shift * side, 0.0 * side, fore_shift * fore], axis=1)
+        # Shifts are given in the body's frame; only their horizontal part moves the root, the feet stay on the floor.
         facing = matrix_from_rotvec(np.asarray(frames.global_orient))
         level = np.einsum("tij,tj->ti", facing, shift) * [1.0, 0.0, 1.0]
         pose = np.array(frames.body_pose).reshape(len(frames), -1, 3)

@@ -136,6 +136,7 @@ class SpeechAnimator:
 
     def rewind(self, seconds: float) -> None:
         """Return to a time and discard what was made for later, as when the person is interrupted."""
+        # Time is counted in whole frames, so that pieces join without gaps whatever their lengths.
         self._made = int(np.clip(round(seconds * self.config.fps), 0, self._made))
         if self.gestures is not None:
             self.gestures.discard_from(self.seconds)

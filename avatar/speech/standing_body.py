@@ -80,6 +80,7 @@ class StandingBody:
         """Return frames whose joints stay within the observed range and its margin; legs are left as they are."""
         if self._range is None:
             return params
+        # Legs are solved by `plant_feet`, and clamping them would lift the feet.
         held = np.array(self._range.clamped(params).body_pose).reshape(len(params), -1, 3)
         held[:, _LEG_ROWS] = np.asarray(params.body_pose).reshape(len(params), -1, 3)[:, _LEG_ROWS]
         return replace(params, body_pose=held.reshape(len(params), -1))
@@ -166,6 +167,9 @@ class _LegSolver:
         self, root: Float64[np.ndarray, "T 3 3"], pelvis: Float64[np.ndarray, "T 3"]
     ) -> Float64[np.ndarray, " T"]:
         """Return the height of the pelvis above where the extended leg reaches the ankle, metres."""
+        # The hip lies on a sphere about the ankle with the extended leg as its radius; its top at the hip's x and z
+        # is the
+        # greatest height.
         to_hip = pelvis + root @ self.offset - self.ankle
         reach = (self.full_length - _KNEE_SLACK) ** 2 - to_hip[:, 0] ** 2 - to_hip[:, 2] ** 2
         return to_hip[:, 1] - np.sqrt(np.maximum(reach, 0.0))
@@ -179,6 +183,9 @@ class _LegSolver:
         ratio = ((to_ankle**2).sum(axis=1) - self.constant) / np.hypot(self.cosine, self.sine)
         bend = np.arctan2(self.sine, self.cosine) + np.arccos(np.clip(ratio, -1.0, 1.0))
         knee = self.knee @ matrix_from_rotvec(bend[:, None] * [1.0, 0.0, 0.0])
+        # Rotate the bent leg, which has the right length, onto the line from hip to ankle; then undo all rotations
+        # above the
+        # foot.
         leg = self.thigh + knee @ self.shin
         upper = _smallest_rotation(leg @ self.hip_in_world.T, to_ankle) @ self.hip_in_world
         hip = np.swapaxes(root, 1, 2) @ upper
@@ -190,6 +197,7 @@ def _smallest_rotation(
     source: Float64[np.ndarray, "T 3"], target: Float64[np.ndarray, "T 3"]
 ) -> Float64[np.ndarray, "T 3 3"]:
     """Return the smallest rotations that align directions with target directions."""
+    # Rotation about a x b by the angle atan2(|a x b|, a . b), accurate at small angles where arccos is not.
     a, b = (one / np.linalg.norm(one, axis=1, keepdims=True) for one in (source, target))
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
@@ -203,6 +211,7 @@ def _choose_standing_frame(skeleton: Skeleton, frames: BodyParams) -> BodyParams
     max_extra_flexion = np.radians(5.0)  # of a knee, above the straightest legs observed
     joints = skeleton.pose(frames)
     feet = joints[:, skeleton.at(*FEET[:2]), 1]
+    # Criteria of standing, metres: difference of the feet's heights, and height of the pelvis above the lower foot.
     apart = feet.max(axis=1) - feet.min(axis=1)
     tall = joints[:, 0, 1] - feet.min(axis=1)
     # Level feet and a high pelvis, or the most level feet if no frame has both.
@@ -211,12 +220,14 @@ def _choose_standing_frame(skeleton: Skeleton, frames: BodyParams) -> BodyParams
     knees = frames.body_pose.reshape(len(frames), -1, 3)[:, [_LEG_ROWS[1], _LEG_ROWS[5]]]
     bent = np.linalg.norm(knees, axis=2).max(axis=1)
     candidates = np.flatnonzero(good & (bent <= bent[good].min() + max_extra_flexion))
+    # Of the candidates the one nearest to the mean pose, since an extreme of the recording makes an odd rest.
     away = np.linalg.norm(frames.body_pose[candidates] - frames.body_pose.mean(axis=0), axis=1)
     return frames.frame(int(candidates[np.argmin(away)]))
 
 
 def _face_forward(frame: BodyParams, skeleton: Skeleton) -> BodyParams:
     """Rotate a frame about the vertical, in place, so that its hips lie along x and it faces +Z."""
+    # The hips' axis in the horizontal plane gives the heading; atan2(z, x) about +y makes it lie along +x.
     left, right = skeleton.pose(frame)[0, skeleton.at("left_hip", "right_hip")]
     across = left - right
     turn = matrix_from_rotvec(np.array([0.0, np.arctan2(across[2], across[0]), 0.0]))

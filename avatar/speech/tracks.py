@@ -23,6 +23,7 @@ class _Move:
     def to(target: Float64[np.ndarray, " n"], state: _State, start: float, end: float) -> _Move:
         """Solve for minimum jerk (Flash and Hogan 1985) with given position, velocity and acceleration at the start."""
         position, velocity, acceleration = state
+        # x(t) = sum c_k t^k with position, velocity and acceleration given at 0 and target, 0, 0 at T: six equations.
         T = end - start
         delta = target - position
         c3 = (20.0 * delta - 12.0 * velocity * T - 3.0 * acceleration * T**2) / (2.0 * T**3)
@@ -68,6 +69,7 @@ class Track:
         """Move to a value, starting at `start` with the state there; discard moves planned for later."""
         assert end > start
         self.discard_from(start)
+        # Start from position, velocity and acceleration there, so that interrupted moves continue smoothly.
         state = tuple(one[0] for one in self._at(np.array([start])))
         self._moves.append(_Move.to(np.asarray(target, np.float64), state, start, end))
 
@@ -124,6 +126,7 @@ class RandomTrack:
     def __call__(self, times: Float64[np.ndarray, " T"]) -> Float64[np.ndarray, "T n"]:
         """Return the values at ascending times in seconds."""
         while len(times) and self._track.end <= times[-1]:
+            # Random numbers are drawn move by move in order of time, whatever times are asked for.
             start = self._track.end + self._rng.uniform(*self._holds)
             self._track.move(self._draw(self._rng), start, start + self._rng.uniform(*self._moves))
         return self._track(times)

@@ -134,6 +134,7 @@ class PiperVoice:
                     owner += [owners[k]] * 2  # a sound begins with the pad before it
         ids += [*self._ids[_PAD], *self._ids[_END]]
         owner += [len(sounds)] * 2
+        # Piper's three scales: noise of the sound, length of the phonemes, noise of their durations.
         scales = np.array([noise, self._scales[1] * slower, noise], np.float32)
         feed = {"input": np.array([ids]), "input_lengths": np.array([len(ids)]), "scales": scales}
         samples, frames = self._model.run(feed)[:2]
