@@ -63,6 +63,8 @@ class ResidualBaseline(Baseline):
         self.gaussians = LearnedGaussians(gaussians)
         self.gaussians.normalise_quats()
         self.codes = FrameCodes(frames, code_size)
+        # Constants of the T-pose: where each Gaussian is, and the
+        # rotation from its triangle's frame to the canonical axes.
         canonical = triangle_frames(rig.vertices, rig.faces)
         self.register_buffer("corner_weights", corner_weights(gaussians.barycentric), persistent=False)
         self.register_buffer("canonical_from_local", canonical.rotations[gaussians.face_index], persistent=False)
@@ -75,8 +77,11 @@ class ResidualBaseline(Baseline):
 
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar as cameras with these centres, metres, see it."""
+        # Frames without a code take the null code, as the student's.
         code = self.codes([pose.frame if pose.frame in self.codes.row else None])[0]
         position, log_scales, quats, colour = self.residuals(pose, code).split((3, 2, 4, 3), dim=-1)
+        # Networks give displacements in canonical axes; they are turned into the triangle's frame, which then carries
+        # them to the pose. Scales, quaternions and colours are added as they are.
         bound = self.gaussians()
         bound = replace(
             bound,
@@ -85,6 +90,7 @@ class ResidualBaseline(Baseline):
             quats=bound.quats + quats,
             dc=bound.dc + colour,
         )
+        # Colours are evaluated at detached means, so that the direction of view does not pull Gaussians elsewhere.
         vertices = self.rig.skin(pose)
         frames = triangle_frames(vertices, self.rig.faces)
         world = world_from_frames(bound, frames)

@@ -21,6 +21,7 @@ def outer_template(template: Template) -> Template:
     Raises:
         InputError: no face can be seen.
     """
+    # Faces under clothes are not seen in the T-pose from any direction; only what is visible is kept.
     seen = seen_faces(template.mesh)
     if not seen.any():
         raise InputError("template", expected="faces that a view from outside sees", received="none")

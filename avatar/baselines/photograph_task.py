@@ -48,6 +48,8 @@ class PhotographTask(PhotometricTask):
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return the loss of one frame, and its terms as numbers."""
+        # With probability `null_share` a pose is shown with the null
+        # code, which thereby learns to stand for unseen frames.
         views = self.views(item)
         pose = self.sequence.pose(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:

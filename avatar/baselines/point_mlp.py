@@ -59,6 +59,8 @@ class PointMLPAvatar(ResidualBaseline):
         # One layer of all inputs, in two parts: that of pose and code is computed once a frame.
         self.of_point = nn.Linear(self.encodings.shape[1], config.width, bias=False)
         self.of_frame = nn.Linear(THETA + config.code_size, config.width)
+        # Initialised as one layer over all inputs would be, by its whole fan-in; the last layer starts at 0, so that
+        # training begins with the skinned template.
         bound = 1.0 / math.sqrt(self.encodings.shape[1] + THETA + config.code_size)
         for layer in (self.of_point, self.of_frame):
             nn.init.uniform_(layer.weight, -bound, bound)
@@ -70,6 +72,8 @@ class PointMLPAvatar(ResidualBaseline):
 
     def residuals(self, pose: Pose, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
         """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
+        # W [phi; theta; z] = W_point phi + W_frame [theta; z]: N
+        # rows from the first term, and one row that is added to all.
         x = F.relu(self.of_point(self.encodings) + self.of_frame(cat([pose.body_pose, code])))
         for layer in self.hidden:
             x = F.relu(layer(x))

@@ -57,6 +57,7 @@ class TexturedMeshAvatar(Baseline):
     def __init__(self, config: TexturedMeshConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> None:
         super().__init__()
         self.config, self.rig = config, rig
+        # Texels are opaque and have one colour (degree 0); each starts with the colour of the nearest fitted Gaussian.
         texels = sample_on_mesh(rig.template, replace(config.sampling, opacity=OPACITY, sh_degree=0))
         texels = replace(texels.to(device=rig.device), dc=_nearest_colors(rig, texels, gaussians))
         self.student = Student(StudentConfig(field=config.field), rig, texels, tuple(frames))
@@ -83,6 +84,7 @@ class TexturedMeshAvatar(Baseline):
 
 def _nearest_colors(rig: Rig, texels: BoundGaussians, gaussians: BoundGaussians) -> Tensor:
     """Return the (N, 3) colours of the nearest Gaussians in the T-pose."""
+    # Both sets of Gaussians are compared by their points on the same template in the T-pose, metres.
     triangles = rig.template.mesh.triangles
 
     def places(bound: BoundGaussians) -> np.ndarray:

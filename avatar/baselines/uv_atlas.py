@@ -48,6 +48,7 @@ def cylinder_atlas(
         points: in the T-pose, metres. faces: each point lies on one of these.
         size: texels a side.
     """
+    # A chart for each body joint and part, renumbered without gaps; each is unrolled to metres along u and v.
     chart = _charts(template)[template.faces[faces, 0]]
     chart = np.unique(chart, return_inverse=True)[1]
     flat = np.zeros((len(points), 2))
@@ -55,8 +56,10 @@ def cylinder_atlas(
         flat[chart == k] = _unrolled(points[chart == k])
     low = np.stack([_by_chart(np.minimum, flat[:, axis], chart) for axis in (0, 1)], axis=1)
     extent = np.stack([_by_chart(np.maximum, flat[:, axis], chart) for axis in (0, 1)], axis=1) - low
+    # One density for all charts keeps texels of the same size everywhere on the body.
     corners, density = _packed(extent, size)
     pixels = corners[chart] + GUTTER + (flat - low[chart]) * density
+    # Each texel takes the nearest point, so that its position can be interpolated from that point's face.
     centres = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).reshape(-1, 2) + 0.5
     distance, nearest = cKDTree(pixels).query(centres)
     anchor = np.where(distance <= REACH, nearest, -1).reshape(size, size)
@@ -65,6 +68,7 @@ def cylinder_atlas(
 
 def _charts(template: Template) -> np.ndarray:
     """Return the (V,) chart of each vertex: part, label of the body there, and the body joint that moves it most."""
+    # Fingers and face have many joints and small areas: move up the tree until a joint of the body is reached.
     joint = np.argmax(template.weights.dense(), axis=1)
     while (beyond := joint >= BODY_JOINTS).any():
         joint = np.where(beyond, template.body.parents[joint], joint)
@@ -93,6 +97,7 @@ def _by_chart(reduce: np.ufunc, values: np.ndarray, chart: np.ndarray) -> np.nda
 
 def _packed(extent: np.ndarray, size: int) -> tuple[np.ndarray, float]:
     """Return (K, 2) corners of K charts in texels, and the largest density, texels a metre, at which they all fit."""
+    # Bisection on the density: the boxes fit at `low` and do not at `high`; 20 halvings are finer than a texel.
     low, high = 0.0, size / max(extent.max(), 1e-6)
     corners = _rows(np.ceil(low * extent) + 2 * GUTTER, size)
     for _ in range(20):
@@ -108,6 +113,7 @@ def _packed(extent: np.ndarray, size: int) -> tuple[np.ndarray, float]:
 
 def _rows(boxes: np.ndarray, size: int) -> np.ndarray | None:
     """Return (K, 2) corners of (K, 2) boxes put in rows, the highest first; None if they do not fit."""
+    # Shelf packing: boxes in rows, sorted by height, so that little of a row's height is lost.
     corners = np.zeros_like(boxes)
     left = top = height = 0.0
     # Each box goes beside the one before it: a loop over charts, not over vertices.

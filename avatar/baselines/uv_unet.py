@@ -53,16 +53,19 @@ class UNet(nn.Module):
     def __init__(self, inputs: int, channels: Sequence[int], outputs: int) -> None:
         super().__init__()
         self.first = ConvLayer(inputs, channels[0])
+        # Each scale halves the side of the finer one on its path down, and is joined with it again on the way up.
         pairs = list(pairwise(channels))
         self.down = nn.ModuleList(ConvLayer(fine, coarse, down=True) for fine, coarse in pairs)
         self.up = nn.ModuleList(ConvLayer(fine + coarse, fine) for fine, coarse in reversed(pairs))
         self.last = nn.Conv2d(channels[0], outputs, 1)
+        # Residuals start at 0, so that training begins with the skinned template.
         nn.init.zeros_(self.last.weight)
         assert self.last.bias is not None
         nn.init.zeros_(self.last.bias)
 
     def forward(self, x: Float[Tensor, "1 I S S"]) -> Float[Tensor, "1 O S S"]:
         """Apply the network to a map of positions."""
+        # Skip connections carry the fine scales across the bottleneck (Ronneberger et al. 2015).
         scales = [self.first(x)]
         for layer in self.down:
             scales.append(layer(scales[-1]))
@@ -89,6 +92,7 @@ class UVUNetAvatar(ResidualBaseline):
         super().__init__(rig, gaussians, frames, code_size=config.code_size)
         self.config = config
         size = config.size
+        # Texels without a point near them stay empty; the others interpolate the corners of their point's face.
         atlas = cylinder_atlas(
             rig.template, self.points.double().cpu().numpy(), gaussians.face_index.cpu().numpy(), size=size
         )
@@ -96,6 +100,7 @@ class UVUNetAvatar(ResidualBaseline):
         texels = torch.nonzero(anchor >= 0)[:, 0]
         grid = torch.tensor(2.0 * atlas.pixels / size - 1.0, dtype=torch.float32, device=rig.device)
         self.register_buffer("texels", texels, persistent=False)
+        # `grid_sample` takes coordinates in [-1, 1] over the whole map.
         face = gaussians.face_index.to(rig.device)[anchor[texels]]
         self.register_buffer("texel_corners", rig.faces[face], persistent=False)
         self.register_buffer("texel_weights", self.corner_weights[anchor[texels]], persistent=False)
@@ -107,6 +112,8 @@ class UVUNetAvatar(ResidualBaseline):
     def position_map(self, pose: Pose) -> Float[Tensor, "1 3 S S"]:
         """Return posed points without the root's motion, metres, 0 between the charts; a constant for gradients."""
         with torch.no_grad():
+            # Without the root's rotation and place the map depends
+            # on the pose alone, and learns no position in the room.
             to_root = pose.root_from_world
             vertices = self.rig.skin(pose) @ to_root[:3, :3].T + to_root[:3, 3]
             seen = (self.texel_weights[..., None] * vertices[self.texel_corners]).sum(1)
@@ -115,6 +122,7 @@ class UVUNetAvatar(ResidualBaseline):
 
     def residuals(self, pose: Pose, code: Float[Tensor, " Z"]) -> Float[Tensor, "N 12"]:
         """Return the outputs in the order of `RESIDUALS`; `code` is that of the frame."""
+        # The code is the same at every texel; each Gaussian then reads its residuals at its own place in the atlas.
         of_frame = code[None, :, None, None].expand(-1, -1, self.config.size, self.config.size)
         maps = self.network(torch.cat([self.position_map(pose), self.person, of_frame], dim=1))
         return F.grid_sample(maps, self.grid, align_corners=False)[0, :, 0].T

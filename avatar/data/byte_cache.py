@@ -26,6 +26,7 @@ class ByteCache:
 
     def get(self, key: Hashable, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Return the cached tensors of a key, or make and cache them, without gradients."""
+        # A hit becomes the most recently used entry.
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key]

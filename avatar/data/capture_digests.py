@@ -17,6 +17,7 @@ def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[
 
     The content of the files is left out, because a sequence has hundreds of gigabytes of them.
     """
+    # Three digests, so that a change can be attributed to cameras, parameters or images.
     cameras, numbers, files = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
     for name, camera in capture.cameras.items():
         cameras.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
@@ -25,6 +26,7 @@ def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[
             cameras.update(repr(capture.recording.distortions[name]).encode())
     for frame, row in params.items():
         _add_frame(numbers, frame, row)
+    # Names and sizes reveal a replaced or missing file at the cost of a directory listing.
     splits, used = capture.splits, 0
     for view, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
         for kind in ("image", "mask", "normal"):
@@ -49,6 +51,7 @@ def params_digest(source: ParamSource) -> str:
 
 
 def _add_frame(numbers: hashlib._Hash, frame: int, row: BodyParams) -> None:
+    # The number first, so that the same parameters in another frame give another digest.
     numbers.update(str(frame).encode())
     for array in ARRAY_NAMES:
         numbers.update(np.ascontiguousarray(getattr(row, array)).tobytes())

@@ -65,6 +65,7 @@ class ClothMotions:
         config: ClothMotionConfig | None = None,
     ) -> None:
         require_positive("frames a second of a motion with simulated clothes", fps)
+        # Shapes are kept for the whole training, because a simulation can only be run in order.
         self.template, self.garments, self.config = template, tuple(garments), config or ClothMotionConfig()
         self._params, self._frames, self._fps = params, np.array(sorted(frames), dtype=np.int64), fps
         self._shapes: dict[int, ClothShape] = {}
@@ -75,6 +76,7 @@ class ClothMotions:
         Raises:
             InputError: a frame that is not among the motion's.
         """
+        # Frames that an earlier run simulated keep their shapes.
         run = sorted(set(run) - set(self._shapes))
         if not run:
             return
@@ -94,6 +96,7 @@ class ClothMotions:
         last: int | None = None
         wanted = set(run)
         for frame in known:
+            # The duration of the first step does not matter, because the simulation starts cold there.
             seconds = 1.0 if last is None else (frame - last) / self._fps
             pose_drawn = self._params(frame)
             shape = driver.follow(paths[frame], seconds, pose_drawn if frame in wanted else None)
@@ -136,6 +139,7 @@ class ClothMotions:
                 poses = resampled(poses, at.astype(float), np.arange(at[-1] + 1.0))
             poses, times = followed(poses, self._fps / even, smoothing=self.config.smoothing)
             out[int(stretch[0])] = [poses.frame(0)]
+            # The filtered motion has `times` poses for each even step; those after the previous frame lead to this one.
             for frame, before, now in zip(stretch.tolist()[1:], at[:-1], at[1:], strict=True):
                 out[frame] = [poses.frame(int(k)) for k in range(times * before + 1, times * now + 1)]
         return out

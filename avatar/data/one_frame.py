@@ -46,6 +46,7 @@ class OneFrame:
         margin: int = 12,
         device: str = "cpu",
     ) -> None:
+        # The vertices are the rest shape of the only pose: no body model is evaluated.
         self.rig, self.device = Rig(template, device), device
         self.background: Tensor = torch.tensor(background, dtype=torch.float32, device=device)
         self.train_frames: tuple[int, ...] = (FRAME,)
@@ -71,6 +72,7 @@ class OneFrame:
 
     def items(self, step: int, *, count: int, views: int, seed: int) -> list[Item]:
         """Return the items of a step; every view comes once an epoch, in an order of the seed and the epoch alone."""
+        # Number views through all steps; dividing by the number of cameras gives the epoch and the place in its order.
         views = min(views, len(self.train_cameras))
         return [
             Item(FRAME, tuple(self._camera_at(number * views + k, seed) for k in range(views)))

@@ -131,6 +131,7 @@ class AvatarSequence:
         device: str = "cpu",
         cloth: ClothMotions | None = None,
     ) -> None:
+        # One reader thread: the next step's images are decoded while the current step computes.
         self.capture, self.config, self.device = capture, config or SequenceConfig(), device
         self.rig = Rig(template, device)
         self.train_cameras, self.train_frames = _training_part(capture)
@@ -150,6 +151,7 @@ class AvatarSequence:
         """Number of training views with a normal map; 0 if normal maps are not read."""
         if not self.config.normals:
             return 0
+        # (cameras, frames) masks: training cameras, training frames, images that exist; then maps among them.
         rows = np.isin(list(self.capture.cameras), self.train_cameras)
         views = rows[:, None] & np.isin(self.capture.frames, self.train_frames) & self.capture.presence()
         return int((views & self.capture.presence("normal")).sum())
@@ -162,6 +164,7 @@ class AvatarSequence:
         Raises:
             InputError: a frame without parameters.
         """
+        # Least recently used poses are dropped, since a sequence may have thousands of frames.
         if frame not in self._poses:
             self._poses[frame] = self._read_pose(frame)
             if len(self._poses) > self.config.kept_poses:
@@ -174,6 +177,7 @@ class AvatarSequence:
 
         The first request simulates all training frames in order, from one cold start.
         """
+        # A training frame has a code and no simulated clothes otherwise; here it is treated as an unseen one.
         pose = self.pose(frame).as_new()
         if self.cloth is None:
             return pose
@@ -194,6 +198,7 @@ class AvatarSequence:
 
         They come at training frames ("novel_view") and at held-out frames ("novel_pose"), where there are any.
         """
+        # Frames are spread over the sequence without its ends, and views without the person are skipped.
         splits = self.capture.splits
         cameras = splits.novel_view_cameras or splits.train_cameras[:2]
         for kind, own in (("novel_view", self.train_frames), ("novel_pose", splits.novel_pose_frames)):
@@ -243,6 +248,7 @@ class AvatarSequence:
 
     def cameras(self, frame: int, visit: int, views: int, seed: int) -> tuple[str, ...]:
         """Return training cameras for the n-th visit of a frame, so that every camera comes equally often."""
+        # The n-th visit takes the n-th group of cameras in a shuffled cycle; a new cycle has a new order.
         names = [name for name in self.train_cameras if self.capture.file(name, frame) is not None]
         views = min(views, len(names))
         chosen = []
@@ -268,6 +274,7 @@ class AvatarSequence:
         return params
 
     def _read_pose(self, frame: int) -> Pose:
+        # Training frames keep the number that selects their code; all others may have simulated clothes.
         if frame in self.train_frames:
             return self.rig.pose(self.params(frame), frame=frame)
         pose = self.rig.pose(self.params(frame))

@@ -58,6 +58,7 @@ class View:
 
     def composited(self, background: Float[Tensor, " 3"]) -> Float32[Tensor, "H W 3"]:
         """Return sRGB in [0, 1] on a background B: `F + (1 - a) B`."""
+        # Foregrounds are premultiplied by opacity, so that only the background is weighted here.
         return self.foreground / 255.0 + (1.0 - self.opacity())[..., None] * background
 
     def photograph(self, background: Sequence[float]) -> UInt8[np.ndarray, "H W 3"]:
@@ -102,6 +103,7 @@ def read_view(capture: Capture, camera: str, frame: int, *, normals: bool = Fals
     Raises:
         InputError: an unknown camera, a damaged image or one of another size than its camera's, or no mask.
     """
+    # `np.array` copies: the tensors must not share memory with the images that the capture caches.
     foreground, alpha = capture.foreground(camera, frame)
     normal_map = capture.normals(camera, frame) if normals else None
     return View(
@@ -118,6 +120,7 @@ def read_views(capture: Capture, frame: int, cameras: Iterable[str]) -> list[Vie
     Raises:
         InputError: an unknown camera, a damaged image or one of another size than its camera's, or no mask.
     """
+    # Missing views end with a warning, but an unknown camera is an error: it is a misspelling.
     views = []
     for name in cameras:
         if name in capture.cameras and capture.file(name, frame) is None:

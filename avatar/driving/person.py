@@ -52,6 +52,7 @@ def person_of_template(template: Template, seen: BodyParams | None = None) -> tu
     Raises:
         InputError: expressions that cannot move a mouth.
     """
+    # Mouth shapes are found by the names of expressions, or by what they do to the surface where names say nothing.
     body = template.body
     face = Face.of(body.expression_names, body.joint_names, seen, body=body)
     frames = _with_expressions(seen, body.num_expressions)
@@ -69,5 +70,6 @@ def _with_expressions(seen: BodyParams | None, expressions: int) -> BodyParams:
     """Return frames padded to all expressions of the body; one frame at rest where there are none."""
     if seen is None:
         return BodyParams.rest(betas=0, expressions=expressions)
+    # Later expressions of the body that the frames lack are 0.
     missing = expressions - seen.expression.shape[1]
     return replace(seen.without_shape(), expression=np.pad(seen.expression, ((0, 0), (0, missing))))

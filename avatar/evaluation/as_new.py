@@ -1,4 +1,4 @@
-"""An avatar that is shown training frames as if they were new."""
+"""Show training frames with an avatar as if their poses were new."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from avatar.rig.rig import Pose, Rig
 
 
 class AsNew(nn.Module):
-    """An avatar that shows every frame as it shows new poses, as it does online: without a frame's code.
+    """An avatar that draws every frame as a new pose, without the frame's code, as it does live.
 
     Args:
-        model: that shows them; its loose clothes are simulated where its own would be in new poses.
+        model: the avatar; its loose clothes are simulated as they are in new poses.
     """
 
     rig: Rig
@@ -31,7 +31,7 @@ class AsNew(nn.Module):
 
 
 def new_pose(sequence: AvatarSequence, frame: int) -> Pose:
-    """Return the pose of any frame as whoever plays it live has it, its clothes simulated."""
+    """Return the pose of any frame as a live player has it: without a code, with simulated clothes."""
     if frame not in sequence.train_frames:
         return sequence.pose(frame)
     return replace(sequence.as_new_pose(frame), known=None)

@@ -1,4 +1,4 @@
-"""Every model measured on the same views, surfaces and pictures."""
+"""Measure every model on the same views and true surfaces, and keep some pictures."""
 
 from __future__ import annotations
 
@@ -21,21 +21,9 @@ from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, S
 from avatar.evaluation.summary import SPREAD_CONVENTION
 from avatar.gaussians.sampling import head_faces
 from avatar.losses.perceptual import PerceptualDistance, load_metric
-from avatar.metrics.speed import CONVENTION as SPEED_CONVENTION
-from avatar.metrics.speed import Speed, bytes_on_disk, measure_speed, parameter_counts
-from avatar.metrics.surface_quality import CONVENTION as SURFACE_CONVENTION
-from avatar.metrics.surface_quality import SAMPLES, SurfaceQuality, mean_surface, surface_quality
-from avatar.metrics.view_quality import (
-    CONVENTION,
-    PERCEPTUAL_CONVENTION,
-    Box,
-    ViewQuality,
-    eight_bit,
-    head_box,
-    head_shown,
-    head_vertices,
-    view_quality,
-)
+from avatar.metrics import speed, surface_quality, view_quality
+from avatar.metrics.surface_quality import SAMPLES, SurfaceQuality, mean_surface
+from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, head_box, head_shown, head_vertices
 from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
 from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
@@ -48,11 +36,13 @@ class EvaluationConfig:
     """Options of an evaluation: views, surfaces, speed and metrics.
 
     Attributes:
-        protocol: which views.
+        protocol: choice of the views.
         metric: perceptual distance: "st-lpips", "lpips" or "none".
-        samples, seed: of the surfaces; 0 samples: no surface is measured.
-        speed_size: width and height of the pictures that are timed. speed_pictures: how many; 0: no speed.
-        shown: views of each set whose pictures are kept, evenly; the worst one comes on top. 0: none.
+        samples: points sampled on each surface; 0: no surface is measured.
+        seed: of the samples.
+        speed_size: width and height of the pictures that are timed.
+        speed_pictures: number of timed pictures; 0: speed is not measured.
+        shown: number of evenly spread views of each set whose pictures are kept beside the worst one; 0: none.
         eps2d: the rasteriser's blur, pixels squared, as in training.
     """
 
@@ -72,7 +62,13 @@ class EvaluationConfig:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Figures, the pictures of some views in the order of sets, and the meshes of a frame of either kind."""
+    """The results of an evaluation.
+
+    Attributes:
+        report: all figures.
+        views: pictures of some views, in the order of sets.
+        surfaces: posed meshes of one training frame and one held-out frame.
+    """
 
     report: EvalReport
     views: tuple[ShownView, ...]
@@ -89,24 +85,26 @@ def evaluate_models(
 ) -> Evaluation:
     """Measure models on a capture: images, surface, speed and size, all by the same rules.
 
-    Every frame is posed once a model, for all cameras of all sets and for the surface. A frame that was trained on
-    takes its own code where a model has codes; any other is shown as new poses are. The head's boxes are those of the
-    sequence's template, whatever a model's own is.
+    Every model poses a frame once, for all cameras of all sets and for the surface. Training frames use their own
+    code where a model has codes; other frames are drawn as new poses. The head's boxes come from the sequence's
+    template, whatever template a model has.
 
     Args:
-        models: modules that are `AvatarModel`s, by the name that tables give them, on the sequence's device.
+        models: on the sequence's device, by their names in tables.
         sequence: the capture and the template of the person.
         files: of the models, for their bytes on disk.
-        progress: called with the share of the frames that are measured.
+        progress: called with the measured share of the frames.
 
     Raises:
-        InputError: no model, a model on another device, no view to measure on, frames without parameters.
+        InputError: no model, a model on another device, no view to measure, frames without parameters.
     """
     config = config or EvaluationConfig()
     _check_models(models, sequence)
+    # Decide everything before any model runs: bad files and empty sets end an evaluation at once, not after hours.
     sets = with_people(sequence.capture, view_sets(sequence.capture, config.protocol))
     truths = truth_frames(sequence.capture, config.protocol, sets) if config.samples else {}
     run = _Run(models, sequence, config, sets, truths, load_metric(config.metric, device=sequence.device))
+    # One pass over all frames, because a pose and its surface serve every set that has the frame.
     frames = sorted({frame for one in sets.values() for frame in one.frames} | set(chain(*truths.values())))
     for done, frame in enumerate(frames):
         progress("frames", done / len(frames))
@@ -134,6 +132,7 @@ class _Run:
         self.skinning_alone: dict[int, SurfaceQuality] = {}
         self.gallery = Gallery(sets, config.shown)
         self.meshes: dict[str, ShownSurface] = {}
+        # The middle frame of each part shows the surfaces in pictures.
         self._middle = {frames[len(frames) // 2]: name for name, frames in truths.items()}
         self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
         self._head_faces: dict[int, Bool[np.ndarray, " F"] | None] = {}
@@ -141,12 +140,15 @@ class _Run:
     def measure(self, frame: int) -> None:
         """Measure all sets' views and the surface of one frame."""
         sequence = self.sequence
+        # Cameras of this frame in all sets, each once: a view that two sets share is drawn once.
         cameras = list(dict.fromkeys(c for one in self.sets.values() for c, f in one.views if f == frame))
         views = [sequence.whole_view(camera, frame) for camera in cameras]
+        # The skinned template places the head for all models alike, so that all are compared over the same pixels.
         skinned = sequence.rig.skin(sequence.pose(frame).without_cloth())
         corners = skinned[self._head].double().cpu().numpy()
         heads = [head_box(corners, view.camera) for view in views]
         shown = [self._head_shown(skinned, view) for view in views]
+        # The true surface, and the baseline that needs no training: linear blend skinning of the template.
         truth = alone = None
         if any(frame in frames for frames in self.truths.values()):
             truth = sequence.capture.truth_mesh(frame)
@@ -156,14 +158,16 @@ class _Run:
             if frame in self._middle:
                 part = self._middle[frame]
                 self.meshes[part] = ShownSurface(part, frame, truth, {SKINNING_ALONE: mesh})
-        # A frame that only its surface is measured of is posed for any eye: the mesh does not depend on it.
+        # The mesh does not depend on the eye: a frame that has no view, but a surface, gets any centre.
         camera_centers = camera_centers_of(views) if views else skinned.new_zeros(1, 3)
+        # Draw and compare every model, in its evaluation mode and without gradients.
         pictures: list[dict[str, UInt8[np.ndarray, "H W 3"]]] = [{} for _ in views]
         for name, model in self.models.items():
             with at_rest(model):
                 posed = model(_pose(model, sequence, frame), camera_centers)
                 for index, view in enumerate(views):
                     pictures[index][name] = self._see(name, posed, index, view, frame, (heads[index], shown[index]))
+            # Models that deform nothing have the mesh of skinning, whose distances are known already.
             if truth is not None and alone is not None:
                 if model.rig.template is sequence.rig.template and torch.equal(posed.vertices, skinned):
                     self.surfaces[name][frame] = alone
@@ -177,23 +181,25 @@ class _Run:
 
     def result(self, files: Mapping[str, Path]) -> Evaluation:
         """Make the report of all frames, with speed and size."""
+        # Means over frames are taken here, once all frames are measured.
         models = {
             name: ModelFigures(
                 views=self.views[name],
                 surfaces=self._by_set(self.surfaces[name]),
                 speed=self._speed(model),
-                parameters=parameter_counts(model),
-                bytes=bytes_on_disk(files[name]) if name in files else None,
+                parameters=speed.parameter_counts(model),
+                bytes=speed.bytes_on_disk(files[name]) if name in files else None,
             )
             for name, model in self.models.items()
         }
         metric = None if self.metric is None else self.metric.name
+        # A report states in words what each of its figures means.
         conventions = {
-            "images": CONVENTION,
+            "images": view_quality.CONVENTION,
             "spread": SPREAD_CONVENTION,
-            **({} if metric is None else {metric: PERCEPTUAL_CONVENTION}),
-            **({"surface": SURFACE_CONVENTION} if self.truths else {}),
-            **({"speed": SPEED_CONVENTION} if self.config.speed_pictures else {}),
+            **({} if metric is None else {metric: view_quality.PERCEPTUAL_CONVENTION}),
+            **({"surface": surface_quality.CONVENTION} if self.truths else {}),
+            **({"speed": speed.CONVENTION} if self.config.speed_pictures else {}),
         }
         report = EvalReport(self.sequence.capture.name, metric, models, self._by_set(self.skinning_alone), conventions)
         return Evaluation(report, self.gallery.views(), tuple(self.meshes[name] for name in self.truths))
@@ -222,7 +228,7 @@ class _Run:
         """Draw one view of a model and compare it, for every set that has the view; return the picture."""
         background = self.sequence.background
         drawn = render_view(posed, index, view, background, eps2d=self.config.eps2d)
-        quality = view_quality(
+        quality = view_quality.view_quality(
             view, drawn.image, drawn.alpha, background, head=head[0], head_pixels=head[1], metric=self.metric
         )
         for part in self._sets_of(view, frame):
@@ -241,7 +247,7 @@ class _Run:
         return [part for part, one in self.sets.items() if (view.name, frame) in one.views]
 
     def _surface(self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
-        return surface_quality(
+        return surface_quality.surface_quality(
             mesh,
             rig.template.vertex_labels,
             truth,
@@ -254,12 +260,13 @@ class _Run:
         parts = {name: {f: frames[f] for f in chosen} for name, chosen in self.truths.items()}
         return {name: Surfaces(mean_surface(list(part.values())), part) for name, part in parts.items()}
 
-    def _speed(self, model: AvatarModel) -> Speed | None:
+    def _speed(self, model: AvatarModel) -> speed.Speed | None:
         """Time pictures of the first set's first camera, through the poses of that set."""
         if not self.config.speed_pictures:
             return None
+        # Speed depends on the picture's size and the number of Gaussians, so that one camera and one set suffice.
         capture, first = self.sequence.capture, next(iter(self.sets.values()))
-        return measure_speed(
+        return speed.measure_speed(
             model,
             [_params(self.sequence, frame) for frame in first.frames],
             capture.cameras[first.views[0][0]],
@@ -277,7 +284,7 @@ def _params(sequence: AvatarSequence, frame: int) -> BodyParams:
 
 
 def _faces_of_head(rig: Rig) -> Bool[np.ndarray, " F"] | None:
-    """Return the template's faces that are the head's; None for a body without a head."""
+    """Return the mask of the faces of the template's head; None for a body without a head."""
     try:
         return head_faces(rig.template)
     except InputError:
@@ -289,7 +296,8 @@ def _mesh(vertices: Float[Tensor, "V 3"], rig: Rig) -> TriangleMesh:
 
 
 def _pose(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Pose:
-    """Pose a frame for a model's own template; clothes are simulated for students alone, others are as published."""
+    """Return a frame's pose for a model's own template, with simulated clothes for students with a field alone."""
+    # A model with a template of its own (a baseline's) is posed by its own rig, where no garments are simulated.
     pose = new_pose(sequence, frame) if isinstance(model, AsNew) else sequence.pose(frame)
     if model.rig.template is sequence.rig.template:
         return pose if simulates(model) else pose.without_cloth()
@@ -297,9 +305,9 @@ def _pose(model: AvatarModel, sequence: AvatarSequence, frame: int) -> Pose:
 
 
 def simulates(model: AvatarModel) -> bool:
-    """Whether loose clothes of a model are simulated: those of students with a field, in its place.
+    """Return whether a model's loose clothes are simulated: those of students with a field, which it replaces.
 
-    Gaussians that follow the joints alone are the baseline that simulation is held against.
+    Students without a field are the baseline for the simulation, because their Gaussians follow the joints alone.
     """
     shown = model.model if isinstance(model, AsNew) else model
     return isinstance(shown, Student) and shown.field is not None

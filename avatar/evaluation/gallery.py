@@ -1,4 +1,4 @@
-"""The pictures that an evaluation keeps: some views of every set, evenly, and the worst one."""
+"""Keep pictures of an evaluation: some views of every set, spread evenly, and the worst one."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ class ShownView:
 
     Attributes:
         set: of views, among `protocol.SETS`.
-        truth: the photograph. rendered: by model. head: box of the head, None where it is not in the image.
-        chosen: "evenly" among the views of its set, or "worst": no other view of the set has a lower PSNR of the
-            person, as the last model draws it.
+        camera: name of the camera.
+        frame: number of the frame.
+        truth: the photograph, sRGB.
+        rendered: pictures by model, sRGB.
+        head: box of the head; None where it is not in the image.
+        chosen: "evenly" among the views of its set, or "worst": the last model's PSNR of the person is the lowest of
+            the set.
     """
 
     set: str
@@ -39,8 +43,10 @@ class ShownSurface:
     """Posed meshes of one frame for pictures.
 
     Attributes:
-        set: "training" or "held_out". truth: the true surface.
-        posed: by model, "skinning alone" first; without the models whose mesh follows its joints alone.
+        set: "training" or "held_out".
+        frame: number of the frame.
+        truth: the true surface.
+        posed: meshes by model, "skinning alone" first; models whose mesh only follows the joints are left out.
     """
 
     set: str
@@ -50,13 +56,15 @@ class ShownSurface:
 
 
 class Gallery:
-    """Chooses among the views that an evaluation passes; holds no more pictures than it will give.
+    """A selection of views of a running evaluation, which holds no other pictures.
 
     Args:
-        count: views of each set that are kept evenly; 0: none, and no worst one either.
+        sets: all views of the evaluation.
+        count: number of evenly spread views of each set; 0: none, and no worst one either.
     """
 
     def __init__(self, sets: Mapping[str, ViewSet], count: int) -> None:
+        # The even choice is known beforehand, so that no other picture is held but the worst of each set so far.
         self._order = list(sets)
         self._evenly = {(name, *pair) for name, one in sets.items() for pair in one.spread(count)}
         self._with_worst = count > 0
@@ -64,10 +72,11 @@ class Gallery:
         self._worst: dict[str, tuple[float, ShownView]] = {}
 
     def pass_by(self, view: ShownView, psnr: float) -> None:
-        """Keep a view if it is one of those to show, or worse than all of its set before.
+        """Keep a view if it was chosen, or if its PSNR is the lowest of its set so far.
 
         Args:
-            psnr: dB over the person, of the model that the worst view is the worst of.
+            view: with its pictures.
+            psnr: dB over the person, of the last model.
         """
         if (view.set, view.camera, view.frame) in self._evenly:
             self._kept.append(view)
@@ -75,7 +84,8 @@ class Gallery:
             self._worst[view.set] = psnr, replace(view, chosen="worst")
 
     def views(self) -> tuple[ShownView, ...]:
-        """Return what was kept in the order of sets, each set's worst view last, though it be kept evenly too."""
+        """Return the kept views in the order of sets, each set's worst view last, even if it was also kept evenly."""
+        # In the order of the sets, then by frame and camera.
         worst = [view for _, view in self._worst.values()]
         kept = [*self._kept, *worst]
         return tuple(

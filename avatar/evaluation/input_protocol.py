@@ -1,4 +1,4 @@
-"""What an evaluation's figures rest on: exact or tracked inputs, by one name and each for itself."""
+"""Describe the inputs behind an evaluation's figures: exact, tracked or mixed, one by one and in one word."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ NORMALS = ("true", "estimated", "none", NOT_KNOWN)
 
 @dataclass(frozen=True)
 class InputProtocol:
-    """The inputs of a run as far as somebody says what they are; nothing in it is guessed.
+    """The origin of the inputs of a run, as far as it is recorded; nothing is guessed.
 
     Attributes:
-        parameters: of the body, among `PARAMETERS`: "tracked" are fitted to images, or exact ones with such errors;
-            "mixed": the template's and the frames' are not of one kind.
-        labels: of the scan that the template is made of, among `LABELS`.
-        normals: maps of the training views, among `NORMALS`; "none": there are no such maps.
-        stage: what the run made the parameters by, among `STAGES`; "": they are the capture's.
-        views_with_normals, training_views: numbers of the training views that have a map, and of all; None where it is
-            not known.
-        training_frames, training_cameras: numbers that the models were trained on; None where it is not known.
+        parameters: of the body, among `PARAMETERS`. "tracked": fitted to images, or exact ones with such errors added;
+            "mixed": of different kinds for template and frames.
+        labels: of the template's scan, among `LABELS`.
+        normals: maps of the training views, among `NORMALS`; "none": there are no maps.
+        training_frames: number of frames that the models were trained on; None: not known.
+        training_cameras: number of cameras that the models were trained on; None: not known.
+        stage: stage of the run that estimated the parameters, among `STAGES`; "": they are the capture's.
+        views_with_normals: number of training views with a normal map; None: not known.
+        training_views: number of all training views; None: not known.
 
     Raises:
-        InputError: another word.
+        InputError: a value that is not among the choices.
     """
 
     parameters: str = NOT_KNOWN
@@ -54,14 +55,15 @@ class InputProtocol:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> InputProtocol:
-        """Make it of its fields by name, as JSON holds them.
+        """Return the protocol whose fields JSON holds by name.
 
         Raises:
-            InputError: another word than those known.
+            InputError: an unknown field or value.
         """
         # The name follows from the fields.
         known = {f.name for f in fields(InputProtocol)} | {"name"}
         require_known("inputs of an evaluation", values, known)
+        # JSON has no classes: check each value against the type of its field, integers or texts.
         for field in fields(InputProtocol):
             value = values.get(field.name, field.default)
             if value is not None and not isinstance(value, int if str(field.type).startswith("int") else str):
@@ -72,11 +74,12 @@ class InputProtocol:
 
     @property
     def name(self) -> str:
-        """One word for all inputs, the first of every caption.
+        """One word for all inputs, with which every caption begins.
 
-        "exact": all that there are are the truth; "tracked": parameters tracked, labels estimated, normals estimated or
-        none; "not known": one of them is not; else "mixed".
+        "exact": all given inputs are the truth; "tracked": parameters are tracked, labels estimated, and normals
+        estimated or none; "not known": one of them is not known; else "mixed".
         """
+        # One unknown input makes the whole unknown; "exact" and "tracked" need all inputs to agree.
         if NOT_KNOWN in (self.parameters, self.labels, self.normals):
             return NOT_KNOWN
         if (self.parameters, self.labels) == (EXACT, "true") and self.normals in ("true", "none"):
@@ -86,7 +89,8 @@ class InputProtocol:
         return MIXED
 
     def sentence(self) -> str:
-        """Everything in one line for a table's caption."""
+        """Return all inputs in one line for a table's caption."""
+        # Each part is named only as far as it is known, so that a caption never states a guess.
         trained = "trained on a number of frames that is not known"
         if self.training_frames is not None and self.training_cameras is not None:
             trained = (

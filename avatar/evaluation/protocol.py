@@ -1,4 +1,4 @@
-"""Which views an evaluation looks at: training views, held-out cameras, held-out frames."""
+"""Choose the views of an evaluation: training views, held-out cameras, held-out frames."""
 
 from __future__ import annotations
 
@@ -16,21 +16,20 @@ SETS: Mapping[str, str] = {
     "novel_pose": "novel poses",
     "novel_pose_training_view": "novel poses, training cameras",
 }
-"""Name -> title. `novel_pose` is seen from the held-out cameras, so that both are new."""
+"""Titles by name. In `novel_pose` held-out cameras see held-out frames, so that both are new."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProtocolConfig:
-    """Which (camera, frame) pairs are measured.
+    """Choice of the measured (camera, frame) pairs.
 
     Attributes:
-        sets: names among `SETS`; empty: all that the capture has views for.
-        every: every n-th frame of what is held out, from the first on: of the held-out frames, and of the training
-            frames as held-out cameras see them.
-        training_every: every n-th training frame of the training views and of the true surfaces; never more of them
-            than `every` takes.
-        cameras_a_frame: of the training cameras, which take turns from frame to frame; held-out ones are all taken.
-        held_out_cameras, held_out_frames: in the place of those that the capture's splits hold out.
+        sets: names among `SETS`; empty: all sets with views.
+        every: step in frames for held-out frames, and for training frames seen by held-out cameras.
+        training_every: step in frames for training views and true surfaces; at least `every` is used.
+        cameras_a_frame: number of training cameras measured in a frame, which take turns; held-out ones are all used.
+        held_out_cameras: cameras to hold out; empty: those of the capture's splits.
+        held_out_frames: frames to hold out; empty: those of the capture's splits.
     """
 
     sets: tuple[str, ...] = ()
@@ -47,7 +46,7 @@ class ProtocolConfig:
 
     @property
     def training_step(self) -> int:
-        """Every n-th training frame is seen from training cameras, and has its surface measured."""
+        """Step in training frames between those with measured training views and surfaces."""
         return max(self.every, self.training_every)
 
 
@@ -56,7 +55,8 @@ class ViewSet:
     """Set of views that are measured together.
 
     Attributes:
-        name: among `SETS`. views: (camera, frame), frame by frame.
+        name: among `SETS`.
+        views: pairs of camera and frame, frame by frame.
     """
 
     name: str
@@ -73,17 +73,17 @@ class ViewSet:
         return tuple(sorted({frame for _, frame in self.views}))
 
     def spread(self, count: int) -> tuple[tuple[str, int], ...]:
-        """At most `count` of the views, evenly from first to last."""
+        """Return at most `count` of the views, evenly from first to last."""
         return tuple(spread(self.views, count))
 
 
 def view_sets(capture: Capture, config: ProtocolConfig) -> dict[str, ViewSet]:
-    """The sets of an evaluation by name, in the order of `SETS`; decided by files that exist, none is opened.
+    """Return the sets of an evaluation by name, in the order of `SETS`; files only have to exist and are not opened.
 
     Raises:
-        InputError: a set that was asked for is empty, or all are; unknown cameras or frames; a frame without
-            parameters.
+        InputError: a requested set is empty, or all are; unknown cameras or frames; a frame without parameters.
     """
+    # Training cameras take turns from frame to frame, since all of them at every frame would dominate the evaluation.
     splits = measured_splits(capture, config)
     pairs = {
         "training": _taking_turns(capture, splits.train_cameras, splits.train_frames[:: config.training_step], config),
@@ -93,9 +93,11 @@ def view_sets(capture: Capture, config: ProtocolConfig) -> dict[str, ViewSet]:
             capture, splits.train_cameras, splits.novel_pose_frames[:: config.every], config
         ),
     }
+    # Sets that were asked for have to hold views; without a request empty ones are left out.
     wanted = config.sets or tuple(name for name in SETS if pairs[name])
     sets = {name: ViewSet(name, tuple(pairs[name])) for name in SETS if name in wanted}
     _require_views(capture, sets)
+    # A model can be posed only where the body's parameters are known.
     without = sorted({f for s in sets.values() for f in s.frames if capture.params(f) is None})
     if without:
         raise InputError(
@@ -108,17 +110,18 @@ def view_sets(capture: Capture, config: ProtocolConfig) -> dict[str, ViewSet]:
 
 
 def with_people(capture: Capture, sets: Mapping[str, ViewSet]) -> dict[str, ViewSet]:
-    """The sets without views whose mask is empty; reads every view, so that a bad file ends it before work starts.
+    """Return the sets without views whose mask is empty; every view is read, so that bad files are found early.
 
     Raises:
-        InputError: a set in which no view is left; a damaged image, one of another size than its camera's, no mask.
+        InputError: no view is left in a set; a damaged image, one of another size than its camera's, no mask.
     """
+    # PSNR over the person has no value where the mask is empty.
     left = {}
     for name, one in sets.items():
         seen = [pair for pair in one.views if capture.foreground(*pair)[1].any()]
         if len(seen) < len(one.views):
             warnings.warn(
-                f"{one.title}: nobody in the masks of {len(one.views) - len(seen)} of {len(one.views)} views; "
+                f"{one.title}: no person in the masks of {len(one.views) - len(seen)} of {len(one.views)} views; "
                 "they are left out",
                 GeometryWarning,
                 stacklevel=2,
@@ -129,13 +132,14 @@ def with_people(capture: Capture, sets: Mapping[str, ViewSet]) -> dict[str, View
 
 
 def truth_frames(capture: Capture, config: ProtocolConfig, sets: Mapping[str, ViewSet]) -> dict[str, tuple[int, ...]]:
-    """Frames whose true surface is measured, "training" and "held_out", as far as the sets look at either.
+    """Return the frames with a measured true surface, "training" and "held_out", for the parts that the sets use.
 
-    Of every `every` held-out frames in a row, and of every `training_step` training frames, the first that has a
-    surface and parameters: surfaces need not be there for the frames that views are measured on.
+    These are the first frames with surface and parameters of every `every` held-out frames in a row, and of every
+    `training_step` training frames. Frames with measured views need no surface.
     """
     if capture.recording.meshes is None:
         return {}
+    # Frames are taken block by block, so that a frame without a surface is replaced by the next one and not lost.
     splits = measured_splits(capture, config)
     wanted = {"held_out" if name.startswith("novel_pose") else "training" for name in sets}
     out = {}
@@ -155,9 +159,10 @@ def _has_truth(capture: Capture, frame: int) -> bool:
 
 
 def measured_splits(capture: Capture, config: ProtocolConfig) -> Splits:
-    """The capture's splits with the user's choice of what is held out."""
+    """Return the capture's splits, with the held-out cameras and frames of the configuration."""
     require_known("held-out cameras", config.held_out_cameras, capture.cameras)
     require_known("held-out frames", config.held_out_frames, capture.frames)
+    # What is held out on request is taken from the training part, so that no view is in both.
     splits = capture.splits
     if config.held_out_cameras:
         train = tuple(name for name in capture.cameras if name not in config.held_out_cameras)
@@ -172,7 +177,8 @@ def measured_splits(capture: Capture, config: ProtocolConfig) -> Splits:
 def _taking_turns(
     capture: Capture, cameras: Sequence[str], frames: Sequence[int], config: ProtocolConfig
 ) -> list[tuple[str, int]]:
-    """A few cameras a frame, the next ones in the next frame, so that all of them are looked through."""
+    """Return views of a few cameras a frame, the next ones in the next frame, so that all cameras are used."""
+    # A window of `cameras_a_frame` cameras advances through those that have an image of the frame.
     out, turn = [], 0
     for frame in frames:
         there = [name for name in cameras if capture.file(name, frame) is not None]
@@ -187,7 +193,7 @@ def _require_views(capture: Capture, sets: Mapping[str, ViewSet]) -> None:
     if empty or not sets:
         splits = capture.splits
         raise InputError(
-            f"views of capture {capture.name} to measure on",
+            f"views of capture {capture.name} to measure",
             expected=f"some for {', '.join(empty)}" if empty else "some",
             received=f"none; {len(splits.novel_view_cameras)} cameras and {len(splits.novel_pose_frames)} frames are "
             f"held out, images of {int(capture.presence().any(axis=0).sum())} frames are there",

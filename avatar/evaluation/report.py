@@ -1,4 +1,4 @@
-"""What an evaluation found, as data that goes to JSON and back."""
+"""Store the figures of an evaluation, and write and read them as JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from smplxpp.metrics.pose_error import PoseError
 SCHEMA = 1
 _SUBJECT = "evaluation report"
 SKINNING_ALONE = "skinning alone"
-"""Row of the template that follows its joints, beside the models' meshes."""
+"""Name of the table row of the template after linear blend skinning, beside the models."""
 SURFACE_SETS: Mapping[str, str] = {"training": "training frames", "held_out": "held-out frames"}
 
 
@@ -30,7 +30,7 @@ def view_key(camera: str, frame: int) -> str:
 
 @dataclass(frozen=True)
 class ViewCounts:
-    """The numbers of what a set of views holds."""
+    """Numbers of images, frames and cameras of a set of views."""
 
     images: int
     frames: int
@@ -39,7 +39,7 @@ class ViewCounts:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Distances to the true surfaces of some frames: each frame's, and their mean."""
+    """Distances to the true surfaces of some frames, each frame's and their mean."""
 
     mean: SurfaceQuality
     frames: dict[int, SurfaceQuality]
@@ -55,10 +55,11 @@ class ModelFigures:
     """All figures that were measured on one model.
 
     Attributes:
-        views: set -> view -> its figures.
-        surfaces: "training" and "held_out" -> distances; without those that have no true surface.
+        views: figures by set and view.
+        surfaces: distances by part, "training" or "held_out"; parts without a true surface are left out.
         speed: None where it was not measured.
-        parameters: by part of the model, and "total". bytes: of its file, None without one.
+        parameters: number of parameters by part of the model, and "total".
+        bytes: size of the model's file; None without one.
     """
 
     views: dict[str, dict[str, ViewQuality]] = field(default_factory=dict)
@@ -73,6 +74,8 @@ class ModelFigures:
 
     def spread(self, name: str) -> dict[str, float]:
         """Return the standard deviations over frames of a set's figures, each the mean over a frame's cameras."""
+        # Cameras of one frame see the same pose, so that their errors are not independent: first their mean, then the
+        # standard deviation over frames.
         by_frame: dict[str, dict[str, ViewQuality]] = {}
         for key, quality in self.views.get(name, {}).items():
             camera, frame = key.rsplit("_", 1)
@@ -90,14 +93,15 @@ class EvalReport:
     """An evaluation of models on a capture.
 
     Attributes:
-        capture: its name. metric: name of the perceptual distance, None without one.
-        models: by name, in the order of tables.
-        skinning_alone: distances of the template that follows its joints, as `ModelFigures.surfaces`.
-        conventions: what the figures mean, in words.
-        inputs: what the figures rest on, as far as it is known.
-        refined_poses: models in held-out frames whose poses were refined on the training cameras' photographs; in
-            `models` they are as the tracker gave them.
-        poses: errors of the poses in use, by frames ("training frames" ...), where the exact ones are known.
+        capture: name of the capture.
+        metric: name of the perceptual distance; None without one.
+        models: figures by name, in the order of tables.
+        skinning_alone: distances of the skinned template, as `ModelFigures.surfaces`.
+        conventions: definitions of the figures, in words.
+        inputs: origin of the inputs, as far as it is known.
+        refined_poses: figures of held-out frames whose poses were refined on the training cameras' photographs; in
+            `models` their poses are the tracker's.
+        poses: errors of the poses in use, by frames ("training frames" ...), where the exact poses are known.
     """
 
     capture: str
@@ -110,7 +114,8 @@ class EvalReport:
     poses: dict[str, PoseError] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """Make what JSON holds, with counts, means and spreads; infinite figures are null, as JSON has none."""
+        """Return the content of the JSON, with counts, means and spreads; infinite figures become null."""
+        # Means, spreads and counts are written for readers of the file; `from_dict` computes them from the views again.
         out = jsonable(self)
         out["inputs"]["name"] = self.inputs.name
         for key, models in (("models", self.models), ("refined_poses", self.refined_poses)):
@@ -123,11 +128,12 @@ class EvalReport:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> EvalReport:
-        """Make the report that `as_dict` was called on; files from before counts and inputs were kept are read too.
+        """Return the report of an `as_dict`; older files, without counts and inputs, are read too.
 
         Raises:
-            InputError: something else.
+            InputError: another schema, or content that does not fit it.
         """
+        # Reports of another schema may have other figures under the same names.
         if values.get("schema") != SCHEMA:
             raise InputError(
                 "evaluation report",
@@ -187,7 +193,7 @@ def _model(values: Mapping[str, Any]) -> ModelFigures:
 
 
 def _view(key: str) -> str:
-    """The name of a view, if it is one: see `view_key`."""
+    """Return the name of a view, checked to be one of `view_key`."""
     camera, _, frame = key.rpartition("_")
     if not camera or not frame.isdecimal():
         raise InputError(f"{_SUBJECT}: view", expected="CAMERA_FRAME", received=repr(key[:80]))
@@ -205,14 +211,14 @@ def _speed(values: Mapping[str, Any]) -> Speed:
 
 
 def _pose(values: Mapping[str, Any]) -> PoseError:
-    # Distances of vertices that there are none of are null.
+    # A group without vertices has no distance: null in the file.
     figures = {name: float("nan") if value is None else value for name, value in values.items() if name != "frames"}
     _require_figures(figures, finite=False)
     return PoseError(frames=int(values["frames"]), **figures)
 
 
 def _quality(values: Mapping[str, Any]) -> ViewQuality:
-    # The figures that every view has are null only where they were infinite.
+    # Every view has these two figures, so that a null means an infinite PSNR.
     _require_figures(values)
     return ViewQuality(**{**values, **{k: float("inf") for k in ("psnr", "psnr_image") if values[k] is None}})
 
@@ -225,6 +231,7 @@ def _surfaces(values: Mapping[str, Any]) -> dict[str, Surfaces]:
 
 
 def _surface(values: Mapping[str, Any]) -> SurfaceQuality:
+    # The labels of a surface have the same figures as the surface itself, hence the recursion.
     figures = {name: value for name, value in values.items() if name != "labels"}
     _require_figures(figures)
     return SurfaceQuality(**figures, labels={name: _surface(part) for name, part in values["labels"].items()})

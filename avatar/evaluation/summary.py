@@ -1,4 +1,4 @@
-"""The tables of an evaluation: images by set of views, surface, cost, and all in one line a model."""
+"""Make the tables of an evaluation: images by set of views, surface, cost, and a summary with a row a model."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ def summary_figures(model: ModelFigures) -> dict[str, float | None]:
     `.spread`, a standard deviation over frames; `SET.images`, `SET.frames` and `surface.SET.frames` are counts.
     """
     out: dict[str, float | None] = {}
+    # The mean of each figure over the views of a set, its standard deviation over frames, and the counts behind both.
     for name in model.views:
         counts = model.counts(name)
         out |= {f"{name}.{key}": value for key, value in model.mean(name).items()}
@@ -49,6 +50,7 @@ def surface_figures(surfaces: Mapping[str, Surfaces]) -> dict[str, float | None]
     """Return mean distances by `surface.SET.FIGURE`, of a label by `surface.SET.LABEL.FIGURE`, with their spreads."""
     out: dict[str, float | None] = {}
     for name, one in surfaces.items():
+        # The whole surface first, then each label's part of it.
         for quality, end in ((one.mean, ""), (one.spread, SPREAD)):
             for prefix, part in (("", quality), *((f"{label}.", q) for label, q in quality.labels.items())):
                 for key in ("p2s", "truth_to_mesh", "chamfer", "p95"):
@@ -58,8 +60,9 @@ def surface_figures(surfaces: Mapping[str, Surfaces]) -> dict[str, float | None]
 
 
 def summary_table(report: EvalReport) -> FigureTable:
-    """Make the line that a paper prints of every model: novel views, novel poses, surface, cost."""
+    """Make the summary table, a row a model: novel views, novel poses, surface, cost."""
     metric = report.metric or ""
+    # Groups of columns: two sets of views, two parts of surfaces, and the cost. Those without figures vanish.
     columns = []
     for name in ("novel_view", "novel_pose"):
         columns += [
@@ -82,7 +85,7 @@ def summary_table(report: EvalReport) -> FigureTable:
 
 
 def image_table(report: EvalReport, name: str, *, refined: bool = False) -> FigureTable:
-    """Make the table of the image figures of one set of views, of refined poses where `refined` says so."""
+    """Make the table of the image figures of one set of views, with refined poses if `refined`."""
     models = report.refined_poses if refined else report.models
     title = f"{SETS[name]}{REFINED_POSES}" if refined else SETS[name]
     metric = report.metric or ""
@@ -102,6 +105,7 @@ def image_table(report: EvalReport, name: str, *, refined: bool = False) -> Figu
         Column("ssim_head", "SSIM", "head", 4, "higher"),
         Column("perceptual_head", metric, "head", 4, "lower"),
     )
+    # All models are measured on the same views, so that the counts of any of them hold for the caption.
     rows = {model: _of_set(figures, name) for model, figures in models.items() if name in figures.views}
     counts = next(figures.counts(name) for figures in models.values() if name in figures.views)
     held = (
@@ -132,6 +136,7 @@ def surface_table(report: EvalReport) -> FigureTable:
             Column(f"surface.{name}.{part}.p2s", f"P2S {part}", group, 2, "lower")
             for part in (HEAD, SKIN.name, *(label.name for label in CLOTH_LABELS))
         ]
+    # Skinning alone is the reference that every deformation has to improve upon.
     rows = {SKINNING_ALONE: surface_figures(report.skinning_alone)} if report.skinning_alone else {}
     rows |= {name: surface_figures(model.surfaces) for name, model in report.models.items() if model.surfaces}
     return FigureTable(
@@ -141,6 +146,7 @@ def surface_table(report: EvalReport) -> FigureTable:
 
 def cost_table(report: EvalReport) -> FigureTable:
     """Make the table of speed and size."""
+    # Models are timed under the same conditions, so that the first one's device and size hold for all.
     speed = next((m.speed for m in report.models.values() if m.speed is not None), None)
     where = "" if speed is None else f" at {speed.width} x {speed.height}, {speed.device}"
     if speed is not None and speed.threads:
@@ -159,7 +165,7 @@ def cost_table(report: EvalReport) -> FigureTable:
 
 
 def pose_table(report: EvalReport) -> FigureTable:
-    """Make the table of the poses in use against the exact ones."""
+    """Make the table of errors of the poses in use against the exact ones."""
     columns = (
         Column("frames", "frames", "", 0),
         Column("body_mm", "body", "mm", 1, "lower"),
@@ -174,6 +180,7 @@ def pose_table(report: EvalReport) -> FigureTable:
 
 def evaluation_tables(report: EvalReport) -> dict[str, FigureTable]:
     """Make every table by the name of its file; those without a row are left out."""
+    # One table a set of views; refined poses have tables of their own, because they use photographs of held-out frames.
     tables = {"summary": summary_table(report)}
     measured = [name for name in SETS if any(name in model.views for model in report.models.values())]
     tables |= {name: image_table(report, name) for name in measured}

@@ -1,4 +1,4 @@
-"""One table of figures as text, CSV or LaTeX."""
+"""Format a table of figures as text, CSV or LaTeX."""
 
 from __future__ import annotations
 
@@ -25,8 +25,11 @@ class Column:
     """Column of a table: one figure of every row.
 
     Attributes:
-        key: in the rows' figures. title: over the column, unit included. group: over the titles of its neighbours.
-        digits: after the point. better: which of two values wins; "" where neither does.
+        key: name of the figure in the rows.
+        title: heading of the column, with its unit.
+        group: heading over this and neighbouring columns.
+        digits: after the point.
+        better: direction of better values; "" where neither is better.
     """
 
     key: str
@@ -36,7 +39,7 @@ class Column:
     better: Literal["higher", "lower", ""] = ""
 
     def shown(self, value: float | None) -> str:
-        """The value for readers; "-" where there is none."""
+        """Return the value for readers; "-" where there is none."""
         if value is None or math.isnan(value):
             return "-"
         return f"{value:,.{self.digits}f}" if math.isfinite(value) else ("inf" if value > 0 else "-inf")
@@ -47,7 +50,10 @@ class FigureTable:
     """Rows of figures under titled columns; columns that no row has a figure for are left out.
 
     Attributes:
-        rows: name -> key -> figure. caption: in words. row_title: over the names.
+        columns: those with a figure in some row.
+        rows: figures by name and key.
+        caption: in words.
+        row_title: heading over the names.
 
     Example:
         >>> table = FigureTable((Column("psnr", "PSNR, dB", better="higher"),), {"Full": {"psnr": 27.1}})
@@ -60,6 +66,7 @@ class FigureTable:
     row_title: str = "model"
 
     def __post_init__(self) -> None:
+        # Columns without any figure would only say "-" and are left out of the table.
         keys = [column.key for column in self.columns]
         if len(set(keys)) < len(keys):
             raise InputError("table columns", expected="distinct keys", received=", ".join(keys))
@@ -67,15 +74,16 @@ class FigureTable:
         object.__setattr__(self, "columns", known)
 
     def header(self) -> list[str]:
-        """Titles, each with its group, for a table without groups."""
+        """Return the titles, each with its group, for a table without groups."""
         return [self.row_title, *(f"{c.group}: {c.title}" if c.group else c.title for c in self.columns)]
 
     def cells(self) -> list[list[str]]:
-        """Names and figures as shown, a list a row."""
+        """Return names and figures as shown, a list for each row."""
         return [[name, *(c.shown(row.get(c.key)) for c in self.columns)] for name, row in self.rows.items()]
 
     def best(self, column: Column) -> set[str]:
-        """Names of the rows that show the best value of a column; none where all or no rows do."""
+        """Return the names of the rows that show the best value of a column; none where all or no rows do."""
+        # Compared as shown: rows whose difference is less than the printed digits are equally good.
         values = {name: row.get(column.key) for name, row in self.rows.items()}
         known = {name: value for name, value in values.items() if value is not None and not math.isnan(value)}
         if not column.better or len(known) < 2:
@@ -85,13 +93,15 @@ class FigureTable:
         return winners if len(winners) < len(known) else set()
 
     def text(self) -> str:
-        """Aligned by spaces, groups over their columns, the caption above."""
+        """Return the table aligned by spaces, groups over their columns, the caption above."""
+        # A column is as wide as its widest cell, and the last column of a group takes what its title needs more.
         body = [[self.row_title, *(c.title for c in self.columns)], *self.cells()]
         widths = [max(map(len, column)) for column in zip(*body, strict=True)]
         groups = [(title, list(members)) for title, members in groupby(range(len(self.columns)), self._group)]
         for title, members in groups:
             missing = len(title) - sum(widths[k + 1] for k in members) - 2 * (len(members) - 1)
             widths[members[-1] + 1] += max(missing, 0)
+        # Names to the left, numbers to the right, so that their decimal points are in line.
         aligned = [[row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in body]
         lines = ["  ".join(cells) for cells in aligned]
         if any(title for title, _ in groups):
@@ -100,7 +110,7 @@ class FigureTable:
         return "\n".join([*([self.caption] if self.caption else []), *(line.rstrip() for line in lines)]) + "\n"
 
     def csv(self) -> str:
-        """Keys as header, every digit of the figures, nothing where there is none."""
+        """Return the table as CSV: keys as header, every digit of the figures, empty cells without a figure."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow([self.row_title, *(c.key for c in self.columns)])
@@ -110,11 +120,12 @@ class FigureTable:
         return out.getvalue()
 
     def latex(self, *, label: str = "") -> str:
-        r"""A `table` for the package booktabs; the best value of a column is bold.
+        r"""Return a LaTeX `table` for the package booktabs; the best value of a column is bold.
 
         Args:
             label: of the table, for `\ref`.
         """
+        # Arrows state which direction is better; \cmidrule underlines the columns of a group.
         arrows = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
         groups = [(title, list(members)) for title, members in groupby(range(len(self.columns)), self._group)]
         lines = [r"\begin{table}", r"\centering"]
@@ -129,6 +140,7 @@ class FigureTable:
             lines += [" & ".join(["", *spans]) + r" \\", "".join(rules)]
         titles = [escape_latex(self.row_title), *(escape_latex(c.title) + arrows[c.better] for c in self.columns)]
         lines += [" & ".join(titles) + r" \\", r"\midrule"]
+        # Bold the best figure of each column, ties included.
         best = [self.best(column) for column in self.columns]
         for name, *figures in self.cells():
             cells = [
@@ -143,5 +155,5 @@ class FigureTable:
 
 
 def escape_latex(text: str) -> str:
-    """Text with what LaTeX reads as commands written as characters."""
+    """Return text with the special characters of LaTeX escaped."""
     return "".join(_LATEX.get(char, char) for char in text)

@@ -144,6 +144,7 @@ class _Cut:
 
     @staticmethod
     def of(template: Template, faces: Int64[np.ndarray, " F"], garments: Sequence[Garment]) -> _Cut:
+        # Vertices of faces with Gaussians, of the garments' particles, and of the body that cloth collides with.
         used = [template.faces[faces].ravel()]
         for garment in garments:
             used += [garment.particles, garment.collider.vertices]
@@ -155,6 +156,7 @@ class _Cut:
 
 def _skeleton(template: Template) -> Tensors:
     body = template.body
+    # Joints of an expression: the regressor is linear, so that it applies to the expression's directions too.
     moved = np.einsum("jv,vce->jce", body.joint_regressor, body.exprdirs)
     optional = ("left_hand_mean", "right_hand_mean", "left_hand_components", "right_hand_components")
     return {
@@ -166,6 +168,7 @@ def _skeleton(template: Template) -> Tensors:
 
 
 def _surface(template: Template, cut: _Cut, config: BundleConfig) -> Tensors:
+    # The skin's vertices come first in a template, so that rows of a basis index the bundle's first vertices.
     at, body = cut.vertices, template.body
     skin = at[at < body.vertex_count]
     index, weights = template.weights.joint_indices[at], template.weights.joint_weights[at]
@@ -185,6 +188,7 @@ def _surface(template: Template, cut: _Cut, config: BundleConfig) -> Tensors:
     for name, basis in (("expression", body.exprdirs), ("pose", body.posedirs)):
         if basis is None or (name == "pose" and not basis.shape[2]):
             continue
+        # Rows that move less than half a step would be stored as zeros.
         own = basis[skin]
         rows = np.flatnonzero((np.abs(own) > (0.0 if config.exact else 0.5 * config.basis_step)).any(axis=(1, 2)))
         out[f"{name}_rows"] = rows.astype(np.int32)
@@ -193,6 +197,7 @@ def _surface(template: Template, cut: _Cut, config: BundleConfig) -> Tensors:
 
 
 def _gaussians(tensors: Mapping[str, Tensor], per_face: Int64[np.ndarray, " F"], config: BundleConfig) -> Tensors:
+    # A player needs neither the offset along the normal on its own nor logits: fold them in.
     own = {name: value.numpy() for name, value in tensors.items()}
     offset = own["offset"].copy()
     offset[:, 0] += own["normal_offset"]
@@ -218,6 +223,8 @@ def _largest(sh: Float[np.ndarray, "N K 3"]) -> Float[np.ndarray, "K 3"]:
 def _field(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
     net, codes, template = student.field, student.codes, student.rig.template
     assert net is not None and codes is not None
+    # Control points are vertices of the template. A field with fewer of
+    # them interpolates: keep the rows of the bundle's vertices alone.
     points = net.points.cpu().numpy()
     if net.rows is None:  # evaluated at every vertex: those of the bundle are enough
         points, kept = cut.vertices, cut.vertices
@@ -225,6 +232,7 @@ def _field(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
     else:
         kept = np.arange(len(points))
         neighbours, weights = (part.cpu().numpy() for part in net.rows.of(torch.as_tensor(cut.vertices)))
+    # The network of clothes is evaluated at control points on clothes alone.
     clothes = template.cloth_mask[points]
     sets, member = _seen(net.sets, net.member, kept)
     small = np.uint16 if len(points) <= 1 << 16 else np.uint32
@@ -278,6 +286,8 @@ def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str,
     """
     shapes = student.blend_shapes
     assert shapes is not None
+    # Quantisation errors are multiplied by the coefficients: the usual
+    # coefficient turns a step of position or colour into a step of the shape.
     config, rng = shapes.config, np.random.default_rng(0)
     body = rng.normal(size=(64, config.pose_size)) * 0.2
     if student.pose_gate is not None:
@@ -292,6 +302,7 @@ def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str,
         if config.jaw:
             of_motion[:, config.expression_size :] = motion.jaw_pose
         head = np.concatenate([head, of_motion])
+    # Root mean square over samples and parts; a floor keeps seldom used shapes from becoming arbitrarily coarse.
     out = {}
     for side, inputs, network in (("head", head, shapes.head), ("body", body, shapes.body)):
         with torch.no_grad():
@@ -306,6 +317,7 @@ def _blend(
     shapes: BlendShapes, order: Int64[Tensor, " N"], usual: Mapping[str, np.ndarray], config: BundleConfig
 ) -> Tensors:
     """Return blend shapes in the bundle's order of Gaussians, each side with the rows that its gate lets through."""
+    # Which row of the shapes belongs to the i-th Gaussian of the bundle; -1 where no shape moves it.
     count, n = shapes.count, shapes.config.head_shapes
     place = np.full(count, -1, dtype=np.int64)
     place[shapes.active.cpu().numpy()] = np.arange(len(shapes.active))
@@ -317,6 +329,7 @@ def _blend(
     out: Tensors = {}
     if shapes.part is not None:
         out["part"] = shapes.part.cpu().numpy()[order.numpy()].astype(np.uint16)
+    # A gate is constant, so that it is multiplied into the shapes, and rows that it closes are left out.
     for side, gate in gates.items():
         rows = np.flatnonzero((gate > 0) & (place >= 0))
         values = (both[place[rows]][:, :, columns[side]] * gate[rows, None, None]).transpose(2, 1, 0)
@@ -327,6 +340,7 @@ def _blend(
         else:
             steps = np.repeat([[config.position_step, config.color_step]], 3, axis=1) / usual[side][:, None]
             out |= blended(side, values, steps)
+        # The networks of the coefficients, with the hidden layers stacked into one tensor.
         layers = [layer for layer in networks[side].children() if isinstance(layer, nn.Linear)]
         first, hidden, last = layers[0], layers[1:-1], layers[-1]
         width = last.in_features

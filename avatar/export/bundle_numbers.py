@@ -22,6 +22,7 @@ def halves(tensors: Mapping[str, np.ndarray]) -> Tensors:
 
 def unsigned(name: str, values: Float[np.ndarray, "*N"], bits: int) -> Tensors:
     """Return values of [0, 1] in whole steps of so many bits, 8 or 16."""
+    # The step is stored with the integers: a reader multiplies, and needs to know no number of bits.
     most = (1 << bits) - 1
     return {
         name: np.rint(values * most).astype(np.uint8 if bits == 8 else np.uint16),
@@ -31,6 +32,7 @@ def unsigned(name: str, values: Float[np.ndarray, "*N"], bits: int) -> Tensors:
 
 def signed(name: str, values: Float[np.ndarray, "*N"], largest: np.ndarray | np.float32) -> Tensors:
     """Return values within `largest`, one for all or one for each place of the last axes, in 8 bits."""
+    # Symmetric quantisation: -127 .. 127, so that 0 is exact and the error is at most half a step.
     step = np.asarray(largest, np.float32) / _LARGEST
     return {
         name: np.clip(np.rint(values / step), -_LARGEST, _LARGEST).astype(np.int8),
@@ -48,6 +50,8 @@ def blended(side: str, values: Float[np.ndarray, "n 6 M"], steps: Float[np.ndarr
 
     Nearly all numbers are a few steps: zip's entropy code takes them to some three bits each.
     """
+    # A Gaussian whose largest value exceeds 127 steps doubles its step as often as it takes: no value is clipped, and
+    # all others keep the fine step.
     units = values / steps[:, :, None]
     largest = np.abs(units).max(axis=(0, 1), initial=0.0)
     exponent = np.ceil(np.log2(np.maximum(largest / _LARGEST, 1.0))).astype(np.uint8)

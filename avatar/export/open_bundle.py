@@ -38,6 +38,7 @@ def bundle_file(source: Path, *, exact: bool = False) -> Iterator[Path]:
         return
     import avatar  # torch is imported here, not for the players of bundles
 
+    # A student is exported to a temporary file and read back, so that it is checked exactly as a bundle is.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"student{SUFFIX}"
         avatar.export_student(avatar.load(source), path, exact=exact)

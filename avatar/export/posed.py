@@ -26,6 +26,8 @@ def posed_splats(bound: BoundGaussians, vertices: Float[Tensor, "V 3"], faces: I
         faces: of the mesh that they are bound to.
     """
     with torch.no_grad():
+        # Viewers know neither triangles nor their scale: take each Gaussian to the world, with thickness and tangential
+        # scales in mean edge lengths, whose logarithm is added.
         bound = bound.to(dtype=torch.float64)
         frames = triangle_frames(vertices.double(), faces)
         world = world_from_frames(bound, frames)

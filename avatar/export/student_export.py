@@ -58,6 +58,8 @@ def export_student(
     Raises:
         InputError: another suffix, or parameters of another body.
     """
+    # The suffix decides; a bundle keeps the student's motion, every other file is made through a bundle in memory, so
+    # that all files show the same avatar as a player does.
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -69,6 +71,7 @@ def export_student(
     if suffix == ".onnx":
         import_module("avatar.formats.onnx_step").write_onnx(path, bundle=bundle)
     else:
+        # The pose: that of the parameters, else the first one of the training, else the rest pose.
         player = AvatarPlayer(bundle)
         motion = params if params is not None else seen_poses(student)
         motion = BodyParams.rest(betas=0, expressions=0) if motion is None else motion
@@ -109,6 +112,7 @@ def export_bundle(
     Returns:
         The file ("out"), "bytes" of its pieces and "total", and the number of "frames" that it plays.
     """
+    # The provenance ties a bundle to the files of its training by their digests.
     motion = seen_poses(student) if motion is None else motion
     origin = student.origin
     extras = BundleExtras(
@@ -126,6 +130,7 @@ def seen_poses(student: Student) -> BodyParams | None:
     """Return the poses that training saw, one after the other, standing as the scan stands; None: not known."""
     if student.pose_gate is None:
         return None
+    # Stored poses are the 21 body joints alone; everything else (hands, place) comes from the pose of the scan.
     poses = student.pose_gate.poses.cpu().double().numpy()
     reference = student.origin.reference
     reference = BodyParams.rest(betas=0) if reference is None else reference

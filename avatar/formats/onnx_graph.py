@@ -73,6 +73,7 @@ class Graph:
 
     def scatter(self, value: str, rows: np.ndarray, count: int, width: int) -> str:
         """Scatter the rows of a value to `rows` (ascending) of a (count, width) array of zeros."""
+        # Inverse index: each row of the output gathers its value, or the row of zeros appended after the last value.
         if len(rows) == count:
             return value
         place = np.full(count, len(rows), np.int64)
@@ -86,6 +87,7 @@ class Graph:
             outputs: value and shape by name.
             about: metadata of the file.
         """
+        # An `Identity` gives each output its public name, even where one value is two outputs.
         helper, infos = self._onnx.helper, []
         for name, (value, shape) in outputs.items():
             self._nodes.append(helper.make_node("Identity", [value], [name]))

@@ -51,6 +51,7 @@ def write_onnx(path: str | Path, bundle: AvatarBundle) -> None:
         )
         added = g("Add", *sides)
     means, quats, scales, dc, frames = world(g, bundle, posed, added)
+    # Opacities are constants of the avatar; colours need the eye and the world frames of the triangles.
     outputs = {
         "means": (means, (N, 3)),
         "quats": (quats, (N, 4)),
@@ -70,6 +71,7 @@ def write_onnx(path: str | Path, bundle: AvatarBundle) -> None:
 def _skinned(g: Graph, bundle: AvatarBundle, rest: str, transforms: str) -> str:
     """Return the vertices after linear blend skinning (V, 3)."""
     t, V = bundle.tensors, bundle.sizes["V"]
+    # x = sum_j w_j (R_j v + t_j): blend the (3, 4) matrices of the k joints of each vertex, then apply them to (v, 1).
     weights = t["surface.joint_weights"] / t["surface.joint_weights"].sum(axis=1, keepdims=True)
     joints = g.gather(transforms, t["surface.joint_indices"])  # (V, k, 12)
     blended = g.reshape(g.sum(g("Mul", joints, weights[:, :, None]), 1), V, 3, 4)
@@ -88,6 +90,7 @@ def skeleton(g: Graph, bundle: AvatarBundle, pose: str, transl: str, expression:
     turns = _rotations(g, pose, J)
     above = g.gather(joints, np.maximum(parents, 0))
     roots = (parents < 0)[:, None].astype(np.float32)
+    # A joint's offset is its rest position relative to its parent's; the root has its own, moved by the translation.
     offsets = g("Add", g("Sub", joints, g("Mul", above, 1.0 - roots)), g("Mul", transl, roots))
     bottom = np.tile(np.eye(4, dtype=np.float32)[3], (J, 1, 1))
     local = g("Concat", g("Concat", turns, g.reshape(offsets, J, 3, 1), axis=2), bottom, axis=1)
@@ -103,11 +106,13 @@ def skeleton(g: Graph, bundle: AvatarBundle, pose: str, transl: str, expression:
         done, place[own] = g("Concat", done, new, axis=0), count + np.arange(len(own))
         count += len(own)
     posed = g.gather(done, place)
+    # Slices of the (J, 4, 4) matrices: axes 1 and 2 (the third constant) from the first to the second constant.
     R = g("Slice", posed, *(g.constant(v, np.int64) for v in ([0, 0], [3, 3], [1, 2])))
     at = g("Slice", posed, *(g.constant(v, np.int64) for v in ([0, 3], [3, 4], [1, 2])))
     # Transforms from the T-pose, and the expression and pose correctives.
     shift = g("Sub", at, g("MatMul", R, g.reshape(joints, J, 3, 1)))
     transforms = g.reshape(g("Concat", R, shift, axis=2), J, 12)
+    # Pose correctives are linear in the entries of R_j - I of every joint but the root.
     features = g.reshape(g("Sub", g.gather(turns, np.arange(1, J)), np.eye(3)), 9 * (J - 1), 1)
     rest, V = g.constant(t["surface.vertices"]), bundle.sizes["V"]
     for name, drives in (("expression", face), ("pose", features)):
@@ -121,15 +126,19 @@ def skeleton(g: Graph, bundle: AvatarBundle, pose: str, transl: str, expression:
 def _rotations(g: Graph, pose: str, J: int) -> str:
     """Return matrices (J, 3, 3) of axis-angles by Rodrigues: `R = I + a K + b K^2`, as `matrix_from_rotvec`."""
     small = 1e-4  # squared angles below this use the series of sin(t) / t
+    # a = sin(t) / t and b = (1 - cos t) / t^2 = (sin(t / 2) / (t / 2))^2 / 2, both of the squared angle.
     squared = g.sum(g("Mul", pose, pose), 1, keep=True)
 
     def sinc(square: str) -> str:
+        # The series 1 - t^2 / 6 + t^4 / 120 is exact to float32 below
+        # the limit; `Max` keeps the unused branch from dividing by 0.
         angle = g("Sqrt", g("Max", square, small))
         series = g("Sub", 1.0, g("Mul", square, g("Sub", 1.0 / 6.0, g("Mul", square, 1.0 / 120.0))))
         return g("Where", g("Less", square, small), series, g("Div", g("Sin", angle), angle))
 
     half = sinc(g("Mul", squared, 0.25))
     a, b = sinc(squared), g("Mul", 0.5, g("Mul", half, half))
+    # K is linear in the axis-angle v: K w = v x w, written as one product with a constant (3, 9) matrix.
     cross = np.zeros((3, 3, 3), np.float32)
     for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         cross[x, z, y], cross[x, y, z] = 1.0, -1.0
@@ -153,6 +162,7 @@ def field(g: Graph, bundle: AvatarBundle, theta: str) -> str:
     frames = g("Concat", g("Mul", theta, sets), codes, axis=1)
     encodings = positional_encoding(t["field.points"], (sizes["X"] - 3) // 6)
 
+    # As in `FieldKernel`, the part of the first layer that depends on the point alone is a constant of the graph.
     def network(name: str, rows: np.ndarray) -> str:
         own = {key.split(".", 2)[2]: value for key, value in t.items() if key.startswith(f"field.{name}.")}
         of_frame = g("Gemm", frames, own["of_frame.weight"], own["of_frame.bias"], transB=1)
@@ -182,6 +192,7 @@ def pose_similarity(g: Graph, bundle: AvatarBundle, theta: str) -> str | None:
     poses = bundle.tensors.get("poses.known")
     if poses is None:
         return None
+    # exp(-x^2 / 2) of the excess x of the distance to the nearest training pose over their usual one, as the player's.
     scale = float(bundle.tensors["poses.scale"])
     away = g("Sub", poses, theta)
     nearest = g("ReduceMin", g.sum(g("Mul", away, away), 1), axes=[0], keepdims=1)
@@ -221,6 +232,7 @@ def world(g: Graph, bundle: AvatarBundle, posed: str, added: str | None) -> tupl
     t, F, N = bundle.tensors, bundle.sizes["F"], bundle.sizes["N"]
     of = np.repeat(np.arange(F), t["gaussians.per_face"])
     faces = t["surface.faces"]
+    # Corners and edges of the F triangles.
     v1, v2, v3 = (g.gather(posed, faces[:, k]) for k in range(3))
     a, b, c = g("Sub", v2, v1), g("Sub", v3, v1), g("Sub", v3, v2)
     # Frames of the triangles: normal, median and their cross product; mean edge lengths of at least a micrometre.
@@ -230,6 +242,7 @@ def world(g: Graph, bundle: AvatarBundle, posed: str, added: str | None) -> tupl
     R = g("Concat", *columns, axis=2)
     lengths = g("Add", g("Add", g.norm(a), g.norm(b)), g.norm(c))
     edge = g("Max", g("Div", lengths, 3.0), 1e-6)
+    # Means: the barycentric point of the triangle plus the local offset in its frame, R (offset + blend shapes).
     u, v = t["gaussians.barycentric"].T
     weights = np.stack([u, v, 1.0 - u - v], axis=1)
     local, dc = g.constant(t["gaussians.offset"]), g.constant(t["gaussians.dc"])
@@ -243,6 +256,8 @@ def world(g: Graph, bundle: AvatarBundle, posed: str, added: str | None) -> tupl
         means = g("Add", means, g("Mul", g.gather(corner, of), weight[:, None]))
     flat = np.full((N, 1), THICKNESS)
     scales = g("Mul", g.gather(edge, of), np.hstack([flat, np.exp(t["gaussians.log_scales"])]))
+    # World rotation = triangle's rotation times the Gaussian's own, as a Hamilton product: all 16 products of
+    # components times a constant (16, 4) matrix of signs.
     turns = g.reshape(g.gather(_quats(g, R, F), of), N, 4, 1)
     pairs = g.reshape(g("Mul", turns, t["gaussians.quats"][:, None, :]), N, 16)
     return means, g("MatMul", pairs, _hamilton()), scales, dc, frames
@@ -264,6 +279,7 @@ def colors(g: Graph, bundle: AvatarBundle, seen: tuple[str, str, str], eye: str)
 def _harmonics(g: Graph, xyz: tuple[str, str, str], count: int) -> str:
     """Return spherical harmonics of degree 1 and up (N, count) as linear combinations of monomials."""
     x, y, z = xyz
+    # A constant 1 of the right shape, then monomials of degree 1 to 3 by one multiplication each.
     powers = {"": g("Add", g("Mul", x, 0.0), 1.0), "x": x, "y": y, "z": z}
     names = ["xx", "yy", "zz", "xy", "yz", "xz"] if count > 3 else []
     names += ["xxx", "xxy", "xxz", "xyy", "xyz", "xzz", "yyy", "yyz", "yzz", "zzz"] if count > 8 else []
@@ -274,6 +290,7 @@ def _harmonics(g: Graph, xyz: tuple[str, str, str], count: int) -> str:
 
 def _coefficients(names: list[str], count: int) -> np.ndarray:
     """Return the (monomials, harmonics) matrix by least squares, exact because harmonics are such polynomials."""
+    # 200 random directions overdetermine the at most 20 coefficients of each harmonic.
     points = np.random.default_rng(0).normal(size=(200, 3))
     directions = points / np.linalg.norm(points, axis=1, keepdims=True)
     monomials = np.stack([_product(directions, name) for name in names], axis=1)
@@ -294,6 +311,8 @@ def _cross(g: Graph, a: str, b: str) -> str:
 
 def _quats(g: Graph, R: str, F: int) -> str:
     """Return unit quaternions wxyz (F, 4) from the best-conditioned row of `4 q q^T`, which is linear in the matrix."""
+    # Entries of 4 q q^T as linear functions of the nine entries of R: the diagonal 1 +- R00 +- R11 +- R22 here, then
+    # sums and differences of opposite entries.
     rows = np.zeros((9, 4, 4), np.float32)
     for k, signs in enumerate(((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))):
         rows[[0, 4, 8], k, k] = signs
@@ -302,6 +321,7 @@ def _quats(g: Graph, R: str, F: int) -> str:
     for i, j, one, other in ((1, 2, 1, 3), (1, 3, 2, 6), (2, 3, 5, 7)):
         rows[one, [i, j], [j, i]] = rows[other, [i, j], [j, i]] = 1.0
     outer = g("Add", g("MatMul", g.reshape(R, F, 9), rows.reshape(9, 16)), np.eye(4).reshape(16))
+    # The row with the largest diagonal entry belongs to the largest |q_k|; dividing by a small one would lose digits.
     diagonal = g("Gather", outer, g.constant([0, 5, 10, 15], np.int32), axis=1)
     best = g("Cast", g("ArgMax", diagonal, axis=1, keepdims=1), to=1)
     chosen = g("Cast", g("Equal", best, np.arange(4.0)[None]), to=1)

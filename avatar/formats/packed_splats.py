@@ -43,7 +43,10 @@ def write_splat_spz(path: str | Path, splats: Splats) -> None:
         fraction_bits -= 1
     if farthest * 2.0**fraction_bits >= 2.0 ** (bits - 1):
         raise InputError(f"splats for {path}", expected="positions within 8,000 km", received=f"{farthest:g} m")
+    # Little-endian 32-bit integers, of which the three low bytes are kept.
     positions = np.rint(splats.means.astype(np.float64) * 2.0**fraction_bits).astype("<i4")
+    # Scales and offsets are the format's: opacity 0..255, colour 0.15 a unit around 1/2, log scales of 1/16 from -10
+    # up, harmonics of 1/128 around 0.
     pieces = (
         positions.reshape(-1, 1).view(np.uint8)[:, :3],
         _byte(splats.opacities * 255.0),
@@ -62,6 +65,7 @@ def _byte(values: Float[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N"]:
 
 def _pack_rotations_spz(wxyz: Float32[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
     """Pack quaternions into 32 bits: the index of the largest of x, y, z, w in two, the other three in ten each."""
+    # q and -q are one rotation: make the largest component positive, then its value follows from the unit length.
     quats = np.roll(wxyz, -1, axis=1).astype(np.float64)
     largest = np.abs(quats).argmax(axis=1)
     quats *= np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -70,6 +74,7 @@ def _pack_rotations_spz(wxyz: Float32[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "
     shift = np.zeros(len(quats), np.uint32)
     for axis in range(3, -1, -1):
         kept = largest != axis
+        # The other three are at most 1 / sqrt(2) in magnitude: nine bits of size and one of sign.
         size = np.minimum(np.rint(np.abs(quats[:, axis]) * (511.0 * 2.0**0.5)), 511.0).astype(np.uint32)
         number = size | ((quats[:, axis] < 0).astype(np.uint32) << 9)
         packed |= np.where(kept, number << shift, 0).astype(np.uint32)
@@ -107,6 +112,7 @@ def write_splat_sog(path: str | Path, splats: Splats) -> None:
     flat = np.sign(splats.means) * np.log1p(np.abs(splats.means.astype(np.float64)))
     low, high = (flat.min(axis=0), flat.max(axis=0)) if len(flat) else (np.zeros(3), np.zeros(3))
     positions = np.rint((flat - low) / np.where(high > low, high - low, 1.0) * 65535.0).astype(np.uint16)
+    # One codebook for the three axes of the scales, and one for the three colours.
     scale_book, scales = _codebook(splats.log_scales)
     color_book, colors = _codebook(splats.f_dc)
     alpha = np.rint(splats.opacities * 255.0).astype(np.uint8)
@@ -159,6 +165,7 @@ def _sort_by_morton(splats: Splats) -> Splats:
     """Sort splats along a Morton curve, so that neighbouring pixels are neighbours in space and compress well."""
     means = splats.means.astype(np.float64)
     low = means.min(axis=0, initial=np.inf)
+    # Ten bits an axis; interleaving their bits orders cells along the curve.
     extent = float((means - low).max(initial=0.0)) or 1.0
     grid = np.minimum((means - low) / extent * 1024.0, 1023.0).astype(np.int64)
     code = np.zeros(len(means), np.int64)
@@ -177,6 +184,8 @@ def _codebook(values: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, " 256
         return np.zeros(256), np.zeros(values.shape, np.uint8)
     # Start between quantiles and even steps: dense values get many entries, and rare ones one nearby.
     book = 0.5 * (np.quantile(flat, np.linspace(0.0, 1.0, 256)) + np.linspace(flat[0], flat[-1], 256))
+    # k-means of sorted numbers: each cluster is an interval between midpoints, and its mean is a difference of prefix
+    # sums. An entry without values stays where it is.
     total = np.concatenate([[0.0], np.cumsum(flat)])
     for _ in range(12):
         cut = np.searchsorted(flat, 0.5 * (book[1:] + book[:-1]))
@@ -196,6 +205,7 @@ def _palette(sets: Float[np.ndarray, "N D"]) -> tuple[Float[np.ndarray, "P D"], 
     if len(sets) <= _MAX_PALETTE:
         return sets, np.arange(len(sets))
     palette = sets[np.linspace(0, len(sets) - 1, _MAX_PALETTE).astype(np.int64)].astype(np.float64)
+    # Lloyd's step: each palette entry becomes the mean of the sets nearest to it, and the sets are assigned again.
     labels = cKDTree(palette).query(sets)[1]
     counts = np.bincount(labels, minlength=len(palette))
     sums = np.stack([np.bincount(labels, column, len(palette)) for column in sets.T.astype(np.float64)], axis=1)
@@ -208,6 +218,7 @@ def _pack_rotations_sog(wxyz: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 
     quats = wxyz.astype(np.float64)
     largest = np.abs(quats).argmax(axis=1)
     quats *= np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    # The three other components lie in [-1, 1] / sqrt(2), mapped to 0..255.
     kept = quats[np.arange(4) != largest[:, None]].reshape(-1, 3)
     small = np.clip(np.rint((kept * 2.0**0.5 * 0.5 + 0.5) * 255.0), 0, 255)
     return np.hstack([small, 252 + largest[:, None]]).astype(np.uint8)

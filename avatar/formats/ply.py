@@ -43,6 +43,7 @@ def write_splat_ply(path: str | Path, splats: Splats) -> None:
     Properties, all float, in 3DGS's order: `x y z nx ny nz f_dc_0..2 f_rest_0..3K-1 opacity scale_0..2 rot_0..3`.
     `f_rest` is channel-major: all red coefficients, then green, then blue.
     """
+    # 3DGS stores harmonics channel by channel: transpose (N, K, 3) to (N, 3, K).
     K = splats.f_rest.shape[1]
     names = (*_POSITION, *_NORMAL, *_DC, *_rest_names(3 * K), *_OPACITY, *_SCALE, *_ROTATION)
     columns = (
@@ -73,6 +74,7 @@ def read_splat_ply(path: str | Path) -> Splats:
     path = Path(path)
     subject = f"splats {path}"
     data = read_bytes(path, subject="splats")
+    # The header tells which properties there are; the number of `f_rest` gives the degree of the harmonics.
     layout = read_ply_layout(data, subject)
     names = layout.dtype.names or ()
     rest = [name for name in names if name.startswith("f_rest_")]
@@ -111,6 +113,7 @@ def read_splat_ply(path: str | Path) -> Splats:
 
 
 def _vertex_table(data: bytes, layout: PlyLayout, subject: str) -> np.ndarray:
+    # `frombuffer` maps the bytes without a copy, and would fail with an obscure error on a truncated file.
     size = layout.count * layout.dtype.itemsize
     if len(data) < layout.start + size:
         raise InputError(
@@ -151,6 +154,7 @@ def read_ply_layout(data: bytes, subject: str) -> PlyLayout:
     Raises:
         InputError: no PLY, a text PLY, a truncated or wrong header, or one without vertices.
     """
+    # `start` moves to the first byte of the vertices while their predecessors are skipped.
     lines, start = _header_lines(data, subject)
     order = ""
     elements: list[tuple[str, int, list[tuple[str, str] | None]]] = []
@@ -194,6 +198,7 @@ def _header_lines(data: bytes, subject: str) -> tuple[list[str], int]:
     """Return the lines before `end_header`, and the offset of the data after it."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r"):
         raise InputError(subject, expected="a PLY file", received=f"a file that starts with {data[:4]!r}")
+    # The header is searched in the first MiB alone, so that a huge foreign file is refused at once.
     end = data.find(b"end_header", 0, 1 << 20)
     newline = data.find(b"\n", end)
     if end < 0 or newline < 0:

@@ -34,6 +34,7 @@ def write_splat_glb(path: str | Path, splats: Splats) -> None:
     """
     if not len(splats):
         raise InputError(f"splats for {path}", expected="at least one", received="none")
+    # The file works without the extension: `extensionsUsed` lists it, `extensionsRequired` does not.
     gltf = pygltflib.GLTF2(
         asset=pygltflib.Asset(version="2.0", generator=f"smplxpp {metadata.version('smplxpp')}"),
         scene=0,
@@ -70,6 +71,7 @@ def _extension_attributes(splats: Splats) -> dict[str, Float32[np.ndarray, "N ..
         "OPACITY": splats.opacities.astype(np.float32),
         "SH_DEGREE_0_COEF_0": splats.f_dc,
     }
+    # Degree d has 2 d + 1 coefficients, one after the other in `f_rest`.
     first = 0
     for degree in range(1, splats.degree + 1):
         for k in range(2 * degree + 1):
@@ -109,6 +111,7 @@ def write_splat_usd(path: str | Path, frames: Iterable[Splats], *, fps: float | 
         harmonics = field.GetPrim().GetAttribute
         count, degree, k = -1, -1, -1
         for k, splats in enumerate(frames):
+            # Animated attributes of USD keep their length: all frames have the splats and the degree of the first.
             if k == 0:
                 count, degree = len(splats), splats.degree
                 harmonics("radiance:sphericalHarmonicsDegree").Set(degree)
@@ -118,6 +121,7 @@ def write_splat_usd(path: str | Path, frames: Iterable[Splats], *, fps: float | 
                     expected=f"{count} splats with harmonics of degree {degree}, as in frame 0",
                     received=f"{len(splats)} of degree {splats.degree}",
                 )
+            # Values at the default time are constant; a still picture needs no samples in time.
             time = pxr.Usd.TimeCode.Default() if fps is None else pxr.Usd.TimeCode(k)
             scales = np.exp(splats.log_scales)
             xyzw = np.roll(splats.unit_quats, -1, axis=1)

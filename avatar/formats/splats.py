@@ -41,6 +41,7 @@ class Splats:
     quats: Float[np.ndarray, "N 4"]
 
     def __post_init__(self) -> None:
+        # Convert first, so that values too large for float32 show as infinities below.
         for f in fields(self):
             object.__setattr__(self, f.name, np.ascontiguousarray(getattr(self, f.name), dtype=np.float32))
         N, K = len(self.means), self.f_rest.shape[1] if self.f_rest.ndim == 3 else -1
@@ -62,6 +63,7 @@ class Splats:
                 raise InputError(
                     f"splats: {name}", expected="finite float32 values", received=f"others, first in splat {bad}"
                 )
+        # The layouts of all formats know degrees 0 to 3; readers divide by the quaternion's length.
         if 3 * K not in REST_COUNTS:
             raise InputError("splats: f_rest", expected="0, 3, 8 or 15 coefficients", received=str(K))
         if N and not self.quats.any(1).all():
@@ -94,6 +96,7 @@ class Splats:
 
     def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> Splats:
         """Return the splats rotated about the origin, with their spherical harmonics."""
+        # Positions, normals and rotations turn, and so do the harmonics, whose axes are the world's.
         R = np.asarray(rotation, np.float64)
         return replace(
             self,
@@ -139,5 +142,6 @@ def _rotate_quats(R: Float[np.ndarray, "3 3"], quats: Float[np.ndarray, "N 4"]) 
     )
     row = outer[np.argmax(np.diag(outer))]
     w, x, y, z = row / np.linalg.norm(row)
+    # The matrix of multiplication by q from the left: (q p) = L(q) p.
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.asarray(quats, np.float64) @ left.T

@@ -30,12 +30,14 @@ def splats_along(
         cloth: what moves loose clothes: "simulate", "field" or "skin".
         notes: receives the player's remarks on the simulation after the last row.
     """
+    # Without a simulation every pose stands alone: clothes follow the field, or skinning.
     rate = motion.fps or DEFAULT_FPS
     if cloth != "simulate" or not player.has_clothes:
         skinned = player.skinned_clothes if cloth == "skin" else None
         for k in rows:
             yield world_splats(player.pose(motion.frame(k), cloth=skinned))
         return
+    # A simulation has a state, so that rows before the first are stepped too and not written.
     begin = max(0, rows[0] - round(PRE_ROLL * rate))
     for k, way in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
         posed = player.step(motion.frame(k), 1.0 / rate, path=way)

@@ -44,6 +44,8 @@ def write_webavatar(path: str | Path, player: AvatarPlayer) -> None:
     weights, joints = _influences(player)
     shown = typical_pose(player)
     posed = player.pose(shown)
+    # Undo the reader's skinning for a typical training pose, so
+    # that the avatar is exact there and errors stay small near it.
     means, quats = _at_rest(player, shown, posed, weights / 255.0, joints)
     N = len(means)
     arrays: dict[str, np.ndarray] = {
@@ -103,9 +105,11 @@ def _at_rest(
 
     Its shaders blend positions by the mean of the joints' transforms, and rotations by the mean of their quaternions.
     """
+    # Transforms from the reader's rest pose to the shown pose: both are known relative to the T-pose.
     to_pose, to_rest = (_square(player.joints(one)[0]) for one in (params, rest_pose()))
     own = (to_pose @ np.linalg.inv(to_rest))[joints]
     mean = np.einsum("nk,nkij->nij", weights, own)
+    # Linear blend skinning is x = M p + t with the weighted mean (M, t): solve for p.
     positions = np.linalg.solve(mean[:, :3, :3], (posed.means - mean[:, :3, 3])[..., None])[..., 0]
     turns = Rotation.from_matrix(own[:, :, :3, :3].reshape(-1, 3, 3)).as_quat().reshape(len(own), _INFLUENCES, 4)
     # Mean quaternion, with the signs aligned.
@@ -113,6 +117,7 @@ def _at_rest(
     for k in range(1, _INFLUENCES):
         sign = np.where(np.sum(total * turns[:, k], axis=1, keepdims=True) < 0, -1.0, 1.0)
         total = total + weights[:, k : k + 1] * sign * turns[:, k]
+    # SciPy's quaternions are xyzw, ours wxyz: roll by one place. q = blend^-1 q_world.
     quats = (Rotation.from_quat(total).inv() * Rotation.from_quat(np.roll(posed.quats, -1, axis=1))).as_quat()
     return positions, np.roll(quats, 1, axis=1)
 
@@ -126,12 +131,14 @@ def _square(transforms: Float[np.ndarray, "J 3 4"]) -> Float64[np.ndarray, "J 4 
 def _influences(player: AvatarPlayer) -> tuple[UInt8[np.ndarray, "N 4"], UInt8[np.ndarray, "N 4"]]:
     """Return weights, which sum to 255, and joints of every Gaussian, the strongest first."""
     t, sizes = player.bundle.tensors, player.bundle.sizes
+    # Skin weights of a Gaussian are those of its triangle's corners, blended by its barycentrics.
     dense: Float[np.ndarray, "V J"] = np.zeros((sizes["V"], sizes["J"]), np.float32)
     rows = np.repeat(np.arange(sizes["V"]), t["surface.joint_indices"].shape[1])
     np.add.at(dense, (rows, t["surface.joint_indices"].ravel()), t["surface.joint_weights"].ravel())
     faces = t["surface.faces"][np.repeat(np.arange(sizes["F"]), t["gaussians.per_face"])]
     u, v = t["gaussians.barycentric"].T
     blended = sum(share[:, None] * dense[faces[:, k]] for k, share in enumerate((u, v, 1.0 - u - v)))
+    # The four strongest joints, with weights in steps of 1/255 that sum to 1 exactly: rounding goes to the strongest.
     joints = np.argsort(-blended, axis=1, kind="stable")[:, :_INFLUENCES]
     shares = np.maximum(np.take_along_axis(blended, joints, axis=1), 0.0)
     steps = np.rint(255.0 * shares / shares.sum(axis=1, keepdims=True)).astype(np.int64)

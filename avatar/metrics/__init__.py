@@ -1,4 +1,4 @@
-"""What a model is measured by: images, surfaces, speed and size."""
+"""The metrics of a model: images, surfaces, speed and size."""
 
 from smplxpp.core.lazy import lazy_exports
 

@@ -1,4 +1,4 @@
-"""What an avatar costs: milliseconds a picture, parameters, bytes on disk."""
+"""Measure the cost of an avatar: milliseconds a picture, parameters, bytes on disk."""
 
 from __future__ import annotations
 
@@ -28,9 +28,16 @@ class Speed:
     """Medians of the time of one picture.
 
     Attributes:
-        width, height: pixels. gaussians: drawn.
-        pose_ms, deform_ms, render_ms: see `CONVENTION`. fps: of deform and render, the median of pictures.
-        pictures: measured. device: in words. threads: of torch and the rasteriser; 0 on a GPU.
+        width: of the pictures, pixels.
+        height: of the pictures, pixels.
+        gaussians: number of drawn Gaussians.
+        pose_ms: joints to skinning transforms, milliseconds.
+        deform_ms: networks, skinning, Gaussians and colours, milliseconds.
+        render_ms: rasterising and clamping, milliseconds.
+        fps: pictures a second of deform and render together.
+        pictures: number of timed pictures.
+        device: name of the GPU, or "CPU".
+        threads: of torch and the rasteriser; 0 on a GPU.
     """
 
     width: int
@@ -58,9 +65,13 @@ def measure_speed(
     """Time pictures of a model in the poses of `params`, over and over.
 
     Args:
+        model: the avatar, on the device to measure.
         params: one frame each.
-        camera: its view is scaled into `size` (width, height) whole, see `fitted`.
-        pictures: timed. warmup: drawn before.
+        camera: scaled to `size`, see `fitted`.
+        size: width and height, pixels.
+        pictures: number of timed pictures.
+        warmup: pictures that are drawn first and not timed.
+        eps2d: blur of the splats, pixels squared.
 
     Raises:
         InputError: no pose, no picture.
@@ -102,13 +113,14 @@ def measure_speed(
 
 
 def fitted(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with its whole picture in the middle of another size, as large as fits.
+    """Return the camera with its whole picture centred in another size, as large as fits.
 
     Raises:
         InputError: a size below 1.
     """
     if width < 1 or height < 1:
         raise InputError("picture size", expected="at least 1 x 1", received=f"{width} x {height}")
+    # Scale by the tighter side; focal lengths and principal point scale with the picture, which is then centred.
     scale = min(width / camera.width, height / camera.height)
     K = camera.K.copy()
     K[:2] *= scale
@@ -132,15 +144,16 @@ def bytes_on_disk(path: Path) -> int:
 
 
 def _blank(camera: Camera) -> View:
-    """A view of nothing, for its camera."""
+    """Return an empty view of a camera."""
     size = (camera.height, camera.width)
     return View(camera, torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(size, dtype=torch.uint8))
 
 
 def _clock(device: torch.device) -> Callable[[], float]:
-    """Make a clock that waits until the device has done what it was given; it gives seconds."""
+    """Return a clock, in seconds, that waits for the device to finish its work."""
 
     def now() -> float:
+        # CUDA runs asynchronously: without the wait a clock would time the launch of kernels alone.
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         return time.perf_counter()

@@ -1,4 +1,4 @@
-"""How far the posed mesh of an avatar is from the true surface of a frame."""
+"""Measure the distance between an avatar's posed mesh and the true surface of a frame."""
 
 from __future__ import annotations
 
@@ -30,8 +30,10 @@ class SurfaceQuality:
     """Distances between a posed mesh and a true surface, mm; None where a side has no point.
 
     Attributes:
-        p2s: posed mesh to truth. truth_to_mesh: the other direction. chamfer: mean of both.
-        p95: 95th percentile of the distances that `p2s` is the mean of.
+        p2s: mean distance from the posed mesh to the truth.
+        truth_to_mesh: mean distance in the other direction.
+        chamfer: mean of both.
+        p95: 95th percentile of the distances from the posed mesh to the truth.
         labels: the same for each label of the template, and for the region `HEAD` where the mesh has a head.
     """
 
@@ -54,18 +56,24 @@ def surface_quality(
     """Compare a posed mesh with the truth over the surfaces that can be seen; see `CONVENTION`.
 
     Args:
-        mesh: posed. vertex_labels: ids of `smplxpp.core.labels` on it. head: its faces that are the head's.
-        truth: the surface that the images show.
+        mesh: posed, metres.
+        vertex_labels: ids of `smplxpp.core.labels` on the mesh.
+        truth: the surface that the images show, metres.
+        head: mask of the head's faces on the mesh; None: no head.
+        samples: points on each surface, before the choice of visible ones.
+        seed: of the samples.
 
     Raises:
         InputError: a mesh without area, or none of it to be seen.
     """
+    # Points of one surface to the whole other one, both ways; labels of the truth are those of the nearest mesh point.
     config = CompareConfig(visible_only=True)
     forth = directed_distances(mesh, truth, samples=samples, seed=seed, source_labels=vertex_labels, config=config)
     back = directed_distances(truth, mesh, samples=samples, seed=seed, target_labels=vertex_labels, config=config)
     quality = _quality(_summary(forth, back))
     if head is None or not head.any():
         return quality
+    # The head is a region across labels: relabel faces as head or rest, and summarise the same distances again.
     region, rest = LABELS[-1].id + 1, LABELS[-1].id + 2
     parts = (
         replace(forth, label=np.where(head[forth.samples.face], region, rest)),
@@ -81,7 +89,7 @@ def _summary(forth: DirectedDistances, back: DirectedDistances) -> MeshCompariso
 
 
 def mean_surface(frames: Sequence[SurfaceQuality]) -> SurfaceQuality:
-    """Plain means of each figure over the frames that have it.
+    """Return plain means of each figure over the frames that have it.
 
     Raises:
         InputError: no frame.
@@ -92,14 +100,15 @@ def mean_surface(frames: Sequence[SurfaceQuality]) -> SurfaceQuality:
 
 
 def surface_spread(frames: Sequence[SurfaceQuality]) -> SurfaceQuality:
-    """Standard deviations over the frames that have each figure, by n - 1; None for fewer than two frames."""
+    """Return standard deviations over the frames that have each figure, by n - 1; None for fewer than two frames."""
     return _over_frames(frames, lambda known: float(np.std(known, ddof=1)) if len(known) > 1 else None)
 
 
 def _over_frames(
     frames: Sequence[SurfaceQuality], statistic: Callable[[Sequence[float]], float | None]
 ) -> SurfaceQuality:
-    """A statistic of every figure over the frames that have it, of all and of each label."""
+    """Return a statistic of every figure over the frames that have it, for the whole surface and each label."""
+    # A figure that a frame lacks (no visible point of a label) does not enter the statistic.
     figures = {
         name: statistic([value for one in frames if (value := getattr(one, name)) is not None])
         for name in ("p2s", "truth_to_mesh", "chamfer", "p95")

@@ -1,4 +1,4 @@
-"""How close a rendered view comes to its photograph, by conventions that are named."""
+"""Measure the similarity of a rendered view and its photograph, by named conventions."""
 
 from __future__ import annotations
 
@@ -72,10 +72,13 @@ def view_quality(
     """Compare a rendered image with the view's.
 
     Args:
-        image: sRGB, clamped to [0, 1] here as a screen would. alpha: rendered opacity.
-        background: sRGB that both are on.
-        head: x0, y0, x1, y1 in pixels. head_pixels: those that show the head, see `head_shown`.
-        metric: perceptual distance to measure too.
+        view: the photograph.
+        image: rendered sRGB, clamped to [0, 1] here as a screen would.
+        alpha: rendered opacity.
+        background: sRGB behind both.
+        head: box x0, y0, x1, y1 of the head, pixels; None: the head is not in the image.
+        head_pixels: mask of the pixels that show the head, see `head_shown`.
+        metric: perceptual distance; None: not measured.
     """
     # Both images lie on the same background, so that its pixels differ only where the silhouettes do.
     real = view.composited(background)
@@ -107,6 +110,7 @@ def view_quality(
 
 
 def _distance(metric: PerceptualDistance | None, image: Tensor, real: Tensor) -> float | None:
+    # The networks of perceptual metrics need a least size; smaller crops have no distance.
     if metric is None or min(image.shape[:2]) < MIN_SIZE:
         return None
     with torch.no_grad():
@@ -114,20 +118,22 @@ def _distance(metric: PerceptualDistance | None, image: Tensor, real: Tensor) ->
 
 
 def mean_quality(views: Mapping[str, ViewQuality]) -> dict[str, float]:
-    """Plain means of each figure over the views that have it; figures that none has are left out."""
+    """Return plain means of each figure over the views that have it; figures that no view has are left out."""
+    # Each figure is averaged over the views that have it: heads are out of some images.
     columns = {f.name: [getattr(quality, f.name) for quality in views.values()] for f in fields(ViewQuality)}
     known = {name: [value for value in values if value is not None] for name, values in columns.items()}
     return {name: sum(values) / len(values) for name, values in known.items() if values}
 
 
 def spread_over_frames(frames: Iterable[Mapping[str, ViewQuality]]) -> dict[str, float]:
-    """Standard deviations, by n - 1, over frames of each figure's mean over a frame's views.
+    """Return standard deviations over frames, by n - 1, of each figure's mean over a frame's views.
 
     Figures that fewer than two frames have, and those that are infinite in one, are left out.
 
     Args:
         frames: the views of each frame by name.
     """
+    # Views of a frame are averaged first, because they are not independent samples.
     means = [mean_quality(views) for views in frames]
     columns = {f.name: [mean[f.name] for mean in means if f.name in mean] for f in fields(ViewQuality)}
     return {
@@ -145,9 +151,11 @@ def head_vertices(template: Template) -> Int[np.ndarray, " N"]:
 
 def head_box(points: Float[np.ndarray, "N 3"], camera: Camera) -> Box | None:
     """Return x0, y0, x1, y1 in pixels around projected points, a little wider; None where nothing is in the image."""
+    # A point behind the camera has no projection, so that such a view has no box.
     x, y, depth = camera.screen_from_world(points).T[:3]
     if not (depth > 0).all():
         return None
+    # Widened on every side, rounded outward to whole pixels, and cut at the image's border.
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     margin = HEAD_MARGIN * (high - low)
     x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int)
@@ -157,6 +165,7 @@ def head_box(points: Float[np.ndarray, "N 3"], camera: Camera) -> Box | None:
 
 def head_shown(mesh: TriangleMesh, head: Bool[np.ndarray, " F"], camera: Camera) -> Bool[Tensor, "H W"]:
     """Return the pixels whose nearest face of a posed mesh is one of its head's."""
+    # A z-buffer gives the nearest face of each pixel; background pixels have -1 and read entry 0 as a placeholder.
     face = rasterize_mesh(mesh, camera).face_id
     return torch.from_numpy((face >= 0) & head[np.maximum(face, 0)])
 

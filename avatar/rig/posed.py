@@ -60,6 +60,7 @@ class AvatarModel(Protocol):
 @contextmanager
 def at_rest(model: AvatarModel | nn.Module) -> Iterator[None]:
     """Run the block without gradients and with the module in its evaluation mode, and restore its mode."""
+    # The mode is restored after an error too, so that a training can go on after a failed evaluation.
     was_training = model.training
     model.eval()
     try:

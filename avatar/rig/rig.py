@@ -84,6 +84,7 @@ class Rig:
     """
 
     def __init__(self, template: Template, device: torch.device | str = "cpu") -> None:
+        # Constants of the template as tensors; the dense (V, J) weights stay in numpy, where poses are blended.
         self.template, self.device = template, torch.device(device)
         self.faces = torch.tensor(template.faces, device=device)
         self.vertices = self._tensor(template.vertices)
@@ -143,6 +144,7 @@ class Rig:
             raise InputError(
                 "posed vertices", expected=f"shape {tuple(self.vertices.shape)}", received=str(vertices.shape)
             )
+        # Identity transforms make skinning an exact copy: x = I v + 0.
         return Pose(
             None,
             body_pose=torch.zeros(THETA, device=self.device),
@@ -167,6 +169,7 @@ class Rig:
         """Return a model's displacements, metres, blended with the simulated ones by their share; None for none."""
         if pose.cloth is None:
             return displacements
+        # Linear blend: dv = s dv_simulated + (1 - s) dv_model, with the share s of each vertex in [0, 1].
         simulated = pose.cloth.share * pose.cloth.displacements
         return simulated if displacements is None else simulated + (1.0 - pose.cloth.share) * displacements
 

@@ -221,7 +221,7 @@ class AvatarPlayer:
     @property
     def normals(self) -> Float32[np.ndarray, "N 3"]:
         """The unit normals of the posed surface at the Gaussians, interpolated from the vertices."""
-        # Interpolate the area-weighted vertex normals at each Gaussian's barycentrics (u, v, 1 - u - v), and normalise.
+        # Interpolate the vertex normals (faces weighted by angle) at each Gaussian's barycentrics, and normalise.
         t = self.bundle.tensors
         faces = t["surface.faces"]
         smooth = TriangleMesh(self._posed, faces).vertex_normals

@@ -102,7 +102,7 @@ def test_views_without_anybody_are_left_out(tmp_path):
 
     wipe("Held0", 4)
     config = ProtocolConfig(every=2)
-    with pytest.warns(GeometryWarning, match="novel poses: nobody in the masks of 1 of 2"):
+    with pytest.warns(GeometryWarning, match="novel poses: no person in the masks of 1 of 2"):
         sets = with_people(open_capture(root), view_sets(open_capture(root), config))
     assert sets["novel_pose"].views == (("Held1", 4),)
     wipe("Held1", 4)
