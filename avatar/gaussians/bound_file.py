@@ -91,6 +91,7 @@ def bound_from_tensors(tensors: Mapping[str, Tensor], about: Mapping[str, Any], 
             raise InputError(f"{subject}: {name}", expected="floats", received=str(value.dtype))
     require_finite(tensors, subject=subject, remedy=_REMEDY)
     try:
+        # The dataclass checks shapes and ranges; its errors are given the file's name.
         bound = BoundGaussians(**{**tensors, "face_index": index.long()}, face_count=count, topology=topology)
     except InputError as error:
         raise InputError(f"{subject}: {error.subject}", expected=error.expected, received=error.received) from None

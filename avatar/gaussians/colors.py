@@ -25,7 +25,7 @@ def sh_color(
         sh: coefficients of degree 1 and up.
         directions: of length 1, in the frame of the coefficients.
     """
-    # Colours below 0 have no meaning in sRGB; 3DGS clamps them in the same way, and values above 1 are kept.
+    # Colours below 0 have no meaning in sRGB; 3DGS clamps them too, and values above 1 are kept.
     degree = degree_of(sh)
     if not degree:
         return dc.clamp_min(0.0).expand(torch.broadcast_shapes(dc.shape, directions.shape))

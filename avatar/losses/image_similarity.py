@@ -42,7 +42,8 @@ def ssim(
     the same bits at any number of threads.
 
     Args:
-        x, y: one image or B of them, in [0, 1]. Gradients flow to both where they ask for it.
+        x: one image or B of them, in [0, 1]. Gradients flow to it where it requires them.
+        y: images of the same shape and type, treated in the same way.
         mask: weights >= 0 of one image or of each: `sum(mask * SSIM) / (C sum(mask))`. Windows are not masked, so
             composite both images on one background first. No gradient flows to the mask.
         padding: "zero" or "valid".

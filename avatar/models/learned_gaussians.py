@@ -43,6 +43,7 @@ class LearnedGaussians(nn.Module):
 
     def forward(self) -> BoundGaussians:
         """Return the current Gaussians, with gradients to the attributes."""
+        # Parameters keep their graph; buffers are constants. The dataclass checks the shapes each time.
         named = {**dict(self.named_parameters()), **dict(self.named_buffers())}
         return BoundGaussians(**named, face_count=self.face_count, topology=self.topology)
 

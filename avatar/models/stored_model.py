@@ -78,6 +78,7 @@ class StoredModel:
                 "track_controls", expected=f"shape (T, K, 3), K up to {most}", received=f"shape {tuple(controls.shape)}"
             )
         self.require("track_controls", tuple(controls.shape))
+        # Rows of the controls belong to these frames, in this order.
         frames = self.require("track_frames", (len(controls),), torch.int64).tolist()
         if len(set(frames)) != len(frames):
             raise InputError("track_frames", expected="each frame once", received="one of them again")

@@ -13,10 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import BoundGaussians, world_from_frames
-from avatar.gaussians.colors import view_colors
-from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.sampling import head_faces
+from avatar.gaussians import BoundGaussians, head_faces, triangle_frames, view_colors, world_from_frames
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.networks.control_points import choose_control_points, template_control_points

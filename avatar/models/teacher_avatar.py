@@ -11,9 +11,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
-from avatar.gaussians.colors import view_colors
-from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
+from avatar.gaussians.binding import on_triangles
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
@@ -100,7 +99,7 @@ class TeacherAvatar(nn.Module):
 
     def centre(self, poses: Iterable[Pose]) -> None:
         """Set mean and standard deviation of the position maps over poses, if the configuration is `centred`."""
-        least_deviation = 1e-3  # metres; smaller differences between poses are not amplified beyond this
+        least_deviation = 1e-3  # metres; it bounds the amplification of small differences between poses
         if not self.config.centred:
             return
         count = 0

@@ -10,9 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import BoundGaussians, world_from_frames
-from avatar.gaussians.colors import view_colors
-from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.control_points import template_control_points
 from avatar.models.networks.sparse_rows import SparseRows
@@ -154,6 +152,7 @@ class Track:
 
     def expected_error(self, frame: int) -> Float[Tensor, " V"]:
         """Return the expected error of the vertices in a frame, metres; 0 if it is unknown."""
+        # One column (K, 1), interpolated to the vertices like a displacement.
         sigma = (
             torch.zeros_like(self.controls[0, :, :1]) if self.sigma is None else self.sigma[self.row[frame], :, None]
         )

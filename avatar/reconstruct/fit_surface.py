@@ -181,6 +181,7 @@ def hull_grid(hull: TriangleMesh, box: Box, cell: float) -> Float[Tensor, "X Y Z
     field, found = SignedDistanceField(hull, solid=True), np.empty(len(points), np.float32)
     for first in range(0, len(points), _CHUNK):
         found[first : first + _CHUNK] = field.query(points[first : first + _CHUNK]).distance
+    # Back to the grid (X, Y, Z); the mesh grid above ran with z fastest.
     return torch.from_numpy(found.reshape(counts))
 
 
@@ -197,6 +198,8 @@ def extract(model: NeuralSurface, box: Box, cell: float) -> TriangleMesh:
     def inside(points: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
         found = np.empty(len(points), np.float32)
         for first in range(0, len(points), _CHUNK):
+            # The extractor wants positive values inside; far values are clamped, because only the zero crossing
+            # matters.
             part = torch.from_numpy(points[first : first + _CHUNK]).to(device)
             found[first : first + _CHUNK] = -model.distance(part).float().cpu().numpy()
         return np.clip(found, -far, far)

@@ -18,7 +18,8 @@ class HashGrid(nn.Module):
 
     Args:
         levels: how many.
-        coarsest, finest: cells along a side of the unit cube.
+        coarsest: cells along a side of the unit cube at the first level.
+        finest: the same at the last level.
         log2_entries: of each table.
         features: of an entry.
 
@@ -51,7 +52,7 @@ class HashGrid(nn.Module):
 
     @property
     def width(self) -> int:
-        """Length of a point's features."""
+        """The number of features of a point, over all levels."""
         return len(self.sizes) * int(self.tables[0].shape[1])
 
     def forward(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N width"]:

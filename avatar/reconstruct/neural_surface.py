@@ -21,7 +21,8 @@ class NeuralSurface(nn.Module):
 
     Args:
         hull: (X, Y, Z) signed distance on a grid, negative inside.
-        low, high: corners of the grid in the world.
+        low: least corner of the grid in the world, metres.
+        high: largest corner.
         grid: features of both networks.
     """
 

@@ -20,7 +20,8 @@ class Rays:
     """N rays with the colour and opacity of their pixels.
 
     Attributes:
-        origin, direction: in the world, directions of unit length.
+        origin: centre of projection in the world, metres.
+        direction: unit vector in the world.
         enter: metres to the hull.
         color: of the pixel, sRGB in [0, 1].
         opacity: of the person.

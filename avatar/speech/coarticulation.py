@@ -114,6 +114,7 @@ def articulate(
 
 def _fill_silences(speech: Speech) -> list[Phoneme]:
     """Return the phonemes with silences in the gaps, before the first and after the last."""
+    # A second of silence on both sides lets the mouth open from rest and return to it.
     out, last = [Phoneme(SILENCE, -1.0, 0.0)], 0.0
     for one in speech.phonemes:
         if one.start > last + 1e-6:
@@ -135,6 +136,7 @@ def _hold_closures(
     curves: Float64[np.ndarray, "T 6"], speech: Speech, times: Float64[np.ndarray, " T"], timing: Timing
 ) -> None:
     """Close the lips for bilabials, and lower lip and teeth for labiodentals, whatever the neighbours blend to."""
+    # The longest step between frames, which the window must cover for a closure to be seen.
     frame = float(np.diff(times).max(initial=0.0))
     for one in speech.phonemes:
         if one.name not in BILABIALS | LABIODENTALS:

@@ -95,6 +95,7 @@ class Curves:
 
     def at(self, times: Float64[np.ndarray, " S"]) -> tuple[Float64[np.ndarray, "S N"], Float64[np.ndarray, "S 3"]]:
         """Return values and jaw at other times, interpolated linearly; neutral outside of the curves."""
+        # 0 outside of the curves, which is the neutral face; np.interp alone would hold the first and the last value.
         inside = ((times >= 0.0) & (times <= self.seconds))[:, None]
 
         def between(values: Float64[np.ndarray, "T W"]) -> Float64[np.ndarray, "S W"]:

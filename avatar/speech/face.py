@@ -127,6 +127,8 @@ class Face:
             frames[:, : seen.expression.shape[1]] = seen.expression
             jaw = np.asarray(seen.jaw_pose)
         neutral, low, high = frames.mean(axis=0), frames.min(axis=0), frames.max(axis=0)
+        # An expression that varies by less is noise of the tracking, and its range says nothing of what the student
+        # can show.
         varied = high - low > 0.05
         margin, least, most = (MARGIN, 0.0, MAX_UNOBSERVED)
         if numbered:
@@ -159,6 +161,8 @@ class Face:
             closed_eyes: 0 to 1.
             strength: factor of the mouth's motion; closures of the lips are not scaled.
         """
+        # Expressions are linear in the articulators: rest + articulators times basis + eyelids, then clipped to the
+        # limits.
         scale = np.where(np.isin(ARTICULATORS, ("press", "tuck")), 1.0, strength)
         asked = self.neutral + (curves * scale) @ self.basis + closed_eyes[:, None] * self.blink
         jaw = np.tile(self.jaw, (len(curves), 1))
@@ -177,6 +181,7 @@ class Face:
         `jawOpen` rotates the jaw joint, at 0.5 as far as an open vowel, and `mouthClose` closes it. The expressions of
         the same names are scaled down as for speech, because the joint already moves the mouth.
         """
+        # A copy: the columns of the jaw are changed below.
         values = strength * values
         jaw = np.tile(self.jaw, (len(values), 1))
         if self.jaw_reach:
@@ -203,6 +208,7 @@ class Face:
                 remedy="give ARKit's",
             )
         asked = np.zeros((len(values), len(self.neutral)))
+        # Body and file may have different numbers of FLAME's expressions; the shared first ones are used.
         width = min(asked.shape[1], values.shape[1])
         asked[:, :width] = strength * values[:, :width]
         jaw = self.jaw + strength * rotations

@@ -154,12 +154,14 @@ def pose_arms(
 
 def largest_rotation(one: Float64[np.ndarray, " 22"], other: Float64[np.ndarray, " 22"]) -> float:
     """Return the largest rotation of a joint of the arms between two states, radians."""
+    # The first 18 numbers are the rotation vectors of the six joints; fingers are not counted.
     apart = _relative_rotvec(matrix_from_rotvec(one[:18].reshape(6, 3)), matrix_from_rotvec(other[:18].reshape(6, 3)))
     return float(np.linalg.norm(apart, axis=-1).max())
 
 
 def shuffle_recent_last(count: int, recent: Sequence[int], rng: np.random.Generator) -> list[int]:
     """Return the numbers below `count` in random order, recently used ones last, the oldest of these first."""
+    # Most recent first and each once; three quarters of the gestures at most wait, so that the choice stays random.
     late = list(dict.fromkeys(reversed(recent)))[: (3 * count) // 4]
     fresh = [k for k in rng.permutation(count).tolist() if k not in late]
     return fresh + late[::-1]

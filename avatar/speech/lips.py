@@ -92,9 +92,12 @@ class LipNetwork:
         h = log_mel(np.concatenate([samples, behind])).T
         for k in range(len(self._layers)):
             h = self.layer(k, h)
+        # Row k ends (k + 1) FRAME after the start and describes the sound `delay` seconds before; rows outside are
+        # cut off.
         logits, mouth = h[: len(PHONES)].T, h[len(PHONES) :].T
         times = (np.arange(len(logits)) + 1) * FRAME - self.delay
         seen = (times >= 0.0) & (times < sound.seconds)
+        # Softmax; subtracting the maximum avoids overflow. The mouth's outputs go through the logistic function.
         grown = np.exp(logits - logits.max(axis=1, keepdims=True))
         phones = grown / grown.sum(axis=1, keepdims=True)
         return LipPrediction(times[seen], phones[seen], (1.0 / (1.0 + np.exp(-mouth)))[seen])
@@ -102,6 +105,7 @@ class LipNetwork:
     def layer(self, k: int, h: Float32[np.ndarray, "I T"]) -> Float32[np.ndarray, "O T"]:
         """Return the output of layer `k` for all rows."""
         weight, bias = self._layers[k]
+        # The first layer has no residual, because it changes the number of channels; the last one has no activation.
         out = _convolve(h, weight, self.dilations[k]) + bias[:, None]
         if k == len(self._layers) - 1:
             return out
@@ -118,6 +122,7 @@ def smooth_mouth(mouth: Float[np.ndarray, "T 6"]) -> Float64[np.ndarray, "T 6"]:
     for row, heard in zip(out, mouth, strict=True):
         mean += 0.5 * (heard - mean)
         row[:] = mean
+    # Smoothstep from 0 at 0.3 to 1 at 0.6: the pressing lips and the jaw close together, without a jump.
     share = np.clip((out[:, _PRESS] - 0.3) / (0.6 - 0.3), 0.0, 1.0)
     closed = share * share * (3.0 - 2.0 * share)
     out[:, _PRESS] = np.maximum(out[:, _PRESS], closed)
@@ -133,6 +138,7 @@ def alignment_score(heard: LipPrediction, speech: Speech) -> float:
     """
     names = np.zeros(len(heard.times), np.int64)
     for one in speech.spoken:
+        # Class 0 is silence, so 0 marks rows without a phoneme.
         first, behind = np.searchsorted(heard.times, (one.start, one.end))
         names[first:behind] = PHONES.index(one.name)
     with_phoneme = np.flatnonzero(names)
@@ -158,6 +164,7 @@ def recognise_phonemes(sound: Sound) -> Speech:
     speech_level(sound)
     seconds = sound.seconds
     heard = LipNetwork.shipped()(sound)
+    # The cost of a change keeps single noisy rows from becoming phonemes of their own.
     path = _best_path(np.log(heard.phones + 1e-9), 3.0)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])
     out = []

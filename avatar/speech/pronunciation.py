@@ -187,6 +187,7 @@ def _drop_foreign_words(text: str, language: str) -> tuple[str, list[str]]:
 
 def _is_foreign(word: str) -> bool:
     """Return whether a word has letters of another script; a single Greek letter is a symbol with a name."""
+    # Unicode names begin with the script: "LATIN SMALL LETTER A". Ordinal and micro signs count as Latin.
     letters = [unicodedata.name(one, "") for one in word if unicodedata.category(one) in ("Lu", "Ll", "Lt", "Lo")]
     strange = [name for name in letters if not name.startswith(("LATIN", "MICRO", "FEMININE", "MASCULINE"))]
     return bool(strange) and not (len(letters) == 1 and strange[0].startswith("GREEK"))

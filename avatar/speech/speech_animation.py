@@ -195,10 +195,12 @@ class SpeechAnimator:
     ) -> tuple[Float64[np.ndarray, "T E"], Float64[np.ndarray, "T 3"]]:
         """Return expressions and jaw, from the curves or the phonemes before and at the times."""
         if self._curves is not None:
+            # Curves with blinks of their own keep them; others get the random ones.
             start, curves = self._curves
             expression, jaw = self._face_of_curves(curves, times - start)
             lids = closed_eyes[:, None] * self._face.blink * (not curves.blinks)
             return np.clip(expression + lids, self._face.lowest, self._face.highest), jaw
+        # `articulate` wants phonemes from 0 on: shift phonemes and times to the first one that still matters.
         first = min((one.start for one in self._phonemes), default=0.0)
         phonemes = tuple(replace(one, start=one.start - first, end=one.end - first) for one in self._phonemes)
         seconds = max([times[-1] - first, *(one.end for one in phonemes)])

@@ -37,6 +37,7 @@ class _Move:
         moving = (times < self.end).astype(np.float64)[:, None]
         out = []
         for order in range(3):
+            # Derivative of t^k: k (k - 1) ... (k - order + 1) t^(k - order).
             powers = np.zeros((len(t), 6))
             for k in range(order, 6):
                 powers[:, k] = np.prod(np.arange(k - order + 1, k + 1)) * t ** (k - order)

@@ -1,4 +1,4 @@
-"""Which clothes of a template are loose, cut for simulation and fitted to the surface that a teacher followed."""
+"""Find the loose clothes of a template, cut them for simulation, and calibrate them to the tracked surface."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class ClothConfig:
-    """Which clothes are simulated, and how.
+    """Choices of the simulation of loose clothes.
 
     Attributes:
-        parts: names of the parts; None: those whose followed surface leaves skinning, and whose simulation brings the
-            person's outline in training views nearer to the masks. Named parts are simulated without that test.
-        garment: how they are cut.
-        calibration: how they are fitted.
+        parts: names of the parts; None: those whose tracked surface departs from skinning, and whose simulation brings
+            the person's outline in training views nearer to the masks. Named parts are simulated without that test.
+        garment: settings of the cut.
+        calibration: settings of the fit to the tracked surface.
         seed: nothing is drawn; there for the stage.
         iterations: steps that a bar of progress shows for the stage.
     """
@@ -62,13 +62,13 @@ class Outlines:
 
 @dataclass
 class LooseClothes:
-    """What was found of the loose clothes of a template.
+    """Loose clothes of a template with the figures by which they were chosen.
 
     Attributes:
         garments: parts to simulate, cut and fitted.
-        calibrations: how well each part that was looked at could be fitted.
-        outlines: outlines of the parts that leave skinning, by name.
-        notes: sentences on what could not be done.
+        calibrations: result of the fit of each part that was tested.
+        outlines: outlines of the parts that depart from skinning, by name.
+        notes: sentences on parts that could not be cut or fitted.
     """
 
     garments: list[Garment] = field(default_factory=list)
@@ -85,14 +85,13 @@ def find_garments(
     *,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> LooseClothes:
-    """Cut the clothes of a template, fit them to the followed surface, and keep those that simulation improves.
+    """Cut the clothes of a template, calibrate them to the tracked surface, and keep those that simulation improves.
 
     Args:
         sequence: the training frames.
         reference: parameters of the pose in which the template's surface is the scan's; None: not known.
-        config: which parts are looked at, and how.
-        track: the surface that was followed through the training frames; None: only named parts are cut, with the
-            default material.
+        config: parts to test and settings.
+        track: the tracked surface of the training frames; None: only named parts are cut, with the default material.
         report: called before each part with the numbers of parts, done and all.
 
     Raises:
@@ -116,7 +115,7 @@ def find_garments(
             log.warning("loose clothes: %s", error)
             continue
         if track is not None and fps is not None:
-            # Drag and the depth of the pinned edge are those with which the simulation comes nearest to the track.
+            # Fit drag and the depth of the pinned edge: the simulation that comes nearest to the track.
             followed = followed_particles(sequence, track, garment, fps)
             garment, calibration = calibrate(template, garment, followed, config=config.calibration)
             out.calibrations.append(calibration)
@@ -136,9 +135,9 @@ def why_none(
 
     Args:
         template: the clothed body.
-        config: which parts are looked at.
+        config: parts to test.
         pose_known: whether the pose of the scan, in which the template is the scanned surface, is known.
-        followed: whether the surface is, or will be, followed through the training frames.
+        followed: whether the surface is, or will be, tracked through the training frames.
         fps: frames a second of the capture.
     """
     if not _wanted(template, config):
@@ -173,25 +172,31 @@ def measure_outlines(
         sequence: the training frames.
         garment: the part.
         fps: frames a second.
-        frames, cameras: at most how many frames, and cameras of each; more cost seconds and change little.
+        frames: largest number of frames; more cost seconds and change little.
+        cameras: largest number of cameras of each frame.
     """
     rig, capture = sequence.rig, sequence.capture
     clothed = with_simulated(sequence, [garment])
     wrong: dict[bool, list[float]] = {False: [], True: []}
     for turn, frame in enumerate(spread(sequence.train_frames, frames)):
         for simulated, pose in ((False, sequence.pose(frame)), (True, clothed.as_new_pose(frame))):
+            # The same pose with the part skinned and with the part simulated, drawn as silhouettes and compared with
+            # the mask.
             mesh = TriangleMesh(rig.skin(pose).double().cpu().numpy(), rig.template.faces)
             for camera in sequence.cameras(frame, turn, cameras, 0):
                 image = capture.mask(camera, frame)
                 if image is None:
                     continue
+                # 1 - IoU; the maximum keeps an empty union from dividing by 0.
                 mask, drawn = image > 127, rasterize_mesh(mesh, capture.cameras[camera]).mask
                 wrong[simulated].append(1.0 - float((mask & drawn).sum() / max((mask | drawn).sum(), 1)))
     return Outlines(float(np.mean(wrong[False])), float(np.mean(wrong[True])), len(wrong[True]))
 
 
 def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment, fps: float) -> Followed:
-    """Return where the followed surface has a garment's particles in the training frames; gaps are NaN."""
+    """Return the positions of a garment's particles on the tracked surface, frame by frame; gaps are NaN."""
+    # All frames between the first and the last, because the simulation needs even steps of time; those that were not
+    # tracked stay NaN, and their poses repeat the last known one.
     frames = np.arange(min(track.row), max(track.row) + 1)
     rig, poses, world = sequence.rig, [], np.full((len(frames), len(garment.particles), 3), np.nan)
     confidence = np.ones(world.shape[:2])

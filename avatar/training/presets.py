@@ -88,6 +88,7 @@ Pretrained = TypeVar("Pretrained", FitTeacherConfig, BakeConfig)
 
 def with_iterations(config: Pretrained, iterations: int) -> Pretrained:
     """Return a configuration with other iterations, and as large a share of its pretraining."""
+    # A training of half the steps has a pretraining of half the steps.
     pretrain = config.pretrain and config.pretrain.shortened(iterations / config.iterations)
     return replace(config, iterations=iterations, pretrain=pretrain)
 

@@ -44,11 +44,10 @@ class TrainConfig:
         loose_parts: names of parts to simulate, in the place of those that the training finds.
         perceptual: metric of the perceptual term: "lpips", "st-lpips", "none", or "auto" for the installed one where
             the preset has the term.
-        hold_out: cameras to keep from training;
-        empty: those that the capture's splits hold out.
+        hold_out: cameras to keep from training; empty: those that the capture's splits hold out.
         seed: seed of all random draws.
         device: "auto", "cpu" or "cuda".
-        force: train again what stands.
+        force: repeat steps that are finished.
         tensorboard: log for TensorBoard too.
 
     Raises:
@@ -103,6 +102,7 @@ class TrainConfig:
             InputError: an unknown preset.
             MissingExtraError: a perceptual metric that is named and not installed.
         """
+        # Seed and share of the iterations first, then single options, which therefore are taken as given.
         chosen = training_preset(preset) if isinstance(preset, str) else preset
         chosen = self._changed(chosen.with_seed(self.seed).shortened(self.iterations_share))
         if self.batch is not None:
@@ -135,6 +135,7 @@ class TrainConfig:
 
     def _changed(self, preset: TrainingPreset) -> TrainingPreset:
         """Return the preset with other iterations and another number of Gaussians."""
+        # Teacher and bake shorten their pretraining in proportion; fit and compensation have none.
         changed: dict[str, Any] = {}
         for step, count in self.iterations.items():
             change = with_iterations if step in ("teacher", "bake") else replace

@@ -1,4 +1,4 @@
-"""What a training reads, checked before it starts: unusable frames and views are left out, mismatches are refused."""
+"""Check the inputs of a training before it starts: leave out unusable frames and views, refuse mismatches."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class TrainScene:
 
     Attributes:
         template: the clothed body.
-        capture: its splits are what is trained on and held out; unusable frames and views are left out.
+        capture: its splits name training and held-out frames; unusable frames and views are left out.
         frame: reference frame of the fit.
         built_frame: frame that the template was built from if it is trained on (then equal to `frame`), else None.
         template_frame: frame whose scan the template was made of if the scan is the capture's own, else None.
         overlap: mean IoU of silhouettes and masks in some training frames.
-        digests: SHA-256 by name of everything that is read.
+        digests: SHA-256 by name of all inputs that the training reads.
     """
 
     template: Template
@@ -48,12 +48,12 @@ class TrainScene:
 
 
 def prepare_scene(template: Template, capture: Capture, *, built_frame: int | None) -> TrainScene:
-    """Check a capture against a template, and leave out what cannot be trained on.
+    """Check a capture against a template, and leave out frames and views that cannot be trained on.
 
     Args:
         template: the clothed body.
-        capture: opened with the parameters of its frames; its splits say what is trained on and held out.
-        built_frame: frame that the template was built from, None where that is not known.
+        capture: opened with the parameters of its frames; its splits name the training and the held-out frames.
+        built_frame: frame that the template was built from; None: not known.
 
     Returns:
         The scene; its digests are those of the capture, and `template_frame` is `built_frame`.
@@ -75,6 +75,7 @@ def prepare_scene(template: Template, capture: Capture, *, built_frame: int | No
             received="none in its splits",
             remedy="see docs/captures.md: splits are read from the capture",
         )
+    # Leave out frames without parameters, then views without masks; what is left of the training frames is used.
     capture, params = with_params(capture)
     capture = with_masks(capture)
     seen = {shown for _, shown in capture.views(capture.splits.train_cameras)}
@@ -97,8 +98,7 @@ def hold_out_cameras(capture: Capture, names: Sequence[str]) -> Capture:
 
     Args:
         capture: with cameras and images.
-        names: cameras to hold out;
-        empty: those of the splits.
+        names: cameras to hold out; empty: those of the splits.
 
     Raises:
         InputError: an unknown camera, no images, or no camera left to train on.
@@ -127,6 +127,7 @@ def hold_out_cameras(capture: Capture, names: Sequence[str]) -> Capture:
 def normal_maps(capture: Capture) -> tuple[int, int]:
     """Return the numbers of training views that have a normal map, and of all training views."""
     splits = capture.splits
+    # `presence` is (cameras, frames); the two masks select training cameras and training frames in it.
     rows = np.isin(list(capture.cameras), splits.train_cameras)
     views = capture.presence() & rows[:, None] & np.isin(capture.frames, splits.train_frames)
     return int((views & capture.presence("normal")).sum()), int(views.sum())
@@ -146,6 +147,7 @@ def silhouette_overlap(posed: TriangleMesh, views: list[View], *, least: float =
     values = []
     for view in views:
         mask, mesh = view.alpha.numpy() > 127, rasterize_mesh(posed, view.camera).mask
+        # Intersection over union of the two silhouettes.
         values.append((mask & mesh).sum() / max((mask | mesh).sum(), 1))
     mean = float(np.mean(values))
     if mean < least:
@@ -205,6 +207,7 @@ def with_masks(capture: Capture) -> Capture:
         InputError: no training view has an image and a mask.
     """
     names = list(capture.cameras)
+    # (cameras, frames) tables: which views have an image, which a mask, and which are trained on.
     images, masks = capture.presence(), capture.presence("mask")
     wanted = np.isin(names, capture.splits.train_cameras)[:, None] & np.isin(
         capture.frames, capture.splits.train_frames
@@ -239,6 +242,7 @@ def compare_shapes(
     Raises:
         InputError: parameters of another person.
     """
+    # Displacement of each vertex by the difference of the two shape vectors, metres; the shape space is linear.
     size = template.body.num_betas
     betas = np.mean([_padded(p.betas[0], size) for p in params], axis=0)
     moved = template.body.shapedirs @ (betas - _padded(template.betas, size))
@@ -269,13 +273,15 @@ def overlap_of(
         template: the clothed body.
         capture: with masks.
         params: of the training frames.
-        frames, cameras: how many frames are looked at, and how many cameras of each: enough to notice a wrong world.
+        frames: number of frames to compare; a few are enough to notice a wrong world.
+        cameras: number of cameras of each frame.
 
     Raises:
         InputError: no person in these masks, or a template elsewhere.
     """
     values = []
     for frame in spread(capture.splits.train_frames, frames):
+        # Evenly spread frames and cameras; views without a person in the mask are left out by the reader.
         seen = [name for name in capture.splits.train_cameras if capture.file(name, frame) is not None]
         views = read_views(capture, frame, spread(seen, cameras))
         if views:

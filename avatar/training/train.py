@@ -67,7 +67,7 @@ def train(
     """Train a student on a capture, as `smplxpp train` does: the same inputs and seed give the same bits.
 
     Poses are refined on the photographs where they are estimates. Gaussians are fitted to the template's frame, a
-    teacher follows the surface and learns the photographs, loose clothes are cut and fitted to the followed surface,
+    teacher follows the surface and learns the photographs, loose clothes are cut and fitted to the tracked surface,
     the student is baked from the teacher, and its blend shapes learn what is left.
 
     Args:
@@ -103,6 +103,7 @@ def train(
             expected='cloth="auto" and a teacher, to whose followed surface clothes are fitted',
             received=f"cloth={cloth!r}, teacher={config.teacher}",
         )
+    # All configurations are made, and wrong options refused, before any file is written.
     recipe = config.recipe(preset, cloth=cloth)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -116,6 +117,7 @@ def train(
         reference.save(folder / TRAINING_FILES.reference)
     scene = prepare_scene(template, capture, built_frame=config.template_frame)
     _refuse_held_out_template(capture, config.template_frame)
+    # Checks that need the template, the capture and the recipe together; after them only work is left.
     steps = [step for step in STEPS if step not in ({"cloth"} if recipe.cloth is None else ())]
     check_training(scene, recipe, steps, pose_known=reference is not None)
     how = config.refinement(wanted=refine == "on" or (refine == "auto" and has_estimated_params(capture)))
@@ -217,7 +219,7 @@ class _Training:
         source, teacher, garments = fitted, None, []
         needs = {"source": fitted}
         if self.recipe.teacher:
-            # The surface is followed through the frames, then the teacher's maps learn the photographs.
+            # Track the surface through the frames, then train the teacher's maps on the photographs.
             training = preset.teacher.starting_at(scene.built_frame)
 
             def teach(session: Session, made: Path) -> Progress:
@@ -230,7 +232,7 @@ class _Training:
             needs = {"source": source}
             teacher = _teacher(source, rig)
             if self.recipe.cloth is not None:
-                # Clothes that leave skinning, cut for simulation and fitted to the followed surface.
+                # Cut the clothes that depart from skinning, and calibrate them to the tracked surface.
                 how = self.recipe.cloth
 
                 def simulate(session: Session, made: Path) -> Progress:
@@ -289,20 +291,22 @@ class _Training:
 
         Args:
             step: name of the step and of its folder.
-            settings: all choices that decide it.
-            scene: what it reads.
-            needs: files of earlier steps by the part that they play.
+            settings: all choices that the result depends on.
+            scene: template and capture.
+            needs: files of earlier steps, by their role.
             work: writes the step's files into the folder that it is given.
 
         Raises:
             UnfinishedTrainingError: the limit of time ended it; its checkpoint stays.
         """
         folder, state = self.folder / step, self.folder / f"{step}_work"
+        # A finished step has the key of its inputs in its record; equal keys mean equal results.
         key = self._key(settings, scene, needs)
         record = folder / _RECORD
         if not self.config.force and record.is_file() and read_json(record).get("key") == key:
             log.info("%s: stands, skipped", step)
             return folder
+        # At least one step works in each call, so that repeated calls with a short limit make progress.
         left = self._deadline - time.monotonic()
         if left <= 0.0 and self._worked:
             raise UnfinishedTrainingError(f"the limit of time was over before {step}; the same call continues")
@@ -332,6 +336,7 @@ class _Training:
 
     def _key(self, settings: Mapping[str, Any], scene: TrainScene, needs: Mapping[str, Path]) -> str:
         """Return the digest of all that decides a step: settings, template, capture, earlier steps, version, device."""
+        # The device counts, because CPU and GPU sum in other orders; the version counts, because the code may change.
         files = {"template": self.folder / TRAINING_FILES.template, **needs}
         identity = {
             "version": version("smplxpp"),

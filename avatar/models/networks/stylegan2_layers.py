@@ -87,7 +87,7 @@ class EqualizedLinear(nn.Module):
         self.scale = 1.0 / math.sqrt(inputs)
 
     def forward(self, x: Float[Tensor, "*B I"]) -> Float[Tensor, "*B O"]:
-        """Apply the layer."""
+        """Return the layer's outputs for a batch of vectors."""
         y = F.linear(x * self.scale, self.weight, self.bias)
         return y if self.lr_multiplier == 1.0 else self.lr_multiplier * y
 
@@ -103,14 +103,14 @@ class _EqualizedConv(nn.Module):
 
 
 class ConvLayer(_EqualizedConv):
-    """Equalised convolution and activation; with `down` the image is filtered and halved on the way."""
+    """Equalised convolution and activation; with `down` the image is filtered and halved between them."""
 
     def __init__(self, inputs: int, outputs: int, *, kernel: int = 3, down: bool = False) -> None:
         super().__init__(inputs, outputs, kernel)
         self.filter = FirFilter() if down else None
 
     def forward(self, x: Float[Tensor, "B I H W"]) -> Float[Tensor, "B O h w"]:
-        """Apply the layer; h and w are H and W, or half of them with `down`."""
+        """Return the activations; h and w are H and W, or half of them with `down`."""
         # Equalised learning rate: stored weights have unit variance, used ones 2 / fan in (He), with the gain's
         # square 2.
         weight = self.weight * self.scale
@@ -162,13 +162,14 @@ def demodulate(weight: Float[Tensor, "O I K K"]) -> Float[Tensor, "O I K K"]:
 
 
 class StyledConv(nn.Module):
-    """Modulated 3 x 3 convolution, fixed noise, bias and activation; with `up` the image is doubled on the way.
+    """Modulated 3 x 3 convolution, fixed noise, bias and activation; with `up` the image is doubled first.
 
     Doubling is a transposed convolution with stride 2 followed by the low-pass filter. The noise is one stored image of
     N(0, 1) whose strength is learnt from zero: detail that stays where it is, hence no flicker.
 
     Args:
-        inputs, outputs: channels.
+        inputs: channels of the input.
+        outputs: channels of the output.
         style_size: length of the style.
         up: double the image.
         noise_size: side of the output in pixels, if noise is to be added.
@@ -191,7 +192,7 @@ class StyledConv(nn.Module):
             self.noise = None
 
     def forward(self, x: Float[Tensor, "B I H W"], style: Float[Tensor, " S"]) -> Float[Tensor, "B O h w"]:
-        """Apply the layer; h and w are H and W, or twice as much with `up`."""
+        """Return the activations; h and w are H and W, or twice as much with `up`."""
         # Filters of unit norm keep the features' variance whatever the style, in the place of a normalisation layer.
         weight = demodulate(self.modulated(style))
         if self.filter is None:
@@ -212,7 +213,8 @@ class ToMaps(nn.Module):
     inverse transform, as Animatable Gaussians has it, up to an orthonormal change of the weights.
 
     Args:
-        inputs, outputs: channels.
+        inputs: channels of the input.
+        outputs: channels of the output.
         style_size: length of the style.
         zero: start from weights of zero: the maps are zero until something is learnt.
     """

@@ -216,7 +216,8 @@ class Teacher(nn.Module):
         """Return the residuals of the position alone, in units of `position_scale`.
 
         Args:
-            positions, semantics: as in `forward`.
+            positions: position maps, as in `forward`.
+            semantics: semantic colours, as in `forward`.
         """
         image = self._image(positions, semantics)
         return self._position(image) if "position" in self.networks else self.networks["all"](image)[0][..., :POSITION]

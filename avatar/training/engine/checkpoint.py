@@ -39,6 +39,7 @@ class Checkpoint:
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint as safetensors, atomically: a kill or a full disk leaves the one before."""
+    # One metadata entry, because safetensors writes several in an order that differs from run to run.
     about = {"iteration": checkpoint.iteration, "seconds": checkpoint.seconds, "key": checkpoint.key}
     tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
     atomic_write_bytes(path, save(tensors, metadata={"training": json.dumps({"schema": SCHEMA, **about})}))

@@ -193,6 +193,7 @@ def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float
             0, 0.0, key, {name: value.detach().cpu() for name, value in task.state().items()}
         )
 
+    # All processes restore the same tensors, also at a new start, so that they begin with equal bits.
     checkpoint = task.distributed.run_on_rank0(start)
     task.restore(checkpoint.tensors)
     return checkpoint.iteration, checkpoint.seconds

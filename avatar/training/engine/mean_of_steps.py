@@ -40,6 +40,7 @@ class MeanOfSteps:
             if not since:
                 self.mean = {key: value.detach().clone() for key, value in self.learned.items()}
             for key, mean in self.mean.items():
+                # m + (x - m) / k, which needs no sum of k terms and no number of steps in advance.
                 mean.lerp_(self.learned[key], 1.0 / (since // EVERY + 1))
         if iteration == self.last:
             for key, mean in self.mean.items():

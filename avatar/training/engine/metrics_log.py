@@ -46,6 +46,7 @@ def read_metrics(path: str | Path) -> list[dict[str, Any]]:
 
 def truncate_metrics(path: str | Path, iteration: int) -> None:
     """Drop the entries after `iteration`, whose steps are repeated from the checkpoint."""
+    # The log may be ahead of the checkpoint, which is written less often.
     kept = [entry for entry in read_metrics(path) if entry["iteration"] <= iteration]
     atomic_write_text(path, "".join(json.dumps(entry) + "\n" for entry in kept))
 

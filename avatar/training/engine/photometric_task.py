@@ -14,8 +14,7 @@ from torch import Tensor
 
 from avatar.data.sequence import FrameSequence, Item, camera_centers_of
 from avatar.data.views import View
-from avatar.gaussians.binding import offset_penalty, scale_penalty
-from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians import offset_penalty, scale_penalty, triangle_frames
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_quality, view_quality

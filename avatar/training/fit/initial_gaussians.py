@@ -13,9 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avatar.data.views import View
-from avatar.gaussians.binding import BoundGaussians, world_from_frames
-from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.gaussians import BoundGaussians, SamplingConfig, sample_on_mesh, triangle_frames, world_from_frames
 from avatar.rig.rig import Rig
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.raster import rasterize_mesh

@@ -10,8 +10,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from avatar.data.views import View
-from avatar.gaussians.binding import BoundGaussians, WorldGaussians, world_from_frames
-from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians import BoundGaussians, WorldGaussians, triangle_frames, world_from_frames
 from avatar.rendering.api import rasterize
 from avatar.training.refinement.config import RefineConfig
 

@@ -59,7 +59,7 @@ def refine_capture(
     `params.npz` has a row for each frame: training frames are refined, all others keep what they had. `cameras.json`
     has the training cameras if they were corrected too. `params_held_out.npz` has the held-out frames refined as well,
     on training cameras alone and with everything else as the training frames left it; no model is trained with it.
-    `gaussians.safetensors` has the colours that were learned on the way.
+    `gaussians.safetensors` has the colours that the refinement learned.
 
     Args:
         scene: opened with the parameters that refinement begins with.
@@ -132,6 +132,7 @@ def _write_params(path: Path, rows: Mapping[int, BodyParams]) -> None:
     first = next(iter(rows.values()))
     arrays: dict[str, np.ndarray] = {}
     for name in ARRAY_NAMES:
+        # Frames may have different numbers of coefficients; shorter ones are filled with zeros, which change nothing.
         width = max(getattr(row, name).shape[1] for row in rows.values())
         arrays[name] = np.full((max(rows) + 1, width), np.nan)
         for frame, row in rows.items():

@@ -16,12 +16,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.photometric_task import (
-    ALONE,
-    PhotometricConfig,
-    PhotometricTask,
-    TaskContext,
-)
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.student.init_blend_shapes import init_blend_shapes

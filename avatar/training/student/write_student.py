@@ -24,10 +24,11 @@ def write_student(
     max_bytes: float | None,
     context: TaskContext,
 ) -> dict[str, Any]:
-    """Write a student whole, and compact for players, and measure the compact one as it is read back.
+    """Write a student whole, and compact for players, and measure the compact one after reading it back.
 
     Args:
-        whole, compact: the files.
+        whole: file of the student in single precision.
+        compact: file of the student for players, in half precision.
         student: with blend shapes.
         sequence: the frames and views that it is measured on.
         config: of its training.

@@ -148,7 +148,7 @@ class TrackTask(PhotometricTask):
         raise AssertionError("steps are those of the levels")
 
     def views(self, item: Item) -> list[View]:
-        """Return the photographs at the level's size; halved ones are kept while the frame is followed."""
+        """Return the photographs at the level's size; halved ones are cached while the frame is tracked."""
         halvings = self._level(self.iteration)[0].halvings
         return [self._halved(view, item.frame, halvings) for view in super().views(item)]
 
