@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
+from pipelines.commands.terminal import print_notes, print_paths
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 FormatName = Literal[
     "auto", "simple", "actorshq", "talkbody4d", "avatarrex", "thuman4", "4ddress", "neus2", "easymocap", "colmap"
 ]
-_SHOWN = 8
 _FRAMES = "numbers and ranges START:STOP or START:STOP:STEP (STOP not included), with commas between"
 
 
@@ -82,8 +81,8 @@ class CaptureCheckCommand:
         if not self.json:
             print_check(check, Console())
         report = None if self.out is None else write_check_report(check, self.out)
-        if report is not None and not self.json:
-            Console().print(f"report  {report}", soft_wrap=True, highlight=False, markup=False)
+        if not self.json:
+            print_paths({"report": report}, Console())
         paths = {"report": None if report is None else str(report)}
         return {**check_as_dict(check), **paths, "exit_status": int(check.failed)}
 
@@ -157,10 +156,7 @@ class CaptureConvertCommand:
             done = convert_capture(capture, self.out, config, progress=progress)
         if not self.json:
             console = Console()
-            for note in done.left_out[:_SHOWN]:
-                console.print(f"[yellow]left out[/]  {escape(note)}", soft_wrap=True, highlight=False)
-            if len(done.left_out) > _SHOWN:
-                console.print(f"[dim]and {len(done.left_out) - _SHOWN} more (--json lists all)[/]")
+            print_notes(done.left_out, console, title="left out")
             files = f"{done.copied} files copied, {done.encoded} encoded again, {done.kept} there already"
             console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False, markup=False)
         return {**vars(done), "exit_status": int(bool(done.left_out))}
@@ -249,8 +245,7 @@ class CaptureDegradeCommand:
         made = degrade_capture(self.capture, self.out, config, body=body)
         if not self.json:
             console = Console()
-            for note in made.left_out:
-                console.print(f"[yellow]left out[/]  {escape(note)}", soft_wrap=True, highlight=False)
+            print_notes(made.left_out, console, title="left out", most=len(made.left_out))
             labels = f"{100 * made.labels_wrong:.1f} % of the labels wrong"
             line = f"{made.out}: {made.frames} frames, keypoints of {made.cameras} cameras, {labels}"
             console.print(line, soft_wrap=True, highlight=False)

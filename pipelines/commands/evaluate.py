@@ -13,6 +13,7 @@ from rich.console import Console
 
 from pipelines.commands.options import ClothMode, Lighting, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import shared_progress
+from pipelines.commands.terminal import print_paths
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
 from smplxpp.core.light import STUDIO, Irradiance, Relighting, panoramas
@@ -153,8 +154,7 @@ class Evaluate:
                 soft_wrap=True,
                 highlight=False,
             )
-            if page.is_file():
-                console.print(f"report  {page}", soft_wrap=True, highlight=False, markup=False)
+            print_paths({"report": page if page.is_file() else None}, console)
         return {**report.as_dict(), "run": str(self.run_folder), "ran": record.ran, "checks": record.manifest["checks"]}
 
     def _lights(self) -> dict[str, Relighting]:

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import shared_progress, training_progress
+from pipelines.commands.terminal import print_paths
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.stage import StageRecord, how_to_continue
 from smplxpp.core.validation import require_at_least, require_positive
@@ -162,10 +163,5 @@ def _print(record: StageRecord, report: Path, *, force: bool) -> None:
         f"({numbers['iterations_per_second']:.1f} a second), {state if record.ran else 'stands, not run again'}",
         soft_wrap=True,
     )
-    for name, path in (
-        ("splats", record.folder / "splats.ply"),
-        ("views", record.folder / "previews"),
-        ("report", report),
-    ):
-        if path.exists():
-            console.print(f"{name}  {path}", soft_wrap=True, highlight=False, markup=False)
+    files = {"splats": record.folder / "splats.ply", "views": record.folder / "previews", "report": report}
+    print_paths({name: path for name, path in files.items() if path.exists()}, console)

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 
 from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText, require_avatar
-from pipelines.report.model import CheckRow
+from pipelines.commands.terminal import print_checks, print_notes, print_paths
 from smplxpp.core import InputError, require_at_least, require_positive
 from smplxpp.core.files.json_file import as_object, read_json
 
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from pipelines.runs.stage import StageRecord
     from pipelines.stages.build_config import ReconstructInputs
     from pipelines.stages.reconstruct import Method
-
-_SHOWN = 8
 
 
 @dataclass(frozen=True)
@@ -178,19 +175,8 @@ def _print(record: StageRecord, scans: dict[str, str], notes: list[str], report:
         highlight=False,
         soft_wrap=True,
     )
-    for check in map(CheckRow.of, record.manifest["checks"]):
-        if check.status != "pass":
-            style = "red" if check.status == "fail" else "yellow"
-            line = escape(f"{check.name}: {check.shown}, {check.explanation}")
-            console.print(f"[{style}]{check.status}[/]  {line}", soft_wrap=True)
-    # A long sequence can have hundreds of notes: print the first ones only.
-    for note in notes[:_SHOWN]:
-        console.print(f"[yellow]note[/]  {escape(note)}", soft_wrap=True, highlight=False)
-    if len(notes) > _SHOWN:
-        console.print(f"[dim]and {len(notes) - _SHOWN} more (--json lists all)[/]")
+    print_checks(record.manifest["checks"], console)
+    print_notes(notes, console)
     if not record.ran:
         console.print("stands, not run again")
-    first = next(iter(scans.values()))
-    for name, path in (("scan", first), ("report", report)):
-        if path is not None:
-            console.print(f"{name}  {path}", soft_wrap=True, highlight=False, markup=False)
+    print_paths({"scan": next(iter(scans.values())), "report": report}, console)

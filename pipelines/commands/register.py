@@ -13,15 +13,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipelines.commands.options import OptionalPath, OptionalText
-from pipelines.report.model import CheckRow
+from pipelines.commands.terminal import print_checks, print_notes, print_paths
 from smplxpp.core import InputError, require_at_least
 from smplxpp.core.files.json_file import as_object, read_json
 
 if TYPE_CHECKING:
     from pipelines.runs.stage import StageRecord
     from pipelines.stages.build_config import RegisterInputs
-
-_SHOWN = 8
 
 
 @dataclass(frozen=True)
@@ -178,6 +176,7 @@ class Register:
 
 
 def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None) -> None:
+    """Print residuals, checks that did not pass, the first notes, and the files."""
     from smplxpp.build.register import RESIDUALS
 
     console, numbers = Console(), record.manifest["numbers"]
@@ -200,20 +199,9 @@ def _print(record: StageRecord, content: Mapping[str, Any], report: Path | None)
         console.print(
             f"[dim]{escape(name)}[/]  {found['points']} keypoints, median {before}{after} px", highlight=False
         )
-    for check in map(CheckRow.of, record.manifest["checks"]):
-        if check.status != "pass":
-            style = "red" if check.status == "fail" else "yellow"
-            line = escape(f"{check.name}: {check.shown}, {check.explanation}")
-            console.print(f"[{style}]{check.status}[/]  {line}")
-    # A long sequence can have hundreds of notes: print the first ones only.
-    notes = content["problems"]
-    for note in notes[:_SHOWN]:
-        console.print(f"[yellow]note[/]  {escape(note)}", soft_wrap=True, highlight=False)
-    if len(notes) > _SHOWN:
-        console.print(f"[dim]and {len(notes) - _SHOWN} more (--json lists all)[/]")
+    print_checks(record.manifest["checks"], console)
+    print_notes(content["problems"], console)
     absent = f", {len(content['absent'])} could not be" if content["absent"] else ""
     how = "" if record.ran else "; stands, not run again"
     console.print(f"{numbers['frames']} frames registered{absent}{how}", highlight=False)
-    for name, path in (("params", record.folder / "params.npz"), ("report", report)):
-        if path is not None:
-            console.print(f"{name}  {path}", soft_wrap=True, highlight=False, markup=False)
+    print_paths({"params": record.folder / "params.npz", "report": report}, console)

@@ -13,9 +13,9 @@ from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath,
 from pipelines.synth.config import SynthConfig, motion_kind
 from pipelines.synth.make_capture import make_capture
 from pipelines.synth.person import CLOTHES
-from pipelines.synth.soft_light import Environment
 from smplxpp.core import InputError, require_at_least, require_choice
 from smplxpp.core.files.panorama_file import read_panorama
+from smplxpp.raster.soft_light import Environment
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 

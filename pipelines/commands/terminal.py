@@ -1,4 +1,4 @@
-"""The standard streams of a command, and errors of the operating system in words."""
+"""Guard the standard streams of a command, and print errors, notes, checks and paths."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import errno
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
+from rich.markup import escape
 from rich.text import Text
+
+from pipelines.report.model import CheckRow
 
 STDOUT = "standard output"
 CLOSED_PIPE = 128 + 13
@@ -100,6 +103,30 @@ def end_of_output(error: OutputError, console: Console) -> int:
         return CLOSED_PIPE
     print_error(error, console)
     return 2
+
+
+def print_notes(notes: Sequence[str], console: Console, *, title: str = "note", most: int = 8) -> None:
+    """Print the first notes and the number of the others, because a long sequence can have hundreds."""
+    for note in notes[:most]:
+        console.print(f"[yellow]{title}[/]  {escape(note)}", soft_wrap=True, highlight=False)
+    if len(notes) > most:
+        console.print(f"[dim]and {len(notes) - most} more (--json lists all)[/]")
+
+
+def print_checks(records: Iterable[Mapping[str, Any]], console: Console) -> None:
+    """Print the checks of a manifest that did not pass."""
+    for check in map(CheckRow.of, records):
+        if check.status != "pass":
+            style = "red" if check.status == "fail" else "yellow"
+            line = escape(f"{check.name}: {check.shown}, {check.explanation}")
+            console.print(f"[{style}]{check.status}[/]  {line}", soft_wrap=True)
+
+
+def print_paths(paths: Mapping[str, str | Path | None], console: Console) -> None:
+    """Print a line with name and path of each file; None is left out."""
+    for name, path in paths.items():
+        if path is not None:
+            console.print(f"{name}  {path}", soft_wrap=True, highlight=False, markup=False)
 
 
 def print_error(error: Exception, console: Console) -> None:

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, require_avatar
 from pipelines.commands.progress import training_progress
+from pipelines.commands.terminal import print_paths
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import FIT_STAGE
 from pipelines.runs.stage import StageRecord, how_to_continue
@@ -232,7 +233,7 @@ def _print(records: dict[str, StageRecord], report: Path, *, force: bool) -> Non
             table.add_row(*_row(record, force=force))
     console.print(table)
     if report.is_file():
-        console.print(f"report  {report}", soft_wrap=True, highlight=False, markup=False)
+        print_paths({"report": report}, console)
 
 
 def _row(record: StageRecord, *, force: bool) -> tuple[str, ...]:

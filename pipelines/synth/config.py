@@ -10,9 +10,9 @@ from pipelines.synth.motion import Motion, Performance
 from pipelines.synth.patterns import SKIRT_PATTERNS
 from pipelines.synth.person import CLOTHES
 from pipelines.synth.simulate import SimulationConfig
-from pipelines.synth.soft_light import LightConfig
 from pipelines.synth.talking import Talking
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
+from smplxpp.raster.soft_light import LightConfig
 
 
 @dataclass(frozen=True)

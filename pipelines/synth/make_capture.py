@@ -17,7 +17,6 @@ from pipelines.synth.config import SynthConfig, motion_kind, split_frames
 from pipelines.synth.person import PART_LABELS, PART_NAMES, Person, person_of, read_layers
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import Take, simulate
-from pipelines.synth.soft_light import Environment, LightConfig, vertex_light
 from pipelines.synth.tracked_inputs import INPUTS, protocols, write_estimated_labels, write_tracked_keypoints
 from pipelines.synth.tracker import tracker_noise
 from pipelines.synth.views import Atlas, LitFrame, RenderedView, hidden_faces, normal_map, paint_atlas, render_view
@@ -29,6 +28,7 @@ from smplxpp.capture.writers.metadata import RigCamera, write_actorshq_scene, wr
 from smplxpp.core import ProgressCallback, TriangleMesh, ignore_progress
 from smplxpp.core.files import atomic_folder, atomic_write_text, read_json
 from smplxpp.core.mesh_files.mesh_io import write_ply
+from smplxpp.raster.soft_light import Environment, LightConfig, vertex_light
 
 
 def make_capture(

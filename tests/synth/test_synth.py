@@ -17,7 +17,6 @@ from pipelines.synth.make_capture import make_capture
 from pipelines.synth.motion import Performance
 from pipelines.synth.person import load_person
 from pipelines.synth.simulate import SimulationConfig
-from pipelines.synth.soft_light import Environment, LightConfig, bounced, vertex_light
 from pipelines.synth.views import LitFrame, normal_map, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
@@ -27,6 +26,7 @@ from smplxpp.capture.writers.images import png16, write_normal_png
 from smplxpp.capture.writers.metadata import FACE, write_calibration_csv, write_cameras_json
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.raster import rasterize_mesh
+from smplxpp.raster.soft_light import Environment, LightConfig, bounced, vertex_light
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 TOPOLOGY = FIXTURE / "geometry" / "topology.npz"

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 from pipelines.synth import textures
 from pipelines.synth.patterns import Color, band, mix, smooth_noise
 from pipelines.synth.person import face_landmarks, face_marks
-from pipelines.synth.soft_light import LightConfig, bounced, vertex_light
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.raster.soft_light import LightConfig, bounced, vertex_light
 
 SKIN_TONES: dict[str, Color] = {
     "pale": (240, 208, 192),
