@@ -169,6 +169,7 @@ def _answer(args: list[str], console: Console) -> int:
     if args[0] in ("-V", "--version"):
         sys.stdout.write(f"smplxpp {__version__}\n")
         return 0
+    # A command has one word or two. With --help a group of commands alone prints its members.
     name = next((n for n in COMMANDS if args[: len(n.split())] == n.split()), None)
     if name is None:
         if args[-1] in HELP and any(n.split()[0] == args[0] for n in COMMANDS):
@@ -178,6 +179,7 @@ def _answer(args: list[str], console: Console) -> int:
         known = ", ".join(groups or COMMANDS)
         console.print(Text("error: ", style="red") + Text(f"no command {' '.join(args[:2])!r}; known: {known}"))
         return USER_ERROR
+    # Log lines and warnings go to standard error, so that standard output holds the answer alone.
     rest = args[len(name.split()) :]
     logging.basicConfig(
         level=logging.INFO, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
@@ -186,6 +188,7 @@ def _answer(args: list[str], console: Console) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return _run(name, rest)
+    # A closed pipe is no error of the input: the caller gives it an exit status of its own.
     except OutputError:
         raise
     except (InputError, MissingExtraError, OSError) as error:

@@ -79,6 +79,7 @@ class BundleBenchmark:
         extras = BundleExtras(
             name="benchmark", garments=load_garments(garments, template) if garments.is_file() else ()
         )
+        # Write a bundle of each precision, and open it as a player would: figures are of the file, not of the arrays.
         figures: dict[str, dict[str, float]] = {}
         with tempfile.TemporaryDirectory() as folder:
             players = {}
@@ -90,6 +91,7 @@ class BundleBenchmark:
         rows = {name: Row() for name in ("full student, torch", *WAYS)}
         for item in sequence.measured_views(self.frames):
             measure(rows, student, players, sequence, item)
+        # All are compared with photographs, and the bundles also with the full student, whose error they share.
         full = rows["full student, torch"].psnr
         stored = (self.run_folder / layout.COMPACT_STUDENT).stat().st_size
         out = {"full student, torch": {"megabytes": stored / 1e6, **_means(full, full)}}

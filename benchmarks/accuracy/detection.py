@@ -73,6 +73,7 @@ class Photographs:
         begin = time.perf_counter()
         found = detect_keypoints(capture, detector, folder, frames=frames)
         seconds = time.perf_counter() - begin
+        # Files of an earlier run are kept, so that seconds count images that were looked at now.
         looked_at = sum(one.detected for one in found.values())
         kept = tuple(capture.frames if frames is None else frames)
         shown = open_capture(self.capture, keypoints=folder, cache_bytes=0)
@@ -124,6 +125,7 @@ class Scans:
                 continue
             seconds = time.perf_counter() - begin
             apart = {key: _MM * float(np.linalg.norm(found[key][0] - truth[key])) for key in found if key in truth}
+            # Angle between the facing of the detected and of the true points, because the registration starts from it.
             true = facing({key: (point, 1.0) for key, point in truth.items()})
             ours = facing(found)
             assert true is not None
@@ -184,6 +186,7 @@ class Masks:
             for k in range(self.rooms):
                 size = capture.cameras[camera].width, capture.cameras[camera].height
                 room = made_room(size, seed=100 * k + number)
+                # The room is seen empty three times, with the noise of a sensor, then with the person in front of it.
                 plates = [photograph_of(room, seed=k) for k in range(3)]
                 model, one_plate = PlateModel(plates), PlateModel(plates[:1])
                 for _, frame in capture.views([camera], frames):
@@ -214,6 +217,7 @@ def _point_errors(capture: Capture, body: BodyModel, frames: tuple[int, ...]) ->
     keypoints = {name: found for name in capture.cameras if (found := capture.keypoints(name)) is not None}
     names = next(iter(keypoints.values())).names
     model = LandmarkModel.of(body, names)
+    # The truth is the landmark on the exact body, projected into each camera.
     truth = np.stack([_landmarks(model, body, capture.params(frame)) for frame in frames])
     by_group: dict[str, list[tuple[float, float]]] = {group: [] for group in _GROUPS}
     possible = dict.fromkeys(_GROUPS, 0)
@@ -225,8 +229,10 @@ def _point_errors(capture: Capture, body: BodyModel, frames: tuple[int, ...]) ->
             within = ((screen[:, :2] >= 0) & (screen[:, :2] <= (camera.width, camera.height))).all(axis=1)
             for k, key in enumerate(model.names):
                 possible[_group(key)] += int(within[k])
+                # A pixel error e at depth z is e z / f on the plane of the point, in metres.
                 if own.confidence[row, k] >= _SURE:
                     by_group[_group(key)].append((pixels[k], pixels[k] * screen[k, 2] / camera.K[0, 0]))
+    # Triangulation joins all cameras, so that outliers of single views should vanish.
     in_space = triangulate(
         keypoints, {name: capture.cameras[name] for name in keypoints}, names=model.names, frames=frames
     )

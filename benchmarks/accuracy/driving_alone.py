@@ -123,15 +123,19 @@ class _Truth:
     def errors(self, run: Path) -> dict[str, dict[str, float]]:
         """Mean, 95th and 99th percentile by true part over all hard poses, mm; the worst pose of each part."""
         template, found, body = Template.load(run / TEMPLATE), load_params_of_run(run), load_body()
+        # Compare visible vertices near the true surface only: others are not on the person, and are counted at the end.
         here = template.pose(found)[0]
         visible = outer_visible_points(template.mesh.with_vertices(here), here, tolerance=0.002)
         squared, face, closest = igl.point_mesh_squared_distance(here, self.mesh.vertices, self.mesh.faces)
         used = visible & (squared < _BELONGS**2)
+        # The true place in a pose: undo the reference pose by the authored weights of the nearest true point, then
+        # pose by the same weights. Any difference left is of weights and fit.
         weights = self._weights_at(face[used], closest[used])
         true_reference = body.forward(self.exact).posed_from_rest[0]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", GeometryWarning)
             rest = unpose(here[used], weights, true_reference, config=_ANY_DETERMINANT).vertices
+        # Without translation, because the fit's own would count in every pose.
         still = {"transl": np.zeros((1, 3))}
         theirs = body.forward(stress_poses(replace(self.exact, **still))).posed_from_rest
         driven = template.pose(stress_poses(replace(found, **still)))[:, used]

@@ -151,6 +151,7 @@ class Bench:
             truth = self.capture.truth_mesh(frame)
             if truth is None:
                 continue
+            # Compare the same point on both surfaces, so that sliding along the cloth counts too.
             vertices = rig.skin_to_numpy(sequence.pose(frame), track.displacements(frame))
             wrong = 1e3 * np.linalg.norm(vertices[self.same.own] - self.same.of(truth), axis=1)
             true.append(wrong)
@@ -159,6 +160,7 @@ class Bench:
             mesh = TriangleMesh(vertices, rig.template.faces)
             found.append(surface_quality(mesh, rig.template.vertex_labels, truth, samples=SAMPLES).labels[self.part])
         surface = mean_surface(found)
+        # Spearman's rank correlation: whether vertices with a large expected error have a large true one.
         latest = max(apart, key=lambda frame: apart[frame])
         return {
             "vertexwise": round(mean(apart.values()), 2),

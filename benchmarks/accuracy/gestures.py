@@ -91,9 +91,12 @@ def measured(body: BodyModel, standing: StandingBody, speech: Speech, seed: int)
     spent = time.process_time() - began
     assert animator.gestures is not None
     strokes = animator.gestures.strokes
+    # Distances of the feet from their place in the first frame: standing feet must not slide.
     feet = standing.skeleton.pose(motion)[:, standing.skeleton.at(*FEET)]
     stressed = np.array([one.start for one in speech.spoken if one.stress == 1])
+    # Beats should strike on the stressed vowel: time from the last such vowel's start to the stroke.
     behind = [float((at - stressed[stressed <= at + 1e-6]).min()) for at, _ in strokes]
+    # Seconds until the same gesture comes again: a short time looks mechanical.
     again = [b - a for k, (a, one) in enumerate(strokes) for b, other in strokes[k + 1 :] if one == other]
     within, ever = likeness(motion)
     return {

@@ -78,10 +78,12 @@ def measure(scan: PersonScan, body: BodyModel, seed: int) -> list[dict]:
         start = time.perf_counter()
         found = label_by_body(mesh, body, params, colors=colors)
         seconds = time.perf_counter() - start
+        # Faces count by area, without those of bridges and filled holes, which no scanner saw.
         area = mesh.face_areas * scan.seen
         right = found.face_labels == scan.face_labels
         wrong = np.zeros((len(LABELS), len(LABELS)))
         np.add.at(wrong, (scan.face_labels, found.face_labels), area / area.sum())
+        # Calibration: within a bin of confidence the share of right area should equal the confidence.
         bins = np.digitize(found.confidence, BINS[1:-1])
         rows.append(
             {
@@ -151,6 +153,7 @@ def main() -> None:
         own = measure(scan, body, k)
         print(f"{scan.name}: {', '.join(format(r['accuracy'], '.3f') for r in own)}", flush=True)
         rows += own
+    # The summary of a case weighs scans alike for accuracy, and area alike for calibration.
     summary = {}
     for case in dict.fromkeys(r["case"] for r in rows):
         own = sorted((r for r in rows if r["case"] == case), key=lambda r: r["accuracy"])

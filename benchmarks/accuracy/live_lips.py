@@ -135,11 +135,13 @@ def measure(network: LipNetwork, utterances: list[tuple[Sound, Speech]]) -> dict
     for sound, speech in utterances:
         heard = network(sound)
         names = np.array([_name(speech, t) for t in heard.times])
+        # Frame by frame, while somebody speaks: the right one of nine or fifteen mouth shapes.
         spoken = names != SILENCE
         for shapes, counts in ((VISEMES, nine), (FIFTEEN, fifteen)):
             counts.update((_shapes(heard, shapes) == _places(names, shapes))[spoken].tolist())
         coarse = {"vowel": tuple(VOWELS), "consonant": tuple(set(PHONES) - VOWELS - {SILENCE})}
         kinds.update((_shapes(heard, coarse) == _places(names, coarse)).tolist())
+        # The same of a recogniser of phonemes that hears the whole sound: what more time and a larger model bring.
         found = recognise_phonemes(sound)
         others = np.array([_name(found, t) for t in heard.times])
         alone.update((_places(others, VISEMES) == _places(names, VISEMES))[spoken].tolist())
@@ -150,6 +152,7 @@ def measure(network: LipNetwork, utterances: list[tuple[Sound, Speech]]) -> dict
         quiet.append(mouth[~spoken, ARTICULATORS.index("jaw")])
         hits, misses, false = closures(mouth, heard.times, speech)
         closed, missed, wrong = closed + hits, missed + misses, wrong + false
+    # The delay at which the jaw correlates best with the truth's, in seconds, and that correlation.
     lag, jaw = _best_lag(shown, wanted)
     return {
         "right of nine shapes, %": _share(nine),

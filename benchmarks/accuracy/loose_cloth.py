@@ -80,10 +80,12 @@ class LooseCloth:
             },
             "rows": {},
         }
+        # Each row moves the loose part by another method; its vertices are compared with the true surfaces.
         for name, shapes in bench.rows():
             figures["rows"][name] = bench.measured(shapes)
             print(f"{name:44s} {figures['rows'][name]}", flush=True)
         figures["rows"] |= self._noisy(bench) if self.draws else {}
+        # Cloth is chaotic: two simulations of starts that hardly differ bound what any prediction can reach.
         figures["chaos_mm"] = bench.chaos()
         figures["milliseconds"] = bench.times()
         print(figures["chaos_mm"], figures["milliseconds"])

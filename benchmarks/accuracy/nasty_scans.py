@@ -96,6 +96,7 @@ class Scan:
 def variants(scan: Scan, joints: dict[str, np.ndarray]) -> dict[str, Callable[[], Scan]]:
     """The scans by name; each is made when it is asked for."""
     x, y, _ = scan.vertices[scan.faces].mean(axis=1).T
+    # Faces that look down, and heights and widths of joints, at which parts are cut off, in metres.
     down = TriangleMesh(scan.vertices, scan.faces).face_normals[:, 1] < -0.5
     neck, wrist, knee = joints["neck"][1] + 0.02, joints["right_wrist"][0], joints["right_knee"][1]
     lower = (scan.labels[scan.faces] == 5).all(axis=1)
@@ -114,6 +115,7 @@ def variants(scan: Scan, joints: dict[str, np.ndarray]) -> dict[str, Callable[[]
         "a vertex at 1e9": lambda: scan.with_stray(1e9),
         "a vertex at infinity": lambda: scan.with_stray(np.inf),
         "a vertex 3 m away": lambda: scan.with_stray(3.0),
+        # Reversed winding keeps the mirrored surface facing outward.
         "mirrored, pose symmetric": lambda: Scan(
             scan.vertices * [-1, 1, 1], scan.faces[:, ::-1], scan.colors, scan.labels
         ),

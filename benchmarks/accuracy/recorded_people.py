@@ -103,6 +103,7 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
     spoken, heard_starts, their_starts = [], [], []
     recognised, sounds = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for one in group:
+        # A text of another recording must be refused, the own one taken.
         others = list(dict.fromkeys(other.text for other in everyone if other.text != one.text))
         taken.give(one.sound, [one.text, *others], recogniser)
         got = _words(one.sound, recogniser)
@@ -117,6 +118,7 @@ def measured(group: list[Recording], everyone: list[Recording], recogniser: Any)
         if one.theirs is not None:
             their_starts += starts_apart(one.theirs, given)
             alone.update(visemes_apart(one.theirs, given))
+        # Without the text the words are recognised first; the alignment to the text is the reference.
         free = align(one.sound, recogniser=recogniser)
         heard_starts += starts_apart(given, free)
         recognised.update(visemes_apart(given, free))

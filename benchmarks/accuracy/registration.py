@@ -60,8 +60,10 @@ class RegistrationBenchmark:
         seen, capture = observed.observations, observed.capture
         assert capture is not None and seen.initial is not None
         exact = load_params(self.capture / "params" / "params.npz", body=body)
+        # Every fit is compared with the exact parameters; held-out frames have figures of their own.
         truth = _Truth(body, exact, bare_and_under(self.capture, body.vertex_count)[1], capture.splits.train_frames)
         rows: dict[str, object] = {"as tracked": truth.errors(seen.frames, seen.initial)}
+        # A start that is further off shows how large the region of convergence is.
         off = replace(seen, initial=_off(body, seen.initial))
         rows[f"{OFF_DEGREES:g} degrees off"] = truth.errors(off.frames, off.initial)
         for name, case in _cases(seen, off).items():

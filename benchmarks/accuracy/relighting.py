@@ -70,18 +70,21 @@ def measure(capture: Capture, player: AvatarPlayer, lights: dict[str, np.ndarray
             continue
         with np.load(file) as arrays:
             vertices = arrays["verts"].astype(np.float64)
+        # The true person of the frame, with the light of her stage at every vertex.
         shown = np.flatnonzero(~hidden_faces(person, vertices))
         mesh = TriangleMesh(vertices, person.tpose.faces[shown])
         stage = LitFrame(mesh, shown, vertex_light(mesh, _LIGHT))
         player.pose(params.without_shape(), frame=frame)
         for name, panorama in lights.items():
             light = Irradiance.of_environment(panorama)
+            # Scale the panorama to the mean of the stage, so that errors are of direction and colour.
             scale = stage_light().mean / light.mean
             lit = LitFrame(mesh, shown, stage.light, environment_light(mesh, _LIGHT, scale * panorama))
             for camera_name in capture.splits.novel_view_cameras:
                 camera = capture.cameras[camera_name]
                 truth, before = (render_view(person, one, camera, supersampling=3) for one in (lit, stage))
                 inside, wanted = truth.mask == 255, truth.image / 255.0
+                # What is divided out matters: white light is the default, the stage's own light is the truth here.
                 white, own = (Relighting(light.exposed(scale), one) for one in (Irradiance.uniform(), stage_light()))
                 pictures = {
                     "nothing done": player.draw(camera)[0],

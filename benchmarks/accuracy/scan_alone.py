@@ -82,12 +82,14 @@ def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, fl
     try:
         frame = find_scan_frame(scan.mesh.vertices, scan.mesh.faces)
         mesh = scan.mesh.with_vertices(convert_points(scan.mesh.vertices, units=frame.units, up=frame.up))
+        # Nothing is given: units, axis, body and labels are found as `smplxpp build --scan` alone does.
         labeller = partial(certain_labels, mesh, body, scan.colors)
         found = locate_body(body, mesh, colors=scan.colors, labeller=labeller)
     except InputError as error:
         return {"scan": scan.name, "refused": str(error)}
     seconds = time.process_time() - begin
     posed = body.forward(found.params)
+    # The same joint and the same vertex in both bodies, in millimetres.
     joints = 1e3 * np.linalg.norm(posed.joints[0] - scan.joints, axis=1)[:BODY_JOINTS]
     row: dict[str, float | str | bool | list[str]] = {
         "scan": scan.name,

@@ -96,6 +96,7 @@ def measure(folder: Path) -> list[dict]:
         ]
         rng = np.random.default_rng(0)
         corrupted = [corrupt(m, rng) for m in clean]
+        # Share of the person's pixels whose labels the corruption leaves right.
         right = sum(int(((a == b) & (a >= 0)).sum()) for a, b in zip(clean, corrupted, strict=True))
         share = right / sum(int((a >= 0).sum()) for a in clean)
         draws = {f"label maps, tracked, draw {seed}": tracked(clean, seed) for seed in (1, 2, 3)}
@@ -112,6 +113,7 @@ def measure(folder: Path) -> list[dict]:
             add(case, votes.argmax(1), votes.any(1), time.perf_counter() - start, votes=votes)
     rng = np.random.default_rng(1)
     noisy = truth_vertex.copy()
+    # Labels of vertices with 15 % replaced at random, as noise without any place.
     wrong = rng.random(len(noisy)) < 0.15
     noisy[wrong] = map_labels(rng.integers(1, 6, int(wrong.sum())), "capture")
     everywhere = np.ones(mesh.face_count, dtype=bool)

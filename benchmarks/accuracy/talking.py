@@ -72,6 +72,7 @@ class Talking:
             began = time.process_time()
             spoken = voice.say(text)
             factors.setdefault("synthesis", []).append((time.process_time() - began) / spoken.sound.seconds)
+            # The synthesiser knows when its phonemes begin; the aligner hears the sound, with and without its text.
             heard = {"the voice": spoken.speech}
             for name, words in (("words given", text), ("words recognised", None)):
                 began = time.process_time()
@@ -82,6 +83,7 @@ class Talking:
             bilabials += sum(phoneme.name in BILABIALS for phoneme in spoken.speech.spoken)
             for name in ("words given", "words recognised"):
                 confused.setdefault(name, Counter()).update(visemes_apart(spoken.speech, heard[name]))
+            # A bias of the aligner that depends on the speed cannot be corrected by one constant.
             for slower in SPEEDS:
                 slow = spoken if slower == 1.0 else voice.say(text, slower=slower)
                 aligned = heard["words given"] if slower == 1.0 else align(slow.sound, text)
@@ -98,6 +100,7 @@ class Talking:
             "lips closed, ms": {k: {"missed": missed[k], **milliseconds(v)} for k, v in closures.items()},
             "mouth shapes, % of the time": {k: shares(v) for k, v in confused.items()},
             "starts by speed, words given, ms": {str(k): milliseconds(v) for k, v in by_speed.items()},
+            # Leave one speed out: its bias is estimated on the others.
             "the same, less the other speeds' bias": {
                 str(k): milliseconds(np.asarray(v) - np.mean([np.mean(w) for j, w in by_speed.items() if j != k]))
                 for k, v in by_speed.items()

@@ -81,6 +81,7 @@ class TrainingBenchmark:
         figures["minutes"] = round(sum(stage["seconds"] for stage in figures["stages"].values()) / 60.0, 2)
         print(json.dumps(figures, indent=1))
         protocol = figures["inputs"]["name"]
+        # The name of the results states a shortened training and tracked inputs, so that none is taken for a full one.
         share = figures["stages"][layout.COMPENSATE_STAGE]["iterations"] / preset.compensate.iterations
         of_all = "" if share == 1 else f" --iterations-share {share:g}"
         name = f"training_{open_capture(self.capture).name}_{self.preset}"
@@ -121,6 +122,7 @@ def stage_figures(folder: Path) -> dict[str, Any]:
         "novel_view",
         "novel_pose",
     )
+    # Some figures are of one stage only, as the seconds of tracking of the teacher.
     found = {"seconds": manifest["seconds"], **{name: numbers[name] for name in kept if name in numbers}}
     if "parameters" in numbers:
         found["parameters"] = numbers["parameters"]["total"]

@@ -180,11 +180,13 @@ def main(options: Options) -> None:
     rows = {name: measure(body, trials, method) for name, method in methods().items()}
     scores = {name: mean_of(each) for name, each in rows.items()}
     first = [trial for trial in trials if trial.case.shape == SHAPES[0]]
+    # Variants of the settings are tried on the first shape alone, against the published method on the same trials.
     published = mean_of(measure(body, first, methods()[_PUBLISHED]))
     variants = {
         name: ratios(mean_of(measure(body, first, configured(config))), published) for name, config in VARIANTS.items()
     }
     garments = {trial.case.garment.name: trial.case.garment for trial in trials}
+    # Ratios of mean errors by garment: below 1 is better than the published method.
     compared = ratios(scores[_OURS], scores[_PUBLISHED])
     figures = {
         "driven, mm": {

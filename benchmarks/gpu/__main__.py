@@ -80,6 +80,7 @@ class GpuBenchmark:
         end = time.monotonic() + 60.0 * self.minutes
         figures: dict[str, Any] = {"minutes": self.minutes, "device": _device(self.dry_run), "parts": {}}
         for k, name in enumerate(chosen):
+            # Time that earlier parts left over goes to the later ones.
             seconds = _seconds(name, chosen[k:], end - time.monotonic())
             job = Job(work, run, self.capture.resolve(), seconds, "cpu" if self.dry_run else "cuda")
             figures["parts"][name] = result = run_part(name, job)
@@ -105,9 +106,11 @@ def run_part(name: str, job: Job) -> dict[str, Any]:
     if job.seconds <= 0:
         return {"state": "stopped", "seconds": 0.0, "error": "no time left"}
     found, log, order = (job.work / f"{name}.{suffix}" for suffix in ("json", "log", "job"))
+    # The part writes its findings as it goes, so that those of a killed part are kept; old ones must not be read.
     found.unlink(missing_ok=True)
     job.save(order)
     with log.open("w") as words:
+        # A process group of its own can be ended with its children, and frees all memory of the GPU.
         process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.gpu.parts", name, str(order)],
             cwd=ROOT,

@@ -166,6 +166,7 @@ def student(job: Job, note: Note) -> None:
     note(gaussians=count, vertices=len(rig.vertices), trained=False, rows={})
     rows: dict[str, Any] = {}
     for name, dtype in (("float32", torch.float32), ("half", torch.float16)):
+        # Half precision must not move Gaussians visibly: the largest distance from float32, in millimetres.
         deform = Deformer(model, dtype)
         with torch.no_grad():
             truth = model(poses[-1], center).gaussians
@@ -325,6 +326,7 @@ def enlarge(source: Path, folder: Path, size: tuple[int, int], *, frames: int = 
     chosen = [*capture.splits.train_cameras[: cameras - 1], *capture.splits.novel_view_cameras[:1]]
     shown = capture.splits.train_frames[:frames]
     for name in chosen:
+        # Cut to the wanted aspect first, then enlarge: intrinsics scale with the pixels.
         box, camera = cut(capture.cameras[name], size)
         for frame in shown:
             pictures = {"rgb": capture.image(name, frame), "mask": capture.mask(name, frame)}

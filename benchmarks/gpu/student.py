@@ -135,6 +135,7 @@ def frames_a_second(
     device = poses[0].body_pose.device
     center = torch.tensor(camera.position[None], dtype=torch.float32, device=device)
 
+    # CUDA works asynchronously: wait for it before each reading of the clock.
     def now() -> float:
         if device.type == "cuda":
             torch.cuda.synchronize(device)
@@ -148,6 +149,7 @@ def frames_a_second(
             deformed = now()
             draw(frame, camera, device)
             times.append((deformed - begin, now() - deformed))
+    # The first pictures compile kernels and fill caches.
     times = times[WARM_UP:]
     return {
         "deform_ms": 1e3 * median(deform for deform, _ in times),

@@ -254,6 +254,7 @@ def photograph(ply: Path, coefficients: int, cameras: dict[str, Camera], options
             command = [chromium, *CHROMIUM_FLAGS, f"--user-data-dir={profile}", site.url]
             browser = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
             try:
+                # The browser sends its pictures back over HTTP, and is killed with its children in any case.
                 ended = site.finished.wait(options.seconds)
             finally:
                 os.killpg(browser.pid, signal.SIGKILL)

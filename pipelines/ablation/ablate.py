@@ -186,12 +186,14 @@ def _write(folder: Path, result: AblationResult, about: Mapping[str, Any], waiti
             "evaluation": result.report.as_dict() if result.rows else None,
         }
     )
+    # Tables and pictures of an earlier run may have other rows, so all of them are made again.
     for stale in (*folder.glob("table.*"), *(folder / PICTURES).glob("*.png")):
         stale.unlink()
     if result.rows:
         for suffix, text in (("txt", table.text()), ("csv", table.csv()), ("tex", table.latex(label="tab:ablation"))):
             atomic_write_text(folder / f"table.{suffix}", text)
         _write_sheets(folder, result)
+    # The results come last: a folder with them has the tables and pictures that belong to them.
     atomic_write_text(folder / RESULTS_FILE, json.dumps(results, indent=1))
     return AblationOutcome(folder, table, results, waiting)
 

@@ -73,6 +73,8 @@ def row_stage(
     record = trainer.found(model)
     assert record is not None
     return Stage(
+        # The key holds all that the figures depend on: the trained model, the true surfaces that are measured
+        # against, the refined held-out poses, and the code of evaluation and stage.
         name=f"{ROWS_FOLDER}/{name}",
         config={"row": row, "evaluation": config, "device": trainer.device, "scale": trainer.scale},
         inputs={

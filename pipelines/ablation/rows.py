@@ -142,6 +142,8 @@ class _Plan:
     def full_system(self, training_frames: int) -> None:
         """Add the stages of the paper's rows."""
         preset = self.preset
+        # The full system and the row of the naked body have the same stages on different templates. The full system's
+        # may stand in the run already (`elsewhere`), and are taken from there.
         for ground, prefix in ((CLOTHED, ""), (NAKED, "naked_")):
             own = {} if prefix else {"fit": (FIT_STAGE,), "teacher": (TEACHER_STAGE,), "bake": (BAKE_STAGE,)}
             self._add(
@@ -170,8 +172,10 @@ class _Plan:
             self._bake(f"{prefix}bake", f"{prefix}teacher", ground=ground, elsewhere=own.get("bake", ()))
         self._compensate("full", "bake", elsewhere=(COMPENSATE_STAGE,))
         self._compensate("naked", "naked_bake", ground=NAKED, teacher="naked_teacher")
+        # Without field the mesh moves by skinning alone; attributes and blend shapes learn as always.
         self._bake("no_field_bake", student=replace(self.student, field=None, control_points=0))
         self._compensate("no_field", "no_field_bake")
+        # Without teacher the bake learns from photographs, in as many views as the rows with a teacher see in all.
         steps = _without_teacher(preset, training_frames)
         self._bake("no_teacher_bake", "gaussians", config=replace(preset.bake, iterations=steps))
         self._compensate("no_teacher", "no_teacher_bake", teacher=None)
@@ -182,10 +186,13 @@ class _Plan:
         if teacher.track is None:
             self.stages["untracked"] = self.stages["full"]
         else:
+            # The start of the paper: zero residuals, without tracking and without pretraining on a tracked surface.
             from_zero = replace(teacher, track=None, pretrain=None)
             self._add(replace(self.teacher, name=_folder("untracked_teacher"), config=from_zero, elsewhere=()))
             self._bake("untracked_bake", "untracked_teacher")
             self._compensate("untracked", "untracked_bake", teacher=None)
+        # Blend shapes with coefficients for each small part of the Gaussians, and shapes that are not divided
+        # into those of the head and those of the body.
         self._compensate("local", "bake", shapes=with_local_shapes(preset.blend_shapes))
         self._compensate("ungated", "bake", shapes=replace(preset.blend_shapes, gated=False))
         self._bake("no_cloth_bake", cloth=None)
@@ -199,6 +206,7 @@ class _Plan:
         )
         self._bake("control_bake", student=replace(self.student, control_points=CONTROL_POINTS))
         self._compensate("control", "control_bake")
+        # The null code stands for poses without a frame. Presets that train with it have this row in their full system.
         if preset.bake.null_share and preset.compensate.null_share:
             self.stages["null_code"] = self.stages["full"]
         else:

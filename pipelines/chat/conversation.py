@@ -178,6 +178,7 @@ class Conversation:
                 thread.join()
 
     def _take(self, part: UtterancePart, recogniser: Recogniser) -> None:
+        # Speech interrupts an answer under way, and the avatar turns to the speaker.
         if part.begins:
             self.stop()
             self.frames.listen(True)
@@ -186,6 +187,8 @@ class Conversation:
         recogniser.hear(part.samples)
         if not part.ends:
             return
+        # Silence decides that an utterance ended, so that its true end lies that much earlier. The pause counts in the
+        # delay that a turn reports.
         began = time.monotonic() - part.silent
         decided = time.monotonic()
         words = recogniser.end()

@@ -77,6 +77,7 @@ class Endpoint:
         body = json.dumps({"model": self.model, "messages": messages, "stream": True, "max_tokens": 300}).encode()
         headers = {"Content-Type": "application/json", "Accept": "text/event-stream, application/json"}
         headers |= {"Authorization": f"Bearer {self.key}"} if self.key else {}
+        # The socket is kept where another thread can close it, so that a stopped answer ends at once.
         connection, waiting = self._connection(), None
         try:
             connection.connect()
@@ -88,6 +89,7 @@ class Endpoint:
             if reply.status != http.client.OK:
                 words = " ".join(reply.read(400).decode(errors="replace").split())
                 raise InputError(subject, expected="status 200", received=f"{reply.status} {words}", remedy=_REMEDY)
+            # Servers that do not stream send the whole answer as one JSON object.
             streamed = "event-stream" in (reply.getheader("Content-Type") or "")
             yield from _streamed(reply, subject) if streamed else _whole(reply, subject)
         except TimeoutError:
@@ -116,11 +118,13 @@ class Endpoint:
 
 def _streamed(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
     """Yield the words of server-sent events, lines `data: {...}` up to `data: [DONE]`."""
+    # Lines and their sum are bounded, because the other side may be anything that answers at this address.
     read, answered = 0, False
     while line := reply.readline(_MOST_LINE):
         read += len(line)
         if read > _MOST_BYTES or (not line.endswith(b"\n") and len(line) == _MOST_LINE):
             raise InputError(subject, expected=f"at most {_MOST_BYTES >> 20} MiB of events", received="more")
+        # Server-sent events have other fields and empty lines too, which carry no words.
         if not line.startswith(b"data:"):
             continue
         data = line[5:].strip()

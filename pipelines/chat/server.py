@@ -131,6 +131,7 @@ def _take(conversation: Conversation, message: str | bytes) -> None:
     Raises:
         InputError: any other message.
     """
+    # Sound is 16-bit little-endian PCM; an odd last byte is half a sample and is dropped.
     if isinstance(message, bytes):
         conversation.heard(np.frombuffer(message[: len(message) // 2 * 2], "<i2").astype(np.int16))
         return

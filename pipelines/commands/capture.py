@@ -307,6 +307,8 @@ class CaptureMasks:
             raise InputError(
                 "options", expected="one of --matting, --plates and --mediapipe", received=" and ".join(given) or "none"
             )
+        # The identity goes into the folder's record, because masks of two origins must not mix in one folder. Plates
+        # differ by camera; the other two models are the same for all.
         if self.plates is not None:
             from pipelines.captures.masks import Plates
 

@@ -106,6 +106,7 @@ class Export:
             up=self.up,
             quiet=self.json,
         )
+        # The notes go to standard error, so that a script that reads the output sees the file alone.
         report = export_file(request)
         if not self.json:
             frames = f", {report['frames']} frames" if report["frames"] > 1 else ""

@@ -70,6 +70,7 @@ def _surfaces(request: FileRequest, template: Template, params: BodyParams | Non
         console=Console(stderr=True),
         disable=request.quiet or len(rows) == 1,
     )
+    # The generator poses one frame at a time while files are written, so that a long motion needs little memory.
     files = ((1, partial(write_obj, template=replace(template, vertices=surface))) for surface in surfaces)
     return request.rate(params) if request.is_series else None, files, notes
 

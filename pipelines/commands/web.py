@@ -73,6 +73,7 @@ class Web:
 
     def _check(self) -> None:
         require_between("option port", self.port, 1, LARGEST_PORT)
+        # Check outputs before the bundle is made, which takes seconds.
         if self.out is None and self.single_file is None and not self.serve:
             raise InputError(
                 "options out, single-file and serve",

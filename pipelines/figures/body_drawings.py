@@ -29,6 +29,7 @@ def draw_keypoints(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw points with a confidence of at least `least` as discs, fainter for lower confidence."""
     height, width = picture.shape[:2]
+    # Draw at a multiple of the size and reduce by the mean of the pixels, which smooths the edges (supersampling).
     size = (_FINE * width, _FINE * height)
     whole = Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR).convert("RGBA")
     layer = Image.new("RGBA", size)
@@ -36,6 +37,8 @@ def draw_keypoints(
     for name, (x, y), certainty in zip(names, _FINE * np.asarray(points), confidence, strict=True):
         if certainty < least:
             continue
+        # Left, right and middle have colours of their own, so that exchanged sides are seen at once. Fingers and toes
+        # are drawn smaller than limbs.
         color = LEFT if "left_" in name else RIGHT if "right_" in name else MIDDLE
         share = _SMALL if name[-1].isdigit() or name.endswith("_tip") else _RADIUS
         radius = share * max(size)
@@ -75,10 +78,12 @@ def draw_bones(
     without: Sequence[int] = (),
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw joints and the bones between them; joints behind the camera, and those of `without`, are left out."""
+    # The third value is the depth along the optical axis; points with a negative one are behind the camera.
     pixels = camera.screen_from_world(joints)
     shown = pixels[:, 2] > 0
     shown[list(without)] = False
     height, width = picture.shape[:2]
+    # Line widths grow with the picture, from one pixel at a height of 500.
     unit = _FINE * max(1.0, height / 500.0)
     whole = Image.fromarray(picture).resize((_FINE * width, _FINE * height), Image.Resampling.BILINEAR)
     draw, places = ImageDraw.Draw(whole), _FINE * pixels[:, :2]

@@ -69,10 +69,14 @@ def render_overlay(
         opacity: of the ghost where it faces the camera, 0 to 1.
     """
     style = style or ShadeStyle()
+    # Shade both layers apart, in linear light. Occlusion would darken the ghost by its own folds, so it is off there.
     back = shade_layer(solid, camera, vertex_colors=solid_colors, style=style)
     front = shade_layer(ghost, camera, style=ShadeStyle(**{**vars(style), "base_color": ghost_color, "occlusion": 0.0}))
     tint = linear_from_srgb(np.array(ghost_color, np.uint8))
+    # Opacity rises to 1 at the rim by Schlick's form (1 - cos)^5 with exponent 3, and only where the ghost is
+    # nearer than the solid.
     alpha = (opacity + (1.0 - opacity) * (1.0 - front.facing) ** 3) * (front.mask & (front.depth < back.depth))
+    # Composite ghost over solid (Porter and Duff's "over"): C = a F + (1 - a) B, for colour and coverage alike.
     over = alpha[..., None] * (0.5 * front.color + 0.5 * tint)
     color = over + (1.0 - alpha[..., None]) * back.color
     coverage = alpha + (1.0 - alpha) * back.mask

@@ -74,6 +74,7 @@ def contact_sheet(
         cells = [caption(image, text, background=background) for image, text in zip(images, captions, strict=True)]
     if not cells:
         raise InputError("pictures of a sheet", expected="at least one", received="none")
+    # All cells have the size of the largest picture; the number of rows is rounded up.
     height, width = max(len(c) for c in cells), max(c.shape[1] for c in cells)
     columns = min(columns, len(cells))
     rows = -(-len(cells) // columns)
@@ -134,6 +135,7 @@ def heat_strip(
     """
     font = ImageFont.load_default(_TEXT)
     count = len(columns)
+    # A cell is a whole number of pixels wide, so that columns do not blur into each other.
     cell = max(1, _WIDTH // count)
     colors = heat_colors(np.asarray(values, dtype=np.float64).ravel(), cmap=cmap, limits=limits)
     cells = colors.reshape(len(rows), count, 3).repeat(_ROW, axis=0).repeat(cell, axis=1)
@@ -143,6 +145,7 @@ def heat_strip(
     draw = ImageDraw.Draw(whole)
     for k, name in enumerate(rows):
         draw.text((left - 6, (k + 0.5) * _ROW), name, fill=INK, font=font, anchor="rm")
+    # A number takes about 40 pixels: label every n-th column, so that numbers do not overlap.
     apart = max(1, -(-count * 40 // _WIDTH))
     for k in range(0, count, apart):
         draw.text((left + (k + 0.5) * cell, cells.shape[0] + 4), str(columns[k]), fill=INK, font=font, anchor="mt")

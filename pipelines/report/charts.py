@@ -24,6 +24,7 @@ def histogram_statistics(values: Num[np.ndarray, "*shape"]) -> dict[str, float]:
         raise InputError(
             "values of a histogram", expected="at least one finite value", received=f"{len(values)} values"
         )
+    # Percentiles of the finite values; the others are counted apart, because one NaN would hide all of them.
     p5, p50, p95, p99 = np.percentile(finite, [5, 50, 95, 99])
     return {
         "count": len(finite),

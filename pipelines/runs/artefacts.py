@@ -120,6 +120,7 @@ def load_fit(run: Path, body: BodyModel) -> PosedFit:
         "rest_joints": (J, 3),
         "posed_from_rest": (J, 4, 4),
     }
+    # A file of another body model has other sizes, which is an error with the name of the array.
     arrays = dict(zip(shapes, read_named(run / POSED_BODY, *shapes), strict=True))
     with values_of(run / POSED_BODY):
         found = {name: as_numbers(arrays[name], shape, subject=name) for name, shape in shapes.items()}

@@ -35,6 +35,7 @@ def keep_out_of_capture(out: Path, capture: Path | None, *, subject: str = "--ou
     """
     if capture is None:
         return
+    # Compare the paths as given and with links resolved: a link may lead into the capture, or out of it.
     for folder, root in ((absolute(out), absolute(capture)), (out.resolve(), capture.resolve())):
         if folder.is_relative_to(root):
             inside = folder.relative_to(root).parts
@@ -101,6 +102,7 @@ def own_run_folder(run: Path, names: Sequence[str]) -> Iterator[None]:
             received=error.strerror or str(error),
             remedy="choose another folder",
         ) from None
+    # The lock does not wait: a second build in the same run is refused at once.
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -112,6 +114,7 @@ def own_run_folder(run: Path, names: Sequence[str]) -> Iterator[None]:
                 remedy="wait for its end, or choose another folder",
             ) from None
         for name in names:
+            # Temporary files of a killed build are incomplete, and under the lock no other process can be writing them.
             for left in run.glob(f".{name}.*"):
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
         yield

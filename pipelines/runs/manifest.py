@@ -29,6 +29,7 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     subject = f"record {path.parent.name}/{path.name}"
     content = as_object(read_json(path, subject="record of a stage"), subject=subject)
+    # In Python True equals 1, so that a boolean would pass for version 1.
     if content.get("schema") != SCHEMA or isinstance(content["schema"], bool):
         raise InputError(subject, expected=f"version {SCHEMA}", received=f"version {shown(content.get('schema'))}")
     for name in _OBJECTS:
@@ -36,6 +37,7 @@ def read_record(path: Path) -> dict[str, Any]:
     for name in _DIGESTS:
         for file, digest in content[name].items():
             as_text(digest, subject=f"{subject}: {name}: {file}")
+    # Names of files have to stay inside of the stage, because they are opened later.
     for file in content["files"]:
         path_inside("stage", file, subject=f"{subject}: files")
     as_number(content.setdefault("seconds", 0.0), subject=f"{subject}: seconds", least=0.0, most=_MOST_SECONDS)

@@ -54,6 +54,7 @@ class CompensateStage(ModelStage):
         }
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
+        # Garments are simulated in poses that count as new, so that blend shapes see the clothes that they will later.
         sequence = clothed_sequence(trainer, self.ground, self.cloth)
         teacher = None if self.teacher is None else trainer.model(self.teacher)
         student = self.student.read(trainer.path(self.student), sequence.rig)

@@ -169,6 +169,7 @@ class Trainer:
     ) -> None:
         self.run, self.scene, self.options, self.together = run, scene, options, together
         self.scale, self.perceptual = scale, perceptual
+        # Stages share one deadline, sequences and records: a preset trains several models on the same data.
         self._deadline = time.monotonic() + options.max_seconds
         self._sequences: dict[str, AvatarSequence] = {}
         self._finished: dict[str, StageRecord] = {}

@@ -84,6 +84,7 @@ def refine(
     Raises:
         InputError: see `open_scene`.
     """
+    # Start from the parameters before any refinement, so that the result does not depend on how often it ran.
     scene = open_scene(run, inputs, refined=False)
     stage = Stage(
         name=REFINE_STAGE,

@@ -82,6 +82,7 @@ def chosen_protocol(run: Path, asked: str | None, *, own_params: bool, measures:
     """
     if load_build(run) is None:
         return asked
+    # Template and models of two protocols would mix exact and tracked inputs in one figure.
     own = run_protocol(run)
     if asked is None or asked == own:
         return own

@@ -139,6 +139,7 @@ def _check(capture: Capture, params: dict[int, BodyParams], out: Path, config: D
         raise InputError(f"capture {root}", expected="exact body parameters", received="none")
     if config.rig and capture.cameras:
         raise InputError("--rig", expected="a capture without cameras", received=f"{len(capture.cameras)} cameras")
+    # Neither folder may lie in the other, or a copy would contain itself.
     if out == root or root in out.resolve().parents or out.resolve() in root.parents:
         raise InputError("--out", expected="a folder apart from the capture's", received=str(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -128,6 +128,7 @@ def read_layers(topology_file: Path, clothes: str = "skirt") -> dict[str, np.nda
     missing = [name for name in needed if name not in arrays]
     if missing:
         raise InputError(f"file {topology_file}", expected=f"the key {missing[0]}", received=", ".join(arrays))
+    # Clothes and motions are modelled on this person's parts; on others they would be meaningless.
     parts = tuple(arrays["part_names"].tolist())
     if parts != PART_NAMES:
         raise InputError(f"file {topology_file}", expected=f"parts {PART_NAMES}", received=str(parts))

@@ -37,6 +37,8 @@ INPUTS = {
 def protocols(*, labels: bool = True, normals: bool = True, keypoints: bool = True) -> dict[str, dict[str, object]]:
     """Return the entry "protocols" of a capture's description, given the kinds of files that it has."""
     return {
+        # `exact` reads the truth: no keypoints are needed. `tracked` reads what trackers and parsers give, without the
+        # true normals and labels of the scan.
         "exact": {
             "parameters": EXACT_PARAMETERS,
             "labels": "labels" if labels else None,

@@ -64,6 +64,7 @@ def training_now(run: Path, *, clock: float | None = None) -> TrainingNow | None
         run: folder of the run.
         clock: current time in seconds; None for now.
     """
+    # The last stage with a log is the one that runs; earlier work folders are left over from killed trainings.
     for name in reversed((REFINE_STAGE, *MODEL_STAGES)):
         folder = run / f"{name}{_WORK}"
         logs = _by_age(folder, "*metrics.jsonl") or _by_age(folder, STATE_RECORD)
@@ -173,6 +174,7 @@ def _student(rig: Rig, source: SplatSource) -> Student:
     from avatar.models.model_file import load_avatar
     from avatar.models.student import Student, StudentConfig
 
+    # The fit has no networks: its Gaussians become a student without field and blend shapes.
     if source.file.name == Path(GAUSSIANS).name:
         bound = load_bound(source.file, faces=rig.template.faces)
         student = Student(StudentConfig(field=None), rig, bound, ())
@@ -226,6 +228,7 @@ def tracked_surface(run: Path, template: Template) -> Surface | None:
         rig, track = read()
         if track is None or frame not in track.row:
             return None
+        # Displacements are along the axes of the T-pose and are added before skinning: x = T(w) (v + dv).
         return rig.skin_to_numpy(rig.pose(params), track.displacements(frame))
 
     return at
@@ -233,6 +236,7 @@ def tracked_surface(run: Path, template: Template) -> Surface | None:
 
 def covariances(quats: Float[np.ndarray, "N 4"], scales: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3 3"]:
     """Return `R S S R^T` of rotations wxyz and standard deviations, metres."""
+    # Columns of R are the axes of the ellipsoid, in the usual form of a unit quaternion.
     w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), _FEWEST)).T
     R = np.stack(
         [

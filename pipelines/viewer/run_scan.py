@@ -57,6 +57,7 @@ def _labelled_scan(run: Path) -> LabelledScan:
     with values_of(run / SCAN_LABELS):
         confidence = as_numbers(confidence, (mesh.face_count,), subject="confidence")
     before = read_arrays(run / SCAN_LABELS, subject="stage file")
+    # Corrections by hand are applied to the labels that the stage found, not to those with earlier corrections.
     if "labels_before_hand" in before:
         found = take(before, "labels_before_hand", "confidence_before_hand", path=run / SCAN_LABELS)
         with values_of(run / SCAN_LABELS):
@@ -113,6 +114,7 @@ def label_again(run: Path, *, progress: Callable[[str, bool], None] = lambda nam
             remedy="give `smplxpp build` again",
         )
     inputs, config = found
+    # A build that registers or reconstructs needs the inputs of these stages too, to find them up to date.
     registration = load_register(run) if inputs.registers else None
     reconstruction = load_reconstruct(run) if inputs.reconstructs else None
     lacks = (registration is None and inputs.registers, reconstruction is None and inputs.reconstructs)

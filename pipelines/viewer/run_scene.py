@@ -104,6 +104,7 @@ class RunScene:
         for name, camera in capture.cameras.items():
             if camera.orthographic or capture.file(name, session.frame) is None:
                 continue
+            # The vertical field of view of a pinhole is 2 atan(h / (2 f_y)), f_y and h in pixels.
             image = _small(capture.image(name, session.frame))
             node = self._server.scene.add_camera_frustum(
                 f"{PHOTOGRAPHS}/{name}",
@@ -145,6 +146,7 @@ class RunScene:
 
     def _glb(self, path: str, data: bytes) -> None:
         node = self._nodes.get(path)
+        # A new node for every change would flicker in the browser: the data of the present one are exchanged.
         if node is None:
             self._nodes[path] = self._server.scene.add_glb(path, data)
         else:
@@ -160,6 +162,7 @@ def _path(layer: Layer) -> str:
 
 
 def _wxyz(camera: Camera) -> tuple[float, ...]:
+    # The camera's orientation in the world is the inverse of cam_from_world; scipy has w last, viser first.
     turn = Rotation.from_matrix(np.asarray(camera.cam_from_world)[:3, :3].T).as_quat()
     return tuple(np.roll(turn, 1).tolist())
 

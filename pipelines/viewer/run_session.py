@@ -152,8 +152,10 @@ class RunSession:
         for joint, degrees in self.turned.items():
             block, first = _PLACES[joint]
             own = blocks[block][0, first : first + 3]
+            # The rotation by hand acts first, about the joint's own axes: R = R_frame R_hand.
             added = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
             blocks[block][0, first : first + 3] = rotvec_from_matrix(matrix_from_rotvec(own) @ added)
+        # The motion may have fewer coefficients than the body: missing ones are 0.
         expression = np.zeros((1, max(params.expression.shape[1], len(self.expressions) if self.expression else 0)))
         expression[:, : params.expression.shape[1]] = params.expression
         for name, value in self.expression.items():

@@ -75,9 +75,11 @@ class RunWindow:
         gui.main_panel.dock_right()
         gui.add_markdown(f"**{session.run.resolve().name}**")
         self._status = gui.add_markdown("")
+        # A slider needs a range, also where there is one frame; it is disabled then.
         last = len(session.motion.numbers) - 1
         self._frame = gui.add_slider("Frame", min=0, max=max(last, 1), step=1, initial_value=0, disabled=not last)
         self._play = gui.add_checkbox("Play", False, disabled=not last)
+        # Without Gaussians the layers of the template are shown first, else the Gaussians.
         has_splats = session.player is not None
         with gui.add_folder("Show"):
             self._splats = gui.add_checkbox("Gaussians", has_splats, disabled=not has_splats)
@@ -151,6 +153,7 @@ class RunWindow:
     def _show_turned(self) -> None:
         of_joint = self.session.turned.get(self._turned.value, (0.0, 0.0, 0.0))
         for axis, degrees in zip(self._axes, of_joint, strict=True):
+            # Setting a slider calls its handler: only real changes are set, so that no redraw follows.
             if axis.value != degrees:
                 axis.value = degrees
 

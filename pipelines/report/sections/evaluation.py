@@ -88,6 +88,7 @@ def evaluation_views(record: StageRecord) -> Section:
     numbers = record.manifest["numbers"]
     models = list(numbers["models"])
     pictures, comparisons, seen = [], [], set()
+    # All held-out views are shown. Of the other sets one view is enough, because training has seen their like.
     for shown in numbers["views"]:
         first, held_out = shown["set"] not in seen, shown["set"] in HELD_OUT_VIEWS
         seen.add(shown["set"])
@@ -95,6 +96,7 @@ def evaluation_views(record: StageRecord) -> Section:
             continue
         truth, rendered = read_tiles(_named(record, shown["file"]), len(models))
         pictures += _view_pictures(shown, truth, rendered)
+        # The slider compares the photograph with the last model, which is the student where there is one.
         if first and held_out:
             pair = Picture("photograph", encode_png(truth)), Picture(models[-1], encode_png(rendered[-1]))
             comparisons.append(Comparison(f"{shown['title']}, every pixel", *pair))

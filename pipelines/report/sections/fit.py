@@ -124,6 +124,7 @@ def _table(numbers: dict[str, Any]) -> Table:
 
 def _curves(path: Path) -> tuple[Curve, ...]:
     """Return curves of PSNR and SSIM over the seconds spent in steps; none for fewer than two evaluations."""
+    # The log has lines of steps too; evaluations alone measure whole views.
     found = [entry for entry in read_metrics(path) if entry["kind"] == "evaluation"]
     if len(found) < 2:
         return ()
@@ -133,6 +134,7 @@ def _curves(path: Path) -> tuple[Curve, ...]:
         for key, title in (("psnr", "person"), ("psnr_head", "head"))
         if all(entry["mean"].get(key) is not None for entry in found)
     }
+    # A capture that holds nothing out is evaluated on training views, and the title states it.
     which = "held-out" if found[0]["held_out"] else "training"
     ssim = {"whole image": (seconds, np.array([entry["mean"]["ssim"] for entry in found]))}
     return (

@@ -82,6 +82,7 @@ def reconstruct_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
 
 def write_reconstruct_report(path: Path, run: Path, record: StageRecord) -> None:
     """Write a page on a reconstruction alone."""
+    # A section that cannot be read becomes a note on the page instead of an error after minutes of work.
     section = readable(record, "Reconstruction", lambda: reconstruct_section(run, record))
     inputs = load_reconstruct(run)
     report = Report(
@@ -145,6 +146,8 @@ def _on_photographs(
 ) -> list[Picture]:
     """Draw the outlines of surface and mask on some photographs, including the worst and those left out."""
     capture = open_photographs(inputs)
+    # Intersection over union of the surface's silhouette and the mask, by camera. The worst one is always shown,
+    # others evenly spread, and at most two of those that were left out.
     agreement = numbers["silhouettes"]
     worst = min(agreement, key=agreement.get)
     names = list(dict.fromkeys([worst, *spread(list(agreement), _PHOTOGRAPHS - 1)]))
@@ -156,6 +159,7 @@ def _on_photographs(
         if mask is not None:
             picture[_outline(mask > 127)] = _MASK_COLOR
         picture[_outline(drawn)] = _SURFACE_COLOR
+        # Crop to the person's height and a margin, because photographs of a rig are mostly background.
         rows = np.flatnonzero(drawn.any(axis=1))
         if len(rows):
             margin = int(_MARGIN * len(drawn))

@@ -81,6 +81,7 @@ def _what(numbers: dict[str, Any]) -> str:
         f"on the body: {np.mean(found['loss_before']):.4f} before, {np.mean(found['loss_after']):.4f} after. The shape "
         "is the template's and stays."
     )
+    # Held-out frames are reported apart: their poses saw the training cameras, and no training reads them.
     if "held_out" in numbers:
         apart = numbers["held_out"]
         text += (

@@ -86,6 +86,7 @@ def register_section(run: Path, record: StageRecord) -> Section:
 
 def write_register_report(path: Path, run: Path, record: StageRecord) -> None:
     """Write a page on a registration alone."""
+    # A section that cannot be read becomes a note on the page instead of an error after minutes of work.
     section = readable(record, "Registration", lambda: register_section(run, record))
     inputs = load_register(run)
     source = None if inputs is None else inputs.root or inputs.scan_file
@@ -123,12 +124,15 @@ def _pictures(inputs: RegisterInputs, fits: _Fits, content: Mapping[str, Any]) -
     worst = worst_frames(content, WORST_FRAMES)
     capture = None if inputs.capture is None else open_inputs(inputs, fits.body)
     pictures = []
+    # The reference frame from several cameras shows the fit that the template is built on; a single view of each
+    # worst frame shows where it fails.
     if capture is not None and content["cameras"]:
         chosen = [(reference, REFERENCE_VIEWS, "reference frame")]
         chosen += [(frame, 1, f"largest residual, {words}") for frame, words in worst if frame != reference]
         for frame, count, why in chosen:
             for name in _cameras_shown(capture, content["cameras"], frame, fits)[:count]:
                 pictures.append(_on_photograph(capture, name, frame, fits, why))
+    # A scan given by hand replaces the capture's own of that frame.
     scans = {} if inputs.root is None else find_scans(inputs.root)
     scans |= {} if inputs.scan_file is None else {inputs.frame: inputs.scan_file}
     if reference in scans:

@@ -258,6 +258,7 @@ def poses_section(run: Path, template: Template, reference: BodyParams, inputs: 
     pictures = []
     for name, vertices in zip(STRESS_POSES, template.pose(stress_poses(reference)), strict=True):
         pictures.append(_pose_picture(template, vertices, name.replace("_", " ")))
+    # Frames of the motion are evenly spread over its length.
     motion = motion_of_build(run, inputs)
     if motion is not None:
         chosen = np.array(spread(range(len(motion)), MOTION_PICTURES))

@@ -45,6 +45,8 @@ def standing_trainings(run: Path, records: Iterable[StageRecord]) -> dict[str, S
         for file, digest in record.manifest["files"].items()
     }
     found, outdated = {}, set()
+    # Stages are in the order of work: one whose input has another digest, or comes from an outdated stage, is
+    # outdated too.
     for stage in TRAIN_STAGES:
         manifest = read_manifest(run / stage)
         if manifest is None:
@@ -92,6 +94,7 @@ def training_section(record: StageRecord) -> Section:
 
 def _how(numbers: Mapping[str, Any]) -> str:
     stopped = "" if numbers["finished"] else " The limit of time ended it; the same command continues."
+    # Peak memory of host and GPU; a training on the CPU has no figure of a GPU.
     memory = ", ".join(
         f"{size / 1e9:.1f} GB {where}"
         for where, size in (
