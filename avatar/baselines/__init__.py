@@ -1,4 +1,4 @@
-"""Other kinds of avatars in the same harness: our rasteriser, data and losses, so that a table compares ideas alone."""
+"""Baselines: other kinds of avatars with our rasteriser, data and losses, so that tables compare the models alone."""
 
 from smplxpp.core.lazy import lazy_exports
 

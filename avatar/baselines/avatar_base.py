@@ -1,4 +1,4 @@
-"""What the baselines share: Gaussians on a mesh that follows its joints alone, with residuals from a network."""
+"""Define the base of the baselines: Gaussians on a skinned mesh, with residuals from a network."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class Baseline(nn.Module, ABC):
     """An avatar that learns from photographs alone (an `AvatarModel`).
 
     Attributes:
-        rig: that of the template. gaussians: those on it.
+        rig: of the template.
+        gaussians: learned Gaussians on the template.
     """
 
     rig: Rig
@@ -41,14 +42,22 @@ class Baseline(nn.Module, ABC):
 
     @abstractmethod
     def groups(self, lr: float, lr_final_factor: float) -> list[ParameterGroup]:
-        """Return what is learned beside the attributes of the Gaussians; `lr` is that of networks."""
+        """Return the learned parameters beside the Gaussians' attributes, in groups with learning rates.
+
+        Args:
+            lr: initial rate of networks.
+            lr_final_factor: final rate as a share of the initial one.
+        """
 
 
 class ResidualBaseline(Baseline):
     """`x = LBS(R (u + du) + ...)`: residuals of position, scale, rotation and colour on a skinned template.
 
     Args:
-        frames: those that have a code. code_size: length of each code.
+        rig: of the template.
+        gaussians: on the template.
+        frames: frames with a code.
+        code_size: length of each code.
     """
 
     corner_weights: Tensor

@@ -19,6 +19,9 @@ def make_baseline(config: BaselineConfig, rig: Rig, gaussians: BoundGaussians, f
     """Make an untrained baseline of the configuration's kind.
 
     Args:
-        rig: that of any template. gaussians: those fitted on it. frames: those that have a code.
+        config: selects the kind and its sizes.
+        rig: of any template.
+        gaussians: fitted on the template.
+        frames: frames with a code.
     """
     return _KINDS[type(config)](config, rig, gaussians, frames)

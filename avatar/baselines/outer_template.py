@@ -1,4 +1,4 @@
-"""A template without layers: what a surface reconstructed from images would give."""
+"""Reduce a template to its outer surface, which a reconstruction from images would give."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from smplxpp.template.template import Template
 
 
 def outer_template(template: Template) -> Template:
-    """Return the faces that views from outside see in the T-pose, with one label for all.
+    """Return the template with only the faces seen from outside in the T-pose, all with the label of skin.
 
-    What is under clothes is gone, so that body and clothes are one outer surface, as the implicit templates of
-    Animatable Gaussians (Li et al. 2024) are; unlike theirs it is not welded where clothes end, and its skinning
-    weights are those of the layers. Vertices stay, those of the body drive its joints.
+    Faces under clothes are dropped. Body and clothes become one outer surface, like the implicit templates of
+    Animatable Gaussians (Li et al. 2024), but it is not welded where clothes end, and keeps the layers' skinning
+    weights. All vertices stay, because those of the body drive its joints.
 
     Raises:
         InputError: no face can be seen.

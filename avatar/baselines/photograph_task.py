@@ -1,4 +1,4 @@
-"""The training of every baseline: photographs, the shared loss, nothing else."""
+"""Train a baseline on photographs alone, with the shared loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Position MLP: every Gaussian's residuals from its place in the T-pose, the pose and a frame code; no teacher.
+"""Position MLP: predict every Gaussian's residuals from its position in the T-pose, the pose and a frame code.
 
 The kind of 3DGS-Avatar (Qian et al. 2024): a shallow network on the canonical position, conditioned on the pose and a
 latent code of the frame, moves, scales, turns and recolours each Gaussian before skinning. Theirs encodes positions in
@@ -28,8 +28,10 @@ class PointMLPConfig:
     """Sizes of the position MLP.
 
     Attributes:
-        frequencies: number of bands of the positional encoding. code_size: length of a frame's code.
-        width, hidden_layers: sizes of the network; one more layer gives the residuals.
+        frequencies: number of bands of the positional encoding.
+        code_size: length of a frame's code.
+        width: of the hidden layers.
+        hidden_layers: number of hidden layers; one more layer gives the residuals.
     """
 
     frequencies: int = 6
@@ -47,7 +49,10 @@ class PointMLPAvatar(ResidualBaseline):
     """`residuals_i = MLP(phi(u_i), theta, z_t)`, u_i the Gaussian in the T-pose; they start at zero.
 
     Args:
-        config: sizes. rig: that of the template. gaussians: those on it. frames: those that have a code.
+        config: sizes.
+        rig: of the template.
+        gaussians: on the template.
+        frames: frames with a code.
     """
 
     encodings: Tensor

@@ -35,11 +35,11 @@ OPACITY = 0.99
 
 @dataclass(frozen=True)
 class TexturedMeshConfig:
-    """What a textured mesh is made of.
+    """Configuration of a textured mesh.
 
     Attributes:
-        field: that of the mesh's motion.
-        sampling: that of the texels; opacity and view dependence are not taken from it.
+        field: displacement field of the mesh.
+        sampling: of the texels; its opacity and view dependence are ignored.
     """
 
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
@@ -50,8 +50,10 @@ class TexturedMeshAvatar(Baseline):
     """A student without blend shapes whose Gaussians are texels: only their colours learn.
 
     Args:
-        config: sizes. rig: that of the template. frames: those that have a code.
-        gaussians: texels near one of these start with its colour.
+        config: sizes.
+        rig: of the template.
+        gaussians: each texel starts with the colour of the nearest one.
+        frames: frames with a code.
     """
 
     def __init__(self, config: TexturedMeshConfig, rig: Rig, gaussians: BoundGaussians, frames: Sequence[int]) -> None:

@@ -1,4 +1,4 @@
-"""A UV atlas made from the template alone: one cylindrical chart a limb, packed by their size."""
+"""Make a UV atlas from the template alone: a cylindrical chart for each limb, packed by size."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 from smplxpp.template.template import Template
 
 BODY_JOINTS = 22
-"""Joints of SMPL-X's layout before face and hands: those hang on the nearest of these above them."""
+"""Number of SMPL-X's body joints. Joints of face and hands belong to their nearest body ancestor."""
 GUTTER = 2
-"""Texels kept free round a chart."""
+"""Free texels around each chart."""
 REACH = 2.5
-"""Texels from a texel to the point that stands for it."""
+"""Largest distance from a texel to its anchor point, texels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Atlas:
     Attributes:
         size: texels a side.
         pixels: column and row of each point, texel centres at +0.5.
-        anchor: the point that stands for a texel, -1 where there is none near.
+        anchor: nearest point of each texel within `REACH`; -1 where there is none.
         chart: the chart of each point.
     """
 
@@ -40,12 +40,14 @@ def cylinder_atlas(
 ) -> Atlas:
     """Unwrap points on the template's faces in the T-pose.
 
-    A chart is what follows one body joint most, part by part. Its axis is the direction of its largest extent; u is the
-    angle round it, times the mean radius, v the height along it. Charts of one texel density are packed in rows. Points
-    inside one another (a tongue in a mouth) have charts of their own as far as the body labels them.
+    A chart holds the points of one part that follow one body joint most. Its axis is the direction of its largest
+    variance, u the angle around it times the mean radius, and v the height along it. All charts have the same texel
+    density and are packed in rows. Nested surfaces (a tongue in a mouth) have separate charts if the body labels them.
 
     Args:
-        points: in the T-pose, metres. faces: each point lies on one of these.
+        template: with the faces.
+        points: in the T-pose, metres.
+        faces: face of each point.
         size: texels a side.
     """
     # A chart for each body joint and part, renumbered without gaps; each is unrolled to metres along u and v.
@@ -67,23 +69,26 @@ def cylinder_atlas(
 
 
 def _charts(template: Template) -> np.ndarray:
-    """Return the (V,) chart of each vertex: part, label of the body there, and the body joint that moves it most."""
+    """Return the (V,) chart of each vertex, by its part, the body's label and its heaviest body joint."""
     # Fingers and face have many joints and small areas: move up the tree until a joint of the body is reached.
     joint = np.argmax(template.weights.dense(), axis=1)
-    while (beyond := joint >= BODY_JOINTS).any():
-        joint = np.where(beyond, template.body.parents[joint], joint)
+    while (outside := joint >= BODY_JOINTS).any():
+        joint = np.where(outside, template.body.parents[joint], joint)
     label = template.body.part_labels[template.body_index]
     return (template.vertex_part * len(template.body.part_label_names) + label) * BODY_JOINTS + joint
 
 
 def _unrolled(points: np.ndarray) -> np.ndarray:
     """Return (n, 2) metres along the circumference and along the axis of (n, 3) points; the seam lies at the back."""
+    # The axis is the direction of the largest variance, the last eigenvector of the scatter matrix.
     centred = points - points.mean(axis=0)
     axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    # Front is +z of the T-pose without its component along the axis; for limbs along z (feet) it is +y.
     towards = np.eye(3)[1] if abs(axis[2]) > 0.7 else np.eye(3)[2]
     front = towards - (towards @ axis) * axis
     front /= np.linalg.norm(front)
     side = np.cross(axis, front)
+    # Angle 0 points to the front, so that the jump of arctan2 from pi to -pi, the seam, lies at the back.
     x, z = centred @ side, centred @ front
     return np.stack([np.arctan2(x, z) * np.hypot(x, z).mean(), centred @ axis], axis=1)
 

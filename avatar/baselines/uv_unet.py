@@ -1,4 +1,4 @@
-"""UV U-Net: the posed naked body as a position map in UV space, and the Gaussians' residuals out of a small U-Net.
+"""UV U-Net: predict the Gaussians' residuals from a UV position map of the posed body by a small U-Net.
 
 The kind of GaussianAvatar (Hu et al. 2024): a pose encoder turns the UV position map of the posed body into a feature
 map, to which one learned feature map of the person is added, and a decoder gives Gaussians their parameters. Theirs has
@@ -30,9 +30,10 @@ class UVUNetConfig:
     """Sizes of the UV U-Net.
 
     Attributes:
-        size: texels of the maps, a side. features: channels of the person's learned map.
-        channels: those of the U-Net's scales, the finest first; each next one has half the side.
-        code_size: length of a frame's code, which joins every texel.
+        size: side of the maps, texels.
+        features: channels of the person's learned map.
+        channels: of the U-Net's scales, the finest first; each next scale has half the side.
+        code_size: length of a frame's code, which every texel gets.
     """
 
     size: int = 128
@@ -48,7 +49,10 @@ class UVUNetConfig:
 
 
 class UNet(nn.Module):
-    """Maps to maps of the same side, zero at first; S is divisible by 2 for every scale but the first."""
+    """A U-Net between maps of the same side, whose output is initially zero.
+
+    The side S has to be divisible by 2 for every scale but the first.
+    """
 
     def __init__(self, inputs: int, channels: Sequence[int], outputs: int) -> None:
         super().__init__()
@@ -79,8 +83,10 @@ class UVUNetAvatar(ResidualBaseline):
     """`residual map = UNet(position map + learned features + z_t)`, looked up bilinearly at each Gaussian.
 
     Args:
-        config: sizes. rig: that of the template, the naked one in the published form. gaussians: those on it.
-        frames: those that have a code.
+        config: sizes.
+        rig: of the template; the published method has the naked body.
+        gaussians: on the template.
+        frames: frames with a code.
     """
 
     texels: Tensor

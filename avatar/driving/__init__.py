@@ -1,4 +1,4 @@
-"""What drives an avatar: its person's face and stance, and what is heard of a text or a recording; no torch."""
+"""Inputs that drive an avatar: its person's face and stance, and the sound and phonemes of speech; without torch."""
 
 from avatar.driving.hearing import Heard, hear
 from avatar.driving.person import face_of_bundle, person_of_bundle, person_of_template

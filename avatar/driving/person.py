@@ -1,4 +1,4 @@
-"""Face and stance of the person of a bundle or of a template, by the poses that training saw."""
+"""Derive face and stance of a person from a bundle or a template, and the poses of the training."""
 
 from __future__ import annotations
 

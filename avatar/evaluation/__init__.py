@@ -1,4 +1,4 @@
-"""How good an avatar is: images, surface, speed and size, measured the same way for every model."""
+"""Evaluate avatars: images, surface, speed and size, measured by the same rules for every model."""
 
 from smplxpp.core.lazy import lazy_exports
 

@@ -1,4 +1,4 @@
-"""A trained student as a bundle for players: what driving needs and nothing else, no number finer than it shows."""
+"""Write a trained student as a bundle for players: only what driving needs, quantised to the visible precision."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ from smplxpp.template.template import Template
 
 @dataclass(frozen=True, kw_only=True)
 class BundleConfig:
-    """How coarse the numbers of a bundle are.
+    """Quantisation of the numbers of a bundle.
 
     Attributes:
         exact: store float32 throughout; else halves and integers as follows.
-        position_step, color_step: of a blend shape times its coefficient's usual size: metres, and sRGB in [0, 1].
-        basis_step: of the body's expressions and pose correctives, metres.
+        position_step: step of a blend shape's position times its usual coefficient, metres.
+        color_step: step of a blend shape's colour times its usual coefficient, sRGB in [0, 1].
+        basis_step: step of the body's expressions and pose correctives, metres.
     """
 
     exact: bool = False
@@ -44,7 +45,7 @@ class BundleConfig:
 
     @property
     def reductions(self) -> dict[str, str]:
-        """What is done, by piece, in words."""
+        """The quantisation of each piece, in words."""
         if self.exact:
             return {"all": "float32"}
         return {
@@ -60,11 +61,14 @@ class BundleConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class BundleExtras:
-    """What goes into a bundle beside the student.
+    """Content of a bundle beside the student.
 
     Attributes:
-        name, licence, provenance: see `AboutAvatar`.
-        garments: the loose clothes. motion: something to play.
+        name: see `AboutAvatar`.
+        licence: see `AboutAvatar`.
+        provenance: see `AboutAvatar`.
+        garments: the loose clothes.
+        motion: to play; None: none is stored.
     """
 
     name: str
@@ -77,7 +81,7 @@ class BundleExtras:
 def write_bundle(
     path: str | Path, student: Student, extras: BundleExtras, config: BundleConfig | None = None
 ) -> dict[str, int]:
-    """Write a student as a bundle, whole or not at all.
+    """Write a student as a bundle; a failed write leaves no file.
 
     Returns:
         Bytes of each piece in the file, and "total".
@@ -131,11 +135,12 @@ def write_bundle(
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """Which of a template's vertices and faces a player needs.
+    """The vertices and faces of a template that a player needs.
 
     Attributes:
-        vertices: increasing. faces: those that carry Gaussians, of indices into the vertices.
-        place: where each of the template's vertices is among them, -1 where it is not.
+        vertices: indices in the template, increasing.
+        faces: faces with Gaussians, as indices into `vertices`.
+        place: index of each of the template's vertices in `vertices`; -1: not among them.
     """
 
     vertices: Int64[np.ndarray, " V"]
@@ -272,17 +277,17 @@ def _regression(student: Student, cut: _Cut, config: BundleConfig) -> Tensors:
 def _seen(
     sets: Tensor | None, member: Tensor | None, kept: Int64[np.ndarray, " C"]
 ) -> tuple[Bool[np.ndarray, "S 21"], Int64[np.ndarray, " C"]]:
-    """Return the sets of joints that points see, and each point's set; one of all joints where all are seen."""
+    """Return the sets of joints that points depend on, and each point's set; one set of all joints by default."""
     if sets is None or member is None:
         return np.ones((1, BODY_JOINTS), dtype=bool), np.zeros(len(kept), dtype=np.int64)
     return sets.cpu().numpy()[:, ::3] > 0.5, member.cpu().numpy().argmax(axis=1)[kept]
 
 
 def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str, np.ndarray]:
-    """Return the usual size of each blend shape's coefficients, by side: what its steps are measured by.
+    """Return the root mean square of each blend shape's coefficients, by side, which scales its quantisation steps.
 
-    Those of the body are taken in the poses that training saw, those of the head in the motion, and of expressions at
-    random where there is none. None counts as smaller than a fifth of the largest.
+    The body's are taken over the poses of the training, the head's over random expressions and the motion. The floor
+    is a fifth of the largest.
     """
     shapes = student.blend_shapes
     assert shapes is not None
@@ -316,7 +321,7 @@ def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str,
 def _blend(
     shapes: BlendShapes, order: Int64[Tensor, " N"], usual: Mapping[str, np.ndarray], config: BundleConfig
 ) -> Tensors:
-    """Return blend shapes in the bundle's order of Gaussians, each side with the rows that its gate lets through."""
+    """Return blend shapes in the bundle's order of Gaussians, each side with the rows whose gate is above 0."""
     # Which row of the shapes belongs to the i-th Gaussian of the bundle; -1 where no shape moves it.
     count, n = shapes.count, shapes.config.head_shapes
     place = np.full(count, -1, dtype=np.int64)
@@ -357,7 +362,7 @@ def _blend(
 
 
 def _garments(garments: Sequence[Garment], cut: _Cut) -> tuple[Tensors, Mapping[str, Any]]:
-    """Return garments over the bundle's vertices; float32 is enough for what float64 is kept in elsewhere."""
+    """Return garments over the bundle's vertices, with float64 arrays narrowed to float32."""
     own = [garment.with_vertices_at(cut.place) for garment in garments]
     arrays, about = garments_to_arrays(own)
     narrow = {name: value.astype(np.float32) for name, value in arrays.items() if value.dtype == np.float64}

@@ -1,4 +1,4 @@
-"""Numbers of a bundle: halves, and integers with the steps that make them numbers again."""
+"""Quantise the numbers of a bundle: half precision, and integers with their quantisation steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MOST_HALF = 65504.0
 
 
 def halves(tensors: Mapping[str, np.ndarray]) -> Tensors:
-    """Return tensors in float16; those that it could not hold stay as they are."""
+    """Return tensors in float16, or in float32 where values exceed its range."""
     return {
         name: value.astype(np.float16 if np.abs(value).max(initial=0.0) < _MOST_HALF else np.float32)
         for name, value in tensors.items()
@@ -21,7 +21,7 @@ def halves(tensors: Mapping[str, np.ndarray]) -> Tensors:
 
 
 def unsigned(name: str, values: Float[np.ndarray, "*N"], bits: int) -> Tensors:
-    """Return values of [0, 1] in whole steps of so many bits, 8 or 16."""
+    """Return values of [0, 1] quantised to 8 or 16 bits, and the step."""
     # The step is stored with the integers: a reader multiplies, and needs to know no number of bits.
     most = (1 << bits) - 1
     return {
@@ -31,7 +31,7 @@ def unsigned(name: str, values: Float[np.ndarray, "*N"], bits: int) -> Tensors:
 
 
 def signed(name: str, values: Float[np.ndarray, "*N"], largest: np.ndarray | np.float32) -> Tensors:
-    """Return values within `largest`, one for all or one for each place of the last axes, in 8 bits."""
+    """Return values up to a magnitude of `largest`, a number or an array of the last axes, in 8 bits with steps."""
     # Symmetric quantisation: -127 .. 127, so that 0 is exact and the error is at most half a step.
     step = np.asarray(largest, np.float32) / _LARGEST
     return {
@@ -41,14 +41,14 @@ def signed(name: str, values: Float[np.ndarray, "*N"], largest: np.ndarray | np.
 
 
 def rounded(name: str, basis: Float[np.ndarray, "R 3 E"], step: float) -> Tensors:
-    """Return a basis in 8 bits: in this step, or in what a direction's largest number needs."""
+    """Return a basis in 8 bits, in steps of `step`, or coarser ones for directions with values above 127 steps."""
     return signed(name, basis, np.maximum(np.abs(basis).max(axis=(0, 1), initial=0.0), _LARGEST * step))
 
 
 def blended(side: str, values: Float[np.ndarray, "n 6 M"], steps: Float[np.ndarray, "n 6"]) -> Tensors:
-    """Return blend shapes in 8 bits: `steps 2^exponent` a unit, the exponent a Gaussian's own where it needs one.
+    """Return blend shapes in 8 bits, in units of `steps 2^exponent` with an exponent for each Gaussian.
 
-    Nearly all numbers are a few steps: zip's entropy code takes them to some three bits each.
+    Most values are a few steps, so that zip compresses them to about three bits each.
     """
     # A Gaussian whose largest value exceeds 127 steps doubles its step as often as it takes: no value is clipped, and
     # all others keep the fine step.

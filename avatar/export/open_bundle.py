@@ -1,4 +1,4 @@
-"""Bundles as players read them: of a file, or made in memory of a trained student; torch is needed for a student."""
+"""Open a bundle from a file, or make one in memory from a trained student, which needs torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avatar.runtime.bundle import SUFFIX
 
 
 def open_bundle(source: Path, *, exact: bool = False) -> AvatarBundle:
-    """Read a bundle, or make one in memory of the student in a folder.
+    """Read a bundle, or make one in memory from the student in a folder.
 
     Args:
         source: a bundle NAME.avatar, or a folder that `avatar.train` or `smplxpp train` wrote.
@@ -27,7 +27,7 @@ def open_bundle(source: Path, *, exact: bool = False) -> AvatarBundle:
 
 @contextmanager
 def bundle_file(source: Path, *, exact: bool = False) -> Iterator[Path]:
-    """Give the file of a bundle: the source itself, or one made of the student in a folder for the block.
+    """Yield the file of a bundle: the source itself, or a temporary one made from the student in a folder.
 
     Args:
         source: a bundle or a folder, as in `open_bundle`.

@@ -1,4 +1,4 @@
-"""Gaussians on a mesh as world-space splats of one pose, which `avatar.formats` writes for other programs."""
+"""Convert Gaussians on a mesh to world-space splats of one pose, which `avatar.formats` writes for other programs."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from smplxpp.core.spherical_harmonics import C0, rotate_sh
 
 
 def posed_splats(bound: BoundGaussians, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Splats:
-    """Return bound Gaussians as world-space splats of one pose, the colours' harmonics turned into the world.
+    """Return bound Gaussians as world-space splats of one pose, with harmonics rotated to the world.
 
-    Viewers evaluate colours in the world's axes, ours live in the triangles' frames: `rotate_sh` takes each Gaussian's
-    coefficients there. `f_dc = (dc - 0.5) / C0`. Computed in float64, kept in float32.
+    Viewers evaluate colours in the world's axes, but our coefficients refer to the triangles' frames: `rotate_sh`
+    rotates them. `f_dc = (dc - 0.5) / C0`. Computed in float64, stored in float32.
 
     Args:
         bound: the local attributes.

@@ -1,4 +1,4 @@
-"""A student in a file of any kind: the bundle of our players, splats of a pose, and the step that makes them."""
+"""Write a student to a file: a bundle for players, splats of a pose or motion, or its step as ONNX."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ def export_student(
     licence: str = "",
     exact: bool = False,
 ) -> dict[str, Any]:
-    """Write a student to a file whose kind its suffix says, whole or not at all.
+    """Write a student to a file, whose suffix selects the format; a failed write leaves no file.
 
     Args:
         student: with its loose clothes and the pose of its scan, as `avatar.train` and `avatar.load` give it.
         path: NAME.avatar (bundle), NAME.ply .spz .sog .glb (splats of a pose), NAME.usdc (splats that move), NAME.onnx.
-        params: of a bundle: the motion that it has to play; of splats: the pose (the first frame) or the motion. None:
-            the poses that training saw.
-        cloth: what moves loose clothes along `params` in splats: a simulation, the student's own field, or skinning.
+        params: motion of a bundle or of moving splats, or pose of other splats (its first frame); None: the poses of
+            the training.
+        cloth: motion of loose clothes in splats along `params`: simulated, by the student's field, or by skinning.
         name: of the avatar in a bundle; None: the student's.
-        licence: of the avatar, as the bundle states it.
+        licence: of the avatar, for the bundle.
         exact: keep every number of a bundle in float32.
 
     Returns:
@@ -99,15 +99,16 @@ def export_bundle(
     exact: bool = False,
     provenance: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Write a student as a bundle for players, whole or not at all.
+    """Write a student as a bundle for players; a failed write leaves no file.
 
     Args:
         student: with its loose clothes.
         path: NAME.avatar.
-        name, licence: of the avatar; no name: the student's.
-        motion: what it has to play; None: the poses that training saw.
+        name: of the avatar; None: the student's.
+        licence: of the avatar.
+        motion: to play; None: the poses of the training.
         exact: keep float32.
-        provenance: where it comes from; None: this version, and the digests of the student's files.
+        provenance: sources of the avatar; None: this version, and the digests of the student's files.
 
     Returns:
         The file ("out"), "bytes" of its pieces and "total", and the number of "frames" that it plays.
@@ -127,7 +128,7 @@ def export_bundle(
 
 
 def seen_poses(student: Student) -> BodyParams | None:
-    """Return the poses that training saw, one after the other, standing as the scan stands; None: not known."""
+    """Return the poses of the training in order, at the place of the scan; None: not known."""
     if student.pose_gate is None:
         return None
     # Stored poses are the 21 body joints alone; everything else (hands, place) comes from the pose of the scan.

@@ -1,4 +1,4 @@
-"""Splats of an avatar along a motion, its loose clothes simulated; torch is not needed."""
+"""Yield splats of an avatar along a motion with simulated loose clothes, without torch."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def splats_along(
         return
     # A simulation has a state, so that rows before the first are stepped too and not written.
     begin = max(0, rows[0] - round(PRE_ROLL * rate))
-    for k, way in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
-        posed = player.step(motion.frame(k), 1.0 / rate, path=way)
+    for k, path in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
+        posed = player.step(motion.frame(k), 1.0 / rate, path=path)
         if k in rows:
             yield world_splats(posed)
     if notes is not None:
