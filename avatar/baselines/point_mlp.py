@@ -25,7 +25,7 @@ from smplxpp.core.validation import require_at_least
 
 @dataclass(frozen=True)
 class PointMLPConfig:
-    """Sizes of the position MLP.
+    """Sizes of the position MLP and of its inputs.
 
     Attributes:
         frequencies: number of bands of the positional encoding.

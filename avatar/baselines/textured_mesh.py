@@ -35,7 +35,7 @@ OPACITY = 0.99
 
 @dataclass(frozen=True)
 class TexturedMeshConfig:
-    """Configuration of a textured mesh.
+    """Choices of a textured mesh: its displacement field and its texels.
 
     Attributes:
         field: displacement field of the mesh.

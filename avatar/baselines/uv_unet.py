@@ -27,7 +27,7 @@ from smplxpp.core.validation import require_at_least
 
 @dataclass(frozen=True)
 class UVUNetConfig:
-    """Sizes of the UV U-Net.
+    """Sizes of the UV U-Net and of its maps.
 
     Attributes:
         size: side of the maps, texels.
@@ -57,7 +57,7 @@ class UNet(nn.Module):
     def __init__(self, inputs: int, channels: Sequence[int], outputs: int) -> None:
         super().__init__()
         self.first = ConvLayer(inputs, channels[0])
-        # Each scale halves the side of the finer one on its path down, and is joined with it again on the way up.
+        # The encoder halves the side from scale to scale; the decoder doubles it and joins the encoder's map of that side.
         pairs = list(pairwise(channels))
         self.down = nn.ModuleList(ConvLayer(fine, coarse, down=True) for fine, coarse in pairs)
         self.up = nn.ModuleList(ConvLayer(fine + coarse, fine) for fine, coarse in reversed(pairs))

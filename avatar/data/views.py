@@ -44,7 +44,7 @@ class View:
 
     @cached_property
     def K(self) -> Float32[Tensor, "3 3"]:
-        """Intrinsics of the camera, pixels."""
+        """Intrinsics of the camera in pixels, the matrix K."""
         return torch.tensor(self.camera.K, dtype=torch.float32, device=self.alpha.device)
 
     @cached_property

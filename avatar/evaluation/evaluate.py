@@ -62,7 +62,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The results of an evaluation.
+    """The results of an evaluation: figures and pictures.
 
     Attributes:
         report: all figures.

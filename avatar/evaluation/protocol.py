@@ -64,7 +64,7 @@ class ViewSet:
 
     @property
     def title(self) -> str:
-        """The set's name for readers."""
+        """The name of the set in tables and messages."""
         return SETS[self.name]
 
     @property
