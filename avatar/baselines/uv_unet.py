@@ -57,7 +57,7 @@ class UNet(nn.Module):
     def __init__(self, inputs: int, channels: Sequence[int], outputs: int) -> None:
         super().__init__()
         self.first = ConvLayer(inputs, channels[0])
-        # The encoder halves the side from scale to scale; the decoder doubles it and joins the encoder's map of that side.
+        # The encoder halves the side from scale to scale; the decoder doubles it and joins the encoder's maps.
         pairs = list(pairwise(channels))
         self.down = nn.ModuleList(ConvLayer(fine, coarse, down=True) for fine, coarse in pairs)
         self.up = nn.ModuleList(ConvLayer(fine + coarse, fine) for fine, coarse in reversed(pairs))

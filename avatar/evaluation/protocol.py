@@ -141,6 +141,7 @@ def truth_frames(capture: Capture, config: ProtocolConfig, sets: Mapping[str, Vi
         return {}
     # Frames are taken block by block, so that a frame without a surface is replaced by the next one and not lost.
     splits = measured_splits(capture, config)
+    # Novel poses are held-out frames; all other sets show training frames.
     wanted = {"held_out" if name.startswith("novel_pose") else "training" for name in sets}
     out = {}
     for name, frames, step in (

@@ -141,6 +141,7 @@ class EvalReport:
                 received=str(values.get("schema")),
                 remedy="evaluate again with this version",
             )
+        # Reading by keys: whatever is missing or of another type ends in one error that names the schema.
         try:
             return EvalReport(
                 capture=as_text(values["capture"], subject=f"{_SUBJECT}: capture"),

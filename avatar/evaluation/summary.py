@@ -89,6 +89,7 @@ def image_table(report: EvalReport, name: str, *, refined: bool = False) -> Figu
     models = report.refined_poses if refined else report.models
     title = f"{SETS[name]}{REFINED_POSES}" if refined else SETS[name]
     metric = report.metric or ""
+    # The person's PSNR comes first, since the plain background inflates the figures of whole images.
     columns = (
         Column("images", "images", "", 0),
         Column("frames", "frames", "", 0),
@@ -122,6 +123,7 @@ def _of_set(model: ModelFigures, name: str) -> dict[str, float | None]:
 
 def surface_table(report: EvalReport) -> FigureTable:
     """Make the table of distances to the true surface, of all, head, skin and each cloth, skinning alone first."""
+    # Each part has one group of columns: distances of the whole surface, then of head, skin and each cloth.
     columns = []
     for name, title in SURFACE_SETS.items():
         group = f"{title}, mm"

@@ -208,6 +208,7 @@ def _gaussians(tensors: Mapping[str, Tensor], per_face: Int64[np.ndarray, " F"],
     offset[:, 0] += own["normal_offset"]
     opacities = torch.sigmoid(tensors["opacity_logits"].double()).numpy()
     quats = own["quats"] / np.linalg.norm(own["quats"], axis=1, keepdims=True)
+    # A byte holds the number of Gaussians on a face, unless some face has more than 255.
     counts: Tensors = {"per_face": per_face.astype(np.uint8 if per_face.max(initial=0) < 256 else np.uint32)}
     plain = {"offset": offset, "log_scales": own["log_scales"], "dc": own["dc"]}
     fine = {"barycentric": own["barycentric"], "opacities": opacities}

@@ -81,6 +81,7 @@ def export_student(
         mode = cloth if params is not None or cloth != "simulate" else "field"
         splats = splats_along(player, motion, range(frames), cloth=mode)
         if suffix in _MOVING:
+            # A single frame is written without samples in time.
             fps = (motion.fps or DEFAULT_FPS) if frames > 1 else None
             import_module("avatar.formats.splat_scenes").write_splat_usd(path, frames=splats, fps=fps)
         else:

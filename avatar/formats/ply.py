@@ -55,6 +55,7 @@ def write_splat_ply(path: str | Path, splats: Splats) -> None:
         splats.log_scales,
         splats.quats,
     )
+    # The header is text; the table follows as one row of little-endian floats for each splat.
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
     table = np.concatenate(columns, axis=1, dtype="<f4")
@@ -97,6 +98,7 @@ def read_splat_ply(path: str | Path) -> Splats:
                 out[:, k] = table[name]
         return out
 
+    # Files store harmonics as (3, K) a splat; `Splats` has (K, 3).
     K = len(rest) // 3
     try:
         return Splats(

@@ -57,6 +57,7 @@ def write_splat_glb(path: str | Path, splats: Splats) -> None:
             "sortingMethod": "cameraDistance",
         }
     }
+    # A scene with one node and one mesh of points.
     gltf.meshes.append(pygltflib.Mesh(name="splats", primitives=[primitive]))
     gltf.nodes.append(pygltflib.Node(name="splats", mesh=0))
     gltf.scenes = [pygltflib.Scene(name="splats", nodes=[0])]

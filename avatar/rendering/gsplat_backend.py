@@ -84,6 +84,7 @@ def _load_gsplat() -> ModuleType:
         if error.name != "gsplat":
             raise
         raise MissingExtraError("gsplat", extra="cuda", purpose="rasterising CUDA tensors") from error
+    # Another release may draw other pictures: the rules of clamping are part of the results.
     if not gsplat.__version__.startswith(SUPPORTED):
         raise InputError(
             "gsplat",

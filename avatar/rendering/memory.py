@@ -104,6 +104,7 @@ def too_many_entries(
     # Tiles that the box of each visible Gaussian overlaps.
     seen = radii[:, 0] > 0
     sides = []
+    # First and last tile of 16 pixels along each axis, clamped to the image; their product is the number of tiles.
     for axis in (0, 1):
         low, high = (means2d[seen, axis] + sign * radii[seen, axis] for sign in (-1, 1))
         first, last = (edge.double().clamp(0, size[axis] - 1).div(16).floor() for edge in (low, high))

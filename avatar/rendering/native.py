@@ -100,6 +100,8 @@ class Workspace:
                     seconds,
                 )
             except OverLimitError:
+                # The kernel has projected all Gaussians before it gives
+                # up: their boxes tell how many entries were needed.
                 _, _, means2d, radii, _ = outputs
                 size = (view.camera.width, view.camera.height)
                 raise too_many_entries(means2d, radii, size, most, BYTES_OF_ENTRY) from None

@@ -50,6 +50,7 @@ def checked_settings(settings: RasterSettings) -> RasterSettings:
     for name in ("near", "far", "eps2d"):
         if not isinstance(getattr(settings, name), numbers.Real) or not math.isfinite(getattr(settings, name)):
             raise InputError(name, expected="a finite number", received=repr(getattr(settings, name)))
+    # A Gaussian at depth 0 has no projection, and a negative blur would make covariances indefinite.
     if not 0 < settings.near < settings.far:
         raise InputError("near, far", expected="0 < near < far, in metres", received=f"{settings.near}, {settings.far}")
     if settings.eps2d < 0:

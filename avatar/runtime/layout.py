@@ -215,6 +215,7 @@ def _floats(value: np.ndarray, step: np.ndarray | None, start: np.ndarray | None
                 received=f"{other.dtype} of shape {other.shape}",
                 remedy=REMEDY,
             )
+        # Overflow gives an infinity, which the check below reports with the tensor's name instead of a warning.
         with np.errstate(over="ignore", invalid="ignore"):
             out = out * other.astype(np.float32) if word == "step" else out + other.astype(np.float32)
     if not np.isfinite(out).all():

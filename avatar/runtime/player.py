@@ -175,11 +175,14 @@ class AvatarPlayer:
         rest = self._shape(expression, features)
         theta = params.body_pose[0].astype(np.float32)
         times.append(self._clock())
+        # Displacements at the control points, metres; the skinning kernel interpolates them to the vertices.
         moved = None if self._field is None else self._field.displacements(theta, frame, self.threads)
         times.append(self._clock())
         displaced = None if cloth is None else self._spread_cloth(cloth)
         added = self._blend(theta, expression, params.jaw_pose[0], frame, displaced)
         times.append(self._clock())
+        # x = (sum_j w_j G_j)(v + dv) for the vertices, then means, rotations and scales of the Gaussians from their
+        # posed triangles. The arrays are those of the last pose, overwritten.
         self._surface(rest, moved, displaced, transforms, self._posed, self.threads)
         out = self._splats
         self._world(self._posed, added, (out.means, out.quats, out.scales, out.dc, out.rotations), self.threads)

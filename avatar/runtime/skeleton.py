@@ -96,6 +96,7 @@ def _body(
     # Shape, faces and labels are not used by players, so they are empty.
     count = len(vertices)
 
+    # Hands are stored as PCA components with a mean; bundles of bodies without hands lack them.
     def of_hands(name: str) -> np.ndarray | None:
         value = bundle.tensors.get(f"skeleton.{name}")
         return None if value is None else value.astype(np.float64)
