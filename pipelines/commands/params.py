@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
 from pipelines.commands.driving import BVH, Driving
-from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from smplxpp.body import load_body
 from smplxpp.body.importers import LayoutName, detect_layout, load_params
-from smplxpp.core import BodyParams, InputError
+from smplxpp.core import BodyParams, InputError, require_positive
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,9 @@ class ParamsConvert:
     body: OptionalPath = None
     """Body model file that the parameters will pose; EasyMocap and TalkBody4D need its root joint (None: open body)."""
     frames: OptionalText = None
-    """Frames to keep, as START:STOP or START:STOP:STEP (None: all)."""
+    """Frames to keep, as START:STOP or START:STOP:STEP, which divides the frames a second (None: all)."""
+    fps: OptionalFloat = None
+    """Frames a second of the input, for a file that states none or a wrong rate (None: as it says)."""
     person: OptionalInt = None
     """Id of the person, for files with several."""
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
@@ -47,11 +49,13 @@ class ParamsConvert:
         """Convert and return a summary."""
         if self.out.suffix.lower() != ".npz":
             raise InputError("--out", expected="a file name ending in .npz", received=str(self.out))
+        if self.fps is not None:
+            require_positive("option fps", self.fps)
         # A .bvh is retargeted to the body; all other layouts are read as they are.
         kept = _parse_frames(self.frames)
         if self.input.suffix.lower() == BVH:
             layout = "bvh"
-            params = Driving(up=self.up).load(self.input, load_body(self.body)).select(kept)
+            params = Driving(up=self.up).load(self.input, load_body(self.body))
         else:
             layout = detect_layout(self.input) if self.layout == "auto" else self.layout
             params = load_params(
@@ -62,7 +66,9 @@ class ParamsConvert:
                 up=self.up,
                 flat_hand_mean=self.flat_hand_mean,
                 max_betas=self.betas,
-            ).select(kept)
+            )
+        # The stated rate is the input's; keeping every n-th frame divides it.
+        params = (params if self.fps is None else replace(params, fps=self.fps)).select(kept)
         if not len(params):
             raise InputError("--frames", expected="a range that holds frames", received=str(self.frames))
         params.save(self.out)

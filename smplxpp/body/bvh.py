@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ class BvhMotion:
         rotations: of each joint relative to its parent.
         root: position of the root.
         fps: frames a second.
+        positions: position relative to its parent of every other joint that has position channels, which replace its
+            offset, by the joint's index.
     """
 
     names: tuple[str, ...]
@@ -37,6 +40,7 @@ class BvhMotion:
     rotations: Float64[np.ndarray, "T J 3 3"]
     root: Float64[np.ndarray, "T 3"]
     fps: float
+    positions: Mapping[int, Float64[np.ndarray, "T 3"]] = field(default_factory=dict)
 
     @property
     def rest(self) -> Float64[np.ndarray, "J 3"]:
@@ -48,7 +52,11 @@ class BvhMotion:
 
 
 def read_bvh(path: str | Path) -> BvhMotion:
-    """Read a BVH file; positions of joints other than the root, which some programs write, are ignored.
+    """Read a BVH file.
+
+    Some programs write positions for every joint (Blender's unconnected bones; hips below a root that stands still).
+    They replace the joint's offset in that frame. Where all of them are nearer to zero than to the offsets, they are
+    taken for displacements from the offsets, as other programs mean them.
 
     Raises:
         InputError: missing, damaged or foreign; numbers that are not finite; no frame.
@@ -79,17 +87,22 @@ class _Reader:
         # Every joint has its columns in the frames; Euler angles are applied in the order of the channels.
         rotations = np.tile(np.eye(3), (len(values), len(widths), 1, 1))
         root = np.repeat(np.array(self._offsets[:1], dtype=np.float64), len(values), axis=0)
+        positions: dict[int, Float64[np.ndarray, "T 3"]] = {}
         for joint, channels in enumerate(self._channels):
             own = values[:, first[joint] : first[joint + 1]]
             rotating = [k for k, name in enumerate(channels) if name.endswith("rotation")]
             if rotating:
                 axes = "".join(channels[k][0] for k in rotating)
                 rotations[:, joint] = Rotation.from_euler(axes, own[:, rotating], degrees=True).as_matrix()
-            for k, name in enumerate(channels):
-                if joint == 0 and name.endswith("position"):
-                    root[:, "XYZ".index(name[0])] = own[:, k]
+            moving = [k for k, name in enumerate(channels) if name.endswith("position")]
+            if moving:
+                place = root if joint == 0 else np.repeat(np.array([self._offsets[joint]]), len(values), axis=0)
+                place[:, ["XYZ".index(channels[k][0]) for k in moving]] = own[:, moving]
+                if joint:
+                    positions[joint] = place
         parents, offsets = np.array(self._parents, dtype=np.int64), np.array(self._offsets, dtype=np.float64)
-        return BvhMotion(tuple(self._names), parents, offsets, rotations, root, fps)
+        _add_offsets(positions, offsets)
+        return BvhMotion(tuple(self._names), parents, offsets, rotations, root, fps, positions)
 
     def _skeleton(self) -> None:
         """Parse the hierarchy; `open_joints` is the stack of braces, None for end sites."""
@@ -179,3 +192,13 @@ class _Reader:
 
     def _wrong(self, expected: str, received: str) -> InputError:
         return InputError(self._subject, expected=expected, received=received)
+
+
+def _add_offsets(positions: dict[int, Float64[np.ndarray, "T 3"]], offsets: Float64[np.ndarray, "J 3"]) -> None:
+    """Add the offsets, in place, where the positions of a file are displacements from them."""
+    # Compare medians over frames and joints: the joint that carries the motion is far from both.
+    distance = {joint: np.linalg.norm(place - offsets[joint], axis=1) for joint, place in positions.items()}
+    length = {joint: np.linalg.norm(place, axis=1) for joint, place in positions.items()}
+    if positions and np.median(list(length.values())) < np.median(list(distance.values())):
+        for joint in positions:
+            positions[joint] += offsets[joint]

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from smplxpp.body.bvh import BvhMotion, read_bvh
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.retarget import FEET, Skeleton, held_feet
-from smplxpp.core import BodyParams, InputError, rotvec_from_matrix
+from smplxpp.core import BodyParams, GeometryWarning, InputError, rotvec_from_matrix
 from smplxpp.core.files.json_file import as_object, as_text, read_json
 
 _FINGERS = SMPLX_JOINTS[25:]
@@ -34,12 +35,12 @@ _MIDDLE = {
 _SIDES = {
     "hip": "Supleg Shipjoint Sthigh thighS Supperleg Ship",
     "knee": "Sleg Sshin calfS Slowleg Slowerleg Sknee Scalf",
-    "ankle": "Sfoot footS Sankle",
-    "foot": "Stoebase Stoe ballS Stoes Stoe0 Sball",
+    "ankle": "Sankle Sfoot footS",
+    "foot": "Stoebase Stoe ballS Stoes Stoe0 Sball Sfoot footS",
     "collar": "Scollar clavicleS Sclavicle Sshoulder",
     "shoulder": "Sarm Sshldr upperarmS Suparm Supperarm Sshoulder",
     "elbow": "Sforearm lowerarmS Slowarm Slowerarm Selbow",
-    "wrist": "Shand handS Swrist",
+    "wrist": "Swrist Shand handS",
 }
 # Bones of a finger are numbered from the hand: in the patterns of Mixamo and CMU, Unreal, Poser, and DAZ.
 _FINGER_NAMES = {
@@ -53,6 +54,7 @@ _FINGER_PATTERNS = ("Shand{finger}{bone}", "{finger}0{bone}S", "S{finger}{bone}"
 _SIDE_NAMES = {"left": ("left", "l"), "right": ("right", "r")}
 _FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
 _CHILD = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
+_STRETCH = 0.02  # share of a bone's length by which it may change: the rounding of files is below
 _CHILD |= {f"{finger}{bone}": f"{finger}{bone + 1}" for finger in _FINGER_NAMES for bone in (1, 2)}
 
 
@@ -66,10 +68,36 @@ def load_bvh(path: str | Path, body: Skeleton, *, joint_map: Mapping[str, str] |
 
     Raises:
         InputError: what `read_bvh` refuses, or required joints that are missing.
+
+    Warns:
+        GeometryWarning: bones below the pelvis that change their length.
     """
     motion = read_bvh(path)
-    found = named_joints(motion.names, joint_map, subject=f"motion {path}")
+    found = named_joints(motion.names, joint_map, parents=motion.parents, subject=f"motion {path}")
+    _warn_of_stretching(motion, found, str(path))
     return bvh_params(motion, found, body)
+
+
+def _warn_of_stretching(motion: BvhMotion, joints: Mapping[str, int], source: str) -> None:
+    """Warn of bones below the pelvis that change their length, which a body's cannot."""
+    above, joint = set(), joints["pelvis"]
+    while joint >= 0:
+        above.add(joint)
+        joint = int(motion.parents[joint])
+    changed = {}
+    for joint, place in motion.positions.items():
+        length = float(np.linalg.norm(motion.offsets[joint]))
+        most = float(np.linalg.norm(place - motion.offsets[joint], axis=1).max())
+        if joint not in above and most > _STRETCH * length:
+            changed[motion.names[joint]] = 100.0 * most / max(length, 1e-9)
+    if changed:
+        worst = max(changed, key=lambda name: changed[name])
+        warnings.warn(
+            f"{source}: {len(changed)} bones move against their parents, {worst} most, by up to {changed[worst]:.0f} % "
+            "of its length: the body's bones keep theirs, and follow the turns alone",
+            GeometryWarning,
+            stacklevel=3,
+        )
 
 
 def read_joint_map(path: str | Path) -> dict[str, str]:
@@ -87,9 +115,20 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
 
 
 def named_joints(
-    names: tuple[str, ...], joint_map: Mapping[str, str] | None, *, subject: str = "motion"
+    names: tuple[str, ...],
+    joint_map: Mapping[str, str] | None,
+    *,
+    parents: Sequence[int] | Int64[np.ndarray, " J"] = (),
+    subject: str = "motion",
 ) -> dict[str, int]:
     """Return the index of the file's joint for each of our joints that it has.
+
+    Args:
+        names: the file's joints.
+        joint_map: our name for each of the file's names; None for the names that other programs use.
+        parents: index of each joint's parent, -1 for the root. With it the spine is read off the skeleton, because
+            programs count its joints from 0, from 1, or not at all. Empty: names decide.
+        subject: the file, for messages.
 
     Raises:
         InputError: a required joint is missing.
@@ -105,6 +144,7 @@ def named_joints(
         found = {name: names.index(name) for name in OURS if name in names}
     else:
         found = _known(names)
+        found |= _spine(found, parents)
     missing = [name for name in NEEDED if name not in found]
     if missing:
         raise InputError(
@@ -138,6 +178,20 @@ def _known(names: tuple[str, ...]) -> dict[str, int]:
                 patterns = [p.format(finger=one, bone=bone) for one in called for p in _FINGER_PATTERNS]
                 take(f"{side}_{finger}{bone}", [p.replace("S", one) for one in spoken for p in patterns])
     return found
+
+
+def _spine(found: Mapping[str, int], parents: Sequence[int] | Int64[np.ndarray, " J"]) -> dict[str, int]:
+    """Return the first, a middle and the last of the three or more joints between pelvis and neck; else none."""
+    if not len(parents) or not {"pelvis", "neck"} <= found.keys():
+        return {}
+    chain, joint = [], int(parents[found["neck"]])
+    while joint >= 0 and joint != found["pelvis"]:
+        chain.append(joint)
+        joint = int(parents[joint])
+    if joint < 0 or len(chain) < 3:
+        return {}
+    chain.reverse()
+    return {"spine1": chain[0], "spine2": chain[len(chain) // 2], "spine3": chain[-1]}
 
 
 def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton) -> BodyParams:
@@ -217,11 +271,16 @@ def _in_world(motion: BvhMotion) -> Float64[np.ndarray, "T J 3 3"]:
 
 
 def _places(motion: BvhMotion) -> Float64[np.ndarray, "T J 3"]:
-    """Return the positions of all joints by forward kinematics."""
+    """Return the positions of all joints by forward kinematics, with the positions that the file states."""
     world = _in_world(motion)
     out = np.empty((len(motion.root), len(motion.names), 3))
     for joint, parent in enumerate(motion.parents):
-        out[:, joint] = motion.root if parent < 0 else out[:, parent] + world[:, parent] @ motion.offsets[joint]
+        if parent < 0:
+            out[:, joint] = motion.root
+            continue
+        # (T, 3, 3) times (T, 3, 1): a joint with position channels is elsewhere in every frame.
+        step = np.atleast_2d(motion.positions.get(joint, motion.offsets[joint]))
+        out[:, joint] = out[:, parent] + (world[:, parent] @ step[..., None])[..., 0]
     return out
 
 

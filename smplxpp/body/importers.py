@@ -15,10 +15,13 @@ from smplxpp.body.model import BodyModel
 from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise, without_holes
 from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.files.json_file import read_json
-from smplxpp.core.files.safe_pickle import safe_load, safe_npz
+from smplxpp.core.files.safe_pickle import safe_load, safe_npy, safe_npz
 
 LayoutName = Literal["auto", "smplx", "amass", "easymocap", "avatarrex", "talkbody4d"]
-_SUFFIXES = (".npz", ".json", ".pkl")
+_SERIES = (".npz", ".json", ".pkl")
+_SUFFIXES = (*_SERIES, ".npy")
+# Files of torch are programs, which only torch reads.
+_TORCH = (".pt", ".pth")
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 # Axis-angle of the rotation about x or z that takes an axis to +y; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
 _Y_UP_FROM: dict[UpAxis, tuple[float, float, float]] = {
@@ -208,8 +211,17 @@ def _content(path: Path) -> Any:
         return safe_npz(path)
     if suffix == ".pkl":
         return safe_load(path)
+    if suffix == ".npy":
+        return safe_npy(path)
     if suffix != ".json":
-        raise InputError(f"file {path}", expected=f"one of {', '.join(_SUFFIXES)}", received=f"suffix {suffix!r}")
+        remedy = "in Python: `found = torch.load(file, map_location='cpu')`, then `numpy.savez('params.npz', **{name: "
+        remedy += "value.numpy() for name, value in found.items()})`, of the dictionary inside that has `body_pose`"
+        raise InputError(
+            f"file {path}",
+            expected=f"one of {', '.join(_SUFFIXES)}",
+            received=f"suffix {suffix!r}",
+            remedy=remedy if suffix in _TORCH else "",
+        )
     return read_json(path)
 
 
@@ -220,14 +232,14 @@ def _frame_files(path: Path) -> list[Path]:
     series: dict[str, list[Path]] = {}
     others = 0
     for file in path.iterdir():
-        if file.suffix.lower() in _SUFFIXES and re.search(r"\d", file.stem):
+        if file.suffix.lower() in _SERIES and re.search(r"\d", file.stem):
             series.setdefault(re.sub(r"\d+", "#", file.name), []).append(file)
         else:
             others += 1
     if len(series) != 1:
         raise InputError(
             f"folder {path}",
-            expected=f"one series of numbered {', '.join(_SUFFIXES)} files",
+            expected=f"one series of numbered {', '.join(_SERIES)} files",
             received=f"{', '.join(sorted(series)) or 'no such file'} ({others} other entries)",
             remedy="give one file, or a folder that holds the frames alone",
         )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, GeometryWarning, InputError
+from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, GeometryWarning, InputError, rotvec_from_matrix
 from smplxpp.core.files.json_file import as_numbers
 
 _JOINTS = dict(POSE_BLOCKS)
@@ -260,9 +260,45 @@ def _outer(record: Mapping[str, Any], frames: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _flat_joints(name: str, value: Any) -> np.ndarray:
-    """Flatten blocks of shape (..., joints, 3) or (..., 1, 3) to one row a frame."""
+    """Return a pose block as one axis-angle row a frame.
+
+    Blocks of shape (..., joints, 3) are flattened; rotation matrices, (..., joints, 3, 3), or (..., 3, 3) of one joint,
+    become axis-angle vectors.
+
+    Raises:
+        InputError: matrices that are no rotations, or joints of six numbers, whose order the file does not tell.
+    """
     value = np.asarray(value)
     joints = _JOINTS.get(name)
-    if joints and value.ndim >= 2 and value.shape[-2:] == (joints, 3) and (joints > 1 or value.ndim == 3):
+    if not joints:
+        return value
+    if value.ndim >= 2 and value.shape[-2:] == (joints, 3) and (joints > 1 or value.ndim == 3):
         return value.reshape(-1, 3 * joints)
+    # Three rows of numbers may be three frames of axis-angle vectors: without an axis for the joint, one matrix is
+    # only taken for one if it is a rotation.
+    single = joints == 1 and value.shape == (3, 3) and _are_rotations(value)
+    stacked = value.shape[-2:] == (3, 3) and (value.shape[-3:-2] == (joints,) or (joints == 1 and value.ndim == 3))
+    if single or stacked:
+        matrices = value.astype(np.float64).reshape(-1, joints, 3, 3)
+        if not _are_rotations(matrices):
+            raise InputError(
+                f"parameter {name}",
+                expected="rotation matrices, orthonormal with determinant 1, or axis-angle vectors",
+                received=f"other matrices of shape {value.shape}",
+            )
+        return rotvec_from_matrix(matrices).reshape(-1, 3 * joints)
+    if value.ndim >= 3 and value.shape[-2:] == (joints, 6):
+        raise InputError(
+            f"parameter {name}",
+            expected="axis-angle vectors or rotation matrices",
+            received=f"six numbers a joint, shape {value.shape}",
+            remedy="convert them with the program that wrote them: some mean the first two columns of the matrix, "
+            "others its first two rows, and the file does not tell which",
+        )
     return value
+
+
+def _are_rotations(matrices: np.ndarray) -> bool:
+    """Whether all matrices (..., 3, 3) are rotations, within the rounding of float16."""
+    square = np.swapaxes(matrices, -1, -2) @ matrices
+    return bool(np.abs(square - np.eye(3)).max(initial=0.0) < 1e-2 and (np.linalg.det(matrices) > 0).all())

@@ -138,9 +138,14 @@ class BodyParams:
         return self.select([index % len(self)])
 
     def select(self, indices: slice | Sequence[int] | np.ndarray) -> BodyParams:
-        """Return the frames that indices, a mask or a slice select."""
+        """Return the frames that indices, a mask or a slice select.
+
+        Every n-th frame of a slice with a step shows 1/n of the frames a second; with others the rate stays.
+        """
         offsets = self.v_shape if self.v_shape is None or len(self.v_shape) == 1 else self.v_shape[indices]
-        return self._with_arrays({name: getattr(self, name)[indices] for name in ARRAY_NAMES}, offsets)
+        found = self._with_arrays({name: getattr(self, name)[indices] for name in ARRAY_NAMES}, offsets)
+        step = abs(indices.step or 1) if isinstance(indices, slice) else 1
+        return found if found.fps is None or step == 1 else replace(found, fps=found.fps / step)
 
     def without_shape(self) -> BodyParams:
         """Return the poses without betas and `v_shape`, for a body that already has the person's shape."""

@@ -117,8 +117,16 @@ def array_names(path: str | Path, *, subject: str = "file", remedy: str = "") ->
         return [name.removesuffix(_SUFFIX) for name in archive.namelist() if name.endswith(_SUFFIX)]
 
 
-def read_array(path: str | Path, *, subject: str = "file", remedy: str = "") -> np.ndarray:
+def read_array(
+    path: str | Path, *, subject: str = "file", remedy: str = "", objects: ObjectReader | None = None
+) -> np.ndarray:
     """Read the array of an npy file.
+
+    Args:
+        path: of the file.
+        subject: what the file is called in messages.
+        remedy: advice in messages about a damaged file.
+        objects: reader of object arrays; None refuses them.
 
     Raises:
         InputError: missing or damaged file, no npy, an array of another type than numbers and texts, or an array
@@ -126,7 +134,7 @@ def read_array(path: str | Path, *, subject: str = "file", remedy: str = "") -> 
     """
     path = regular_file(path, subject=subject, remedy=remedy)
     with _as_input_error(f"{subject} {path}", "an npy array", remedy), open(path, "rb") as stream:
-        return _read(stream, path.stat().st_size, f"{subject} {path}", remedy, None)
+        return _read(stream, path.stat().st_size, f"{subject} {path}", remedy, objects)
 
 
 def check_dtype(text: str) -> np.dtype:

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import read_arrays
+from smplxpp.core.files.array_file import read_array, read_arrays
 from smplxpp.core.files.paths import regular_file
 from smplxpp.core.files.pickle_machine import PickleMachine
 from smplxpp.core.files.pickle_values import InertObject, RefusedName
@@ -68,6 +68,16 @@ def safe_npz(path: str | Path, *, keys: Iterable[str] | None = None) -> dict[str
         InputError: what `read_arrays` refuses, or an object array that names something refused.
     """
     return read_arrays(path, keys=keys, objects=_load)
+
+
+def safe_npy(path: str | Path) -> Any:
+    """Read an npy file: its array, or the one object that `numpy.save` packed into it, in the manner of `safe_load`.
+
+    Raises:
+        InputError: what `read_array` refuses, or a pickle that names something refused.
+    """
+    array = read_array(path, objects=_load)
+    return array.item() if array.dtype.hasobject and array.size == 1 else array
 
 
 def dense_array(value: Any, *, subject: str) -> np.ndarray:
