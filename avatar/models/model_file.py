@@ -188,5 +188,6 @@ def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Studen
 def _stored(value: Tensor, compact: bool) -> Tensor:
     value = value.detach().cpu().contiguous()
     if compact:
+        # Halving precision: float16 has 11 significant bits, enough for residuals; indices fit into 32 bits.
         value = value.half() if value.is_floating_point() else value.int() if value.dtype == torch.int64 else value
     return value

@@ -107,6 +107,7 @@ class StoredModel:
 
     def blended(self, config: BlendShapeConfig, count: int) -> dict[str, Tensor | None]:
         """Return the tensors from which blend shapes of `count` Gaussians are made, as arguments of `BlendShapes`."""
+        # Pruned blend shapes have fewer rows of U and C than Gaussians; part and head weight exist for all Gaussians.
         active = self.tensors.get(f"{SHAPES}active")
         rows = len(active) if active is not None and active.ndim == 1 else count
         self.require(f"{SHAPES}active", (rows,), torch.int64)

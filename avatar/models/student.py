@@ -48,7 +48,7 @@ class StudentConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class StudentOrigin:
-    """What belongs to a student beside its networks and Gaussians; bundles and other files take it along.
+    """Name, garments and reference pose of a student, which bundles and other exported files contain too.
 
     Attributes:
         name: name of the avatar.
@@ -138,7 +138,7 @@ class Student(nn.Module):
         z = self.blend_shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)
         # Body shapes fade in unseen poses and under simulated clothes; head shapes do not.
         head = self.blend_shapes.config.head_shapes
-        of_head, of_body = z.clone(), self._known(pose) * z
+        of_head, of_body = z.clone(), self._pose_weight(pose) * z
         of_head[..., head:], of_body[..., :head] = 0.0, 0.0
         if pose.cloth is None:
             du, dc = self.blend_shapes(of_head + of_body)
@@ -149,7 +149,7 @@ class Student(nn.Module):
             )
         return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
 
-    def _known(self, pose: Pose) -> float | Tensor:
+    def _pose_weight(self, pose: Pose) -> float | Tensor:
         """Return the weight of a pose as one of the training's, in [0, 1]; body shapes fade with it."""
         if pose.known is not None:
             return pose.known

@@ -131,9 +131,9 @@ class TeacherAvatar(nn.Module):
 
     def position_input(self, pose: Pose) -> Float[Tensor, "1 2 S S 3"]:
         """Return the position maps of a pose as the networks' input, without gradients."""
-        return self._shown(self._root_positions(pose)[1])
+        return self._standardised(self._root_positions(pose)[1])
 
-    def _shown(self, positions: Tensor) -> Tensor:
+    def _standardised(self, positions: Tensor) -> Tensor:
         return ((positions - self.mean_positions) / self.deviation if self.config.centred else positions)[None]
 
     def inputs(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> TeacherMaps:
@@ -144,14 +144,14 @@ class TeacherAvatar(nn.Module):
             to_root = pose.root_from_world
             vertices, positions = self._root_positions(pose)
             if not self.config.sees_view:
-                return TeacherMaps(self._shown(positions), None)
+                return TeacherMaps(self._standardised(positions), None)
             normals = self.maps.interpolate(vertex_normals(vertices, self.rig.faces))
             from_root = camera_centers @ to_root[:3, :3].T + to_root[:3, 3]
             # (C, 2, S, S): cosine of the angle between the posed normal and the direction to each camera, 0 off the
             # body.
             directions = F.normalize(from_root[:, None, None, None] - positions, dim=-1)
             cosines = (F.normalize(normals, dim=-1) * directions).sum(-1)
-            return TeacherMaps(self._shown(positions), cosines * self.maps.mask)
+            return TeacherMaps(self._standardised(positions), cosines * self.maps.mask)
 
     def residual_maps(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> Residuals:
         """Return the maps of all residuals in a pose: (1, 2, R, R, ...), colour (C, 2, R, R, 3)."""

@@ -166,7 +166,8 @@ def surface_loss(
     color = (person[:, None] * (seen - rays.color).abs()).sum() / (3 * person.sum()).clamp(min=1)
     # The clamp bounds the cross-entropy's slope where a ray is nearly opaque or clear.
     mask = torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), rays.opacity)
-    # A signed distance has a gradient of length 1; the residual term keeps f near the hull where no photograph tells.
+    # A signed distance has a gradient of length 1. The residual term keeps f near the hull where photographs do not
+    # determine it.
     eikonal = ((gradient.norm(dim=1) - 1) ** 2).mean()
     residual = (distance - model.hull_distance(points.reshape(-1, 3)).reshape(distance.shape)).abs().mean()
     return color + config.mask * mask + config.eikonal * eikonal + config.residual * residual

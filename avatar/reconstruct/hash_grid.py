@@ -65,11 +65,11 @@ class HashGrid(nn.Module):
             cell = place.detach().floor().clamp(max=size - 1)
             part = (place - cell)[:, None]
             weights = torch.where(self.corners.bool(), part, 1 - part).prod(dim=-1)
-            rows = self._rows(cell.long()[:, None] + self.corners, size, len(table))
+            rows = self._table_rows(cell.long()[:, None] + self.corners, size, len(table))
             found.append((weights[..., None] * table[rows]).sum(dim=1))
         return torch.cat(found, dim=1)
 
-    def _rows(self, corner: Int[Tensor, "N 8 3"], size: int, entries: int) -> Int[Tensor, "N 8"]:
+    def _table_rows(self, corner: Int[Tensor, "N 8 3"], size: int, entries: int) -> Int[Tensor, "N 8"]:
         # A dense level has one row a corner. Otherwise XOR of the coordinates times large primes, modulo the table's
         # size: where corners collide, the gradients of points at the surface dominate the shared row (Mueller et al.).
         x, y, z = corner.unbind(dim=-1)

@@ -104,7 +104,7 @@ class SpeechAnimator:
         Args:
             speech: phonemes in time.
             more: another speech follows at once, so that hands stay up; else they are retracted.
-            curves: of the face, in the place of those made from the phonemes.
+            curves: of the face; they replace those made from the phonemes.
 
         Raises:
             InputError: more than half an hour, or curves that the body does not have.
@@ -231,7 +231,7 @@ def talking_motion(
         face: the face of the person.
         body: a `StandingBody`, which gestures; or one frame in which the body stands still.
         config: options.
-        curves: of the face, in the place of those made from the phonemes.
+        curves: of the face; they replace those made from the phonemes.
 
     Raises:
         InputError: options out of range, no frame, curves that the body does not have, or more than half an hour.

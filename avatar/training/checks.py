@@ -1,4 +1,4 @@
-"""What is refused before a training starts, and what its log notes once."""
+"""Check template and recipe before a training starts, and log once what the losses leave out."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ def check_training(scene: TrainScene, recipe: Recipe, steps: Sequence[str], *, p
 
 def note_missing_normals(capture: Capture, recipe: Recipe, steps: Sequence[str]) -> None:
     """Log once where the loss has no normal term although the recipe asks for one."""
+    # Compare the number of training views with a normal map with that of all training views.
     trainings = [getattr(recipe.preset, name) for name in ("teacher", "bake", "compensate") if name in steps]
     there, views = normal_maps(capture)
     if there == views or not any(training.weights.normal for training in trainings):

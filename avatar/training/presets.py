@@ -1,4 +1,4 @@
-"""Everything that `smplxpp train` decides, under one name."""
+"""Presets of a training: the configurations of all its stages, by name."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOCAL_PARTS = 256
 
 
 def with_local_shapes(shapes: BlendShapeConfig) -> BlendShapeConfig:
-    """Return local blend shapes in the place of the paper's: each part of the Gaussians has its own coefficients."""
+    """Return local blend shapes instead of the paper's: each part of the Gaussians has its own coefficients."""
     return replace(shapes, parts=LOCAL_PARTS, head_shapes=5, body_shapes=11)
 
 
@@ -111,12 +111,25 @@ class _Steps:
 
 @dataclass(frozen=True)
 class _Size:
-    """What tells one preset for two cores from another: numbers of things, the tracking's prior, iterations, rates.
+    """Values in which the presets for two cores differ.
 
-    `pretrain` are the teacher's iterations before it sees photographs, `field` those of the student's field before the
-    bake. The compensation's rate is that of its mapping networks; those of U and C are in proportion. `penalties`
-    multiplies its penalties of large and far Gaussians. `averaged` is the share of the steps whose mean bake and
-    compensation end with.
+    Attributes:
+        gaussians: number of Gaussians.
+        head_share: share of them on the head.
+        control_points: of the tracking and of the field.
+        track: levels of the tracking.
+        body_motion_weight: see `TrackConfig`.
+        tight_reach: see `TrackConfig`.
+        pretrain: the teacher's iterations before it sees photographs.
+        field: pretraining of the student's field before the bake.
+        fit: iterations of the fit.
+        rates: learning rates of the fit.
+        teacher: training of the teacher.
+        bake: training of the field.
+        compensate: training of the blend shapes; its rate is that of the mapping networks, U and C in proportion.
+        averaged: share of the last steps of bake and compensation over which parameters are averaged.
+        penalties: factor of the compensation's penalties of large and far Gaussians.
+        surface_normals: see `PhotometricConfig`.
     """
 
     gaussians: int

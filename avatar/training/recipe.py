@@ -1,4 +1,4 @@
-"""What a training does: the options of `avatar.train`, and the configurations of all steps that follow from them."""
+"""Turn the options of `avatar.train` into the configurations of all its steps."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class TrainConfig:
         refine_cameras: correct the poses of the training cameras together with those of the person.
         max_minutes: stop after as many minutes of work; the same call continues.
         iterations_share: share of the preset's iterations, of all steps.
-        iterations: iterations by step ("fit", "teacher", "bake", "compensate"), in the place of the preset's.
+        iterations: iterations by step ("fit", "teacher", "bake", "compensate"); they replace the preset's.
         batch: poses in a step of optimisation, None for the preset's.
         gaussians: number of Gaussians, None for the preset's.
         blend_shapes: "full" as published; "local": 256 parts with coefficients of their own and 16 columns; "pruned":
             full, and the compact file keeps those that move and colour most.
         max_megabytes: size of the compact file with pruned blend shapes.
         teacher: whether the student is baked from a teacher; False: from the photographs alone.
-        loose_parts: names of parts to simulate, in the place of those that the training finds.
+        loose_parts: names of parts to simulate; they replace those that the training finds.
         perceptual: metric of the perceptual term: "lpips", "st-lpips", "none", or "auto" for the installed one where
             the preset has the term.
         hold_out: cameras to keep from training; empty: those that the capture's splits hold out.
@@ -188,7 +188,7 @@ class Recipe:
 def with_perceptual(preset: TrainingPreset) -> TrainingPreset:
     """Return the preset with the paper's weight of the perceptual term where it has none."""
     weight = ReconstructionWeights().perceptual
-    return _each(
+    return _with_changes(
         preset,
         lambda config: {"weights": replace(config.weights, perceptual=config.weights.perceptual or weight)},
     )
@@ -196,10 +196,10 @@ def with_perceptual(preset: TrainingPreset) -> TrainingPreset:
 
 def with_batch(preset: TrainingPreset, items: int | None = None, *, least: int = 1) -> TrainingPreset:
     """Return the preset with `items` poses in a step of every training (None: its own), and at least `least`."""
-    return _each(preset, lambda config: {"poses_per_step": max(least, items or config.poses_per_step)})
+    return _with_changes(preset, lambda config: {"poses_per_step": max(least, items or config.poses_per_step)})
 
 
-def _each(preset: TrainingPreset, changes: Callable[[PhotometricConfig], Mapping[str, Any]]) -> TrainingPreset:
+def _with_changes(preset: TrainingPreset, changes: Callable[[PhotometricConfig], Mapping[str, Any]]) -> TrainingPreset:
     """Return the preset with changes of the three trainings."""
     trainings = {name: getattr(preset, name) for name in _TRAININGS}
     return replace(preset, **{name: replace(config, **changes(config)) for name, config in trainings.items()})

@@ -92,7 +92,7 @@ def prepare_scene(template: Template, capture: Capture, *, built_frame: int | No
 
 
 def hold_out_cameras(capture: Capture, names: Sequence[str]) -> Capture:
-    """Hold out cameras in the place of those that the capture's splits hold out.
+    """Hold out cameras instead of those that the capture's splits hold out.
 
     Cameras that the splits hold out and `names` does not are trained on; cameras of neither split stay unused.
 

@@ -73,8 +73,8 @@ def train(
     Args:
         template: the clothed body, as `smplxpp.build_template` gives it.
         capture: with images, masks, and the parameters of its frames; its splits say what is held out.
-        out: folder of checkpoints and results. A step that stands there with the same inputs is not repeated, and one
-            that was interrupted continues.
+        out: folder of checkpoints and results. A step that is finished there with the same inputs is not
+            repeated, and an interrupted one continues.
         preset: "demo" (minutes), "cpu", "gpu", "paper", "paper-small", or a preset of your own.
         refine: "auto": refine the poses where they were registered, or where the capture declares them as tracked.
         cloth: "auto": simulate the clothes that leave skinning and that a simulation improves; "none": no clothes.

@@ -1,1 +1,1 @@
-"""What every training shares: the loop, tasks solved by gradients, checkpoints, processes, logs."""
+"""Parts that all trainings share: the loop, optimisation tasks, checkpoints, processes and logs."""

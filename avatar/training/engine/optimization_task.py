@@ -149,7 +149,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         return {}
 
     def autocast(self) -> torch.autocast:
-        """Return what to put around networks alone: rasteriser and losses need float32. Cast what comes out."""
+        """Return the autocast context of networks alone; rasteriser and losses need their outputs in float32."""
         enabled = self.optimiser_config.amp and self.device.type == "cuda"
         return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
 
@@ -163,12 +163,14 @@ class OptimizationTask(ABC, Generic[Batch]):
             DivergedError: a loss or gradient is not finite, on any process; nothing has changed.
             InputError: fewer items than processes.
         """
+        # Rates of this step by the schedule; fused Adam reads them from its groups.
         items = self.micro_batches(iteration)
         for group, own in zip(self.optimiser.param_groups, self.groups, strict=True):
             group["lr"] = own.lr * self.lr_factor(iteration, own)
         # Gradients of the micro-batches, shared among the processes and summed over them.
         self.optimiser.zero_grad(set_to_none=True)
         outcomes = self.distributed.share_out(items, lambda item: self._backward(item, len(items)))
+        # A loss that is not finite on any process stops all of them, before a parameter has changed.
         finite = []
         for item, figures in zip(items, outcomes, strict=True):
             if figures is None:
@@ -212,7 +214,9 @@ class OptimizationTask(ABC, Generic[Batch]):
                 value.copy_(tensors[key])
                 moments = {moment: tensors.get(f"adam.{moment}.{key}") for moment in MOMENTS}
                 self.optimiser.state[value] = {
-                    moment: _laid_out(content, value) for moment, content in moments.items() if content is not None
+                    moment: _copy_in_layout(content, value)
+                    for moment, content in moments.items()
+                    if content is not None
                 }
 
     def _backward(self, item: Batch, count: int) -> Mapping[str, float] | None:
@@ -224,7 +228,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         return figures if _finite((loss, *gradients)) else None
 
 
-def _laid_out(content: Tensor, parameter: Tensor) -> Tensor:
+def _copy_in_layout(content: Tensor, parameter: Tensor) -> Tensor:
     """Return a copy with the parameter's device and memory layout, because fused Adam walks both together."""
     if content.shape != parameter.shape:  # the number of steps
         return content.to(parameter.device, copy=True)

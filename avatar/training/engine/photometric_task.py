@@ -266,6 +266,7 @@ class PhotometricTask(OptimizationTask[Item]):
         quality: dict[str, dict[str, ViewQuality]] = {}
         images: dict[str, np.ndarray] = {}
         for measured in self.sequence.measured_views(self.config.evaluated):
+            # Held-out views at full size, without gradients; kinds are new views and new poses.
             of_view, images[measured.name] = self.measure(measured.view, measured.frame)
             quality.setdefault(measured.kind, {})[measured.name] = of_view
         return quality, images

@@ -100,7 +100,7 @@ class Distributed:
                 box[0] = work()
             except Exception as caught:  # noqa: BLE001  raised again below, after the others know
                 error = caught
-                box[1] = _words(caught)
+                box[1] = _error_fields(caught)
         dist.broadcast_object_list(box, src=0, device=torch.device(self.device))
         if error is not None:
             raise error
@@ -157,7 +157,7 @@ def _number(name: str) -> int:
     return int(text)
 
 
-def _words(error: Exception) -> tuple[str, dict[str, str]]:
+def _error_fields(error: Exception) -> tuple[str, dict[str, str]]:
     """Return an error as the arguments of an `InputError`."""
     if isinstance(error, InputError):
         return error.subject, {"expected": error.expected, "received": error.received, "remedy": error.remedy}

@@ -31,7 +31,7 @@ from smplxpp.template.template import Template
 
 @dataclass(frozen=True, eq=False)
 class FitScene:
-    """What a fit is made on.
+    """Template, posed vertices and views of one frame, from which Gaussians are fitted.
 
     Attributes:
         template: the clothed body.

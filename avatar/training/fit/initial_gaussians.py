@@ -44,13 +44,13 @@ def initial_gaussians(
     start = sample_on_mesh(rig.template, sampling)
     # A first sample measures the gradient magnitude of the photographs; the second one follows it.
     if detail:
-        rates, seen = _shown(rig, vertices, start, [changes(view) for view in views])
+        rates, seen = _measure_colors(rig, vertices, start, [changes(view) for view in views])
         density = density_of_detail(rig.template, start.face_index.numpy(), rates.cpu().numpy(), seen, detail)
         start = sample_on_mesh(rig.template, sampling, density=density)
-    return replace(start.to(device=rig.device), dc=_shown(rig, vertices, start, views)[0])
+    return replace(start.to(device=rig.device), dc=_measure_colors(rig, vertices, start, views)[0])
 
 
-def _shown(
+def _measure_colors(
     rig: Rig, vertices: Float[np.ndarray, "V 3"], gaussians: BoundGaussians, views: Sequence[View]
 ) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
     """Return the colours of Gaussians on a template at `vertices` in the views, and whether any view shows each."""

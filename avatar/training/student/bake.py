@@ -134,7 +134,7 @@ class BakeTask(PhotometricTask):
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
         """Return `L_rec + nonrigid L_non + semantic L_sem` of one frame and its terms."""
-        pose = self._shown(self.sequence.pose(item.frame), item.frame)
+        pose = self._augmented_pose(self.sequence.pose(item.frame), item.frame)
         views = self.views(item)
         posed = self.student(pose, camera_centers_of(views))
         # Without a teacher: the photometric loss on photographs alone.
@@ -167,7 +167,7 @@ class BakeTask(PhotometricTask):
             maps = mesh_maps(posed.vertices, self.sequence.rig.faces, view.camera)
             yield maps.interpolate(self.labels)
 
-    def _shown(self, pose: Pose, frame: int) -> Pose:
+    def _augmented_pose(self, pose: Pose, frame: int) -> Pose:
         """Return the pose that the field sees: a share of them as new ones, with noise on theta."""
         # Random numbers depend on seed, iteration and frame alone, so that a continued training draws the same
         # ones.

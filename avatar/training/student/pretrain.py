@@ -80,12 +80,14 @@ class PretrainFieldTask(PretrainTask):
         draws = np.random.default_rng((self.seed, 4, self.iteration)).random(len(item))
         shown = [frames[k] if draw >= self.null_share else None for k, draw in zip(item, draws, strict=True)]
         # (B, 63), (B, K, 3) and (B, K); the L1 distance over x, y, z, weighted by the confidence of the track.
-        pose, known, weight = (torch.stack(parts) for parts in zip(*(self._of(k) for k in item), strict=True))
+        pose, known, weight = (
+            torch.stack(parts) for parts in zip(*(self._training_pair(k) for k in item), strict=True)
+        )
         apart = (self.field.at_points(pose, self.codes(shown)) - known).abs().sum(-1)
         loss = (weight * apart).sum() / weight.sum() / self.teacher.config.position_scale
         return loss, {"loss": float(loss.detach())}
 
-    def _of(self, number: int) -> tuple[Tensor, ...]:
+    def _training_pair(self, number: int) -> tuple[Tensor, ...]:
         """Return theta (63,), known displacements (K, 3) at the field's points, metres, and their weights (K,)."""
 
         def make() -> tuple[Tensor, ...]:

@@ -40,11 +40,12 @@ def write_student(
     """
     small, keep = (student, 1.0) if max_bytes is None else pruned_to(student, sequence, max_bytes)
     bytes_of = {whole.name: save_avatar(whole, student), compact.name: save_avatar(compact, small, compact=True)}
-    # As a player has it: half precision, and without what was pruned.
+    # Read the file as a player does: half precision, pruned blend shapes.
     stored = load_avatar(compact, sequence.rig)
     assert isinstance(stored, Student)
+    # Figures are those of the stored student on held-out views; the preview shows the training alone.
     quiet = replace(context, preview=lambda images: None)
-    # Measured alone: what holds neighbours in training is not made.
+    # Without the coherence term, whose search for neighbours only a training needs.
     task = CompensateTask(sequence, stored, replace(config, coherence=0.0), quiet)
     figures = task.evaluate(config.iterations)
     measured = {kind: figures[kind] for kind in ("novel_view", "novel_pose") if kind in figures}

@@ -55,7 +55,7 @@ class PretrainTeacherTask(PretrainTask):
             loss = sum(sizes[1:], sizes[0]) / len(maps)
             return loss, {"loss": float(loss.detach())}
         # With a track: weighted L1 distance at the Gaussians.
-        inputs, known, weights = zip(*(self._of(frame, self.track) for frame in frames), strict=True)
+        inputs, known, weights = zip(*(self._training_pair(frame, self.track) for frame in frames), strict=True)
         with self.autocast():
             found = self.teacher.networks.positions(torch.cat(inputs), self.teacher.semantics)
         units = torch.stack(known) / self.teacher.config.position_scale
@@ -63,7 +63,7 @@ class PretrainTeacherTask(PretrainTask):
         loss = (weight * apart).sum() / weight.sum()
         return loss, {"loss": float(loss.detach())}
 
-    def _of(self, frame: int, track: Track) -> tuple[Tensor, ...]:
+    def _training_pair(self, frame: int, track: Track) -> tuple[Tensor, ...]:
         """Return the input map of a frame, the Gaussians' known displacements (N, 3) and their weights (N,).
 
         Displacements are in metres along the axes of the T-pose.

@@ -136,7 +136,7 @@ class ClothPrediction:
 
     @property
     def share(self) -> Float[Tensor, "K 1 1"] | float:
-        """How much of a control point's displacements is simulated; 0 without a simulation."""
+        """The simulation's share of each control point's displacements; 0 without a simulation."""
         return 0.0 if self.simulated is None else self.simulated.share[:, None, None]
 
     def start(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:

@@ -32,6 +32,7 @@ class SurfaceNormals:
 
     def __init__(self, sequence: AvatarSequence, track: Track, parts: Collection[str] | None = None) -> None:
         self.sequence, self.track = sequence, track
+        # Faces of the chosen parts; the first array makes the union defined without any part.
         template = sequence.rig.template
         parts = {label.name for label in CLOTH_LABELS} if parts is None else parts
         shown = [template.part_faces(name) for name in template.part_names if name in parts]

@@ -37,7 +37,7 @@ STRUCTURE_HALVINGS = 1
 
 @dataclass(frozen=True, eq=False)
 class FramePriors:
-    """What is known of a frame's displacements before its photographs are used, metres along the axes of the T-pose.
+    """Priors of a frame's displacements before its photographs are used, metres along the axes of the T-pose.
 
     Attributes:
         start: displacements at which the optimisation starts.

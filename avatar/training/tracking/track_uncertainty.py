@@ -1,4 +1,4 @@
-"""What photographs determine of control points: their structure tensors, and the expected error of a track."""
+"""Uncertainty of tracked control points: structure tensors of photographs, and a Kalman filter of the errors."""
 
 from __future__ import annotations
 
