@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 from avatar.data.capture_digests import params_digest
 from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
-from avatar.evaluation.protocol import (
-    SETS,
-    ProtocolConfig,
-    measured_splits,
-    truth_frames,
-    view_sets,
-    with_people,
-)
+from avatar.evaluation.protocol import SETS, measured_splits, view_sets, with_people
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, ModelFigures, view_key
 from avatar.evaluation.summary import evaluation_tables, summary_figures
 from avatar.gaussians.bound_file import load_bound
@@ -37,7 +28,7 @@ from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE
-from pipelines.stages.evaluate_inputs import input_protocol
+from pipelines.stages.evaluate_inputs import input_protocol, surface_digest
 from pipelines.stages.evaluate_poses import (
     exact_params,
     of_held_out_poses,
@@ -351,13 +342,3 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
                     )
                 )
     return checks
-
-
-def surface_digest(capture: Capture, protocol: ProtocolConfig) -> str:
-    """Return the SHA-256 of the true surfaces that are measured."""
-    digest = hashlib.sha256()
-    for frame in chain(*truth_frames(capture, protocol, view_sets(capture, protocol)).values()):
-        mesh = capture.truth_mesh(frame)
-        assert mesh is not None  # `truth_frames` chose frames that have one
-        digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
-    return digest.hexdigest()

@@ -1,10 +1,13 @@
-"""Collect what capture, build and trainings state about the inputs of an evaluation: exact, tracked or estimated."""
+"""Collect the inputs of an evaluation: whether they are exact, tracked or estimated, and the true surfaces."""
 
 from __future__ import annotations
 
+import hashlib
+from itertools import chain
 from pathlib import Path
 
 from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
+from avatar.evaluation.protocol import ProtocolConfig, truth_frames, view_sets
 from avatar.training.scene import normal_maps
 from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import MANIFEST, read_manifest
@@ -70,3 +73,13 @@ def _trained(run: Path) -> tuple[str | None, int | None, int | None]:
             normals = numbers.get("normals")
             return None if normals is None else as_text(normals, subject=f"{subject}: normals"), frames, cameras
     return None, None, None
+
+
+def surface_digest(capture: Capture, protocol: ProtocolConfig) -> str:
+    """Return the SHA-256 of the true surfaces that are measured."""
+    digest = hashlib.sha256()
+    for frame in chain(*truth_frames(capture, protocol, view_sets(capture, protocol)).values()):
+        mesh = capture.truth_mesh(frame)
+        assert mesh is not None  # `truth_frames` chose frames that have one
+        digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
+    return digest.hexdigest()

@@ -34,21 +34,11 @@ from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, InputError, MeshLike, TriangleMesh, as_mesh, require_at_least, require_positive
 from smplxpp.core.topology import face_adjacency
 from smplxpp.raster import outer_visible_points
-from smplxpp.segment.by_body_chart import TRUNK, BodyChart, chart_of_scan
+from smplxpp.segment.by_body_chart import TRUNK, BodyChart, chart_of_scan, in_arm, in_column
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
 from smplxpp.segment.by_body_layers import Layers, find_layers
-from smplxpp.segment.by_body_outfit import (
-    ARM_END,
-    ARM_START,
-    COLUMN_END,
-    Outfit,
-    OutfitConfig,
-    Rings,
-    find_outfit,
-    in_arm,
-    in_column,
-)
+from smplxpp.segment.by_body_outfit import ARM_END, ARM_START, COLUMN_END, Outfit, OutfitConfig, Rings, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.segment import SegmentedScan

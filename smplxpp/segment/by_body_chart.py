@@ -144,3 +144,13 @@ def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> Bo
     distance = np.where(far < 0.04, along, np.copysign(far, along))
     place = own[nearest]
     return BodyChart(place.region, place.height, place.reach, place.azimuth, place.face_height, distance, place.side)
+
+
+def in_column(chart: BodyChart) -> np.ndarray:
+    """Return the faces of feet, legs and trunk."""
+    return np.isin(chart.region, (FOOT, LEG, TRUNK))
+
+
+def in_arm(chart: BodyChart) -> np.ndarray:
+    """Return the faces of arms and hands."""
+    return np.isin(chart.region, (ARM, HAND))

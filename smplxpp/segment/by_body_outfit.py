@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.labels import LABELS, LOWER, SHOE, SKIN, UPPER
-from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HIP, KNEE, LEG, TRUNK, WRIST, BodyChart
+from smplxpp.segment.by_body_chart import HIP, KNEE, WRIST
 
 # Rings in standard metres: their length, the end of the column, and the ends of the arm.
 STEP = 0.015
@@ -363,13 +363,3 @@ def _margin(cost: np.ndarray, place: np.ndarray, best: int) -> float:
 def _usual(place: np.ndarray, low: float, high: float, nats: float) -> np.ndarray:
     """Return a penalty of 0 within a range, which rises linearly to `nats` at 20 cm outside of it."""
     return nats * np.maximum(np.maximum(low - place, place - high), 0.0) / 0.2
-
-
-def in_column(chart: BodyChart) -> np.ndarray:
-    """Return the faces of feet, legs and trunk."""
-    return np.isin(chart.region, (FOOT, LEG, TRUNK))
-
-
-def in_arm(chart: BodyChart) -> np.ndarray:
-    """Return the faces of arms and hands."""
-    return np.isin(chart.region, (ARM, HAND))

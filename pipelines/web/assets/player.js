@@ -1,4 +1,4 @@
-/* smplxpp player, Apache-2.0; web/ of the project has its sources a4d451bca706a5785ecd1081bb5b8872959aae5b91b72040824226f1858a80cd */
+/* smplxpp player, Apache-2.0; web/ of the project has its sources e3eed8d2225ccf05fbb7179b2acae19c4e9ebf05d93ac6229eae924ad179499a */
 "use strict";(()=>{var Ce=`:root {
   --ground: #121418;
   --raised: rgba(28, 31, 37, 0.86);

@@ -1,4 +1,4 @@
-/** The network's mouth without jitter, and with lips that close: `avatar.speech.lips.steady`, row by row. */
+/** The network's mouth without jitter, and with lips that close: `smooth_mouth` of `avatar.speech.lips`, row by row. */
 
 import { ARTICULATORS } from "./network.ts";
 
