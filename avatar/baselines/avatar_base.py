@@ -9,9 +9,8 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import BoundGaussians, corner_weights, world_from_frames
-from avatar.gaussians.colors import view_colors
-from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
+from avatar.gaussians.binding import corner_weights
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.deformation_field import FrameCodes
 from avatar.models.networks.teacher import local_offsets

@@ -6,8 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from smplxpp.capture import Capture
-from smplxpp.capture.splits import Splits
+from smplxpp.capture import Capture, Splits
 from smplxpp.core import GeometryWarning, InputError, require_at_least, require_known, spread
 
 SETS: Mapping[str, str] = {

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from avatar.runtime import AvatarBundle, load_bundle
-from avatar.runtime.bundle import SUFFIX
+from avatar.runtime.bundle import SUFFIX, AvatarBundle, load_bundle
 
 
 def open_bundle(source: Path, *, exact: bool = False) -> AvatarBundle:

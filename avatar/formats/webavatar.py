@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from scipy.spatial.transform import Rotation
 
-from avatar.runtime.player import AvatarPlayer
-from avatar.runtime.splatting import WorldSplats
+from avatar.runtime import AvatarPlayer, WorldSplats
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 

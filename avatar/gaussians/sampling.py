@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.frames import MIN_EDGE
 from smplxpp.cloth.opening_bridges import find_opening_bridges
+from smplxpp.core import TriangleMesh, require_at_least, require_between, require_choice, require_positive, row_lengths
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, row_lengths
 from smplxpp.core.spherical_harmonics import coefficient_count
-from smplxpp.core.validation import require_at_least, require_between, require_choice, require_positive
 from smplxpp.raster import outer_visible_faces
 from smplxpp.template.template import Template
 

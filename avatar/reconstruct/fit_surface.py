@@ -15,9 +15,8 @@ from avatar.reconstruct.neural_surface import NeuralSurface
 from avatar.reconstruct.rays import Rays, opacities, rays_of, weights_of
 from smplxpp.core import InputError, ProgressCallback, TriangleMesh, ignore_progress, require_at_least, require_positive
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.reconstruct import PhotoView
+from smplxpp.reconstruct import Box, PhotoView
 from smplxpp.reconstruct.hull import main_body, zero_surface
-from smplxpp.reconstruct.views import Box
 
 _CHUNK = 1 << 17  # points evaluated at once, which bounds the memory
 

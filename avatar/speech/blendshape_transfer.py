@@ -18,8 +18,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial import cKDTree
 
 from avatar.speech.curves import ARKIT
-from smplxpp.body import load_body
-from smplxpp.body.model import BodyModel
+from smplxpp.body import BodyModel, load_body
 from smplxpp.core import BodyParams, InputError
 
 _EYES = ("left_eye_smplhf", "right_eye_smplhf")

@@ -15,9 +15,8 @@ from avatar.speech.phonemes import Phoneme, Speech
 from avatar.speech.secondary_motion import PosturalSway, blinks, gaze, head_motion, nods
 from avatar.speech.standing_body import StandingBody
 from avatar.speech.tracks import Track
+from smplxpp.core import matrix_from_rotvec, require_at_least, require_between, require_positive, rotvec_from_matrix
 from smplxpp.core.params import DEFAULT_FPS, BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.core.validation import require_at_least, require_between, require_positive
 
 _IDLE_TRUNK = 0.45
 """Factor of the trunk's motion while the person does not talk; 1 while talking. Set by eye."""

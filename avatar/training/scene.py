@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from avatar.data.capture_digests import capture_digests
 from avatar.data.views import View, read_views
-from smplxpp.capture import Capture, Splits
-from smplxpp.capture.recording import Problem
+from smplxpp.capture import Capture, Problem, Splits
 from smplxpp.core import BodyParams, GeometryWarning, InputError, TriangleMesh, spread
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template

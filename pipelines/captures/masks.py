@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from smplxpp.capture import Capture
+from smplxpp.capture import Capture, write_mattes
 from smplxpp.capture.files import IMAGE_SUFFIXES, subfolders
-from smplxpp.capture.masks import write_mattes
 from smplxpp.capture.views import read_color
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import as_object, atomic_write_text, read_bytes, read_json

@@ -25,12 +25,8 @@ from pipelines.runs.layout import GARMENTS
 from smplxpp.cloth import Garment, cut_garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, display_colors, require_at_least, require_positive, spread
 from smplxpp.core.camera import Camera
-from smplxpp.core.errors import InputError
-from smplxpp.core.labels import display_colors
-from smplxpp.core.params import DEFAULT_FPS, BodyParams
-from smplxpp.core.spread import spread
-from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.raster.shading import ShadeStyle
 from smplxpp.template.template import Template
 

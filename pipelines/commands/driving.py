@@ -10,9 +10,8 @@ import numpy as np
 
 from pipelines.commands.options import OptionalPath
 from pipelines.runs.layout import TEMPLATE
-from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.body import BodyModel, UpAxis, load_body, load_params
 from smplxpp.body.bvh_params import load_bvh, read_joint_map
-from smplxpp.body.importers import UpAxis
 from smplxpp.body.retarget import Skeleton, retarget
 from smplxpp.cloth.poses import resampled
 from smplxpp.core import BodyParams, GeometryWarning, InputError

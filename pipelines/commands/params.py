@@ -11,8 +11,7 @@ import tyro
 
 from pipelines.commands.driving import BVH, Driving
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
-from smplxpp.body import load_body
-from smplxpp.body.importers import LayoutName, detect_layout, load_params
+from smplxpp.body import LayoutName, detect_layout, load_body, load_params
 from smplxpp.core import BodyParams, InputError, require_positive
 
 log = logging.getLogger(__name__)

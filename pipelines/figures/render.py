@@ -11,8 +11,7 @@ from pipelines.figures.colors import heat_colors
 from pipelines.figures.sheets import color_bar
 from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb
-from smplxpp.raster import ShadeStyle, render_shaded
-from smplxpp.raster.shading import resolve, shade_layer
+from smplxpp.raster.shading import ShadeStyle, render_shaded, resolve, shade_layer
 
 
 def render_heat(

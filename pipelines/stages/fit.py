@@ -13,8 +13,7 @@ import numpy as np
 
 from avatar.data.views import View
 from avatar.formats import write_splat_ply
-from avatar.gaussians.binding import BoundGaussians
-from avatar.gaussians.bound_file import load_bound, save_bound
+from avatar.gaussians import BoundGaussians, load_bound, save_bound
 from avatar.metrics.view_quality import CONVENTION, mean_quality
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import METRICS_FILE

@@ -48,8 +48,7 @@ from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, register
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces, vertex_labels
 from smplxpp.build.validate import validate_template
-from smplxpp.core import BodyParams, StageOutput, display_colors
-from smplxpp.core.mesh_files.mesh_io import write_ply
+from smplxpp.core import BodyParams, StageOutput, display_colors, write_ply
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics.distance import MM
 from smplxpp.segment import Corrections

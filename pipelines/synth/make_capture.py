@@ -25,9 +25,8 @@ from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import rounded, save_compact
 from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg, write_normal_png
 from smplxpp.capture.writers.metadata import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
-from smplxpp.core import ProgressCallback, TriangleMesh, ignore_progress
+from smplxpp.core import ProgressCallback, TriangleMesh, ignore_progress, write_ply
 from smplxpp.core.files import atomic_folder, atomic_write_text, read_json
-from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.raster.soft_light import Environment, LightConfig, vertex_light
 
 

@@ -10,11 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.core.camera import Camera
+from smplxpp.core import BodyParams, Camera, matrix_from_rotvec, require_between, require_positive, rotvec_from_matrix
 from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.core.validation import require_between, require_positive
 
 
 @dataclass(frozen=True)

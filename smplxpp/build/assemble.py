@@ -8,18 +8,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Integer
 
-from smplxpp.assemble import (
-    AssemblyConfig,
-    CanonicalPart,
-    assemble_template,
-    body_colors_from_scan,
-    cut_holes,
-    fill_holes,
-)
+from smplxpp.assemble import body_colors_from_scan, cut_holes, fill_holes
+from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
-from smplxpp.core import BodyParams, Check, InputError, SKIN, StageOutput
+from smplxpp.core import SKIN, BodyParams, Check, InputError, StageOutput
 from smplxpp.metrics.distance import MM
 from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
 from smplxpp.template.template import Template

@@ -20,16 +20,9 @@ from smplxpp.clean import sanitize
 from smplxpp.core import Check, InputError, ProgressCallback, StageOutput
 from smplxpp.core.files.json_file import as_number, as_numbers, as_object, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
-from smplxpp.reconstruct import (
-    PhotoView,
-    ReconstructConfig,
-    Reconstruction,
-    adopt_surface,
-    reconstruct,
-    silhouette_agreement,
-    usable_views,
-)
+from smplxpp.reconstruct import ReconstructConfig, Reconstruction, adopt_surface, reconstruct
 from smplxpp.reconstruct.neus2 import UnitCube, mesh_in_world
+from smplxpp.reconstruct.views import PhotoView, silhouette_agreement, usable_views
 
 Maker = Callable[..., Reconstruction]
 """`make(views, progress=...)`: reconstructs the surface of a moment."""

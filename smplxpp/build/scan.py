@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from smplxpp.clean import PointSurface, check_human_scale, convert_points, sanitize, surface_from_points
-from smplxpp.clean.repair import Sanitized
-from smplxpp.clean.scan_frame import AUTO, find_scan_frame
+from smplxpp.clean import PointSurface, Sanitized, sanitize, surface_from_points
+from smplxpp.clean.scan_frame import AUTO, check_human_scale, convert_points, find_scan_frame
 from smplxpp.core import GeometryWarning, InputError, MeshLike, as_mesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes

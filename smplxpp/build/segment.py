@@ -14,18 +14,11 @@ from smplxpp.build.config import BuildInputs
 from smplxpp.build.data import PreparedScan
 from smplxpp.build.scan import ScanFile, scan_file_labels
 from smplxpp.capture import read_cameras
-from smplxpp.core import BodyParams, Check, GeometryWarning, InputError, SKIN, StageOutput, TriangleMesh
+from smplxpp.core import SKIN, BodyParams, Check, GeometryWarning, InputError, StageOutput, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh
-from smplxpp.segment import (
-    Corrections,
-    SegmentedScan,
-    holds_labels,
-    label_by_body,
-    read_label_map,
-    segment_scan,
-    vote_in_agreement,
-)
+from smplxpp.segment import SegmentedScan, holds_labels, label_by_body, read_label_map, segment_scan, vote_in_agreement
+from smplxpp.segment.corrections import Corrections
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,21 +15,15 @@ from smplxpp.build.completeness import completeness_checks, photograph_checks
 from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PreparedScan
 from smplxpp.clean import loop_lengths, thickened
-from smplxpp.core import BodyParams, CLOTH_LABELS, Check, InputError, LABELS, SKIN, StageOutput, TriangleMesh, spread
+from smplxpp.core import CLOTH_LABELS, LABELS, SKIN, BodyParams, Check, InputError, StageOutput, TriangleMesh, spread
 from smplxpp.core.solids import closed_mesh
 from smplxpp.core.topology import border_loops
-from smplxpp.metrics import (
-    CompareConfig,
-    DirectedDistances,
-    directed_distances,
-    interpenetration,
-    mesh_quality,
-    point_to_surface,
-    stretch_report,
-    summarize,
-)
+from smplxpp.metrics import CompareConfig, DirectedDistances, directed_distances, point_to_surface, summarize
 from smplxpp.metrics.conventions import convention_named
 from smplxpp.metrics.distance import MM
+from smplxpp.metrics.interpenetration import interpenetration
+from smplxpp.metrics.quality import mesh_quality
+from smplxpp.metrics.stretch import stretch_report
 from smplxpp.template.template import BODY_PART, Template
 
 

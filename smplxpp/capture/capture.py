@@ -18,12 +18,8 @@ from smplxpp.capture.recording import KINDS, Problem, Recording
 from smplxpp.capture.splits import Splits
 from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
-from smplxpp.core.camera import Camera
+from smplxpp.core import BodyParams, Camera, Keypoints2D, TriangleMesh, require_choice
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_choice
 
 if TYPE_CHECKING:
     from smplxpp.body import BodyModel

@@ -24,13 +24,10 @@ from smplxpp.capture.writers.metadata import (
     write_description,
     write_plain_cameras_json,
 )
+from smplxpp.core import BodyParams, require_between, require_choice, require_positive, write_ply
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
+from smplxpp.core.files import as_object, jsonable, read_bytes, read_json
 from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes, atomic_write_text
-from smplxpp.core.files.json_file import as_object, jsonable, read_json
-from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh_files.mesh_io import write_ply
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_between, require_choice, require_positive
 
 _RECORD = "conversion.json"
 

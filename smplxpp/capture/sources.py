@@ -12,9 +12,8 @@ from jaxtyping import Int64
 
 from smplxpp.body import BodyModel, LayoutName, UpAxis, load_params, params_from_content
 from smplxpp.capture.files import FileSeries
-from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, TriangleMesh
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, TriangleMesh, read_mesh
 from smplxpp.core.files.safe_pickle import safe_npz
-from smplxpp.core.mesh_files.mesh_io import read_mesh
 
 # Arrays with a row for each frame in the layouts that stack frames.
 _STACKED = (*ARRAY_NAMES, "poses", "trans")

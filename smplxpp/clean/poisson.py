@@ -15,9 +15,8 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from smplxpp.clean.components import drop_specks
+from smplxpp.core import TriangleMesh, normalize_rows, require_at_least, row_lengths
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
-from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
-from smplxpp.core.validation import require_at_least
 
 FEWEST_POINTS = 500
 """Least number of points; fewer cannot show a person."""

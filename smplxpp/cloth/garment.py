@@ -15,11 +15,9 @@ from smplxpp.cloth.embedding import Embedding, embed
 from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.model import ClothModel, build_model
 from smplxpp.cloth.opening_bridges import find_opening_bridges
+from smplxpp.core import BodyParams, TriangleMesh, require_at_least, require_choice, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
 from smplxpp.core.topology import component_labels
-from smplxpp.core.validation import require_at_least, require_choice, require_positive
 from smplxpp.template.template import BODY_PART, Template
 
 

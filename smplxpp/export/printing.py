@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pygltflib
 
-from smplxpp.core import InputError, MeshLike, TriangleMesh, as_mesh, require_choice
+from smplxpp.core import InputError, MeshLike, TriangleMesh, as_mesh, require_choice, write_ply
 from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes
 from smplxpp.core.files.package_file import zip_bytes
-from smplxpp.core.mesh_files.mesh_io import write_ply
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.printing_check import MODEL, check_written
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from smplxpp.body import BodyModel
-from smplxpp.body.model import PosedBody
+from smplxpp.body import BodyModel, PosedBody
 from smplxpp.core import BodyParams, InputError
 from smplxpp.metrics.distance import MM
 

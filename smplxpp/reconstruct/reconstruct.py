@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
+from smplxpp.core import TriangleMesh, require_at_least, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_at_least, require_positive
 from smplxpp.reconstruct.colors import blend_colors
 from smplxpp.reconstruct.hull import main_body, pixel_footprint, soft_hull, solid_status
 from smplxpp.reconstruct.mask_consensus import Consensus, find_consensus

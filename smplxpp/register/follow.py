@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from smplxpp.body import BodyModel
+from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.params import BodyParams
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.raster import rasterize_mesh
 from smplxpp.register.fit import register
 from smplxpp.register.kinematics import BodyState

@@ -10,12 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Integer, UInt8
 
 from smplxpp.body import BodyModel
-from smplxpp.core.camera import Camera
+from smplxpp.core import BodyParams, Camera, Keypoints2D, TriangleMesh, require_at_least, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError
-from smplxpp.core.keypoints import Keypoints2D
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.params import BodyParams
-from smplxpp.core.validation import require_at_least, require_positive
 
 ViewMap = Callable[[str, int], "UInt8[np.ndarray, 'H W'] | None"]
 """Reads a map of a camera and a frame, None where there is none."""

@@ -13,13 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64, Int64, Integer
 
+from smplxpp.core import LABEL_BY_NAME, LABELS, TriangleMesh, matrix_from_rotvec, require_choice, rotvec_from_matrix
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_numbers, as_object, as_text, read_json
-from smplxpp.core.labels import LABEL_BY_NAME, LABELS
-from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.core.validation import require_choice
 from smplxpp.segment.corrected_faces import ScanSurface, nearest_faces, stroked_faces
 from smplxpp.segment.segment import SegmentedScan
 

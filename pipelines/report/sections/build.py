@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pipelines.figures import (
-    body_cameras,
-    encode_jpeg,
-    render_shaded,
-)
+from pipelines.figures import body_cameras, encode_jpeg, render_shaded
 from pipelines.report import CheckRow, KeyNumber, Picture, Report, Section, write_report
 from pipelines.report.builder import readable, readable_numbers
 from pipelines.report.sections.evaluation import (

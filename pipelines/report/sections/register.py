@@ -19,8 +19,7 @@ from pipelines.runs.artefacts import load_located, load_stacked_params, read_nam
 from pipelines.runs.layout import LOCATION_FILE, REGISTER_STAGE
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import RegisterInputs, load_register
-from smplxpp.body import BodyModel, load_body
-from smplxpp.body.model import PosedBody
+from smplxpp.body import BodyModel, PosedBody, load_body
 from smplxpp.build.observe import open_inputs
 from smplxpp.build.register import BODY_JOINTS, RESIDUALS
 from smplxpp.build.scan import read_scan

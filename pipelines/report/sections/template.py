@@ -8,15 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipelines.figures import (
-    blend_joint_colors,
-    body_cameras,
-    encode_jpeg,
-    render_heat,
-    render_overlay,
-    render_shaded,
-    row,
-)
+from pipelines.figures import body_cameras, encode_jpeg, render_heat, render_overlay, render_shaded, row
+from pipelines.figures.colors import blend_joint_colors
 from pipelines.report import CheckRow, Comparison, Histogram, Picture, Section, Table
 from pipelines.runs.artefacts import load_arrays, load_cleaned_parts, load_parts, load_weights, read_named, values_of
 from pipelines.runs.layout import SCAN_LABELS
@@ -24,14 +17,10 @@ from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
+from smplxpp.core import CLOTH_LABELS, LABELS, BodyParams, TriangleMesh, concatenate_meshes, display_colors, spread
 from smplxpp.core.camera import Camera
 from smplxpp.core.files.json_file import as_list, as_text
-from smplxpp.core.labels import CLOTH_LABELS, LABELS, display_colors
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
-from smplxpp.core.params import BodyParams
-from smplxpp.core.spread import spread
-from smplxpp.metrics import point_to_surface
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.distance import MM, point_to_surface
 from smplxpp.template.template import Template
 
 POSE_HEIGHT = 520

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body import BodyModel, load_body
-from smplxpp.clean.scan_frame import METRES_PER_UNIT, convert_points
-from smplxpp.clean.simplify import simplify
+from smplxpp.clean import METRES_PER_UNIT, convert_points, simplify
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 
 _FLIP = np.array([-1.0, 1.0, 1.0])  # mirrors points at x = 0

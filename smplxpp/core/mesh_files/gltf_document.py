@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text, parse_json
-from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files import as_integer, as_list, as_object, as_text, parse_json, read_bytes
 from smplxpp.core.mesh_files.texture import TextureCache, file_beside
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

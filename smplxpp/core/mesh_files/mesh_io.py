@@ -16,10 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.array_file import read_arrays
-from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.json_file import as_numbers
-from smplxpp.core.files.paths import regular_file
+from smplxpp.core.files import as_numbers, atomic_write_bytes, read_arrays, regular_file
 from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.mesh_files.gltf_file import read_gltf
 from smplxpp.core.mesh_files.obj_file import read_obj

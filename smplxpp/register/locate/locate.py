@@ -12,10 +12,8 @@ import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
 from smplxpp.body import BodyModel
+from smplxpp.core import SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
-from smplxpp.core.labels import SKIN
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
-from smplxpp.core.params import BodyParams
 from smplxpp.register.kinematics import Kinematics
 from smplxpp.register.locate.icp import PinnedLandmarks
 from smplxpp.register.locate.search import Found, LocateConfig, Search
