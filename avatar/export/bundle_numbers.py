@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import torch
 from jaxtyping import Float
+
+from avatar.models.student import Student
+from smplxpp.core import BodyParams
 
 Tensors = dict[str, np.ndarray]
 _LARGEST = 127
@@ -61,3 +65,38 @@ def blended(side: str, values: Float[np.ndarray, "n 6 M"], steps: Float[np.ndarr
         f"{side}.step": steps.astype(np.float32),
         f"{side}.exponent": exponent,
     }
+
+
+def usual_coefficients(student: Student, motion: BodyParams | None) -> dict[str, np.ndarray]:
+    """Return the root mean square of each blend shape's coefficients, by side, which scales its quantisation steps.
+
+    The body's are taken over the poses of the training, the head's over random expressions and the motion. The floor
+    is a fifth of the largest.
+    """
+    shapes = student.blend_shapes
+    assert shapes is not None
+    # Quantisation errors are multiplied by the coefficients: the usual
+    # coefficient turns a step of position or colour into a step of the shape.
+    config, rng = shapes.config, np.random.default_rng(0)
+    body = rng.normal(size=(64, config.pose_size)) * 0.2
+    if student.pose_gate is not None:
+        body = student.pose_gate.poses.cpu().numpy()
+    elif motion is not None:
+        body = motion.body_pose
+    head = rng.uniform(0.0, 0.5, (256, config.head_inputs))
+    if motion is not None and np.abs(motion.expression).max(initial=0.0) > 0.0:
+        width = min(config.expression_size, motion.expression.shape[1])
+        of_motion = np.zeros((len(motion), config.head_inputs))
+        of_motion[:, :width] = motion.expression[:, :width]
+        if config.jaw:
+            of_motion[:, config.expression_size :] = motion.jaw_pose
+        head = np.concatenate([head, of_motion])
+    # Root mean square over samples and parts; a floor keeps seldom used shapes from becoming arbitrarily coarse.
+    out = {}
+    for side, inputs, network in (("head", head, shapes.head), ("body", body, shapes.body)):
+        with torch.no_grad():
+            z = network(torch.tensor(inputs, dtype=torch.float32, device=shapes.U.device))
+            z = z.unflatten(1, (config.parts, -1))
+        size = z.square().mean(dim=(0, 1)).sqrt().cpu().numpy()
+        out[side] = np.maximum(size, max(0.2 * float(size.max(initial=0.0)), 1e-3))
+    return out
