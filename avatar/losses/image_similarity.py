@@ -43,7 +43,7 @@ def ssim(
 
     Args:
         x: one image or B of them, in [0, 1]. Gradients flow to it where it requires them.
-        y: images of the same shape and type, treated in the same way.
+        y: images of the same shape and type; gradients flow to them in the same way.
         mask: weights >= 0 of one image or of each: `sum(mask * SSIM) / (C sum(mask))`. Windows are not masked, so
             composite both images on one background first. No gradient flows to the mask.
         padding: "zero" or "valid".

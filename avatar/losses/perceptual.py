@@ -121,6 +121,7 @@ class ShiftTolerantLPIPS(PerceptualDistance):
             )
             state[f"layer_weights.{k}"] = stored.get(f"lin{k}.model.1.weight")
         for name, value in metric.state_dict().items():
+            # The reshape drops axes of length 1 alone, so that equal numbers of entries are enough to check.
             given = state[name]
             if given is None or given.numel() != value.numel():
                 raise InputError(

@@ -86,6 +86,7 @@ def open_student(folder: Path, files: StudentFiles, *, device: str = "cpu") -> S
     Raises:
         InputError: template or student are missing, damaged or of each other's.
     """
+    # The error names the command that makes the missing file.
     for name, what in ((files.template, "template"), (files.student, "student")):
         if not (folder / name).is_file():
             raise InputError(

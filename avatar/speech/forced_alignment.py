@@ -140,9 +140,11 @@ def _align_words(decoder: Any, sound: Sound, words: list[str]) -> Speech | None:
     """
     # Faint noise, because the stops of a synthetic voice are exact zeros, which the recogniser cannot score.
     data = _samples(sound, 1e-3)
+    # Words that the recogniser does not know are added with the phones of the spelling rules.
     for word in dict.fromkeys(words):
         if decoder.lookup_word(word) is None:
             decoder.add_word(word, " ".join(one.rstrip("012") for one in phones_from_word(word)[0]), True)
+    # First pass: times of the words. Second pass: times of the phones within them.
     decoder.config["bestpath"] = False
     try:
         decoder.set_align_text(" ".join(words))

@@ -132,6 +132,7 @@ def pose_arms(
     Hands whose pose is not stored as axis-angle vectors of 15 joints keep their fingers.
     """
     frames = standing.select(np.zeros(len(states), dtype=np.int64))
+    # The first 18 numbers of a state are the rotation vectors of three joints an arm, left then right.
     pose = np.array(frames.body_pose).reshape(len(states), -1, 3)
     pose[:, [*_ARM_ROWS["left"], *_ARM_ROWS["right"]]] = states[:, :18].reshape(-1, 6, 3)
     hands = {f"{side}_hand_pose": np.array(getattr(frames, f"{side}_hand_pose")) for side in _SIDES}

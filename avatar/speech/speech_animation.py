@@ -80,6 +80,7 @@ class SpeechAnimator:
         self.gestures: GesturePlanner | None = None
         self._sway: PosturalSway | None = None
         self._body = body if isinstance(body, StandingBody) else None
+        # A standing body gestures and sways; a single frame moves its face, head and eyes alone.
         if isinstance(body, StandingBody):
             self._standing = body.standing
             self.gestures = GesturePlanner(body, size=self.config.gestures, seed=seed)

@@ -71,6 +71,7 @@ class PiperVoice:
         described = Path(f"{model}.json")
         about = read_json(described, subject="voice's description")
         try:
+            # Sampling rate, the language of the phonemes, ids of each IPA symbol, and scales of noise and length.
             self.rate = int(about["audio"]["sample_rate"])
             self.language = str(about["espeak"]["voice"])
             self._ids = {str(key): [int(one) for one in value] for key, value in about["phoneme_id_map"].items()}
@@ -172,6 +173,7 @@ def _symbols(ipa: str) -> list[tuple[str, str]]:
     out: list[tuple[str, str]] = []
     before, at = "", 0
     while at < len(ipa):
+        # Two-character symbols (diphthongs, affricates) are matched before single ones.
         name, length = arpabet_from_ipa(ipa, at)
         piece = ipa[at : at + length]
         if name:

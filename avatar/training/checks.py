@@ -35,6 +35,7 @@ def check_training(scene: TrainScene, recipe: Recipe, steps: Sequence[str], *, p
         )
     if recipe.cloth is None:
         return
+    # Wrong names are refused now; parts that cannot be simulated only cost a warning.
     if "cloth" in steps and recipe.cloth.parts:
         require_known("loose parts", recipe.cloth.parts, loose_names(scene.template))
     if recipe.follows and {"teacher", "cloth"} & set(steps):

@@ -62,7 +62,7 @@ class Outlines:
 
 @dataclass
 class LooseClothes:
-    """Loose clothes of a template with the figures by which they were chosen.
+    """Loose clothes of a template, and the figures that decided their choice.
 
     Attributes:
         garments: parts to simulate, cut and fitted.

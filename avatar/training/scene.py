@@ -115,6 +115,7 @@ def hold_out_cameras(capture: Capture, names: Sequence[str]) -> Capture:
             "option hold-out", expected=f"cameras among {', '.join(capture.cameras)}", received=", ".join(unknown)
         )
     splits = capture.splits
+    # Named cameras replace the split's held-out ones; cameras of neither split stay unused.
     held_out = tuple(names) or splits.novel_view_cameras
     known = {*splits.train_cameras, *splits.novel_view_cameras}
     train = tuple(name for name in capture.cameras if name in known and name not in held_out)
@@ -174,6 +175,7 @@ def with_params(capture: Capture) -> tuple[Capture, dict[int, BodyParams]]:
     Raises:
         InputError: no training frame has parameters.
     """
+    # A damaged row of parameters costs its frame, not the training; the first reason is shown in the warning.
     splits, known, why = capture.splits, {}, {}
     for frame in (*splits.train_frames, *splits.novel_pose_frames):
         try:

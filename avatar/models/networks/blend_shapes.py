@@ -67,6 +67,7 @@ def mapping_networks(config: BlendShapeConfig) -> dict[str, nn.Module]:
 
 
 def _mapping_network(inputs: int, outputs: int, config: BlendShapeConfig) -> nn.Sequential:
+    # inputs -> width -> ... -> width with ReLU, then a linear layer without activation: coefficients have any sign.
     sizes = [inputs, *[config.width] * config.hidden_layers]
     layers: list[nn.Module] = []
     for before, after in pairwise(sizes):

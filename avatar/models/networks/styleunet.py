@@ -293,6 +293,7 @@ class StyleUNet(nn.Module):
         view_features = (None, None)
         if view_cosines is not None and self.view_encoder is not None:
             view_features = self.view_encoder(view_cosines)
+        # The encoder's half of each skip convolution is computed once for both decoders and all heads.
         style, skips = self.style(), self.merge.skips(features)
         coarsest = features[self.config.bottleneck]
         # Decode front and back with shared skip connections.

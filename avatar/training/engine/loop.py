@@ -129,6 +129,7 @@ def run_training(
             sinks.append(stack.enter_context(closing(events)).add)
 
     def progress(evaluation: Mapping[str, Any] | None = None) -> Progress:
+        # Steps of this session by their time; evaluations and checkpoints are not counted.
         rate = (done - first) / spent if spent else 0.0
         return Progress(done, config.iterations, spent_before + spent, rate, logged, evaluation, spent)
 
@@ -158,6 +159,7 @@ def run_training(
             processes.run_on_rank0(evaluate)
         # Steps, with logs, evaluations and checkpoints at their intervals.
         while done < config.iterations and spent < config.max_seconds:
+            # The first process's clock counts for all, so that all stop at the same step.
             begin = time.perf_counter()
             values = task.step(done)
             took = processes.run_on_rank0(lambda: time.perf_counter() - begin)  # noqa: B023  called at once

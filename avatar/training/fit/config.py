@@ -65,6 +65,7 @@ class FitConfig:
     def photometric(self) -> PhotometricConfig:
         """Return what the fit shares with the other trainings on photographs: everything but the start."""
         # The loss of all trainings, without normals and perceptual term.
+        # (1 - s) L1 + s D-SSIM as in 3DGS, with the opacity term that keeps dark hair on a black background.
         return PhotometricConfig(
             iterations=self.iterations,
             scale_penalty=self.scale_penalty,

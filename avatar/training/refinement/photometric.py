@@ -169,6 +169,7 @@ class PhotometricLoss:
 
     def _draw(self, world: WorldGaussians, features: Tensor, view: View) -> tuple[Tensor, Tensor]:
         eps2d = 0.1  # pixels squared of blur, as in the trainings
+        # Colours have the background behind them; all other channels are 0 there.
         image, alpha, _ = rasterize(
             world.means,
             world.quats,
