@@ -90,6 +90,8 @@ def _least_area(rim: Float[np.ndarray, "L 3"], taken: set[tuple[int, int]]) -> l
     count = len(rim)
     cost, middle = np.full((count, count), np.inf), np.zeros((count, count), dtype=np.int64)
     cost[np.arange(count - 1), np.arange(1, count)] = 0.0
+    # From short chains of the border to long ones, so that both parts of a split are known. Diagonals that are edges of
+    # the mesh already would get a third face.
     for gap in range(2, count):
         for i in range(count - gap):
             j = i + gap

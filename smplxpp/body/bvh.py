@@ -111,8 +111,10 @@ class _Reader:
         while self._at < len(self._words):
             word = self._next()
             if word in ("ROOT", "JOINT"):
+                # Exactly the first joint is the root.
                 if (word == "ROOT") != (not self._names) or len(self._names) >= _MOST_JOINTS:
                     raise self._wrong(f"one ROOT and at most {_MOST_JOINTS} joints", word)
+                # The innermost open brace that belongs to a joint, not to an end site, is the parent.
                 parent = next((joint for joint in reversed(open_joints) if joint is not None), -1)
                 current = len(self._names)
                 self._names.append(self._name())
@@ -165,6 +167,7 @@ class _Reader:
         if len(header) != 2 or header[0] != "Frames" or not header[1].isdigit() or not rest:
             raise self._wrong("Frames: and Frame Time:", " ".join(header)[:40] or "none")
         try:
+            # The frame time stands before the motion's numbers, so that it is the first of them.
             values = np.array(rest.split(), dtype=np.float64)
         except ValueError:
             raise self._wrong("numbers after Frame Time:", "others") from None

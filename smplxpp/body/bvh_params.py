@@ -133,6 +133,7 @@ def named_joints(
     Raises:
         InputError: a required joint is missing.
     """
+    # A map of the user decides alone; else our own names, which our writer uses; else the names of other programs.
     if joint_map is not None:
         unknown = [name for name in joint_map if name not in names]
         if unknown:
@@ -158,6 +159,7 @@ def named_joints(
 
 def _known(names: tuple[str, ...]) -> dict[str, int]:
     """Match joints by the names that other programs use."""
+    # Names without name space ("mixamorig:"), separators and case.
     plain = [re.sub(r"[\s_.\-]", "", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
     found: dict[str, int] = {}
 

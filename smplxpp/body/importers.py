@@ -137,6 +137,7 @@ def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
         return parts
     if max_betas < 0:
         raise InputError("number of betas to keep", expected="0 or more", received=str(max_betas))
+    # Sums of squares over all frames, of the coefficients that stay and of those that go.
     kept, dropped = (
         sum(float(np.square(part.params.betas[:, columns]).sum()) for part in parts)
         for columns in (slice(max_betas), slice(max_betas, None))
@@ -160,6 +161,8 @@ def _joined(parts: list[Frames], body: BodyModel | None, up: UpAxis) -> BodyPara
     if not outer and up == "y":
         return params
     body = body or load_body()
+    # Rigid motions are about the world's origin, parameters turn about the root joint: `_moved` needs the body for
+    # that.
     if outer:
         params = _moved(params, body, *(np.concatenate(values) for values in zip(*outer, strict=True)))
     if up != "y":
@@ -229,6 +232,7 @@ def _frame_files(path: Path) -> list[Path]:
     """The file itself, or the numbered files of a folder in order."""
     if not path.is_dir():
         return [path]
+    # Files that differ in their numbers alone form one series.
     series: dict[str, list[Path]] = {}
     others = 0
     for file in path.iterdir():

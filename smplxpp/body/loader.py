@@ -172,6 +172,7 @@ class _Builder:
         """
         basis = self._array("shapedirs", (vertex_count, 3, None))
         width = basis.shape[2]
+        # The file's own counts, else a body without expressions, else the two conventions of SMPL-X.
         if "num_betas" in self.raw:
             shape = int(np.asarray(self.raw["num_betas"]))
             expression = int(np.asarray(self.raw.get("num_expressions", width - shape)))

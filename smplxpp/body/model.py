@@ -118,6 +118,7 @@ class BodyModel:
         return f"BodyModel({self.name!r}, {counts}, {bases})"
 
     def _check(self) -> None:
+        # Every array against V and J of the regressor and the tree; None in a shape leaves that axis open.
         V, J = self.joint_regressor.shape[-1], len(self.parents)
         shapes: dict[str, tuple[int | None, ...]] = {
             "v_template": (V, 3),
@@ -144,6 +145,7 @@ class BodyModel:
                 raise self._unfit(name, f"shape {shape}", f"shape {value.shape}")
         if len(self.joint_names) != J:
             raise self._unfit("joint_names", f"{J} names", f"{len(self.joint_names)}")
+        # Parents before children, so that one pass over the joints composes all global transforms.
         if not (J and self.parents[0] == -1 and all(0 <= p < j for j, p in enumerate(self.parents.tolist()) if j)):
             raise self._unfit("parents", "one root first (-1), every parent before its children", "others")
         # Indices of labels and landmarks must exist.
@@ -203,10 +205,12 @@ class BodyModel:
             flat_hand_mean = (
                 params.flat_hand_mean if isinstance(params, BodyParams) else bool(params.get("flat_hand_mean", False))
             )
+        # Shape first: joints are regressed from the shaped vertices, before any pose corrective is added.
         arrays = _checked_arrays(params)
         rotations = matrix_from_rotvec(self._axis_angles(arrays, flat_hand_mean))
         shaped, rest_joints = self._shaped(arrays)
         offsets = self._pose_offsets(rotations)
+        # Correctives belong to the rest pose, before skinning. The translation is in the transforms of the joints.
         rest = shaped if offsets is None else shaped + offsets
         posed_from_rest, joints = forward_kinematics(rest_joints, self.parents, rotations, transl=arrays["transl"])
         vertices = skin(rest, self._constant("weights", rest), posed_from_rest)
@@ -255,6 +259,7 @@ class BodyModel:
                 remedy="use the body that the parameters were fitted with, or cut the parameters "
                 "(smplxpp params convert --betas, load_params(max_betas=))",
             )
+        # One matrix product over all vertices and axes; fewer coefficients than directions use the first of these.
         flat = basis.reshape(3 * self.vertex_count, known)[:, :used]
         return (coefficients @ flat.T).reshape(-1, self.vertex_count, 3)
 
@@ -262,6 +267,8 @@ class BodyModel:
         if self.posedirs is None:
             return None
         identity = matrix_from_rotvec(_zeros(rotations, (3,)))  # of the rotations' kind, type and device
+        # Correctives are linear in R_j - I of every joint but the root, whose rotation deforms nothing (Loper et al.
+        # 2015).
         feature = rotations[:, 1:] - identity
         return self._blend("posedirs", feature.reshape(len(rotations), -1), "pose")
 
@@ -272,6 +279,7 @@ class BodyModel:
             value = arrays[name]
             blocks.append(self._full_hand(name, value, flat_hand_mean) if name.endswith("hand_pose") else value)
         full = array_namespace(blocks[0]).concatenate(blocks, -1).reshape(len(blocks[0]), -1, 3)
+        # Joints beyond the named blocks, the two hands of SMPL, do not rotate.
         missing = self.joint_count - full.shape[1]
         if missing:
             full = array_namespace(full).concatenate([full, _zeros(full, (len(full), missing, 3))], 1)
@@ -290,6 +298,7 @@ class BodyModel:
                     received=f"{width} PCA coefficients",
                     remedy="load the body model that the parameters were fitted with",
                 )
+            # Coefficients of the first principal components, hence 45 axis-angle numbers of 15 joints.
             value = value @ components[:width]
         mean = None if flat_hand_mean else self._constant(f"{side}_mean", value)
         return value if mean is None else value + mean
@@ -325,6 +334,7 @@ def _checked_arrays(params: BodyParams | Mapping[str, Array]) -> dict[str, Array
             raise InputError(
                 f"parameter {name}", expected=f"shape (T, {width or 'any'})", received=f"shape {tuple(value.shape)}"
             )
+    # A single row stands for all frames; broadcasting keeps it a view and the gradient flows back to the one row.
     frames = max(value.shape[0] for value in given.values())
     like = next(iter(given.values()))
     xp, out = array_namespace(like), {}

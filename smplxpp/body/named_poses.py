@@ -125,6 +125,7 @@ def stress_poses(reference: BodyParams) -> BodyParams:
     """
     first = reference.frame(0)
     count = len(STRESS_POSES)
+    # Axis-angle vectors of all joints of SMPL-X in radians; joints that a pose does not name stay at rest.
     pose = np.zeros((count, 55, 3))
     for row, joints in enumerate(STRESS_POSES.values()):
         for joint, degrees in joints.items():

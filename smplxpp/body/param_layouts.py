@@ -49,6 +49,7 @@ def without_holes(content: Any) -> tuple[Any, list[int]]:
     if not isinstance(content, Mapping):
         return content, []
     arrays = {name: value for name, value in content.items() if isinstance(value, np.ndarray) and value.ndim > 1}
+    # Only arrays with a row for each frame are repaired; values of the whole take have another length.
     counts = [len(arrays[name]) for name in _STACKED if name in arrays]
     count = counts[0] if counts else 0
     arrays = {name: value for name, value in arrays.items() if len(value) == count and value.dtype.kind == "f"}
@@ -57,6 +58,7 @@ def without_holes(content: Any) -> tuple[Any, list[int]]:
         good &= (np.abs(value.reshape(count, -1)) <= _FARTHEST).all(axis=1)
     if count < 2 or good.all() or not good.any():
         return content, []
+    # Index of the last good frame up to each frame; before the first good one, the first.
     held = np.maximum.accumulate(np.where(good, np.arange(count), np.argmax(good)))
     return {**content, **{name: value[held] for name, value in arrays.items()}}, np.flatnonzero(~good).tolist()
 

@@ -150,6 +150,8 @@ class ViewReader:
         else:
             self._check_background(image, opacity, image_path)
             if any(self.background):
+                # Compositing is C = a F + (1 - a) c. The product a F is what remains without the background; 0.5 rounds
+                # on truncation.
                 share = 1.0 - np.asarray(opacity, dtype=np.float32)[..., None] / 255.0
                 colour = np.asarray(self.background, dtype=np.float32) * 255.0
                 person = np.asarray(image) - share * colour + 0.5

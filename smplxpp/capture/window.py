@@ -71,6 +71,8 @@ class Window:
 
         if self == Window((0.0, 0.0, float(image.width), float(image.height)), image.width, image.height):
             return image
+        # From exact to approximate: unchanged, a crop of whole pixels, means of whole blocks, and last a resampling
+        # filter.
         whole_box = all(edge == int(edge) for edge in self.box)
         x0, y0, x1, y1 = self.box
         pixels = (int(x0), int(y0), int(x1), int(y1))

@@ -136,6 +136,7 @@ def _usable(points: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " n"]:
     An outlier is ten times farther from its eight nearest points than the median point.
     """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    # `unique` sorts by position; sorting its indices restores the order of the file.
     kept = finite[np.sort(np.unique(points[finite], axis=0, return_index=True)[1])]
     if len(kept) >= FEWEST_POINTS:
         apart = cKDTree(points[kept]).query(points[kept], k=NEIGHBOURS // 2)[0].mean(axis=1)
@@ -161,6 +162,7 @@ def _normals(
     estimated = estimate_normals(points)
     if given is None:
         return estimated, "normals estimated"
+    # Rows that are not finite or zero have no normal and take the estimated one.
     known = np.isfinite(given).all(axis=1) & (row_lengths(np.nan_to_num(given)) > 0)
     own = normalize_rows(np.where(known[:, None], np.nan_to_num(given), 0.0))
     share = float(_agrees(own[known], estimated[known]).mean()) if known.any() else 0.5

@@ -202,6 +202,7 @@ def _weld(vertices: np.ndarray, referenced: np.ndarray, tolerance: float) -> np.
     most = 100
     target = np.arange(len(vertices))
     tree = cKDTree(vertices[referenced])
+    # Counted before the pairs are listed, because only the list needs memory. Each pair counts twice here.
     if tree.count_neighbors(tree, tolerance) > 2 * most * len(referenced):
         raise InputError(
             "mesh vertices",
@@ -211,6 +212,7 @@ def _weld(vertices: np.ndarray, referenced: np.ndarray, tolerance: float) -> np.
         )
     pairs = tree.query_pairs(tolerance, output_type="ndarray")
     if len(pairs):
+        # Connected components of the pairs, so that chains merge as one; the lowest index stands for its component.
         group = component_labels(pairs, len(referenced))
         _, first = np.unique(group, return_index=True)
         target[referenced] = referenced[first[group]]

@@ -157,6 +157,7 @@ def _merge_coincident(
     """
     edges = TriangleMesh(points, faces).edges
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    # Relative to the mean edge, so that the test does not depend on the units or the density.
     short = edges[length < _COINCIDENT * length.mean()]
     if not len(short):
         return points, faces, point_of_free
@@ -165,6 +166,7 @@ def _merge_coincident(
     first = np.unique(group, return_index=True)[1][np.unique(group, return_inverse=True)[1]]
     faces = first[faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    # Two faces over the same three vertices bound no volume: both go.
     _, same, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
     faces = faces[count[same.ravel()] == 1]
     kept = np.unique(faces)

@@ -233,6 +233,7 @@ def _size(solid: manifold3d.Manifold) -> float:
 def _measured(solid: manifold3d.Manifold, config: SolidConfig, dropped: int, gaps: dict[str, float]) -> SolidReport:
     mesh = mesh_of_solid(solid)
     walls = wall_thickness(mesh, solid=solid, seed=config.seed) * 1e3
+    # Percentiles in millimetres over sampled points, because a single smallest wall is often a sharp crease.
     p1, p5, median = np.percentile(walls, (1, 5, 50))
     size = np.ptp(mesh.vertices, axis=0) * 1e3
     return SolidReport(

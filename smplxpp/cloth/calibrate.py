@@ -23,7 +23,8 @@ class CalibrationConfig:
     """What is searched, and when a simulation is worth its while.
 
     Attributes:
-        drags: 1/s. pin_depths: metres. All pairs are tried; what lies between them is chaos's luck.
+        drags: 1/s.
+        pin_depths: metres. All pairs are tried; what lies between them is chaos's luck.
         drag_prior: how far the garment's own drag is believed: the distance counts as larger by this share for each
             squared factor of two from it. Slow motion tells drags hardly apart, and what was followed there is stiffer
             than cloth; a motion that does tell finds the same drag with and without it.
@@ -56,8 +57,11 @@ class Calibration:
     """What was found for one part.
 
     Attributes:
-        part: its name. moves: whether its followed surface leaves skinning. fitted: whether the values below are.
-        drag, pin_depth: 1/s and metres. drag_spread, pin_spread: standard deviations by leaving blocks of frames out
+        part: its name.
+        moves: whether its followed surface leaves skinning.
+        fitted: whether the values below are.
+        drag, pin_depth: 1/s and metres.
+        drag_spread, pin_spread: standard deviations by leaving blocks of frames out
             (jackknife); None where nothing was fitted.
         skinned, simulated: mean distance of particles to the followed surface, metres, by skinning alone and with
             these values.
@@ -81,7 +85,8 @@ class Followed:
     """A motion and the surface that was followed along it.
 
     Attributes:
-        params: T frames, evenly spaced. fps: of them.
+        params: T frames, evenly spaced.
+        fps: of them.
         world: where the particles of a garment were found, metres; NaN rows are not looked at, and count for nothing.
         confidence: from 0 to 1, how much each counts; None: all alike.
     """

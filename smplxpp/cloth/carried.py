@@ -34,11 +34,14 @@ class CarriedVertices:
     """N vertices that n particles carry, kept out of a collider of c vertices; `Embedding.carried` by a kernel.
 
     Args:
-        embedding: of the vertices. faces: of the particles. collider: what they keep out of.
+        embedding: of the vertices.
+        faces: of the particles.
+        collider: what they keep out of.
         particles: their number n.
     """
 
     def __init__(self, embedding: Embedding, faces: Int[np.ndarray, "m 3"], collider: Collider, particles: int) -> None:
+        # Many vertices ride on one triangle; each distinct triangle is posed once.
         triangles, which = np.unique(embedding.corners, axis=0, return_inverse=True)
         self._count, self._shapes = len(embedding.corners), ((particles, 3), (len(collider.margin), 3))
         arrays = (
@@ -63,7 +66,8 @@ class CarriedVertices:
         """Return where the vertices are, metres: `margin` metres before the surface where they lie behind that.
 
         Args:
-            particles: where they are. surface: where the collider's vertices are.
+            particles: where they are.
+            surface: where the collider's vertices are.
         """
         assert (particles.shape, surface.shape) == self._shapes
         out = np.empty((self._count, 3), dtype=np.float32)
@@ -84,7 +88,8 @@ class SkinnedRows:
     """R of V vertices under linear blend skinning, there and back.
 
     Args:
-        weights: of all V vertices. rows: which of them.
+        weights: of all V vertices.
+        rows: which of them.
     """
 
     def __init__(self, weights: SkinWeights, rows: Int64[np.ndarray, " R"]) -> None:

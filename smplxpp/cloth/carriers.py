@@ -28,18 +28,23 @@ def find_carriers(cloth: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray, "
     it, what is tight of the border's upper half does.
 
     Args:
-        cloth: N vertices, without bridges. body: the naked body in the same pose, closed or nearly.
+        cloth: N vertices, without bridges.
+        body: the naked body in the same pose, closed or nearly.
     """
+    # Signed distance to the body, metres; unreferenced vertices stay infinitely far.
     distance = np.full(cloth.vertex_count, np.inf)
     used = cloth.referenced
     distance[used] = SignedDistanceField(body, solid=True).query(cloth.vertices[used]).distance
+    # Cloth that lies on the body from above, with a normal that looks up, is held by it.
     out = (distance < TIGHT) & (cloth.vertex_normals[:, 1] > LIES)
     for loop in border_loops(cloth.faces):
         if loop_length(cloth, loop) < SHORTEST_OPENING:
             continue
+        # An opening that looks up is worn and may stand off farther; any other one holds only where it is tight.
         reach = WORN if opening_axis(cloth, loop)[1] > UP else TIGHT
         if float(np.median(distance[loop])) < reach:
             out[loop] = True
+    # Nothing holds it and there is a border: the part torn from opening to opening hangs on the tight upper half of it.
     if not out.any() and len(border := np.unique(cloth.border_edges)):
         height = cloth.vertices[:, 1]
         middle = 0.5 * (height[used].min() + height[used].max())

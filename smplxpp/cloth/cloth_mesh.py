@@ -87,13 +87,18 @@ def coarsen(mesh: TriangleMesh, spacing: float) -> tuple[Int[np.ndarray, " n"], 
         The vertices of `mesh`, and triangles of indices into them, oriented as its faces are.
     """
     used = mesh.referenced
+    # In a triangular lattice of spacing s every vertex stands for an area of sqrt(3) / 2 s^2.
     area = float(mesh.face_areas.sum())
     count = int(np.clip(round(area / (0.5 * np.sqrt(3.0) * spacing**2)), min(12, len(used)), len(used)))
     seeds = _farthest(mesh.vertices, used, count)
     border = np.zeros(mesh.vertex_count, dtype=bool)
     border[mesh.border_edges] = True
+    # Lloyd's iteration on the surface: assign vertices to the geodesically nearest seed, move each seed to its cell's
+    # middle.
     for _ in range(3):
         seeds = _middles(mesh.vertices, used, geodesics(mesh, seeds)[1], border)
+    # A face whose corners lie in three different cells becomes a triangle between their seeds; repeated ones are
+    # dropped.
     cell = np.full(mesh.vertex_count, -1, dtype=np.int64)
     cell[seeds] = np.arange(len(seeds))
     faces = cell[geodesics(mesh, seeds)[1]][mesh.faces]

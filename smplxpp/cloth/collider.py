@@ -32,7 +32,8 @@ class ColliderMesh:
     """Vertices of the template that stand for surfaces.
 
     Attributes:
-        vertices: of the template. faces: of indices into them.
+        vertices: of the template.
+        faces: of indices into them.
         margin, deepest: see `Collider`.
     """
 

@@ -69,7 +69,8 @@ class ClothDriver:
     """Steps garments of one template, the inner ones first; each touches the body and what it lies over.
 
     Args:
-        template: the person. garments: cut from it.
+        template: the person.
+        garments: cut from it.
         config: how motions are followed.
 
     Attributes:
@@ -230,8 +231,10 @@ class ClothDriver:
         """Go on along poses that are even in time, and return the cloth for the body that is drawn at their end.
 
         Args:
-            way: at least one frame, as `smplxpp.cloth.following.ways` yields them. seconds: of all of it.
-            drawn: one frame; None: the last of the way. posed: the drawn body, where it is there already.
+            way: at least one frame, as `smplxpp.cloth.following.ways` yields them.
+            seconds: of all of it.
+            drawn: one frame; None: the last of the way.
+            posed: the drawn body, where it is there already.
         """
         for pose in way:
             shape = self.step(pose, seconds / len(way))

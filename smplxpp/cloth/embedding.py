@@ -19,7 +19,8 @@ class Embedding:
     """N fine vertices in the frames of m coarse triangles.
 
     Attributes:
-        corners: of each vertex's triangle. weights: barycentric.
+        corners: of each vertex's triangle.
+        weights: barycentric.
         offset: metres along the triangle's first edge, along the second direction in its plane, and along the coarse
             mesh's smooth normal.
     """

@@ -19,7 +19,8 @@ class Fabric:
         bend_stiffness: N m: how strongly a hinge returns to its curvature at rest. 0: not at all, which saves a third
             of the time.
         slack: relative elongation of the path from an attachment that tethers allow.
-        drag: of the air, 1/s. normal_drag: of what moves along its own normal, 1/s, on top.
+        drag: of the air, 1/s.
+        normal_drag: of what moves along its own normal, 1/s, on top.
         inner_friction: at which neighbours' velocities become alike, 1/s.
         friction: Coulomb's coefficient against the skin.
     """

@@ -23,7 +23,9 @@ def followed(poses: BodyParams, fps: float, *, smoothing: float = SMOOTHING) -> 
     Frame k is pose k times that number.
 
     Args:
-        poses: T frames. fps: of them. smoothing: seconds; 0: none.
+        poses: T frames.
+        fps: of them.
+        smoothing: seconds; 0: none.
     """
     poses = smoothed(poses, radius=smoothing * fps)
     times, last = max(1, ceil(SLOWEST / fps - 1e-6)), len(poses) - 1
@@ -39,7 +41,9 @@ def ways(
     """Yield for every frame the poses that lead to it from the one before, even in time, it (smoothed) the last.
 
     Args:
-        params: T frames, evenly spaced. fps: of them. smoothing: seconds; 0: none.
+        params: T frames, evenly spaced.
+        fps: of them.
+        smoothing: seconds; 0: none.
         leap: metres a second of the root; what is faster is a cut, over which nothing is smoothed.
 
     Raises:

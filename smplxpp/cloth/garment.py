@@ -26,7 +26,8 @@ class GarmentConfig:
     """Options of cutting a garment from a template.
 
     Attributes:
-        spacing: of its particles, metres. collider_spacing: of the collider's vertices.
+        spacing: of its particles, metres.
+        collider_spacing: of the collider's vertices.
         pin_depth: metres along the cloth from where the body carries it up to which it follows the body exactly.
         band: width, in metres, of the transition from skinning to simulation next to the pins.
         skin_margin, sheet_margin: metres that cloth keeps from the skin and from other clothes.
@@ -54,12 +55,15 @@ class Garment:
 
     Attributes:
         part: its name in the template.
-        config: choices. reference: one frame, the pose that it was scanned in; its shape there is its shape at rest.
+        config: choices.
+        reference: one frame, the pose that it was scanned in; its shape there is its shape at rest.
         particles: vertices of the template that the particles are.
         rest: the simulated mesh in the reference pose, metres.
         lengths: of `rest.edges`, along the cloth, metres.
         depth: of particles along the cloth from what the body carries, metres; inf without a path.
-        vertices: of the template that it carries. vertex_depth: theirs. embedding: theirs.
+        vertices: of the template that it carries.
+        vertex_depth: theirs.
+        embedding: theirs.
         collider: what it may touch.
     """
 
@@ -117,19 +121,22 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
     """Make a part of a template ready to be simulated.
 
     Args:
-        part: its name. reference: one frame: the pose in which the template's surface is the scan's.
+        part: its name.
+        reference: one frame: the pose in which the template's surface is the scan's.
 
     Raises:
         InputError: no such part, the body itself, a part without area, or one that nothing carries.
     """
     config = config or GarmentConfig()
     require_choice("loose part", part, [name for name in template.part_names if name != BODY_PART])
+    # The garment at rest is the scan's: the template in the pose of the scan, not in the T-pose.
     posed = TriangleMesh(template.pose(reference)[0], template.faces)
     cloth, index = posed.submesh(template.part_faces(part))
     body = TriangleMesh(posed.vertices, template.faces[template.part_faces(BODY_PART)])
     if cloth.face_count and looks_inwards(cloth, body):
         warnings.warn(f"{part}: its faces look inwards; it is simulated turned over", GeometryWarning, stacklevel=2)
         cloth = turned_over(cloth)
+    # The simulated sheet is the largest piece without bridges, which would tie its openings together.
     kept = largest_piece(cloth, ~find_opening_bridges(template)[template.part_faces(part)])
     if not cloth.face_areas[kept].sum() > 0:
         raise InputError(f"loose part {part!r}", expected="a surface with area", received="none beside bridges")
@@ -142,7 +149,9 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
             received="none in the pose of the scan",
             remedy="leave the part to skinning (--cloth field or skin), or name other parts",
         )
+    # Geodesic distance to what holds the cloth, metres: the deeper a vertex hangs, the freer it is.
     depth = geodesics(sheet, carriers)[0]
+    # Particles are fewer than vertices; every vertex rides on a triangle of particles.
     seeds, faces = coarsen(sheet, config.spacing)
     rest, of_seeds = TriangleMesh(sheet.vertices[seeds], faces).submesh(_held(seeds, faces, depth, config))
     seeds = seeds[of_seeds]

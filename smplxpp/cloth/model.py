@@ -23,8 +23,10 @@ class ClothModel:
         inverse_mass: 1/kg; 0 where the particle follows its place exactly.
         edges, lengths: pairs of particles, and their distance at rest along the cloth, metres.
         stretch, compress: compliances of the edges, m/N.
-        hinges: the two ends of an inner edge, then the corners across it. curvature: weights of the four corners.
-        rest_curvature: along the hinge's normal. bend: compliance of a hinge.
+        hinges: the two ends of an inner edge, then the corners across it.
+        curvature: weights of the four corners.
+        rest_curvature: along the hinge's normal.
+        bend: compliance of a hinge.
         spring: m/N to the particle's place, inf where there is none; None: nowhere.
         anchor, tether: the particle that holds this one, -1 where none does, and the longest distance to it, metres.
     """
@@ -66,17 +68,22 @@ def build_model(
         lengths: of `rest.edges`, metres; None: the chords.
     """
     n, (a, b) = rest.vertex_count, rest.edges.T
+    # Lumped masses: a third of each face's area times the density goes to each corner. Fixed particles have infinite
+    # mass.
     area = sum(np.bincount(rest.faces[:, k], rest.face_areas / 3.0, minlength=n) for k in range(3))
     fixed = attachment >= 1.0
     inverse_mass = np.where(fixed, 0.0, 1.0 / (fabric.density * np.maximum(area, 1e-7)))
     chord = row_lengths(rest.vertices[a] - rest.vertices[b])
     lengths = chord if lengths is None else lengths
+    # Spring constant of an edge, N/m: membrane stiffness times the area that the edge stands for, over its length
+    # squared. The solver takes compliances, the inverses.
     stiffness = fabric.stretch_stiffness * np.maximum(_edge_areas(rest), 1e-9) / np.maximum(chord, 1e-6) ** 2
     # From what holds the cloth downwards: corrections then travel far within a substep.
     anchor, tether, depth = _tethers(rest, lengths, fixed, fabric.slack)
     moves = np.flatnonzero(~(fixed[a] & fixed[b]))
     order = moves[np.argsort((depth[a] + depth[b])[moves], kind="stable")]
     hinges, curvature, rest_curvature, bend = _hinges(rest, fixed, fabric.bend_stiffness)
+    # Partly attached particles hang on springs, whose compliance falls from infinity (free) to 0 (fixed).
     spring = None
     if attach_stiffness > 0 and ((attachment > 0) & ~fixed).any():
         with np.errstate(divide="ignore"):
@@ -178,6 +185,7 @@ def _tethers(
     n = rest.vertex_count
     if not fixed.any():
         return np.full(n, -1, np.int32), np.zeros(n, np.float32), np.zeros(n)
+    # Shortest path along the cloth from each particle to its nearest fixed one.
     distance, _, source = dijkstra(
         edge_graph(rest, lengths),
         directed=False,

@@ -60,11 +60,14 @@ def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarra
         axis = opening_axis(mesh, loop)
         if axis[1] > _UPWARDS:
             continue
+        # Faces near such an opening that look along its axis close it like a lid: all corners do, or the face and
+        # one corner.
         near = geodesics(mesh, loop)[0] < REACH
         looks = (near & (mesh.vertex_normals @ axis > _VERTEX))[mesh.faces]
         along = near[mesh.faces].any(axis=1) & (mesh.face_normals @ axis > _FACE)
         bridges |= looks.all(axis=1) | (looks.any(axis=1) & along)
     found = np.flatnonzero(bridges)
+    # Behind a true bridge there is air. Faces with the body behind them are the garment itself and stay.
     for depth in _HOLLOW:
         behind = mesh.face_centers[found] - depth * mesh.face_normals[found]
         found = found[body.query(behind).distance > 0] if len(found) else found

@@ -27,8 +27,10 @@ def play(
     """Yield the posed surface of every frame, metres; the clothes start cold before the first one.
 
     Args:
-        params: T frames, evenly spaced. fps: of them.
-        config: of the driver. smoothing: of what the clothes follow (`smplxpp.cloth.following`), seconds.
+        params: T frames, evenly spaced.
+        fps: of them.
+        config: of the driver.
+        smoothing: of what the clothes follow (`smplxpp.cloth.following`), seconds.
         notes: list to which the remarks of the driver are added.
     """
     driver = ClothDriver(template, garments, config)
@@ -38,6 +40,8 @@ def play(
         frame = params.frame(k)
         posed = template.posed_body(frame)
         shape = driver.follow(way, 1.0 / fps, frame, posed=posed)
+        # Cloth is displaced at rest and then skinned: v = sum_j w_j G_j (rest + share displacement). The body's rest
+        # vertices bring shape, expression and pose correctives.
         rest = template.vertices.copy()
         rest[:count] = posed.rest_vertices[0]
         rest[shape.vertices] += shape.share[:, None] * shape.displacements

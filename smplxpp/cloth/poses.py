@@ -42,7 +42,8 @@ def smoothed(params: BodyParams, *, radius: float) -> BodyParams:
     """Smooth a motion in time with Gaussian weights, every joint about its own rotation; what a noisy tracker shakes.
 
     Args:
-        params: T frames, evenly spaced. radius: standard deviation, frames; 0 changes nothing.
+        params: T frames, evenly spaced.
+        radius: standard deviation, frames; 0 changes nothing.
     """
     require_at_least("smoothing of motion", radius, 0.0)
     count, reach = len(params), int(np.ceil(3.0 * radius))
@@ -77,7 +78,9 @@ def resampled(params: BodyParams, times: Float[np.ndarray, " T"], wanted: Float[
     taken in the space of rotation vectors about each step's first pose; at the ends a motion goes on as it came.
 
     Args:
-        params: T frames. times: theirs, seconds, increasing. wanted: between the first and the last of them.
+        params: T frames.
+        times: theirs, seconds, increasing.
+        wanted: between the first and the last of them.
 
     Raises:
         InputError: times that do not increase, or as many as there are frames; wanted ones beyond them.
@@ -119,7 +122,8 @@ class CausalSmoother:
     ones do not lag.
 
     Args:
-        cutoff: hertz at rest. speed_gain: hertz a radian (or a metre) a second.
+        cutoff: hertz at rest.
+        speed_gain: hertz a radian (or a metre) a second.
     """
 
     def __init__(self, *, cutoff: float = 3.0, speed_gain: float = 2.0) -> None:
@@ -146,6 +150,9 @@ class CausalSmoother:
             step = _step(both, rows, np.array([1]), turning)
             width = 3 if step.shape[1] % 3 == 0 else max(step.shape[1], 1)
             speed = np.linalg.norm(step.reshape(-1, width), axis=1) / seconds
+            # One-euro filter (Casiez et al. 2012): the cutoff f = f_min + gain |speed| lets fast motion through and
+            # damps jitter at rest. A first-order low pass moves by the share a / (1 + a) of the step, with a = 2 pi f
+            # dt.
             rate = 2.0 * np.pi * (self.cutoff + self.speed_gain * speed) * seconds
             share = np.repeat(rate / (1.0 + rate), width)[None]
             changes[name] = _moved(old, share * step, turning)

@@ -114,6 +114,7 @@ class ClothSolver:
             ("four moments of places", places, len(self.model.inverse_mass)),
             ("four moments of the collider", skin, len(self.collider.margin)),
         ):
+            # Four moments let the native code interpolate positions with continuous velocity between the middle two.
             wanted = [(count, 3)] * (2 if name == "particles" else 4)
             if [array.shape for array in arrays] != wanted:
                 received = str([array.shape for array in arrays])
@@ -122,6 +123,7 @@ class ClothSolver:
             (ctypes.c_void_p * 4)(*(address(array).value for array in places)),
             (ctypes.c_void_p * 4)(*(address(array).value for array in skin)),
         )
+        # Whole substeps of at most the configured length; the small term keeps round-off from adding one.
         native_library().smplxpp_cloth_advance(
             *(ctypes.byref(self._native), ctypes.byref(self._forces), ctypes.byref(moments)),
             ctypes.c_float(seconds),

@@ -26,7 +26,8 @@ class GarmentThread:
     """State of one garment while it is simulated.
 
     Args:
-        garment: what it is. rows: (R,) vertices of the template whose places it is given, increasing.
+        garment: what it is.
+        rows: (R,) vertices of the template whose places it is given, increasing.
     """
 
     def __init__(self, garment: Garment, rows: Int64[np.ndarray, " R"], config: DriverConfig) -> None:

@@ -106,6 +106,7 @@ def card_identity(card: ModelCard) -> str:
 def _values(content: Mapping[str, Any], subject: str) -> dict[str, Any]:
     """Convert the values of a card's file, with errors that name the key."""
     out: dict[str, Any] = {}
+    # Names come from a known layout or one by one; a list of names overrides the layout.
     if "layout" in content:
         name = as_text(content["layout"], subject=f"{subject}: layout")
         require_choice(f"{subject}: layout", name, tuple(LAYOUTS))

@@ -88,6 +88,7 @@ class OnnxDetector:
     def _points(self, cut: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "K 3"]:
         """Run the model and return points with confidences, in pixels of the input."""
         card = self.card
+        # The normalisation is stated in the order of the model's channels, so that channels are exchanged first.
         if card.channels == "bgr":
             cut = cut[..., ::-1]
         tensor = ((cut - np.array(card.mean, np.float32)) / np.array(card.std, np.float32)).transpose(2, 0, 1)[None]

@@ -26,7 +26,8 @@ def write_amass(path: str | Path, body: BodyModel, params: BodyParams) -> None:
     (without their mean). The turn is about the root joint of this body. Left out: expressions.
 
     Args:
-        body: completes the hands, and says where the root is. params: T frames; betas, where they have any, are those
+        body: completes the hands, and says where the root is.
+        params: T frames; betas, where they have any, are those
             of their first frame.
 
     Raises:
@@ -48,7 +49,9 @@ def write_amass(path: str | Path, body: BodyModel, params: BodyParams) -> None:
         )
     betas = np.zeros(_BETAS)
     betas[: min(given, _BETAS)] = params.betas[0, :_BETAS]
+    # AMASS has +Z up. The rotation of the world turns the root's orientation, and its translation about the root joint.
     turned = _z_up(body, params)
+    # Complete axis-angle vectors in the order of the model's joints: hand PCA and mean hand are expanded here.
     poses = body.axis_angles(turned).reshape(len(params), -1)
     arrays: dict[str, object] = {"gender": "neutral", "trans": turned.transl, "betas": betas, "poses": poses}
     if body.joint_count == 52:

@@ -28,7 +28,8 @@ def write_bvh(
     complete. Left out: expressions, and what they and the shape do to the joints.
 
     Args:
-        body: J joints, whose names they get. params: T frames, at their `fps` or `DEFAULT_FPS`.
+        body: J joints, whose names they get.
+        params: T frames, at their `fps` or `DEFAULT_FPS`.
         joints: at rest, metres; None: those of the mean shape.
 
     Raises:
@@ -41,10 +42,12 @@ def write_bvh(
         received = f"{len(params)} frames, roots {roots.tolist()}"
         raise InputError("motion for BVH", expected="at least one frame, and one root first", received=received)
     rest = body.joint_regressor @ body.v_template if joints is None else np.asarray(joints, np.float64)
+    # Offset of each joint from its parent at rest; the root's is its position.
     offsets = UNITS_A_METRE * (rest - np.where(body.parents[:, None] >= 0, rest[body.parents], 0.0))
     order = _depth_first(body)
     lines = ["HIERARCHY", *_node(body, offsets, 0, ""), "MOTION"]
     lines += [f"Frames: {len(params)}", f"Frame Time: {1.0 / fps:.8f}"]
+    # Columns in the order of the hierarchy, depth first, as readers of BVH expect them.
     turns = euler_zxy(body.joint_rotations(params))[:, order].reshape(len(params), -1)
     places = UNITS_A_METRE * (rest[0] + params.transl)
     pattern = " ".join(["%.6f"] * (3 + turns.shape[1]))

@@ -48,6 +48,7 @@ def export_template(path: str | Path, template: Template, *, animation: BodyPara
     elif suffix in _USD:
         write_usd(path, template, animation=animation)
     elif suffix == ".obj":
+        # OBJ has no skeleton, so that the one pose is baked into the vertices.
         posed = template if animation is None else replace(template, vertices=template.pose(animation)[0])
         write_obj(path, posed)
     else:

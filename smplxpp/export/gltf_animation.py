@@ -51,8 +51,10 @@ def joint_motion(
     posed = _joints_alone(template).forward(params.without_shape())
     global_rotations = posed.posed_from_rest[..., :3, :3]
     parents = template.body.parents
+    # Local rotations R_parent^T R_joint. The root's parent is the world.
     above = np.where((parents >= 0)[:, None, None], global_rotations[:, parents], np.eye(3))
     rotations = above.swapaxes(-1, -2) @ global_rotations
+    # d_j of the docstring: how far the expression moves a joint at rest.
     moved = posed.rest_joints - template.joints
     translations = rest_offsets(template) + moved - (rotations @ moved[..., None])[..., 0]
     translations[:, parents < 0] += params.transl[:, None]
@@ -126,6 +128,7 @@ def add_animation(
 def _joints_alone(template: Template) -> BodyModel:
     """The body model with its joints as the only vertices; being linear in the vertices, they move as in the model."""
     model, regressor = template.body, template.body.joint_regressor
+    # Every base is regressed to the joints once, so that a motion costs J instead of V vertices a frame.
     eye = np.eye(model.joint_count)
     return replace(
         model,

@@ -67,6 +67,7 @@ class BufferBuilder:
         kept = np.zeros_like(array)
         kept[rows] = array[rows]
         indices = rows.astype(index_dtype(len(array)))
+        # Sparse storage pays only while indices and values together take less than the full array.
         if indices.nbytes + array[rows].nbytes >= array.nbytes:
             return self.add(kept, target=pygltflib.ARRAY_BUFFER, bounds=True)
         accessor = self._accessor(array)

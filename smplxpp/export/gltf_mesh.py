@@ -25,6 +25,7 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
     Returns:
         Indices of the nodes, the body's first.
     """
+    # Weights are rounded so that rows sum to exactly one. Colours are linear, as COLOR_0 of glTF is, not sRGB.
     joints, weights = quantized_influences(template.weights)
     normals = _unit_normals(template)
     colors = linear_rgba16(template.vertex_colors)
@@ -39,6 +40,7 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
             "NORMAL": buffers.add(normals[rows], target=ARRAY_BUFFER),
             "COLOR_0": buffers.add(colors[rows], target=ARRAY_BUFFER, normalized=True),
         }
+        # glTF holds four influences a set, so that more of them need further sets.
         for k, (set_joints, set_weights) in enumerate(influence_sets(joints[rows], weights[rows])):
             attributes[f"JOINTS_{k}"] = buffers.add(set_joints, target=ARRAY_BUFFER)
             attributes[f"WEIGHTS_{k}"] = buffers.add(set_weights, target=ARRAY_BUFFER)

@@ -62,6 +62,7 @@ def add_skin(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template) 
     root = len(gltf.nodes)
     nodes = root + 1 + np.arange(len(parents))
     offsets = rest_offsets(template)
+    # Children of the skeleton's root (-1) and of each joint.
     children = [nodes[parents == j].tolist() for j in range(-1, len(parents))]
     gltf.nodes.append(pygltflib.Node(name="skeleton", children=children[0]))
     for name, offset, below in zip(template.body.joint_names, offsets, children[1:], strict=True):

@@ -64,7 +64,9 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _problems(faces: np.ndarray, count: int) -> list[str]:
     """What keeps faces from bounding a solid, in words."""
+    # Faces with two equal corners have no area; readers merge corners at one place, which makes some.
     flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    # A closed, oriented 2-manifold has every directed edge once, and its reverse once.
     edges = half_edges(faces[~flat])
     forth, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     several = len(forth) - len(np.unique(forth))
@@ -73,6 +75,7 @@ def _problems(faces: np.ndarray, count: int) -> list[str]:
         "open edges": int(np.setxor1d(forth, back).size // 2),
         "edges of more than two faces, or wound against each other": several,
     }
+    # The test of vertices assumes manifold edges and therefore comes last.
     if not any(found.values()):
         touching = np.unique(faces[:, 0]).size and int((~igl.is_vertex_manifold(faces)).sum())
         found["vertices in which the surface touches itself"] = touching

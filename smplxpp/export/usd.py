@@ -86,6 +86,7 @@ def _add_parts(pxr: SimpleNamespace, stage: Any, template: Template) -> list[str
         # Parts follow each other in the vertices, so the part's own indices are these.
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy((faces - rows[0]).astype(np.int32).ravel()))
         mesh.CreateSubdivisionSchemeAttr("none")
+        # Garments are open surfaces, whose inside shows at hems; of the body only the outside shows.
         mesh.CreateDoubleSidedAttr(name != BODY_PART)
         mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
         mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals[rows]))
@@ -109,6 +110,7 @@ def _add_expressions(pxr: SimpleNamespace, stage: Any, template: Template, mesh:
     names, targets = [], []
     for k, expression in enumerate(template.body.expression_names):
         offsets = np.ascontiguousarray(template.body.exprdirs[:, :, k], np.float32)
+        # Blend shapes are sparse: only vertices that an expression moves are stored.
         rows = np.flatnonzero(np.square(offsets).sum(axis=1) > _STILL**2)
         shape = pxr.UsdSkel.BlendShape.Define(stage, mesh.GetPath().AppendChild(_identifier(expression)))
         shape.CreateOffsetsAttr(pxr.Vt.Vec3fArray.FromNumpy(offsets[rows]))
@@ -131,6 +133,7 @@ def _add_material(pxr: SimpleNamespace, stage: Any, template: Template, mesh: An
     surface = pxr.UsdShade.Shader.Define(stage, path.AppendChild("surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", types.Float).Set(0.9)
+    # The colour is read from the vertices' primvar `displayColor`, since the template has no texture.
     reader = pxr.UsdShade.Shader.Define(stage, path.AppendChild("color"))
     reader.CreateIdAttr("UsdPrimvarReader_float3")
     reader.CreateInput("varname", types.String).Set("displayColor")
@@ -145,6 +148,7 @@ def _add_motion(
 ) -> None:
     joints, shapes = named
     rotations, translations = joint_motion(template, params)
+    # Quaternions as (x, y, z, w) in float32, the memory layout of Vt.QuatfArray.
     xyzw = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().astype(np.float32)
     xyzw = xyzw.reshape(*rotations.shape[:2], 4)
     weights = np.zeros((len(params), len(shapes)), np.float32)

@@ -34,7 +34,8 @@ def open_usd(path: str | Path, *, default: str, fps: float | None = None) -> Ite
 
     Args:
         path: .usdc (binary), .usda (text) or .usd (binary).
-        default: name of the prim that stands for the file. fps: time codes a second; None: nothing moves.
+        default: name of the prim that stands for the file.
+        fps: time codes a second; None: nothing moves.
 
     Raises:
         InputError: another suffix.

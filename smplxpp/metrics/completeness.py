@@ -75,13 +75,16 @@ def uncovered_body(
     body itself hides, armpits and the mouth, is not asked for.
 
     Args:
-        body: in the scan's pose. scan: in metres.
+        body: in the scan's pose.
+        scan: in metres.
         behind: metres that the scan may lie behind the body along a view, for fits that are off.
         views, resolution: of parallel views spread over the sphere.
     """
     points = sample_surface(body, samples, seed=seed)
     normals = normalize_rows(points.normals)
     seen, open_ = np.zeros(samples), np.zeros(samples)
+    # Two depth maps a view: of the body alone, and of the scan. A sample counts in a view that the body itself does not
+    # block; it is open there if the scan is met only farther behind it, or not at all.
     for camera in outside_views(concatenate_meshes([body, scan]), views=views, resolution=resolution):
         naked, clothed = (rasterize_mesh(mesh, camera).depth for mesh in (body, scan))
         x, y, z = camera.screen_from_world(points.points).T[:3]
@@ -89,6 +92,7 @@ def uncovered_body(
         shown = (normals @ camera.forward < -_FACING) & (z <= naked[row, column] + _BEFORE)
         seen += shown
         open_ += shown & (clothed[row, column] > z + behind)
+    # Share of its views in which a sample is open; NaN for samples that no view sees.
     share = np.divide(open_, seen, out=np.full(samples, np.nan), where=seen > 0)
     return Uncovered(points.face, share)
 
@@ -112,11 +116,13 @@ def far_patches(scan: TriangleMesh, chosen: Bool[np.ndarray, " M"], body: Triang
     centers = scan.face_centers[index]
     off = point_to_surface(centers, body)[0] > far
     index, centers = index[off], centers[off]
+    # Of these, the faces within a millimetre of what views from outside show.
     seen = outer_visible_points(scan, centers, tolerance=1e-3)
     index, centers = index[seen], centers[seen]
     if not len(index):
         return []
     patch, area = face_components(scan.faces[index]), scan.face_areas[index]
+    # Area of each connected patch, and its centroid weighted by area.
     total = np.bincount(patch, area)
     middle = np.stack([np.bincount(patch, area * centers[:, k]) for k in range(3)], axis=1) / total[:, None]
     return [Patch(float(total[k]), (middle[k, 0], middle[k, 1], middle[k, 2])) for k in np.argsort(-total)]

@@ -31,13 +31,15 @@ class Convention:
 
     Attributes:
         name: of the preset.
-        unit: of `p2s` and `chamfer`. scale: from metres to the power `power` to that unit.
+        unit: of `p2s` and `chamfer`.
+        scale: from metres to the power `power` to that unit.
         power: 1 for distances, 2 for squared ones.
         points: measure from area-weighted samples or from vertices.
         target: measure to the surface or to the nearest sample of it.
         p2s_direction: which direction is called P2S.
         combine: Chamfer from the two directions; None where the source defines no Chamfer.
-        definition: in words. source: where it is written.
+        definition: in words.
+        source: where it is written.
     """
 
     name: str

@@ -50,7 +50,8 @@ class DirectedDistances:
     Attributes:
         samples: the points, their faces and normals.
         distance: (P,) float64 metres, unsigned.
-        closest: (P, 3) float64 the target's point. face: (P,) int64 the target's face there.
+        closest: (P, 3) float64 the target's point.
+        face: (P,) int64 the target's face there.
         angle: (P,) float64 degrees in [0, 180] between the normals; a target with reversed winding gives 180.
         label: (P,) int64, or None without labels.
     """
@@ -122,6 +123,7 @@ def point_to_surface(
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError("points", expected="finite values of shape (P, 3)", received=f"shape {points.shape} or NaN")
     require_surface(mesh, "target mesh")
+    # The tree is built over faces with an area; `solid` leads back to their indices in the mesh.
     solid = np.flatnonzero(mesh.face_areas > 0)
     faces = mesh.faces[solid]
     if not len(points):
@@ -156,6 +158,7 @@ def directed_distances(
     require_surface(source, "source mesh")
     require_surface(target, "target mesh")
     points = sample_surface(source, samples, seed=seed) if convention.points == "area" else vertex_samples(source)
+    # Inner sides and inner layers that no scanner sees exist in one of the meshes only and would count as errors.
     if config.visible_only:
         seen = outer_visible_points(source, points.points, tolerance=config.visible_tolerance)
         points = points.select(seen)
@@ -163,6 +166,7 @@ def directed_distances(
             raise InputError(
                 "visible samples", expected="some", received="none", remedy="raise visible_tolerance or samples"
             )
+    # Exact point-to-triangle distance, or, as some published protocols have it, to the nearest of sampled points.
     if convention.target == "surface":
         distance, closest, face = point_to_surface(points.points, target)
         barycentric = barycentric_coordinates(closest, target.triangles[face])
@@ -199,7 +203,8 @@ def compare(
 
     Args:
         pred, gt: metres.
-        samples: points a mesh, before the choice of visible ones. seed: of the samples; the same seed, the same bits.
+        samples: points a mesh, before the choice of visible ones.
+        seed: of the samples; the same seed, the same bits.
         preset: the convention of `p2s` and `chamfer`.
         pred_labels, gt_labels: labels of the faces (M,) or vertices (N,) of either mesh; each adds a result a label. A
             mesh without labels takes those of the closest points of the other.
@@ -246,6 +251,8 @@ def _summary(
     labels: dict[str, MeshComparison],
 ) -> MeshComparison:
     there, back_again = _stats(forth, masks[0]), _stats(back, masks[1])
+    # Precision is the share of predicted points within the threshold, recall that of the true points, F-score their
+    # harmonic mean. The Chamfer distance follows the convention; Hausdorff is the larger of the two maxima.
     distances = [d.distance[mask] for d, mask in zip((forth, back), masks, strict=True)]
     directed = [convention.directed(d) if len(d) else None for d in distances]
     precision, recall = (float(np.mean(d * MM <= threshold_mm)) if len(d) else None for d in distances)
@@ -275,6 +282,7 @@ def _summary(
 
 
 def _stats(directed: DirectedDistances, mask: np.ndarray) -> DirectionStats | None:
+    # All distances in millimetres, the angle between normals in degrees.
     mm = directed.distance[mask] * MM
     if not len(mm):
         return None

@@ -20,7 +20,8 @@ class PenetrationReport:
     """Points of an outer layer against an inner surface.
 
     Attributes:
-        count: points nearer to the inside than `clearance_mm` asks. fraction: of all points.
+        count: points nearer to the inside than `clearance_mm` asks.
+        fraction: of all points.
         depth_mean_mm, depth_max_mm: of the missing distance `clearance - signed distance` over those points; 0 if none.
         clearance_mm: asked for.
         signed_distance: (N,) float64 metres, negative inside.
@@ -72,6 +73,7 @@ def penetration(
         raise InputError("outer layer", expected="points", received="none")
     require_at_least("clearance in metres", clearance, 0.0)
     signed, _, _ = signed_distance(points, inner)
+    # A margin relative to the size of the mesh, below which the sign of a distance is round-off.
     penetrating = signed < clearance - SIGN_RESOLUTION * inner.bbox_diagonal
     depth = (clearance - signed[penetrating]) * MM
     return PenetrationReport(

@@ -27,7 +27,8 @@ def mirror_ratio(
     her from her image.
 
     Args:
-        points: of the scan, skin at best. body: in the scan's pose.
+        points: of the scan, skin at best.
+        body: in the scan's pose.
         center, across: a point of the plane to mirror at, and its normal: the body's middle, from hip to hip.
     """
     tree = search_tree(body)

@@ -51,19 +51,25 @@ def mirrored_by_views(
     best on the body; the scan as it is and on the body.
 
     Args:
-        colors: of the scan's vertices. views: cameras, and what they saw, of their size; a few hundred pixels do.
-        body: in the scan's pose. center, across: as `mirror_ratio` takes them.
+        colors: of the scan's vertices.
+        views: cameras, and what they saw, of their size; a few hundred pixels do.
+        body: in the scan's pose.
+        center, across: as `mirror_ratio` takes them.
 
     Returns:
         None where the photographs look like neither, or no view shows enough.
     """
+    # A reflection turns faces inside out, so that their order of corners is reversed.
     image = TriangleMesh(reflected(scan.vertices, center, across), np.ascontiguousarray(scan.faces[:, ::-1]))
     given, other = (
         min((_seen(mesh, colors, views) for mesh in meshes), key=lambda seen: seen.unexplained)
         for meshes in ((scan, _moved_to(scan, body)), (_moved_to(image, scan), _moved_to(image, body)))
     )
+    # Photographs of something else, or a wrong calibration, decide nothing.
     if min(given.unexplained, other.unexplained) > 1.0 - _LEAST_EXPLAINED:
         return None
+    # Project the photograph on the line from the scan's rendering h to the mirror image's m, over all views at once:
+    #   place = sum (p - h) . (m - h) / sum |m - h|^2, which minimises |p - h - place (m - h)|^2.
     along, length, variance = 0.0, 0.0, 0.0
     for one, two in zip(given.views, other.views, strict=True):
         if one is None or two is None:
@@ -112,10 +118,12 @@ def _seen(mesh: TriangleMesh, colors: np.ndarray, views: Sequence[tuple[Camera, 
 
 def _view(mesh: TriangleMesh, colors: np.ndarray, camera: Camera, photograph: np.ndarray) -> _View | None:
     maps = rasterize_mesh(mesh, camera)
+    # Pixels well inside the silhouette, because its border mixes person and background.
     row, col = np.nonzero(binary_erosion(maps.mask, iterations=_INSIDE))
     if len(row) < _LEAST_PIXELS:
         return None
     drawn = _blurred(maps.interpolate(mesh.faces, colors))
+    # Normalised convolution: blur the colours and the mask, and divide, so that the background does not darken borders.
     share = uniform_filter(maps.mask.astype(np.float64), _BLUR)
     drawn = drawn[row, col] / share[row, col, None]
     photograph = _blurred(np.asarray(photograph, dtype=np.float64))
@@ -124,6 +132,7 @@ def _view(mesh: TriangleMesh, colors: np.ndarray, camera: Camera, photograph: np
     inside = (row >= 0) & (row < camera.height) & (col >= 0) & (col < camera.width)
     row, col, drawn = row[inside], col[inside], drawn[inside]
     there = photograph[row, col]
+    # Gain and offset of each channel absorb exposure and white balance, of which a scan's colours know nothing.
     gain, rest = _gain(drawn, there)
     out = np.full_like(photograph, np.nan)
     out[row, col] = there.mean(axis=0) + gain * (drawn - drawn.mean(axis=0))
@@ -157,7 +166,8 @@ def _locally_moved(view: _View) -> np.ndarray:
     box = (slice(row.min(), row.max() + 1), slice(col.min(), col.max() + 1))
     drawn, photograph = view.drawn[box].astype(np.float32), view.photograph[box].astype(np.float32)
     best, least = drawn.copy(), np.full(drawn.shape[:2], np.inf, dtype=np.float32)
-    # Not to be moved comes first: of equals it is the one.
+    # Try zero offset first, so that ties keep it.
+    # Block matching: the squared difference, averaged over a window, decides for each pixel.
     for move in sorted(product(range(-_LOCAL, _LOCAL + 1), repeat=2), key=lambda move: max(map(abs, move))):
         moved = np.roll(drawn, move, (0, 1))
         covered = np.isfinite(moved[..., 0])

@@ -27,7 +27,8 @@ class PoseError:
         frames: their number.
         body_mm, bare_mm, covered_mm: of the body's vertices: all, those in the open, those that a part covers; NaN
             where there are none.
-        joints_mm: of the joints. degrees: between local rotations of a joint, a joint.
+        joints_mm: of the joints.
+        degrees: between local rotations of a joint, a joint.
     """
 
     frames: int

@@ -19,14 +19,18 @@ class MeshQuality:
     """Figures of a mesh's quality, as `mesh_quality` measures them.
 
     Attributes:
-        vertices, faces: counts. unreferenced_vertices: in no face.
+        vertices, faces: counts.
+        unreferenced_vertices: in no face.
         duplicate_faces: faces with the corners of an earlier one, in any order.
         components: pieces that share no vertex.
         euler: V - E + F over referenced vertices (2 for one closed piece, less 1 a border, less 2 a handle).
-        nonmanifold_edges: edges with three or more faces. nonmanifold_vertices: whose faces form more than one fan.
+        nonmanifold_edges: edges with three or more faces.
+        nonmanifold_vertices: whose faces form more than one fan.
         inconsistent_edges: edges with two faces that run along them in the same direction (one has the wrong winding).
         flipped_faces: faces to turn so that each orientable patch is consistent, its majority kept.
-        border_edges: with one face. border_loops: connected pieces of border. border_lengths_mm: longest first.
+        border_edges: with one face.
+        border_loops: connected pieces of border.
+        border_lengths_mm: longest first.
         zero_area_faces: with no area at all.
         aspect_p50, aspect_p95, aspect_p99, aspect_max: circumradius over twice the inradius (1 for an equilateral
             triangle), of the faces with area.

@@ -25,10 +25,13 @@ def self_intersections(mesh: MeshLike) -> Int64[np.ndarray, "P 2"]:
     triangles = mesh.triangles
     found = [np.zeros((0, 2), dtype=np.int64)]
     for pairs in _candidate_pairs(triangles):
+        # Faces with two common vertices share an edge; one common vertex does not exclude a true intersection.
         shared = (mesh.faces[pairs[:, 0]][:, :, None] == mesh.faces[pairs[:, 1]][:, None, :]).sum(axis=(1, 2))
         pairs = pairs[shared < 2]
+        # Cheap rejection first: a triangle that cuts another has corners on both sides of the other's plane.
         pairs = pairs[_straddles(triangles[pairs[:, 0]], triangles[pairs[:, 1]])]
         cut = np.zeros(len(pairs), dtype=bool)
+        # Triangles intersect if an edge of either passes through the inside of the other.
         for a, b in ((0, 1), (1, 0)):
             for k in range(3):
                 start, end = triangles[pairs[:, a], k], triangles[pairs[:, a], (k + 1) % 3]

@@ -15,9 +15,11 @@ class StretchReport:
     """Edge length ratios `posed / rest` and turned faces.
 
     Attributes:
-        edge_count: edges measured. degenerate_edges: left out, without length at rest.
+        edge_count: edges measured.
+        degenerate_edges: left out, without length at rest.
         p50, p99, p999, max, min: of the ratio.
-        limit: of the flag. flagged_edges: edges longer than `limit` times their rest length.
+        limit: of the flag.
+        flagged_edges: edges longer than `limit` times their rest length.
         flipped_faces: see `flipped_faces`.
     """
 
@@ -66,6 +68,7 @@ def flipped_faces(rest: MeshLike, posed: MeshLike) -> Bool[np.ndarray, " M"]:
     pairs = rest.face_pairs
 
     def agreement(mesh: TriangleMesh) -> np.ndarray:
+        # Sum over edge neighbours of their area vectors (cross products of two edges, twice the area along the normal).
         around = np.zeros((mesh.face_count, 3))
         for axis in range(3):
             for own, other in ((0, 1), (1, 0)):
@@ -90,6 +93,7 @@ def stretch_report(rest: MeshLike, posed: MeshLike, *, limit: float = 3.0) -> St
     known = ratio[np.isfinite(ratio)]
     if not len(known):
         raise InputError("rest mesh", expected="edges with a length", received="none")
+    # Percentiles over edges of known length, because the maximum alone may be one sliver.
     p50, p99, p999 = np.percentile(known, (50, 99, 99.9))
     return StretchReport(
         edge_count=len(known),

@@ -27,7 +27,8 @@ class WeightReport:
     Attributes:
         vertex_count, joint_count: N, J.
         row_sum_error: largest |sum of a row - 1|.
-        negative: number of negative weights. minimum: the smallest weight.
+        negative: number of negative weights.
+        minimum: the smallest weight.
         zero_rows: vertices without any weight; they would stay at the origin without a word.
         influences: influences[k] vertices have k joints with a weight above 0.
         reference: total variation to the reference weights, or None.

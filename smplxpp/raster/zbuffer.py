@@ -93,6 +93,7 @@ def _rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera, near: fl
         raise InputError("near", expected="a finite distance in metres", received=repr(near))
     threads = thread_count(threads)
     check_size(camera.width, camera.height, f"camera {camera.name!r}: image size")
+    # Columns are x and y in pixels and the depth in metres; parallel views have no near plane.
     screen = np.ascontiguousarray(camera.screen_from_world(vertices), dtype=np.float64)
     faces = np.ascontiguousarray(faces, dtype=np.int32)
     height, width = camera.height, camera.width

@@ -26,12 +26,14 @@ def blend_colors(
     """
     best, outlier = 4, 0.08
     samples, opaque = _sampled(mesh, seen, pyramids)
+    # Frontal views count most; a pixel that covers more of the surface counts less. Then keep the best four a vertex.
     weight = np.where(opaque & (seen.cosine > LEAST_COSINE), seen.cosine**2, 0.0)
     weight = weight / np.maximum(seen.pixel, 1e-6)
     order = np.sort(weight, axis=1)
     least = order[:, -min(best, order.shape[1])]
     weight = np.where(weight >= least[:, None], weight, 0.0)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+    # Exposures are equalised before the robust mean, or a darker camera would look like an outlier everywhere.
     gains = _gains(samples, weight)
     samples = samples * gains[None].astype(np.float32)
     # Two rounds of iteratively reweighted means with Cauchy weights.
@@ -53,11 +55,13 @@ def _sampled(mesh: TriangleMesh, seen: Sight, pyramids: Pyramids) -> tuple[Float
         screen = camera.screen_from_world(mesh.vertices[rows])
         start, (height, width) = pyramids.starts[k, 0], pyramids.sizes[k, 0]
         image = pyramids.values[start : start + 4 * int(height) * int(width)].reshape(height, width, 4)
+        # Pixel centres lie at half-integers. The clamp keeps the right and lower neighbour inside the image.
         x = np.clip(screen[:, 0] - 0.5, 0, width - 1.001)
         y = np.clip(screen[:, 1] - 0.5, 0, height - 1.001)
         column, row = x.astype(np.int64), y.astype(np.int64)
         du, dv = (x - column)[:, None], (y - row)[:, None]
         corners = [image[row + j, column + i] for j in (0, 1) for i in (0, 1)]
+        # Bilinear interpolation: along the row above and below, then between them.
         top = corners[0] + du * (corners[1] - corners[0])
         value = top + dv * (corners[2] + du * (corners[3] - corners[2]) - top)
         samples[rows, k] = value[:, :3]
@@ -83,11 +87,13 @@ def _gains(samples: np.ndarray, weight: np.ndarray) -> np.ndarray:
     if not len(samples):
         return gains
     squares = np.einsum("nv,nvc->vc", weight, samples**2, dtype=np.float64)
+    # With means m fixed, each gain is g = sum w s m / sum w s^2; with gains fixed, m is the weighted mean of g s.
     for _ in range(5):
         mean = _mean(samples * gains[None], weight)
         products = np.einsum("nv,nvc,nc->vc", weight, samples, mean, dtype=np.float64, optimize=True)
         gains = np.divide(products, squares, out=np.ones_like(products), where=squares > 0)
         gains = np.clip(gains, 0.5, 2.0)
+        # A common factor would change nothing but the brightness; the geometric mean fixes it at 1.
         gains /= np.exp(np.log(gains).mean(axis=0))
     return gains
 

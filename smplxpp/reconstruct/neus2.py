@@ -66,6 +66,7 @@ def mesh_in_world(
     least_agreement = 0.7  # a mesh in the wrong space has a mean IoU near 0
     cubes = [cube] if cube is not None else [UnitCube(), UnitCube(0.33)]
     found: dict[str, tuple[float, TriangleMesh]] = {}
+    # Try every space and keep the one whose silhouettes agree best with the masks.
     for space in SPACES:
         for one in cubes if space != "world" else cubes[:1]:
             moved = mesh.with_vertices(world_from_space(mesh.vertices, space, one))

@@ -46,6 +46,7 @@ class Pyramids:
                 sizes.append(level.shape[:2])
                 start += level.size
                 height, width = level.shape[0] // 2, level.shape[1] // 2
+                # A mean of 2 x 2 blocks; an odd last row or column is dropped.
                 if min(height, width) >= 2:
                     even = level[: 2 * height, : 2 * width]
                     level = even.reshape(height, 2, width, 2, 4).mean(axis=(1, 3))

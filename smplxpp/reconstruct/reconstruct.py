@@ -127,6 +127,7 @@ def reconstruct(
     config = config or ReconstructConfig()
     progress("masks", 0.0)
     # Views with plausible masks, and of these the ones whose silhouettes agree.
+    # Masks are judged one by one; contradictions between them do not matter for a surface that is given.
     usable, faults = usable_views(views)
     silhouettes = [Silhouette.of(view) for view in usable]
     consensus = find_consensus(silhouettes)
@@ -228,11 +229,13 @@ def look_at(
     none, full = 0.1, 0.7
     mean = mean_of_neighbours(mesh)
     normals = smooth_normals(mesh, mean)
+    # Depth tests from every camera; then the photometric agreement of patches at the surface itself (offset 0).
     sights = sight(mesh, normals, pyramids.cameras)
     seen = sights.seen()
     scores = sweep_scores(mesh.vertices, normals, sights, pyramids, np.zeros(1), PatchConfig(most_views=most_views))[
         :, 0
     ]
+    # Two rounds of averaging with neighbours, since the score of a single patch is noisy.
     for _ in range(2):
         scores = 0.5 * scores + 0.5 * (mean @ scores)
     confidence = np.clip((scores - none) / (full - none), 0.0, 1.0)

@@ -117,10 +117,12 @@ def smallest_depths(
         shown = np.zeros(len(part), np.int32)
         for silhouette in silhouettes:
             depth = silhouette.depth(part)
+            # A camera that does not show the point says nothing about it.
             shown += depth < UNSEEN
             if count == 1:
                 np.minimum(smallest[:, 0], depth, out=smallest[:, 0])
             else:
+                # Keep the running `count` smallest, so that memory does not grow with the number of views.
                 both = np.concatenate([smallest, depth[:, None]], axis=1)
                 smallest = np.sort(both, axis=1)[:, :count]
         out[first : first + chunk] = np.where((shown >= least)[:, None], smallest, -UNSEEN)

@@ -113,6 +113,7 @@ def check_spread(center: Float64[np.ndarray, " 3"], cameras: Sequence[Camera]) -
     """
     least_apart, wide_gap = 100.0, 150.0  # degrees
     to = view_directions_from(center, cameras)
+    # Angle between the two most different viewing directions, from the smallest cosine.
     widest = float(np.degrees(np.arccos(np.clip((to @ to.T).min(), -1.0, 1.0))))
     if widest < least_apart:
         raise InputError(

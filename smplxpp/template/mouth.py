@@ -55,7 +55,9 @@ def shown_mouth(
     """Mark what somebody ahead of a posed head could see of the inside of the mouth.
 
     Args:
-        template: the person. inside: its `inside_of_mouth`. posed: its vertices, metres.
+        template: the person.
+        inside: its `inside_of_mouth`.
+        posed: its vertices, metres.
     """
     seen, count = np.zeros_like(inside), template.body.vertex_count
     if inside.any() and "head" in template.body.joint_names:

@@ -61,6 +61,7 @@ def check_source(source: TriangleMesh, weights: Float[np.ndarray, "V J"]) -> Flo
             received=f"{int(bad.sum())} other rows, first at vertex {used[first]} with sum {total[first]:.6g}",
             remedy="normalise the body model's weights",
         )
+    # Divide by the sum, so that rows sum to one in double precision and not only within the tolerance.
     out = np.zeros_like(weights)
     out[used] = rows / total[:, None]
     return out

@@ -195,6 +195,7 @@ def settle_unmatched(
     if config.unmatched == "nearest":
         warnings.warn(f"skin weights: {message}; they take the nearest weights", GeometryWarning, stacklevel=3)
         return rows, weights, policies
+    # All weight on one joint: the piece moves rigidly with it.
     out = weights.copy()
     out[rows] = 0.0
     out[rows, config.joint_index(config.unmatched.removeprefix("rigid:"), weights.shape[1])] = 1.0
@@ -215,6 +216,8 @@ def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> 
     u, v, w = b - a, c - a, p - a
     uu, uv, vv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (u, v), (v, v)))
     wu, wv = np.einsum("ij,ij->i", w, u), np.einsum("ij,ij->i", w, v)
+    # Normal equations of p - a = beta u + gamma v by Cramer's rule; det = |u x v|^2, compared with the longest edge^4
+    # to be independent of scale.
     det = uu * vv - uv * uv
     flat = det <= 1e-14 * np.maximum(uu, vv) ** 2
     safe = np.where(flat, 1.0, det)
@@ -223,5 +226,6 @@ def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> 
     along_v = flat & ~along_u
     beta = np.where(flat, np.where(along_u, wu / np.where(uu > 0, uu, 1.0), 0.0), beta)
     gamma = np.where(flat, np.where(along_v, wv / np.where(vv > 0, vv, 1.0), 0.0), gamma)
+    # Points whose projection is outside are clipped and renormalised, which keeps the weights convex.
     weights = np.clip(np.stack([1.0 - beta - gamma, beta, gamma], axis=1), 0.0, None)
     return weights / weights.sum(axis=1, keepdims=True)

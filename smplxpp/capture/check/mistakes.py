@@ -49,8 +49,10 @@ class Mistake:
     """A correction to try: of the camera, or of the body in the camera's world.
 
     Attributes:
-        words: what is wrong if the correction fits. advice: what to do then.
-        camera: the corrected camera. body: the corrected vertices, None where a sample does not know them.
+        words: what is wrong if the correction fits.
+        advice: what to do then.
+        camera: the corrected camera.
+        body: the corrected vertices, None where a sample does not know them.
     """
 
     words: str

@@ -56,6 +56,7 @@ def read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distortio
     cameras, distortions = {}, {}
     for name, entry in content.items():
         source = f"file {path}: camera {name}"
+        # x_cam = R x_world + T, metres; K in pixels of the stored image.
         K, R, T, size = (required(entry, key, source=source) for key in ("K", "R", "T", "imgSize"))
         width, height = as_numbers(size, (2,), subject=f"{source}: imgSize").tolist()
         cameras[name] = pinhole(name, K, R, T, (width, height), opencv_pixels=True)

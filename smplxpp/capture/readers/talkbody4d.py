@@ -117,6 +117,7 @@ def _read_calibration(path: Path) -> tuple[dict[str, Camera], dict[str, Distorti
     cameras, distortions = {}, {}
     for name, entry in content["cameras"].items():
         source = f"file {path}: camera {name}"
+        # The pose is stored under the camera's own name, or relative to the reference camera.
         pose = poses.get(name) or next((poses[key] for key in poses if key.startswith(f"{name}_to_")), None)
         if pose is None:
             raise InputError(

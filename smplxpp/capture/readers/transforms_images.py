@@ -84,6 +84,7 @@ def places(images: Sequence[NamedImage], *, subject: str) -> list[tuple[str, int
 def _keys(images: Sequence[NamedImage]) -> tuple[list[PurePosixPath], list[int]]:
     if any(image.frame is not None for image in images):
         return _without_frames(images), [image.frame or 0 for image in images]
+    # Names that differ in their last number alone form a group: the frames of one camera, or the cameras of one moment.
     numbers = [number_at_end(image.path) for image in images]
     groups: dict[tuple[PurePosixPath, str], list[NamedImage]] = defaultdict(list)
     for image, number in zip(images, numbers, strict=True):
@@ -94,6 +95,7 @@ def _keys(images: Sequence[NamedImage]) -> tuple[list[PurePosixPath], list[int]]
     alone = single and None not in numbers and all(prefix == "" for _, prefix in groups)
     timed = alone or any(still[group] and len({m.path for m in members}) > 1 for group, members in groups.items())
     folders = Counter(folder for folder, _ in groups)
+    # Times in the file, where it has several, decide the order of the moments; numbers in names decide otherwise.
     times = sorted({image.time for image in images if image.time is not None})
     moments = {time: rank for rank, time in enumerate(times)}
     keys, frames = [], []

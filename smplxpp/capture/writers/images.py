@@ -74,13 +74,16 @@ def png16(image: UInt16[np.ndarray, "H W 3"]) -> bytes:
     """Return the bytes of a 16-bit RGB PNG, which Pillow cannot write; all rows use the `Up` filter."""
     height, width = image.shape[:2]
     rows = np.ascontiguousarray(image.astype(">u2")).view(np.uint8).reshape(height, -1)
+    # Filter type 2 (Up) stores each byte minus the one above it modulo 256, with zeros above the first row.
     filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)
     filtered[:, 0] = 2
     filtered[:, 1:] = np.diff(rows, axis=0, prepend=np.zeros((1, rows.shape[1]), np.uint8))
 
     def chunk(kind: bytes, data: bytes) -> bytes:
+        # Length, type, data, and the CRC of type and data (PNG specification, section 5.3).
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
+    # Bit depth 16 and colour type 2 (RGB); no interlacing.
     header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
     parts = [chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(filtered.tobytes(), 9)), chunk(b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
