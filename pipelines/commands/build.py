@@ -73,7 +73,7 @@ class Build:
     up: Literal["auto", "y", "z", "x", "-y", "-z", "-x"] = "auto"
     """Upward axis of the scan file. auto: found where the scan comes alone, else +Y."""
     detector: OptionalText = None
-    """Keypoint model that finds the facing direction of a scan without parameters: `mediapipe` (extra detect), or a
+    """Keypoint model that tells front and limbs of a scan without parameters: `mediapipe` (extra detect), or a
     pose model in ONNX."""
     keep_bridges: bool = False
     """Keep faces of the scan that bridge two limbs, as under the arms; they tear when a pose opens the gap."""

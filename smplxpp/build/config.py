@@ -50,7 +50,7 @@ class BuildConfig:
             body and the colours. "auto": the first of views, scan and body that there is.
         register: whether the body is registered to the capture (or to the scan), "on", "off" or "auto". "auto": where
             the capture states that its parameters are tracked, and where it has none.
-        detector: keypoint model that finds the facing direction of a scan without parameters: "mediapipe" or an ONNX
+        detector: keypoint model that tells front and limbs of a scan without parameters: "mediapipe" or an ONNX
             file. None: the surface alone decides.
         budgets: number of faces kept by part name.
         remesh: method that makes the parts' faces, "quadric" or "isotropic".

@@ -13,7 +13,7 @@ from jaxtyping import Int64, UInt8
 from smplxpp.body import BodyModel
 from smplxpp.build.data import LocatedInScan
 from smplxpp.build.scan import ScanFile
-from smplxpp.build.scan_keypoints import facing, keypoints_of_scan
+from smplxpp.build.scan_keypoints import Landmarks, facing, keypoints_of_scan
 from smplxpp.clean import smooth_if_rough
 from smplxpp.core import BACKGROUND, BodyParams, Check, StageOutput, TriangleMesh
 from smplxpp.core.files.json_file import jsonable
@@ -21,6 +21,9 @@ from smplxpp.detect import load_detector
 from smplxpp.register import ScanObservation, bare_of_scan, read_landmarks
 from smplxpp.register.locate import LocatedBody, locate_body
 from smplxpp.segment import label_by_body
+
+_CERTAIN = 0.4
+"""Certainty from which a detector's point proposes the pose of a limb: less is seen by few views, or only by some."""
 
 
 def landmark_points(landmarks: Path | Mapping[str, Any] | None) -> dict[str, np.ndarray] | None:
@@ -45,7 +48,7 @@ def locate_in_scan(
         scan: repaired.
         body: the model.
         landmarks: points placed by hand, which are trusted.
-        detector: keypoint model that is asked for the front; see `BuildConfig`. Not used beside landmarks.
+        detector: keypoint model that is asked for the front and for limbs; see `BuildConfig`. Not used beside landmarks.
 
     Raises:
         InputError: no person, or landmarks that the body does not have.
@@ -54,11 +57,14 @@ def locate_in_scan(
     mesh, colors = smooth_if_rough(scan.clean.mesh).mesh, scan.colors
     labeller = partial(certain_labels, mesh, body, colors)
     search = partial(locate_body, body, mesh, colors=colors, labeller=labeller)
-    # Search from the surface alone first, because it is precise; keypoints can only correct the front.
-    found = search(landmarks=landmark_points(landmarks))
+    # Search the surface, because it is precise; a detector's keypoints propose limbs and can correct the front.
     note = ""
     if detector is not None and landmarks is None:
-        found, note = _confirmed(found, search, mesh, colors, detector)
+        seen = keypoints_of_scan(mesh, colors, load_detector(detector))
+        found = search(hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
+        found, note = _confirmed(found, search, seen)
+    else:
+        found = search(landmarks=landmark_points(landmarks))
     # Keep the labels that a registration may lean on, a label for each vertex of a certain face.
     labels = np.full(mesh.vertex_count, BACKGROUND, dtype=np.int64)
     # One label a face, BACKGROUND where body and colours disagree.
@@ -95,17 +101,12 @@ def locate_in_scan(
 
 
 def _confirmed(
-    found: LocatedBody,
-    search: Callable[..., LocatedBody],
-    mesh: TriangleMesh,
-    colors: UInt8[np.ndarray, "N 3"] | None,
-    detector: str,
+    found: LocatedBody, search: Callable[..., LocatedBody], landmarks: Landmarks
 ) -> tuple[LocatedBody, str]:
     """The found body if a detector's keypoints on pictures of the scan agree on the front; else search again with them.
 
-    Keypoints are centimetres off and geometry is not, so that they decide the front alone.
+    Keypoints are centimetres off and geometry is not, so that they propose limbs and decide the front alone.
     """
-    landmarks = keypoints_of_scan(mesh, colors, load_detector(detector))
     front = facing(landmarks)
     if front is None:
         return found, "the detector's keypoints do not tell the front"

@@ -8,7 +8,9 @@
 4. *Dressed fit*: candidates are fitted with one-sided residuals. Skin lies on the surface, cloth stands off by a gap of
    its region and an unknown offset that garment, limb and side share and that is eliminated (`cloth_offsets`,
    `dressed`).
-5. *Decision*: the candidate with the least misfit and pose cost wins, is fitted with its fingers, and gets a confidence
+5. *Second look*: limbs that the surface does not show there, or that a detector sees elsewhere, are searched again in
+   the surface that the rest of the dressed body leaves (`second_look`).
+6. *Decision*: the candidate with the least misfit and pose cost wins, is fitted with its fingers, and gets a confidence
    from its margin over the other facing (`locate`).
 
 Every step minimises a weighted sum of squares by damped Gauss-Newton on the normal equations of `smplxpp.register`.

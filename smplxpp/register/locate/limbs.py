@@ -23,10 +23,10 @@ from smplxpp.register.observations import RegisterConfig
 from smplxpp.register.priors import Anatomy, Priors
 from smplxpp.register.start import Start
 
-# Rotation vectors of the joints of a limb, degrees, applied one after the other.
-_Limb = tuple[list[Float64[np.ndarray, " 3"]], ...]
-# Mirrors rotation vectors of the left side to the right side.
-_MIRROR = np.array([1.0, -1.0, -1.0])
+LimbPose = tuple[list[Float64[np.ndarray, " 3"]], ...]
+"""Rotation vectors of the joints of a limb, degrees, applied one after the other."""
+MIRROR = np.array([1.0, -1.0, -1.0])
+"""Mirrors rotation vectors of the left side to the right side."""
 
 
 def try_limbs(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState) -> BodyState:
@@ -39,7 +39,7 @@ def try_limbs(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, 
     ):
         for side in ("left", "right"):
             index = [place[f"{side}_{joint}"] for joint in joints]
-            mirror = np.ones(3) if side == "left" else _MIRROR
+            mirror = np.ones(3) if side == "left" else MIRROR
             # A pose of the grid replaces the limb if it is nearer by half a per cent of the whole distance.
             chosen = state
             for vectors in tried:
@@ -63,9 +63,9 @@ def state_distance(
     return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface, far=far)
 
 
-def _arms() -> list[_Limb]:
+def _arms() -> list[LimbPose]:
     """Return the grid of arm poses: lowered from the T-pose, taken forwards, twisted, bent at the elbow; degrees."""
-    out: list[_Limb] = []
+    out: list[LimbPose] = []
     for lowered, forwards, twisted, bent in product((-78, -48, -12, 30, 70), (0, -45, -85), (0, 65), (-8, -60, -110)):
         if twisted and bent > -30:
             continue  # twisting a straight arm changes nothing
@@ -74,7 +74,7 @@ def _arms() -> list[_Limb]:
     return out
 
 
-def _legs() -> list[_Limb]:
+def _legs() -> list[LimbPose]:
     """Return the grid of leg poses: lifted forwards at the hip, bent at the knee; degrees."""
     poses = product((15, 0, -25, -60, -90), (4, 40, 85))
     return [([np.array([lifted, 0.0, -5.0])], [np.array([knee, 0.0, 0.0])]) for lifted, knee in poses]
@@ -90,11 +90,11 @@ def try_hands(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, 
         state: the body, fitted without its fingers.
     """
     for side in ("left", "right"):
-        state = _try_hand(kinematics, proxy, surface, state, side)
+        state = try_hand(kinematics, proxy, surface, state, side)
     return state
 
 
-def _try_hand(
+def try_hand(
     kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, state: BodyState, side: str
 ) -> BodyState:
     """Refine one hand; return the state as it is if too little of the hand can be seen."""
@@ -109,7 +109,7 @@ def _try_hand(
     def distance(one: BodyState) -> float:
         return state_distance(kinematics, arm, about, one, far=0.06)
 
-    mirror = np.ones(3) if side == "left" else _MIRROR
+    mirror = np.ones(3) if side == "left" else MIRROR
     curled_ones = fingers[["thumb" not in names[k] for k in fingers]]
     # The grid, degrees: twist of the forearm, bend of the wrist, curl of every finger joint.
     tried = []

@@ -17,6 +17,7 @@ from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.register.kinematics import Kinematics
 from smplxpp.register.locate.icp import PinnedLandmarks
 from smplxpp.register.locate.search import Found, LocateConfig, Search
+from smplxpp.register.locate.second_look import look_again
 
 Labeller = Callable[[BodyParams], "Integer[np.ndarray, ' M'] | None"]
 """Labels every face of the surface, given the body in it, negative where unknown; None for no labels at all."""
@@ -50,12 +51,14 @@ class LocatedBody:
         confidence: from 0 to 1; a result below 0.5 should be inspected.
         notes: sentences about what speaks against it and what to do.
         candidates: all that were fitted to the end, the winner first.
+        moved: limbs that were found elsewhere when they were searched again.
     """
 
     params: BodyParams
     confidence: float
     notes: tuple[str, ...] = ()
     candidates: tuple[Candidate, ...] = field(default=())
+    moved: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,7 @@ def locate_body(
     *,
     colors: UInt8[np.ndarray, "N 3"] | None = None,
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
+    hints: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     labeller: Labeller | None = None,
     config: LocateConfig | None = None,
     progress: ProgressCallback = ignore_progress,
@@ -106,6 +110,8 @@ def locate_body(
         mesh: of the whole person, metres, +Y up (`smplxpp.clean.find_scan_frame`), tilted by at most 20 degrees.
         colors: of the vertices.
         landmarks: known positions of points of the body (`smplxpp.register.landmarks`), from a detector or by hand.
+        hints: points of the body that a detector sees, under their `coco_*` names. They propose poses of single limbs,
+            which are kept only where the surface prefers them.
         labeller: labels the surface once the body is known; the body is then fitted again with what is skin.
         config: options.
         progress: called with the running step and its share done.
@@ -123,7 +129,8 @@ def locate_body(
     found = search.candidates()
     if pinned is not None:
         pinned.make_robust()
-    best = search.finished(found[0])
+    # Limbs that the dressed body's surface does not show are searched once more before labels depend on them.
+    best, moved = look_again(search, search.finished(found[0]), hints=hints)
     refuse_non_persons(best)
     if labeller is not None:
         labels = labeller(best.state.to_params(body))
@@ -135,6 +142,7 @@ def locate_body(
         confidence_of(best, others),
         notes_of(best, others),
         tuple(_candidate(one) for one in (best, *others)),
+        moved,
     )
 
 
@@ -189,12 +197,13 @@ def confidence_of(best: Found, others: Sequence[Found]) -> float:
     """Return the confidence of the best candidate, from 0 to 1, as a product of five factors.
 
     A logistic function of its margin over the other facing (1/2 at half of the margin that is clearly distinct), one of
-    its cost, the share of the surface that it explains, 0.2 for an unlikely shape, and 0.4 for missing parts.
+    its cost against the surface alone, the share of the surface that it explains, 0.2 for an unlikely shape, and 0.4
+    for missing parts.
     """
     rival = [one.cost - best.cost for one in others if one.facing @ best.facing < 0]
     apart = min(rival) if rival else _BOUNDS.margin
     distinct = 1.0 / (1.0 + np.exp(-(apart - _BOUNDS.margin / 2) / (_BOUNDS.margin / 4)))
-    good = 1.0 / (1.0 + np.exp((best.cost - _BOUNDS.good_cost) / 1.5))
+    good = 1.0 / (1.0 + np.exp((best.surface_cost - _BOUNDS.good_cost) / 1.5))
     whole = np.clip(
         (best.misfit.covered - _BOUNDS.least_covered) / (_BOUNDS.doubtful_covered - _BOUNDS.least_covered), 0.0, 1.0
     )

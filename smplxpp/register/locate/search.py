@@ -84,8 +84,16 @@ class Found:
 
     @property
     def cost(self) -> float:
-        """The misfit with the cost of the pose, in millimetres; a squared deviation of the pose costs 0.05 mm."""
-        return 1e3 * (self.misfit.total + self.landmarks) + 0.05 * self.pose_cost
+        """The cost against the surface and the distance of the landmarks, in millimetres: what ranks candidates."""
+        return self.surface_cost + 1e3 * self.landmarks
+
+    @property
+    def surface_cost(self) -> float:
+        """The misfit with the cost of the pose, in millimetres; a squared deviation of the pose costs 0.05 mm.
+
+        Landmarks do not count: a hand is centimetres off, which says nothing against the surface.
+        """
+        return 1e3 * self.misfit.total + 0.05 * self.pose_cost
 
     @property
     def facing(self) -> Float64[np.ndarray, " 2"]:
@@ -165,15 +173,26 @@ class Search:
             found: the candidate.
             skin: whether a point of `fine` is bare skin; None if unknown.
         """
+        # Hands from a grid first, then the whole body.
+        state = try_hands(self.kinematics, self.many, self.fine, found.state)
+        return self.polished(found.name, state, skin, steps=self.config.finish_steps)
+
+    def polished(self, name: str, state: BodyState, skin: np.ndarray | None, *, steps: int) -> Found:
+        """Fit a state with its fingers to all points; the reach of skin falls from 30 to 15 mm.
+
+        Args:
+            name: of the pose of its start.
+            state: the body.
+            skin: whether a point of `fine` is bare skin; None if unknown.
+            steps: number of Gauss-Newton steps.
+        """
         skin = np.zeros(len(self.fine), dtype=bool) if skin is None else skin
         term = Dressed(self.outer, self.bare, self.fine, skin)
-        # Hands from a grid first, then the whole body with a reach of skin that falls from 30 to 15 mm.
-        state, steps = try_hands(self.kinematics, self.many, self.fine, found.state), self.config.finish_steps
         for k, reach in enumerate(np.geomspace(0.03, 0.015, steps)):
             term.reach = float(reach)
             state = self._step(state, term, self.config.pose_prior, fingers=True)
             self.progress("fit", (k + 1) / steps)
-        return self._measured(found.name, state)
+        return self._measured(name, state)
 
     def _columns(self, joints: Sequence[int]) -> Columns:
         body = self.kinematics.body

@@ -11,7 +11,11 @@ import pytest
 from smplxpp.body import load_body, load_params
 from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
 from smplxpp.core.mesh_files.mesh_io import read_mesh
+from smplxpp.register.kinematics import BodyState
 from smplxpp.register.locate import LocateConfig, locate_body
+from smplxpp.register.locate.dressed import PARTS, Misfit
+from smplxpp.register.locate.locate import confidence_of
+from smplxpp.register.locate.search import Found
 
 PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
 QUICK = LocateConfig(
@@ -130,3 +134,12 @@ def test_a_person_in_centimetres_is_refused_with_the_options_named(body, scan):
 def test_colours_of_another_mesh_are_refused(body, scan):
     with pytest.raises(InputError, match="colours"):
         locate_body(body, scan, colors=np.zeros((3, 3), dtype=np.uint8), config=QUICK)
+
+
+def test_landmarks_that_are_centimetres_off_do_not_lower_the_confidence():
+    """A hand places landmarks centimetres off; a surface that fits as well as before is believed as much."""
+    parts = dict.fromkeys(PARTS, 0.9)
+    state = BodyState(np.eye(3)[None, None], np.zeros((1, 3)), np.zeros(10), np.zeros((1, 10)))
+    best = Found("by hand", state, Misfit(0.005, 0.015, 0.95, 0.7, parts), 10.0, landmarks=0.0)
+    assert best.cost < replace(best, landmarks=0.04).cost
+    assert confidence_of(replace(best, landmarks=0.04), ()) == confidence_of(best, ()) > 0.7
