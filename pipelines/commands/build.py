@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText
 from pipelines.commands.progress import stage_progress
 from pipelines.runs.folders import keep_out_of_capture
 from pipelines.runs.layout import BUILD_STAGES, CORRECTIONS_FILE, LANDMARKS_FILE, REGISTER_STAGE, reconstructed_scan
@@ -72,6 +72,9 @@ class Build:
     """Units of the scan file. auto: found where the scan comes alone, else those of the parameters, metres."""
     up: Literal["auto", "y", "z", "x", "-y", "-z", "-x"] = "auto"
     """Upward axis of the scan file. auto: found where the scan comes alone, else +Y."""
+    height: OptionalFloat = None
+    """The person's stature in metres (1.75), for a scan that comes alone and has no unit: voxels, data scaled to 1,
+    photogrammetry. In any pose: the body that is found in the scan gets it."""
     detector: OptionalText = None
     """Keypoint model that tells front and limbs of a scan without parameters: `mediapipe` (extra detect), or a
     pose model in ONNX."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipelines.runs.layout import (
     CANONICAL,
+    LOCATE_STAGE,
     PARAMS,
     PARTS,
     PARTS_WITHOUT_BRIDGES,
@@ -23,7 +24,7 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import MANIFEST, StageRecord
 from smplxpp.body import BodyModel, load_params
 from smplxpp.build.data import LocatedInScan, Part, PosedFit, PreparedScan
-from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, SkinWeights, TriangleMesh
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, SkinWeights, TriangleMesh, require_positive
 from smplxpp.core.files import as_integer, as_numbers, read_arrays
 from smplxpp.core.files.safe_pickle import safe_npz
 from smplxpp.skinning import Unposed
@@ -137,7 +138,7 @@ def save_located(folder: Path, located: LocatedInScan) -> None:
     """Write the body that was found in a scan: one row of parameters, certain labels, and the body's bare vertices."""
     params, labels = LOCATED_FILES
     located.params.save(folder / params)
-    np.savez(folder / labels, labels=located.labels, bare=located.bare)
+    np.savez(folder / labels, labels=located.labels, bare=located.bare, scale=np.float64(located.scale))
 
 
 def load_located(folder: Path) -> LocatedInScan:
@@ -150,6 +151,16 @@ def load_located(folder: Path) -> LocatedInScan:
     labels, bare = read_named(folder / file, "labels", "bare")
     with values_of(folder / file):
         return LocatedInScan(load_params(folder / params), labels.astype(np.int64), bare.astype(bool))
+
+
+def load_scan_scale(run: Path) -> float:
+    """Read by how much the stage that found the body scales the scan, as it was read, to the stated stature."""
+    path = run / LOCATE_STAGE / LOCATED_FILES[1]
+    (scale,) = read_named(path, "scale")
+    with values_of(path):
+        value = float(as_numbers(scale, (), subject="scale"))
+        require_positive("scale", value)
+        return value
 
 
 def save_parts(folder: Path, parts: Mapping[str, Part]) -> None:

@@ -19,6 +19,7 @@ from pipelines.runs.artefacts import (
     load_parts,
     load_prepared_scan,
     load_scan_labels,
+    load_scan_scale,
     load_stacked_params,
     load_weights,
     save_arrays,
@@ -63,6 +64,7 @@ def locate(folder: Path, build: BuildContext) -> StageOutput:
         load_body(build.inputs.body),
         landmarks=placed if placed.exists() else None,
         detector=build.config.detector,
+        height=build.config.height,
     )
     save_located(folder, found)
     (folder / LOCATION_FILE).write_text(json.dumps(output.numbers, indent=1) + "\n")
@@ -71,7 +73,9 @@ def locate(folder: Path, build: BuildContext) -> StageOutput:
 
 def capture(folder: Path, build: BuildContext) -> StageOutput:
     """Write the scan in metres, +Y up, repaired, and the frame's parameters."""
-    scan, output = prepare_scan(_read_scan(build))
+    # The stage that found the body has written by how much a scan without a unit has to be scaled.
+    scale = 1.0 if build.config.height is None else load_scan_scale(build.run)
+    scan, output = prepare_scan(_read_scan(build).scaled(scale))
     save_scan(folder, scan)
     _params_of_frame(build).save(folder / "params.npz")
     return output
@@ -203,7 +207,8 @@ def validate(folder: Path, build: BuildContext) -> StageOutput:
 
 
 def _read_scan(build: BuildContext) -> ScanFile:
-    return read_scan(build.inputs.scan_file, units=build.config.units, up=build.config.up)
+    config = build.config
+    return read_scan(build.inputs.scan_file, units=config.units, up=config.up, height=config.height)
 
 
 def _params_of_frame(build: BuildContext) -> BodyParams:

@@ -93,7 +93,7 @@ def _unbuilt_scan(run: Path) -> LabelledScan:
     inputs, config = found
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)  # told by the build
-        scan = read_scan(inputs.scan_file, units=config.units, up=config.up)
+        scan = read_scan(inputs.scan_file, units=config.units, up=config.up, height=config.height)
     raw, clean = scan.raw, scan.clean
     colors = np.full((len(raw.vertices), 3), GREY, np.uint8) if raw.vertex_colors is None else raw.vertex_colors
     return LabelledScan(clean.mesh, np.asarray(colors[clean.source_vertex], dtype=np.uint8), None, None)

@@ -12,7 +12,7 @@ import numpy as np
 from smplxpp.assemble import FillHolesConfig
 from smplxpp.capture import Capture
 from smplxpp.clean import BridgeConfig
-from smplxpp.clean.scan_frame import AUTO
+from smplxpp.clean.scan_frame import AUTO, check_height
 from smplxpp.core import BodyParams, InputError, LABELS, MeshLike, require_at_least, require_between, require_choice
 
 STEPS = (
@@ -38,6 +38,8 @@ class BuildConfig:
         units: units of the scan, one of `UNITS`. "auto": found from the person's height where the scan comes alone,
             else metres.
         up: upward axis of the scan, one of `UP_AXES`. "auto": found where the scan comes alone, else +Y.
+        height: the person's stature in metres, standing upright, for a scan that comes alone and has no unit. The scan
+            is scaled until the body that is found in it, in whatever pose, has it. None: units tell the size.
         frame: number of the reference frame, near the T-pose.
         protocol: the capture's protocol, which names the files that are read. None: without one.
         keypoints: folder of keypoints that replaces the capture's own.
@@ -69,6 +71,7 @@ class BuildConfig:
 
     units: str = AUTO
     up: str = AUTO
+    height: float | None = None
     frame: int = 0
     protocol: str | None = None
     keypoints: Path | None = None
@@ -94,6 +97,8 @@ class BuildConfig:
         # uses it.
         for name, choices in (("units", UNITS), ("up", UP_AXES), ("label_source", LABEL_SOURCES)):
             require_choice(f"option {name}", getattr(self, name), choices)
+        if self.height is not None:
+            check_height(self.height, self.units)
         require_choice("option register", self.register, (AUTO, "on", "off"))
         require_choice("option method", self.method, ("ours", "paper"))
         parts = _default_budgets()

@@ -60,11 +60,13 @@ class LocatedInScan:
         params: one frame.
         labels: certain labels of the scan's vertices, -1 elsewhere.
         bare: the body's vertices that nothing covers.
+        scale: by which the scan, as it was read, has to be scaled so that the body has the stated stature; 1 without.
     """
 
     params: BodyParams
     labels: Int64[np.ndarray, " N"]
     bare: Bool[np.ndarray, " V"]
+    scale: float = 1.0
 
     def labels_of(self, vertices: int) -> Int64[np.ndarray, " N"] | None:
         """Return the labels for a scan of this many vertices; None where it was another scan."""

@@ -118,6 +118,7 @@ def _of_capture(request: BuildRequest) -> BuildInputs:
     """The inputs of a capture: a scan that it lacks is reconstructed, parameters that it lacks are registered."""
     root, config = request.root, request.config
     assert root is not None
+    _refuse_height(config, "a capture, whose cameras state the size")
     # Decide first who makes the parameters, because the search for the reference frame only asks for a fit if one is
     # used.
     registers = _registers(request)
@@ -170,6 +171,8 @@ def _of_scan(request: BuildRequest) -> BuildInputs:
     for name in ("protocol", "keypoints", "masks"):
         if getattr(config, name) is not None:
             raise InputError(f"option {name}", expected="with --capture", received="with --scan")
+    if request.params is not None:
+        _refuse_height(config, "parameters, which state the size")
     # Parameters beside a lone scan are used unchanged, unless the user asks for a registration that starts from them.
     registers = request.params is not None and config.register == "on"
     return BuildInputs(
@@ -185,6 +188,16 @@ def _of_scan(request: BuildRequest) -> BuildInputs:
         label_source="body" if config.label_source == "body" else "auto",
         body=request.body_file,
     )
+
+
+def _refuse_height(config: BuildConfig, received: str) -> None:
+    if config.height is not None:
+        raise InputError(
+            "option height",
+            expected="a scan alone, in which the body is searched",
+            received=received,
+            remedy="state the units instead: --units",
+        )
 
 
 def _registers(request: BuildRequest) -> bool:

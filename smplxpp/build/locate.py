@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,18 +42,50 @@ def locate_in_scan(
     *,
     landmarks: Path | Mapping[str, Any] | None = None,
     detector: str | None = None,
+    height: float | None = None,
 ) -> tuple[LocatedInScan, StageOutput]:
     """Find the body in a scan, and say what else it might have been and how certain it is.
+
+    With a stature the scan is scaled by what the body found in it lacks of that, and searched again, until both agree.
 
     Args:
         scan: repaired.
         body: the model.
         landmarks: points placed by hand, which are trusted.
         detector: keypoint model that is asked for the front and for limbs; see `BuildConfig`. Not used beside landmarks.
+        height: the person's stature, metres; None: the scan has its size.
 
     Raises:
         InputError: no person, or landmarks that the body does not have.
     """
+    placed = landmark_points(landmarks)
+    found, output = _located(scan, body, placed, detector)
+    if height is None:
+        return found, output
+    # Poses, shoes and hair make the scan's extent another length than the stature. The body's shape prior draws a
+    # wrong size towards the mean, so that one step need not suffice. 1 % is less than shoes and hair add.
+    scale, tolerance, rounds = 1.0, 0.01, 3
+    for _ in range(rounds):
+        lacks = height / stature(body, found.params)
+        if abs(lacks - 1.0) < tolerance:
+            break
+        scale *= lacks
+        there = None if placed is None else {name: scale * point for name, point in placed.items()}
+        found, output = _located(scan.scaled(scale), body, there, detector)
+    numbers = {"height": height, "stature": stature(body, found.params), "scale": scale}
+    return replace(found, scale=scale), StageOutput(output.checks, {**output.numbers, **numbers})
+
+
+def stature(body: BodyModel, params: BodyParams) -> float:
+    """Return the height of a shaped body that stands upright, metres: from soles to top of the head in the T-pose."""
+    shaped = body.forward(BodyParams.rest(betas=params.betas[0], expressions=0, v_shape=params.v_shape))
+    return float(np.ptp(shaped.vertices[0][:, 1]))
+
+
+def _located(
+    scan: ScanFile, body: BodyModel, landmarks: dict[str, np.ndarray] | None, detector: str | None
+) -> tuple[LocatedInScan, StageOutput]:
+    """Find the body in a scan of known size; see `locate_in_scan`."""
     # Search on the surface that the template will be made of: smoothed where the scan is rough.
     mesh, colors = smooth_if_rough(scan.clean.mesh).mesh, scan.colors
     labeller = partial(certain_labels, mesh, body, colors)
@@ -64,7 +97,7 @@ def locate_in_scan(
         found = search(hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
         found, note = _confirmed(found, search, seen)
     else:
-        found = search(landmarks=landmark_points(landmarks))
+        found = search(landmarks=landmarks)
     # Keep the labels that a registration may lean on, a label for each vertex of a certain face.
     labels = np.full(mesh.vertex_count, BACKGROUND, dtype=np.int64)
     # One label a face, BACKGROUND where body and colours disagree.

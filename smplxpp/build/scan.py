@@ -7,7 +7,7 @@ labels and colours of points follow as those of a mesh's vertices do. It has no 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -23,6 +23,10 @@ from smplxpp.segment import map_labels, read_labels
 from smplxpp.segment.label_files import check_element_count
 
 
+# Formats whose files are in metres: by the format, or because their reader converts the unit that they state.
+_METRES = (".glb", ".gltf", ".fbx")
+
+
 @dataclass(frozen=True, eq=False)
 class ScanFile:
     """A scan as its file has it, and repaired.
@@ -31,7 +35,8 @@ class ScanFile:
         raw: in the file's units and axes; without faces where it is a point cloud.
         clean: metres, +Y up, with the places of its elements in the file. Faces of a cloud's surface come from none
             (-1).
-        units: in which the file is written, as given or as found.
+        units: in which the file is written, as given or as found; the length of one in millimetres where the person's
+            height told it.
         up: upward axis of the file, as given or as found.
         note: how units and axis were found; empty where they were given.
     """
@@ -48,14 +53,29 @@ class ScanFile:
         return None if self.raw.vertex_colors is None else self.clean.mean_colors(self.raw.vertex_colors)
 
 
-def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -> ScanFile:
+    def scaled(self, factor: float) -> ScanFile:
+        """Return the scan with its repaired surface scaled about the origin; 1 is the scan itself."""
+        if factor == 1.0:
+            return self
+        mesh = self.clean.mesh
+        clean = replace(self.clean, mesh=mesh.with_vertices(mesh.vertices * factor))
+        note = f"{self.note}; scaled by {factor:.4f} so that the body in it has that stature"
+        return replace(self, clean=clean, note=note)
+
+
+def read_scan(
+    scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", height: float | None = None
+) -> ScanFile:
     """Read a scan: a mesh, or a point cloud, whose surface is reconstructed.
 
     Args:
         scan: a file (PLY, OBJ, GLB, STL, OFF, npz, pickle), or a mesh in memory with or without colours:
             `TriangleMesh`, `trimesh.Trimesh`, or a pair (vertices, faces).
-        units: as `convert_points` takes them; "auto": found from the person's height.
+        units: as `convert_points` takes them; "auto": metres of a glTF file, whose format states them, if that is a
+            person's size, else found from the person's height.
         up: upward axis likewise; "auto": found from the shape of the person.
+        height: metres from the lowest to the highest point, for a scan without a unit; it takes the place of `units`.
+            A build corrects it for the pose, with the body that it finds (`smplxpp.build.locate_in_scan`).
 
     Raises:
         InputError: no surface, or no person that stands upright in metres; the file is named.
@@ -75,24 +95,43 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y") -
     note = ""
     # A search for units and axis needs faces; a cloud gets a coarse surface for it, because the full one needs
     # metres.
-    if AUTO in (units, up):
+    scale: str | float = units
+    if AUTO in (units, up) or height is not None:
         vertices, faces = (raw.vertices, raw.faces) if not raw.is_cloud else _rough_surface(raw)
-        frame = find_scan_frame(vertices, faces, units=units, up=up)
-        units, up, note = frame.units, frame.up, frame.note
+        stated = _stated_units(path, raw) if units == AUTO and height is None else units
+        try:
+            frame = find_scan_frame(vertices, faces, units=stated, up=up, height=height)
+        except InputError as error:
+            raise _named(error, name) from None
+        scale, up, note = frame.units, frame.up, frame.note
     # From here on metres and +Y up; faces keep their orientation, since the change of axes is a rotation.
-    vertices = convert_points(raw.vertices, units=units, up=up)
+    vertices = convert_points(raw.vertices, units=scale, up=up)
     try:
-        clean = _of_cloud(path, raw, units, up) if raw.is_cloud else sanitize(vertices, raw.faces)
+        clean = _of_cloud(path, raw, scale, up) if raw.is_cloud else sanitize(vertices, raw.faces)
     except InputError as error:
-        raise InputError(
-            f"scan {name}: {error.subject}",
-            expected=error.expected,
-            received=error.received,
-            remedy=error.remedy,
-        ) from None
+        raise _named(error, name) from None
     # The last guard of the units: a scan in centimetres, inches or millimetres that was read as metres fails here.
     check_human_scale(clean.mesh.vertices, subject=f"scan {name}")
-    return ScanFile(raw, clean, units, up, note)
+    return ScanFile(raw, clean, scale if isinstance(scale, str) else f"{1000.0 * scale:.4g} mm", up, note)
+
+
+def _named(error: InputError, name: str) -> InputError:
+    """Return the error with the scan's name before its subject."""
+    subject = error.subject if error.subject.startswith(f"scan {name}") else f"scan {name}: {error.subject}"
+    return InputError(
+        subject.replace(": scan:", ":"), expected=error.expected, received=error.received, remedy=error.remedy
+    )
+
+
+def _stated_units(path: Path | None, raw: RawMesh) -> str:
+    """Return the units that a file's format states, if they give a person's size; else AUTO."""
+    # glTF is in metres by its specification, but exporters of centimetres exist. Lower than what is asked about
+    # elsewhere, because a stated unit makes a child or a crouching person plausible.
+    if path is None or path.suffix.lower() not in _METRES:
+        return AUTO
+    finite = raw.vertices[np.isfinite(raw.vertices).all(axis=1)]
+    size = float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
+    return "m" if 0.7 <= size <= 2.6 else AUTO
 
 
 def scan_file_labels(
@@ -137,7 +176,7 @@ def _raw_of(mesh: MeshLike) -> RawMesh:
     return RawMesh(found.vertices, found.faces, vertex_colors=kept)
 
 
-def _of_cloud(path: Path | None, raw: RawMesh, units: str, up: str) -> Sanitized:
+def _of_cloud(path: Path | None, raw: RawMesh, units: str | float, up: str) -> Sanitized:
     """The repaired surface of a cloud, its vertices traced to points."""
     if path is None:
         surface = _make_surface(raw, units, up)
@@ -178,7 +217,7 @@ class _Cloud:
     path: Path
     changed: int
     size: int
-    units: str
+    units: str | float
     up: str
     raw: RawMesh = field(compare=False)
 
@@ -189,7 +228,7 @@ def _surface(cloud: _Cloud) -> PointSurface:
     return _make_surface(cloud.raw, cloud.units, cloud.up)
 
 
-def _make_surface(raw: RawMesh, units: str, up: str) -> PointSurface:
+def _make_surface(raw: RawMesh, units: str | float, up: str) -> PointSurface:
     normals = raw.vertex_normals
     if normals is not None:
         normals = convert_points(normals, units="m", up=up)

@@ -142,7 +142,10 @@ class _Build:
         if inputs.locates:
             with self._step("locate") as step:
                 file = self._read_scan()
-                located, step.output = locate_in_scan(file, body, landmarks=config.landmarks, detector=config.detector)
+                located, step.output = locate_in_scan(
+                    file, body, landmarks=config.landmarks, detector=config.detector, height=config.height
+                )
+                file = file.scaled(located.scale)
         if self.plan.registration is not None:
             registration = self._register(self.plan.registration, located)
 
@@ -185,7 +188,7 @@ class _Build:
 
     def _read_scan(self) -> ScanFile:
         assert self.inputs.scan is not None
-        return read_scan(self.inputs.scan, units=self.config.units, up=self.config.up)
+        return read_scan(self.inputs.scan, units=self.config.units, up=self.config.up, height=self.config.height)
 
     def _reconstruct(self, asked: ReconstructInputs) -> None:
         """Reconstruct the scan of the reference frame into the request's file, because scans are read from files."""

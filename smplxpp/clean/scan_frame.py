@@ -22,24 +22,39 @@ _Y_FROM_UP = {
     "-z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
     "-x": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
 }
+# Heights from head (or a raised hand) to foot for which a unit is taken without a question, metres: standing adults and
+# adolescents. Lower ones are children, crouching people or sizes in no unit at all; what is scaled to 1 is 1 m high.
+_LOW, _HIGH = 1.3, 2.5
 _Bodies = list[tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]]
 AUTO = "auto"
 
 
-def convert_points(points: Num[np.ndarray, "N 3"], *, units: str = "m", up: str = "y") -> Float64[np.ndarray, "N 3"]:
+def convert_points(
+    points: Num[np.ndarray, "N 3"], *, units: str | float = "m", up: str = "y"
+) -> Float64[np.ndarray, "N 3"]:
     """Convert points in the stated units and axes to metres, +Y up.
 
     Args:
         points: points in the source's frame.
-        units: "m", "cm", "mm" or "inch".
+        units: "m", "cm", "mm" or "inch", or the metres of one unit.
         up: the source's upward axis: "y", "z", "x", "-y", "-z" or "-x".
 
     Raises:
         InputError: an unknown name.
     """
-    for name, value, known in (("units", units, METRES_PER_UNIT), ("up", up, _Y_FROM_UP)):
-        require_choice(f"option {name}", value, tuple(known))
-    return np.asarray(points, dtype=np.float64) @ _Y_FROM_UP[up].T * METRES_PER_UNIT[units]
+    if isinstance(units, str):
+        require_choice("option units", units, tuple(METRES_PER_UNIT))
+    require_choice("option up", up, tuple(_Y_FROM_UP))
+    scale = METRES_PER_UNIT[units] if isinstance(units, str) else units
+    return np.asarray(points, dtype=np.float64) @ _Y_FROM_UP[up].T * scale
+
+
+def sizes_by_unit(size: float) -> str:
+    """Return in words what a size would be in each unit: `98.9 m, 98.9 cm (0.989 m), ...`."""
+    return ", ".join(
+        f"{size:.4g} {unit}" + ("" if scale == 1.0 else f" ({size * scale:.3g} m)")
+        for unit, scale in METRES_PER_UNIT.items()
+    )
 
 
 def check_human_scale(vertices: Float[np.ndarray, "N 3"], *, subject: str = "scan") -> None:
@@ -67,7 +82,8 @@ def check_human_scale(vertices: Float[np.ndarray, "N 3"], *, subject: str = "sca
             received=f"a largest extent of {size:.4g}",
             remedy=f"the file is probably in {fitting[0]}: state it with --units {fitting[0]}"
             if fitting
-            else "state the units with --units, and check for stray geometry far from the person",
+            else "state the units with --units, or the person's stature in metres with --height (a scan alone), and "
+            "check for stray geometry far from the person",
         )
     # Swapped axes: the longest extent is not the vertical one.
     widest = int(np.argmax(extent))
@@ -86,20 +102,25 @@ class ScanFrame:
     """Units and upward axis of a scan's coordinates.
 
     Attributes:
-        units: a name of `METRES_PER_UNIT`.
+        units: a name of `METRES_PER_UNIT`, or the metres of one unit where the person's height was stated.
         up: upward axis, as `convert_points` takes it.
         unambiguous: whether every other axis fits clearly worse.
         note: the finding as a sentence for logs.
     """
 
-    units: str
+    units: str | float
     up: str
     unambiguous: bool
     note: str
 
 
 def find_scan_frame(
-    vertices: Num[np.ndarray, "N 3"], faces: Int[np.ndarray, "M 3"], *, units: str = AUTO, up: str = AUTO
+    vertices: Num[np.ndarray, "N 3"],
+    faces: Int[np.ndarray, "M 3"],
+    *,
+    units: str = AUTO,
+    up: str = AUTO,
+    height: float | None = None,
 ) -> ScanFrame:
     """Find the units and the upward axis of a person's scan.
 
@@ -111,20 +132,34 @@ def find_scan_frame(
         faces: faces of the scan.
         units: known units; "auto" finds them.
         up: known upward axis; "auto" finds it.
+        height: metres from the lowest to the highest point; the units then follow from it.
 
     Raises:
-        InputError: no surface, or no unit gives a person's height.
+        InputError: no surface, units that are stated beside a height, or a size that is no standing person's in any
+            unit, or that of data scaled to [-1, 1].
     """
+    if height is not None:
+        check_height(height, units)
     surface = _surface(np.asarray(vertices, dtype=np.float64), np.asarray(faces))
-    bodies = _bodies()
-    costs = {axis: _cost(surface, bodies, axis) for axis in (tuple(_Y_FROM_UP) if up == AUTO else (up,))}
+    costs = {up: 0.0}
+    if up == AUTO:
+        bodies = _bodies()
+        costs = {axis: _cost(surface, bodies, axis) for axis in _Y_FROM_UP}
     order = sorted(costs, key=lambda axis: costs[axis])
     best = order[0]
-    height = float(np.ptp(convert_points(surface.points, up=best)[:, 1]))
-    chosen = _units(height) if units == AUTO else units
+    whole = convert_points(np.asarray(vertices)[np.unique(faces)], up=best)[:, 1]
+    whole = whole[np.isfinite(whole)]
+    size = float(np.ptp(_without_strays(whole)))
+    if height is not None:
+        axis = f"{'stated' if up != AUTO else 'found'} upward axis {best}"
+        note = f"stated height {height:g} m: {size:.4g} units of {1000 * height / size:.4g} mm; {axis}"
+        return ScanFrame(height / size, best, True, note)
+    if units == AUTO:
+        _refuse_normalised(whole)
+    chosen = _units(size) if units == AUTO else units
     # The axis is unambiguous if the second best has a distance more than 15 % larger.
     unambiguous = len(order) == 1 or costs[order[1]] > 1.15 * costs[best]
-    note = f"{'stated' if units != AUTO else 'found'} units {chosen}: {height:.4g} {chosen} from head to foot; "
+    note = f"{'stated' if units != AUTO else 'found'} units {chosen}: {size:.4g} {chosen} from head to foot; "
     note += f"{'stated' if up != AUTO else 'found'} upward axis {best}"
     if not unambiguous:
         note += f", though {order[1]} fits nearly as well: state it with --up"
@@ -144,19 +179,54 @@ def _surface(vertices: np.ndarray, faces: np.ndarray) -> SurfacePoints:
     return surface if outwards else SurfacePoints.from_arrays(surface.points, -surface.normals, surface.face)
 
 
-def _units(height: float) -> str:
-    # Heights of people from head (or a raised hand) to foot, metres. If several units fit, the height nearest to 1.7 m
-    # decides.
-    low, high, usual = 0.9, 2.5, 1.7
-    fitting = [u for u, scale in METRES_PER_UNIT.items() if low <= height * scale <= high]
-    if not fitting:
+def check_height(height: float, units: str) -> None:
+    """Refuse a stated height that is no person's, or that comes beside stated units.
+
+    Raises:
+        InputError: naming the option.
+    """
+    tallest = 2.6  # metres; the tallest person measured so far was 2.72 m, and a height in feet is 4 and more
+    if not 0.4 <= height <= tallest:
         raise InputError(
-            "scan: size",
-            expected=f"a person {low} to {high} m high in {', '.join(METRES_PER_UNIT)}",
-            received=f"{height:.4g} from head to foot",
-            remedy="give a scan of a whole person, without stray geometry, and state its units with --units",
+            "option height",
+            expected=f"a person's height in metres, 0.4 to {tallest}",
+            received=f"{height:g}",
+            remedy="1.75 is one metre and 75 centimetres",
         )
-    return min(fitting, key=lambda u: abs(np.log(height * METRES_PER_UNIT[u] / usual)))
+    if units not in (AUTO, "m"):
+        raise InputError("option height", expected="units or a height", received=f"both: units {units}")
+
+
+def _without_strays(values: np.ndarray) -> np.ndarray:
+    """Return coordinates without those that lie off the rest by more than a tenth of it, as stray geometry does."""
+    ordered = np.sort(values)
+    low, high = np.searchsorted(ordered, np.quantile(ordered, (0.001, 0.999)))
+    reach = 0.1 * (ordered[high] - ordered[low])
+    return ordered[(ordered >= ordered[low] - reach) & (ordered <= ordered[high] + reach)]
+
+
+def _refuse_normalised(heights: np.ndarray) -> None:
+    """Refuse a scan that reaches from -1 to 1 exactly: data sets are scaled so, and nobody stands 1 m in the floor."""
+    if abs(heights.min() + 1.0) < 1e-3 and abs(heights.max() - 1.0) < 1e-3:
+        raise _no_size("2 from head to foot, from -1 to 1: scaled data, whose unit is lost", 2.0)
+
+
+def _units(height: float) -> str:
+    # Bounds of neighbouring units do not overlap, so that at most one fits.
+    for unit, scale in METRES_PER_UNIT.items():
+        if _LOW <= height * scale <= _HIGH:
+            return unit
+    raise _no_size(f"{height:.4g} from head to foot", height)
+
+
+def _no_size(received: str, size: float) -> InputError:
+    return InputError(
+        "scan: size",
+        expected=f"a person {_LOW} to {_HIGH} m high in {', '.join(METRES_PER_UNIT)}",
+        received=received,
+        remedy=f"{sizes_by_unit(size)}: state which it is with --units, or the person's stature in metres with "
+        "--height 1.75; check for stray geometry and half a person",
+    )
 
 
 def _cost(surface: SurfacePoints, bodies: _Bodies, up: str) -> float:

@@ -59,3 +59,40 @@ def test_no_surface_is_refused(person):
 def test_a_leaning_person_is_upright_enough(person):
     lean = matrix_from_rotvec(np.radians([15.0, 0.0, 5.0]))
     assert find_scan_frame(person.vertices @ lean.T, person.faces).up == "y"
+
+
+# --- sizes in no unit ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1.0, 989.0, 20.0])
+def test_a_size_in_no_unit_is_asked_about(person, size):
+    """989 voxels were taken for millimetres, and a person scaled to 1 for one of a metre, without a word."""
+    scaled = person.vertices / np.ptp(person.vertices[:, 1]) * size
+    with pytest.raises(
+        InputError, match=rf"received {size:g} from head.*{size:g} mm \({size / 1000:.3g} m\).*--height"
+    ):
+        find_scan_frame(scaled, person.faces, up="y")
+
+
+def test_data_scaled_to_minus_one_and_one_is_asked_about(person):
+    low, high = person.vertices[:, 1].min(), person.vertices[:, 1].max()
+    scaled = (person.vertices - [0, 0.5 * (low + high), 0]) * 2.0 / (high - low)
+    with pytest.raises(InputError, match="from -1 to 1"):
+        find_scan_frame(scaled, person.faces, up="y")
+    assert find_scan_frame(scaled, person.faces, units="m", up="y").units == "m"
+    assert find_scan_frame(scaled + [0, 1, 0], person.faces, up="y").units == "m"  # who stands on the floor is 2 m high
+
+
+def test_a_stated_height_gives_the_scale_whatever_lies_around(person):
+    vertices = np.concatenate([person.vertices * 7.0, [[0, 1e4, 0]]])
+    faces = np.concatenate([person.faces, [[len(vertices) - 1] * 2 + [0]]])
+    found = find_scan_frame(vertices, faces, up="y", height=1.75)
+    assert isinstance(found.units, float) and found.up == "y" and "stated height 1.75 m" in found.note
+    metres = convert_points(person.vertices * 7.0, units=found.units, up=found.up)
+    assert np.ptp(metres[:, 1]) == pytest.approx(1.75)
+
+
+@pytest.mark.parametrize(("height", "units", "words"), [(175.0, "auto", "175"), (1.75, "cm", "both: units cm")])
+def test_heights_that_are_none_are_refused(person, height, units, words):
+    with pytest.raises(InputError, match=f"option height.*{words}"):
+        find_scan_frame(person.vertices, person.faces, units=units, height=height)

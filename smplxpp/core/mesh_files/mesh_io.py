@@ -1,4 +1,4 @@
-"""Read mesh files (PLY, OBJ, glTF, STL, OFF, npz, pickle) and write PLY.
+"""Read mesh files (PLY, OBJ, glTF, STL, OFF, FBX, npz, pickle) and write PLY.
 
 Nothing is merged, split, reordered or repaired on reading, so that labels in a second file stay valid. Vertices and
 faces are those of the file, except that a polygon becomes a fan of triangles in its place.
@@ -18,6 +18,7 @@ from jaxtyping import UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import as_numbers, atomic_write_bytes, read_arrays, regular_file
 from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
+from smplxpp.core.mesh_files.fbx_file import read_fbx
 from smplxpp.core.mesh_files.gltf_file import read_gltf
 from smplxpp.core.mesh_files.obj_file import read_obj
 from smplxpp.core.mesh_files.ply_file import read_ply
@@ -131,6 +132,7 @@ _READERS = {
     ".gltf": read_gltf,
     ".stl": read_stl,
     ".off": read_off,
+    ".fbx": read_fbx,
     ".npz": _read_npz,
     ".pkl": _read_pickle,
 }
