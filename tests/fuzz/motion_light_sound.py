@@ -12,7 +12,8 @@ from smplxpp.body import load_body
 from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.retarget import Skeleton
 from smplxpp.core.files.panorama_file import read_panorama
-from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
+from smplxpp.core.files.sound_file import read_sound
+from smplxpp.core.files.wave_file import Sound, wave_bytes
 from smplxpp.core.light import Irradiance
 from smplxpp.core.params import BodyParams
 from smplxpp.export.bvh import write_bvh
@@ -87,7 +88,7 @@ def sound_doors() -> list[Door]:
         Door(
             f"sound {kind}",
             lambda folder, data=data: (folder / "x.wav").write_bytes(data),
-            lambda folder: read_wave(folder / "x.wav").at_rate(8000),
+            lambda folder: read_sound(folder / "x.wav").at_rate(8000),
         )
         for kind, data in (("integers", wave_bytes(Sound(samples, 16_000))), ("floats", stereo))
     ]

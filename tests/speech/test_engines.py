@@ -9,8 +9,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from avatar.driving import hear
 from avatar.speech import articulate
-from avatar.speech.forced_alignment import align, force_align, load_recogniser
+from avatar.speech.forced_alignment import NotEnglishError, align, force_align, load_recogniser
 from avatar.speech.phonemes import BILABIALS, SILENCE, VOWELS
 from avatar.speech.pronunciation import pronounce
 from avatar.speech.voice import PiperVoice, _symbols
@@ -137,6 +138,33 @@ def test_a_voice_whose_stops_are_zeros_is_aligned(recogniser):
         sound, truth = espeak.say(text, "en-gb-x-rp", 130, 30)
         found = align(sound, text, recogniser=decoder)
         assert np.abs(starts_apart(truth, found)).mean() < 0.04
+
+
+def test_words_come_with_their_times(spoken, recogniser):
+    """The words of a text lie where the voice said them."""
+    found = align(spoken.sound, TEXT)
+    assert found.transcript == TEXT.lower().rstrip(".")
+    assert all(one.end <= other.start + 1e-6 for one, other in pairwise(found.words))
+    storm = found.words[-1]
+    truth = [one for one in spoken.speech.spoken if one.name == "S"][-1].start
+    assert abs(storm.start - truth) < 0.06 and storm.end <= found.seconds
+
+
+def test_another_language_is_said_and_followed_by_its_sounds(spoken, recogniser, tmp_path):
+    """Speech played backwards has sounds and no words of English; words were laid over it without a remark."""
+    backwards = Sound(spoken.sound.samples[::-1].copy(), spoken.sound.rate)
+    with pytest.raises(NotEnglishError, match=r"words that match its sounds by .*--hear sounds"):
+        align(backwards)
+    (tmp_path / "a.wav").write_bytes(wave_bytes(backwards))
+    heard = hear(audio=tmp_path / "a.wav")
+    assert "does not sound like English" in heard.notes[0]
+    assert not heard.speech.words and heard.speech == hear(audio=tmp_path / "a.wav", follow="sounds").speech
+    # Who asks for words gets them, with a doubt.
+    forced = hear(audio=tmp_path / "a.wav", follow="words")
+    assert forced.speech.words and "hardly match" in forced.notes[0]
+    (tmp_path / "b.wav").write_bytes(wave_bytes(spoken.sound))
+    plain = hear(audio=tmp_path / "b.wav")
+    assert plain.notes == [] and "umbrella before the big storm" in plain.speech.transcript
 
 
 def test_silence_and_a_blip_are_refused(recogniser):

@@ -17,7 +17,10 @@ from smplxpp.core.files.paths import read_bytes
 # Codes of the sample format in a WAV file; an extensible header holds the code in its second part.
 _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
 _EXPECTED = "a WAV file (RIFF): integers of 8, 16, 24 or 32 bits, or floats"
-_REMEDY = "`ffmpeg -i INPUT -ac 1 -ar 16000 speech.wav` makes one of any recording"
+REMEDY = "`ffmpeg -i INPUT -ac 1 -ar 16000 speech.wav` makes one of any recording"
+"""What helps where a recording cannot be read."""
+MAX_BYTES = 1 << 30
+"""Size from which a sound file is refused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,14 +59,18 @@ def read_wave(path: str | Path) -> Sound:
     Raises:
         InputError: missing, damaged or foreign; a coding other than integers and floats; NaN.
     """
-    max_bytes, (lowest_rate, highest_rate), max_channels = 1 << 30, (4000, 384_000), 64
+    return sound_of_wave(read_bytes(path, subject="sound", most=MAX_BYTES), path)
+
+
+def sound_of_wave(data: bytes, path: str | Path) -> Sound:
+    """Return the sound in the bytes of a WAV file as `read_wave` does; `path` names it in errors."""
+    (lowest_rate, highest_rate), max_channels = (4000, 384_000), 64
     subject = f"sound {path}"
-    data = read_bytes(path, subject="sound", most=max_bytes)
     if data[:4] != b"RIFF" or data[8:12] != b"WAVE":
-        raise InputError(subject, expected=_EXPECTED, received="another kind of file", remedy=_REMEDY)
+        raise InputError(subject, expected=_EXPECTED, received="another kind of file", remedy=REMEDY)
     chunks = _chunks(data)
     if len(chunks.get(b"fmt ", b"")) < 16 or b"data" not in chunks:
-        raise InputError(subject, expected=_EXPECTED, received="no description or no samples", remedy=_REMEDY)
+        raise InputError(subject, expected=_EXPECTED, received="no description or no samples", remedy=REMEDY)
     # Format header: sample format, channels, rate, bytes per second, bytes per block, bits per sample.
     kind, channels, rate, _, block, bits = struct.unpack("<HHIIHH", chunks[b"fmt "][:16])
     # WAVE_FORMAT_EXTENSIBLE keeps the true code in the first two bytes of its GUID, at byte 24.
@@ -71,7 +78,7 @@ def read_wave(path: str | Path) -> Sound:
         (kind,) = struct.unpack("<H", chunks[b"fmt "][24:26])
     known = (kind == _PCM and bits in (8, 16, 24, 32)) or (kind == _FLOAT and bits in (32, 64))
     if not known:
-        raise InputError(subject, expected=_EXPECTED, received=f"coding {kind} of {bits} bits", remedy=_REMEDY)
+        raise InputError(subject, expected=_EXPECTED, received=f"coding {kind} of {bits} bits", remedy=REMEDY)
     if not (1 <= channels <= max_channels and lowest_rate <= rate <= highest_rate and block == channels * bits // 8):
         raise InputError(
             subject,
