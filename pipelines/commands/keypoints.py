@@ -40,7 +40,8 @@ class KeypointsConvert:
     def run(self) -> dict:
         """Convert the files and return the number of frames and points for each camera."""
         from smplxpp.capture import open_capture
-        from smplxpp.capture.keypoint_files import KeypointFiles, KeypointOptions, find_places
+        from smplxpp.capture.keypoint_files import KeypointOptions
+        from smplxpp.capture.keypoint_places import KeypointFiles, find_places
         from smplxpp.capture.writers.arrays import write_keypoints
 
         if not self.input.is_dir():

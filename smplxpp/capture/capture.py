@@ -298,6 +298,10 @@ class Capture:
         # From pixels of the file (distorted, full size) to those of the shown image.
         return shown_keypoints(found, full, self.windows[camera], self.recording.distortions.get(camera))
 
+    def keypoint_notes(self) -> tuple[str, ...]:
+        """Return sentences about the people in view and whose keypoints were taken."""
+        return () if self.recording.keypoints is None else self.recording.keypoints.notes()
+
     def truth_mesh(self, frame: int) -> TriangleMesh | None:
         """Return the true surface of a frame as the images show it; None if the data set has none."""
         return None if self.recording.meshes is None else self.recording.meshes.read(frame)

@@ -6,14 +6,14 @@ Keypoints are one file of all frames or a folder with a file for each frame; doc
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
-from smplxpp.capture.files import subfolders
+from smplxpp.capture.keypoint_order import body_25_order
 from smplxpp.capture.keypoint_people import (
     Person,
     chosen_person,
@@ -29,7 +29,8 @@ from smplxpp.core.files.safe_pickle import safe_npz
 
 KeypointFormat = Literal["auto", "simple", "openpose", "openpose-25b", "easymocap", "mmpose", "coco", "mediapipe"]
 _HOLISTIC = ("pose", "face", "left_hand", "right_hand")
-_SUFFIXES = (".npz", ".json")
+_SAMPLED = 40  # files of a camera that tell the order of OpenPose's 25 points
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class KeypointOptions:
     """Options for reading files of detected keypoints.
 
     Attributes:
-        format: "auto" recognises the format by the content, except OpenPose's BODY_25B, which has as many points as
-            BODY_25 and must be named `openpose-25b`.
+        format: "auto" recognises the format by the content; OpenPose's BODY_25B, which has as many points as BODY_25,
+            by the size of the face.
         person: id of the person in the file, else the index in its list; None: in each frame the person with the
             greatest sum of confidences.
         size: width and height of the images, for MediaPipe's normalised coordinates.
@@ -66,8 +67,27 @@ def read_keypoints(path: str | Path, options: KeypointOptions | None = None) -> 
         InputError: no file, a damaged file, an unknown layout, or another number of points than the layout has.
     """
     path, options = Path(path), options or KeypointOptions()
+    return _named_errors(path, lambda: _read(path, options))
+
+
+def read_people(path: str | Path, options: KeypointOptions | None = None) -> dict[int, list[Person]]:
+    """Read all people of one camera by frame, in pixels of the images on disk, centres at +0.5.
+
+    Args:
+        path: as `read_keypoints`, but no npz of this project, which has one person.
+        options: format and image size; `person` and `first_frame` are not applied.
+
+    Raises:
+        InputError: as `read_keypoints`.
+    """
+    path, options = Path(path), options or KeypointOptions()
+    return _named_errors(path, lambda: _people(path, options))
+
+
+def _named_errors(path: Path, read: Callable[[], T]) -> T:
+    """Turn what a broken layout raises into an error that names the file."""
     try:
-        return _read(path, options)
+        return read()
     except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
@@ -78,101 +98,81 @@ def read_keypoints(path: str | Path, options: KeypointOptions | None = None) -> 
         ) from None
 
 
-@dataclass(frozen=True, eq=False)
-class KeypointFiles:
-    """Keypoint files by camera, read on request.
-
-    Attributes:
-        places: file or folder of each camera with keypoints.
-        options: options for reading.
-        sizes: width and height of each camera's images on disk.
-    """
-
-    places: Mapping[str, Path]
-    options: KeypointOptions = field(default_factory=KeypointOptions)
-    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-
-    def cameras(self) -> tuple[str, ...]:
-        """Return the names of the cameras with keypoints."""
-        return tuple(self.places)
-
-    def read(self, camera: str) -> Keypoints2D | None:
-        """Read the keypoints of a camera, None without any.
-
-        Raises:
-            InputError: as `read_keypoints`.
-        """
-        if camera not in self.places:
-            return None
-        o = self.options
-        size = self.sizes.get(camera, o.size)
-        return read_keypoints(self.places[camera], KeypointOptions(o.format, o.person, size, o.first_frame))
-
-
-def find_places(folder: Path, cameras: Iterable[str] | None = None) -> dict[str, Path]:
-    """Find the keypoints of each camera: the folder of its name, or the file (`CAM.npz`, `CAM.json`, `CAM_more.json`,
-    `results_CAM.json`).
-
-    Args:
-        folder: folder with a file or a folder for each camera.
-        cameras: names of the cameras; None: every file and every folder belongs to a camera.
-    """
-    # A folder of the camera's name wins over files, since OpenPose writes a file a frame.
-    inside = set(subfolders(folder))
-    files = sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in _SUFFIXES)
-    if cameras is None:
-        return {name: folder / name for name in sorted(inside)} | {_camera_of(path): path for path in files}
-    found: dict[str, Path] = {}
-    for camera in cameras:
-        if camera in inside:
-            found[camera] = folder / camera
-            continue
-        # "cam1" must not match the file of "cam10": no digit may follow the name.
-        own = [path for path in files if re.match(rf"(results_)?{re.escape(camera)}(?!\d)", path.stem)]
-        # Prefer the exact name, then the shortest: additions such as dates make names longer.
-        own.sort(key=lambda path: (_camera_of(path) != camera, len(path.stem)))
-        if own:
-            found[camera] = own[0]
-    return found
-
-
-def _camera_of(path: Path) -> str:
-    return path.stem.removeprefix("results_").removesuffix("_keypoints")
-
-
 def _read(path: Path, options: KeypointOptions) -> Keypoints2D:
     # An npz of our own layout has names; otherwise it holds MediaPipe's arrays.
-    if path.suffix.lower() == ".npz" and path.is_file():
+    if path.suffix.lower() == ".npz" and path.is_file() and options.format in ("auto", "simple"):
         arrays = safe_npz(path)
-        if "joint_names" in arrays and options.format in ("auto", "simple"):
+        if "joint_names" in arrays:
             return _own_layout(arrays, path)
-        frames = dict(_mediapipe_arrays(arrays, path, options))
+    frames = _people(path, options)
+    # One person a frame; by id if the user names one, else the most confident.
+    chosen = {number: chosen_person(people, options.person) for number, people in frames.items()}
+    if options.person is not None and not any(chosen.values()):
+        ids = sorted({-1 if one.id is None else one.id for people in frames.values() for one in people})
+        raise InputError("--person", expected=f"one of the ids {ids[:12]}, or a place", received=str(options.person))
+    return joined(chosen, options.first_frame)
+
+
+def _people(path: Path, options: KeypointOptions) -> dict[int, list[Person]]:
+    """Read the people of all frames."""
+    frames: dict[int, list[Person]] = {}
+    if options.format == "auto":
+        options = replace(options, format=_order_of(path))
+    if path.suffix.lower() == ".npz" and path.is_file():
+        frames = dict(_mediapipe_arrays(safe_npz(path), path, options))
     elif path.is_dir():
-        frames = {}
-        # A folder with a file a frame: the last number of the name is the frame (`CAM_000012_keypoints.json`).
-        files = {_last_number(p): p for p in sorted(path.iterdir()) if p.suffix.lower() == ".json"}
+        files = frame_files(path)
         for number in sorted(files):
             frames.update(_frames(read_json(files[number]), number, options, source=f"file {files[number]}"))
     elif path.is_file():
         frames = dict(_frames(read_json(path), 0, options, source=f"file {path}"))
-    else:
-        frames = {}
     if not frames:
         raise InputError(
             f"keypoints {path}",
             expected="an npz or JSON file, or a folder of JSON files with a number each",
             received="nothing of the kind" if path.exists() else "no such file",
         )
-    return _joined(frames, options)
+    return frames
 
 
-def _joined(frames: Mapping[int, list[Person]], options: KeypointOptions) -> Keypoints2D:
+def frame_files(folder: Path) -> dict[int, Path]:
+    """Return the JSON files of a folder by frame, the last number of the name (`CAM_000012_keypoints.json`)."""
+    return {_last_number(p): p for p in sorted(folder.iterdir()) if p.suffix.lower() == ".json"}
+
+
+def _order_of(path: Path) -> KeypointFormat:
+    """Return OpenPose's format where 25 points tell their order, else "auto".
+
+    Raises:
+        InputError: lists of 25 points whose order people do not tell.
+    """
+    told = body_25_order(sampled_people(path))
+    if told == "unclear":
+        raise InputError(
+            f"keypoints {path}",
+            expected="25 points of which the face tells whether they are BODY_25 or BODY_25B",
+            received="no face, or one of the same size in both orders",
+            remedy="name the order: smplxpp keypoints convert --format openpose (BODY_25) or openpose-25b",
+        )
+    return "auto" if told == "none" else told
+
+
+def sampled_people(path: Path) -> Iterator[Any]:
+    """Yield `pose_keypoints_2d` of the people in evenly spread files; nothing for files of other formats."""
+    if path.suffix.lower() == ".npz":
+        return
+    files = list(frame_files(path).values()) if path.is_dir() else [path] if path.is_file() else []
+    for file in files[:: max(1, len(files) // _SAMPLED)]:
+        content = read_json(file)
+        people = content.get("people") if isinstance(content, Mapping) else None
+        for one in people if isinstance(people, list) else ():
+            numbers = one.get("pose_keypoints_2d") if isinstance(one, Mapping) else None
+            if isinstance(numbers, list):
+                yield numbers
+
+
+def joined(chosen: Mapping[int, Person | None], first_frame: int | None) -> Keypoints2D:
     """Join the chosen person of each frame into one table; frames without one are all 0."""
-    # One person a frame; by id if the user names one, else the most confident.
-    chosen = {number: chosen_person(people, options.person) for number, people in frames.items()}
-    if options.person is not None and not any(chosen.values()):
-        ids = sorted({-1 if one.id is None else one.id for people in frames.values() for one in people})
-        raise InputError("--person", expected=f"one of the ids {ids[:12]}, or a place", received=str(options.person))
     # Detectors may leave points out, so that the columns are the union of all names in order of first appearance.
     names = tuple(dict.fromkeys(name for one in chosen.values() if one is not None for name in one.points))
     numbers, column = sorted(chosen), {name: k for k, name in enumerate(names)}
@@ -183,7 +183,7 @@ def _joined(frames: Mapping[int, list[Person]], options: KeypointOptions) -> Key
         for name, point in one.points.items() if one is not None else ():
             table[row, column[name]] = point
     # The numbers of files may start anywhere; `first_frame` says which frame of the capture the first one is.
-    shift = 0 if options.first_frame is None else options.first_frame - numbers[0]
+    shift = 0 if first_frame is None else first_frame - numbers[0]
     return Keypoints2D(names, np.array(numbers, dtype=np.int64) + shift, table[..., :2], table[..., 2])
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.capture.distortion import Distortion
-from smplxpp.capture.keypoint_files import KeypointFiles, KeypointFormat, KeypointOptions, find_places
+from smplxpp.capture.keypoint_files import KeypointFormat, KeypointOptions
+from smplxpp.capture.keypoint_places import KeypointFiles, find_places
 from smplxpp.capture.recording import Recording
 from smplxpp.capture.window import Window
 from smplxpp.core import Camera, InputError, Keypoints2D

@@ -57,8 +57,14 @@ class KeypointSource(Protocol):
     def cameras(self) -> tuple[str, ...]:
         """Return the names of the cameras with keypoints."""
 
+    def frames(self) -> tuple[int, ...]:
+        """Return the frames with keypoints in any camera."""
+
     def read(self, camera: str) -> Keypoints2D | None:
         """Read the keypoints of a camera in pixels of the images on disk; None without any."""
+
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences about the people in view and who was taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +139,10 @@ class Recording:
         return self.files.get(kind, {}).get(camera)
 
     def frames(self) -> tuple[int, ...]:
-        """Return all frames with an image in any camera; without any image, those with parameters."""
+        """Return all frames with an image in any camera; without any image, those with parameters, else keypoints."""
         images = [series.numbers for series in self.files.get("image", {}).values()]
         if images:
             return tuple(np.unique(np.concatenate(images)).tolist())
-        return () if self.params is None else tuple(self.params.frames().tolist())
+        if self.params is not None:
+            return tuple(self.params.frames().tolist())
+        return () if self.keypoints is None else self.keypoints.frames()

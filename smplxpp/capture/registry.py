@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from smplxpp.body import BodyModel
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.keypoint_files import KeypointOptions
+from smplxpp.capture.keypoint_places import KeypointFiles
 from smplxpp.capture.keypoints import with_keypoints
 from smplxpp.capture.masks import with_masks
 from smplxpp.capture.problems import lens_problems
@@ -19,16 +22,20 @@ from smplxpp.capture.readers import (
     dress4d,
     easymocap,
     neus2,
+    rig,
     simple,
     talkbody4d,
     thuman4,
 )
-from smplxpp.capture.readers.common import ReaderOptions
+from smplxpp.capture.readers.common import ReaderOptions, RigOptions
+from smplxpp.capture.recording import Recording
 from smplxpp.capture.splits import Splits
+from smplxpp.capture.subject import SubjectKeypoints
+from smplxpp.capture.views import read_alpha
 from smplxpp.capture.window import Window
 from smplxpp.core import InputError, require_choice
 
-_MODULES = (simple, actorshq, talkbody4d, avatarrex, thuman4, dress4d, neus2, easymocap, colmap)
+_MODULES = (simple, actorshq, talkbody4d, avatarrex, thuman4, dress4d, neus2, easymocap, colmap, rig)
 READERS = {reader.NAME: reader for reader in _MODULES}
 FORMATS: tuple[str, ...] = tuple(READERS)
 
@@ -41,6 +48,8 @@ def open_capture(
     params: str | Path | None = None,
     keypoints: str | Path | None = None,
     person: int | None = None,
+    subject: int | None = None,
+    rig: RigOptions | None = None,
     body: BodyModel | None = None,
     hold_out_every: int | None = None,
     protocol: str | None = None,
@@ -55,7 +64,10 @@ def open_capture(
         params: body parameters that replace the capture's (such as a tracker's).
         keypoints: folder of keypoints that replace the capture's, with a file or a folder for each camera in a layout
             of docs/captures.md.
-        person: person whose keypoints are taken; None: in each frame the one of most confidence.
+        person: id in the files of the person whose keypoints are taken, in each view by itself; None: the subject.
+        subject: where several people are in view, the place of the one that is taken, in the order in which views agree
+            on them, by size and nearness to the middle (`smplxpp.capture.subject`); None: the first.
+        rig: calibration, unit and axes of a rig that has no layout of a data set.
         body: body model of the parameters, for layouts that rotate it about the origin; None: open body.
         hold_out_every: hold out every n-th training camera as a novel view.
         protocol: name of the capture's protocol whose files are read; `params` replaces its parameters.
@@ -77,7 +89,11 @@ def open_capture(
     if format is not None:
         require_choice("format of the capture", format, FORMATS)
     options = ReaderOptions(
-        params=None if params is None else Path(params), protocol=protocol, body=body, person=person
+        params=None if params is None else Path(params),
+        protocol=protocol,
+        body=body,
+        person=person,
+        rig=rig or RigOptions(),
     )
     try:
         recording = READERS[format or detect_format(root)].read(root, options)
@@ -96,11 +112,28 @@ def open_capture(
         recording = with_masks(recording, Path(masks))
     if keypoints is not None:
         recording = with_keypoints(recording, Path(keypoints), KeypointOptions(person=person))
+    if person is None:
+        recording = _with_subject(recording, subject)
     splits = recording.splits or Splits.all_train(recording.cameras, recording.frames())
     if hold_out_every is not None:
         splits = splits.hold_out_cameras(hold_out_every)
     windows = {name: Window.full(camera) for name, camera in recording.cameras.items()}
     return Capture(recording, splits, windows, ArrayCache(cache_bytes))
+
+
+def _with_subject(recording: Recording, subject: int | None) -> Recording:
+    """Return the recording with the keypoints of one person over all cameras and frames."""
+    files = recording.keypoints
+    if not isinstance(files, KeypointFiles):
+        return recording
+    masks = recording.files.get("mask", {})
+
+    def mask(camera: str, frame: int) -> np.ndarray | None:
+        path = masks[camera].path(frame) if camera in masks else None
+        return None if path is None else np.asarray(read_alpha(path))
+
+    chosen = SubjectKeypoints(files, recording.cameras, recording.distortions, subject, mask if masks else None)
+    return replace(recording, keypoints=chosen)
 
 
 def detect_format(path: str | Path) -> str:
@@ -111,6 +144,8 @@ def detect_format(path: str | Path) -> str:
     """
     root = Path(path)
     fitting = [name for name, reader in READERS.items() if reader.detect(root)]
+    # A calibration file alone makes a rig of any folder that no layout of a data set fits.
+    fitting = [name for name in fitting if name != rig.NAME] or fitting
     if len(fitting) == 1:
         return fitting[0]
     looked_for = "; ".join(f"{name}: {reader.LOOKS_FOR}" for name, reader in READERS.items())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,7 +16,7 @@ from smplxpp.body import BodyModel
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name
 from smplxpp.capture.recording import ParamSource
 from smplxpp.capture.sources import find_params
-from smplxpp.core import Camera, InputError
+from smplxpp.core import Camera, InputError, require_choice
 from smplxpp.core.files.image_file import image_size
 from smplxpp.core.files.json_file import as_integer, as_numbers
 from smplxpp.core.files.paths import check_name
@@ -30,13 +30,41 @@ class ReaderOptions:
         params: parameter file or folder that replaces the data set's own.
         protocol: name of the protocol whose files are read; None: no protocol.
         body: body model of the parameters; None: the open body.
-        person: person whose keypoints are taken; None: the one of most confidence.
+        person: id of the person whose keypoints are taken; None: the subject (`smplxpp.capture.subject`).
+        rig: calibration, unit and axes of a rig whose layout is not that of a data set.
     """
 
     params: Path | None = None
     protocol: str | None = None
     body: BodyModel | None = None
     person: int | None = None
+    rig: RigOptions = field(default_factory=lambda: RigOptions())
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """Options of a laboratory's rig (`smplxpp.capture.readers.rig`).
+
+    Attributes:
+        calibration: calibration file, or folder with one; None: looked for in the folder and beside it.
+        units: unit of the calibration's lengths (m, cm, mm, inch); None: that of its format, else guessed.
+        up: axis of its world that points up; None: that of its format, else what the pictures say.
+
+    Raises:
+        InputError: an unknown unit or axis, a path that does not exist.
+    """
+
+    calibration: Path | None = None
+    units: str | None = None
+    up: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.units is not None:
+            require_choice("--units", self.units, ("m", "cm", "mm", "inch"))
+        if self.up is not None:
+            require_choice("--up", self.up, ("x", "y", "z", "-x", "-y", "-z"))
+        if self.calibration is not None and not self.calibration.exists():
+            raise InputError("--calibration", expected="a file, or a folder with one", received=str(self.calibration))
 
 
 def pinhole(name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, opencv_pixels: bool = False) -> Camera:

@@ -1,0 +1,124 @@
+"""Calibrations of one file a camera, or of two files for all: OpenCap's pickles, OpenCV's YAML.
+
+A file stands for its whole rig: files of the same kind in its folder, or in the folders beside its own, belong to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smplxpp.capture.calibrations.file_camera import FileCamera, RigFile, entry, file_camera
+from smplxpp.capture.calibrations.opencv_yaml import read_opencv_yaml
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.safe_pickle import dense_array, safe_load
+
+# Names that OpenCV users give to the parts of a camera, the commonest first.
+_K = ("camera_matrix", "K", "cameraMatrix", "intrinsic_matrix", "intrinsics", "M")
+_DIST = ("distortion_coefficients", "dist_coeffs", "dist_coefs", "dist", "D", "distCoeffs", "distortion")
+_ROTATION = ("R", "rotation_matrix", "rotation", "rvec", "Rot", "rotation_vector")
+_TRANSLATION = ("T", "t", "tvec", "translation", "translation_vector")
+_POSE = ("extrinsics", "extrinsic", "RT", "Rt", "cam_from_world", "extrinsic_matrix")
+_WIDTH, _HEIGHT = ("image_width", "width", "w"), ("image_height", "height", "h")
+_OPENCAP_FILE = "cameraIntrinsicsExtrinsics.pickle"
+
+
+def is_opencap(content: Any) -> bool:
+    """Tell `intrinsicMat` with a rotation and a translation."""
+    return isinstance(content, Mapping) and {"intrinsicMat", "rotation", "translation"} <= set(content)
+
+
+def is_opencv_yaml(content: Any) -> bool:
+    """Tell a camera's intrinsics and pose in one file, or EasyMocap's pair (`names`)."""
+    if not isinstance(content, Mapping):
+        return False
+    return "names" in content or (_first(content, _K) is not None and _has_pose(content))
+
+
+def read_opencap(path: Path, content: Any) -> RigFile:
+    """OpenCap: `Videos/CAM/cameraIntrinsicsExtrinsics.pickle`, millimetres, the world of a standing checkerboard.
+
+    `x_cam = rotation X + translation`; y of the board points down. `imageSize` is height, width.
+    """
+    beside = sorted(path.parent.parent.glob(f"*/{_OPENCAP_FILE}")) if path.name == _OPENCAP_FILE else [path]
+    cameras = []
+    for file in beside or [path]:
+        found = content if file == path else safe_load(file)
+        source, name = f"calibration {file}", file.parent.name if len(beside) > 1 else path.stem
+        K, R, T = (
+            dense_array(entry(found, key, source=source), subject=f"{source}: {key}")
+            for key in ("intrinsicMat", "rotation", "translation")
+        )
+        dist, size = (
+            None if key not in found else dense_array(found[key], subject=f"{source}: {key}")
+            for key in ("distortion", "imageSize")
+        )
+        cameras.append(
+            file_camera(
+                name,
+                K,
+                R,
+                T,
+                source=source,
+                size=None if size is None or size.size != 2 else size.ravel()[::-1],
+                dist=() if dist is None else dist,
+            )
+        )
+    return RigFile(tuple(cameras), 1e-3, "-y")
+
+
+def read_opencv_cameras(path: Path, content: Any) -> RigFile:
+    """OpenCV's `FileStorage`: a file a camera, each with intrinsics and pose; or EasyMocap's intri.yml and extri.yml."""
+    if "names" in content:
+        return _read_pair(path)
+    cameras = []
+    for file in sorted(path.parent.glob(f"*{path.suffix}")):
+        found = content if file == path else read_opencv_yaml(file)
+        if "names" not in found and _first(found, _K) is not None and _has_pose(found):
+            cameras.append(_yaml_camera(file, found))
+    return RigFile(tuple(cameras))
+
+
+def _yaml_camera(path: Path, content: Mapping[str, Any]) -> FileCamera:
+    source = f"calibration {path}"
+    pose = _first(content, _POSE)
+    if pose is not None:
+        pose = np.asarray(pose, dtype=np.float64)
+        if pose.shape not in ((3, 4), (4, 4)):
+            raise InputError(f"{source}: pose", expected="shape (3, 4) or (4, 4)", received=f"{pose.shape}")
+        R, T = pose[:3, :3], pose[:3, 3]
+    else:
+        R, T = _first(content, _ROTATION), _first(content, _TRANSLATION)
+    sides = [_first(content, names) for names in (_WIDTH, _HEIGHT)]
+    size = content.get("image_size") if any(side is None for side in sides) else sides
+    dist = _first(content, _DIST)
+    return file_camera(
+        path.stem, _first(content, _K), R, T, source=source, size=size, dist=() if dist is None else dist
+    )
+
+
+def _read_pair(path: Path) -> RigFile:
+    """Read EasyMocap's two files: `K_CAM`, `dist_CAM`; `R_CAM` or `Rot_CAM`, `T_CAM`. Metres."""
+    intri, extri = (read_opencv_yaml(path.with_name(name)) for name in ("intri.yml", "extri.yml"))
+    source, cameras = f"calibration {path.with_name('intri.yml')}", []
+    for name in entry(intri, "names", source=source):
+        K, T = entry(intri, f"K_{name}", source=source), entry(extri, f"T_{name}", source=f"calibration {path}")
+        R = extri[f"R_{name}"] if f"R_{name}" in extri else entry(extri, f"Rot_{name}", source=f"calibration {path}")
+        size = (intri.get(f"W_{name}", 0.0), intri.get(f"H_{name}", 0.0))
+        dist = intri.get(f"dist_{name}", intri.get(f"D_{name}", ()))
+        known = all(isinstance(side, float) and side >= 1 for side in size)
+        cameras.append(file_camera(name, K, R, T, source=source, size=size if known else None, dist=dist))
+    return RigFile(tuple(cameras), 1.0)
+
+
+def _first(content: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    return next((content[name] for name in names if name in content), None)
+
+
+def _has_pose(content: Mapping[str, Any]) -> bool:
+    return _first(content, _POSE) is not None or (
+        _first(content, _ROTATION) is not None and _first(content, _TRANSLATION) is not None
+    )

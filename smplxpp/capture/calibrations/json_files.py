@@ -1,0 +1,104 @@
+"""Calibrations in JSON of data sets: CMU Panoptic, Shelf and Campus, MVHumanNet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smplxpp.capture.calibrations.file_camera import FileCamera, RigFile, entry, file_camera, numbers_of
+from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import as_number, read_json
+from smplxpp.core.files.safe_pickle import safe_load
+
+# Kinds of cameras of the Panoptic studio, the preferred one first.
+_PANOPTIC_KINDS = ("hd", "vga", "kinect-color")
+
+
+def is_panoptic(content: Any) -> bool:
+    """Tell a list `cameras` whose entries have `distCoef` and `resolution`."""
+    listed = content.get("cameras") if isinstance(content, Mapping) else None
+    first = listed[0] if isinstance(listed, list) and listed else None
+    return isinstance(first, Mapping) and {"K", "R", "t", "distCoef", "resolution"} <= set(first)
+
+
+def is_shelf(content: Any) -> bool:
+    """Tell cameras by number with `fx`, `k`, `p` and a position `T`."""
+    return _all_entries(content, {"R", "T", "fx", "fy", "cx", "cy"})
+
+
+def is_mvhumannet(content: Any) -> bool:
+    """Tell cameras by image name with `camera_pos`, `rotation` and `translation`."""
+    return _all_entries(content, {"rotation", "translation", "camera_pos"})
+
+
+def _all_entries(content: Any, keys: set[str]) -> bool:
+    return (
+        isinstance(content, Mapping)
+        and bool(content)
+        and all(isinstance(one, Mapping) and keys <= set(one) for one in content.values())
+    )
+
+
+def read_panoptic(path: Path, content: Any) -> RigFile:
+    """CMU Panoptic: centimetres, y down. Of its kinds of cameras the HD cameras are read, else VGA, else Kinects.
+
+    `x_cam = R X + t` and OpenCV's five coefficients, as the toolbox's `projectPoints` has them.
+    """
+    source, cameras = f"calibration {path}", entry(content, "cameras", source=f"calibration {path}")
+    kinds = {str(one.get("type", "")) if isinstance(one, Mapping) else "" for one in cameras}
+    kind = next((name for name in _PANOPTIC_KINDS if name in kinds), None)
+    chosen = [one for one in cameras if kind is None or (isinstance(one, Mapping) and one.get("type") == kind)]
+    read = []
+    for one in chosen:
+        name = str(entry(one, "name", source=source))
+        K, R, t, size = (entry(one, key, source=f"{source}: camera {name}") for key in ("K", "R", "t", "resolution"))
+        read.append(file_camera(name, K, R, t, source=source, size=size, dist=one.get("distCoef", [])))
+    left = len(cameras) - len(chosen)
+    notes = (f"{left} cameras of other kinds than {kind} left out",) if left else ()
+    return RigFile(tuple(read), 0.01, "-y", notes)
+
+
+def read_shelf(path: Path, content: Any) -> RigFile:
+    """Shelf and Campus as VoxelPose and mmpose keep them: millimetres, z up; T is the position, `x_cam = R (X - T)`."""
+    source, cameras = f"calibration {path}", []
+    for key, one in content.items():
+        name = f"Camera{key}" if str(key).isdigit() else str(key)
+        fx, fy, cx, cy = (as_number(one[k], subject=f"{source}: camera {key}: {k}") for k in ("fx", "fy", "cx", "cy"))
+        R, position = (numbers_of(one[k], subject=f"{source}: camera {key}: {k}") for k in ("R", "T"))
+        k, p = (numbers_of(one.get(n, []), subject=f"{source}: camera {key}: {n}").ravel() for n in ("k", "p"))
+        if R.shape != (3, 3) or position.size != 3 or k.size not in (0, 3) or p.size not in (0, 2):
+            raise InputError(
+                f"{source}: camera {key}",
+                expected="R of 3 x 3 numbers, T of 3, k of 3, p of 2",
+                received=f"{R.shape}, {position.size}, {k.size}, {p.size}",
+            )
+        k, p = (np.pad(values, (0, count - values.size)) for values, count in ((k, 3), (p, 2)))
+        K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+        dist = (*k[:2], *p, k[2])
+        cameras.append(file_camera(name, K, R, -R @ position.ravel(), source=source, dist=dist))
+    return RigFile(tuple(cameras), 1e-3, "z")
+
+
+def read_mvhumannet(path: Path, content: Any) -> RigFile:
+    """MVHumanNet's `camera_extrinsics.json`: thousandths of a unit that `camera_scale.pkl` beside it gives in metres.
+
+    All cameras share `camera_intrinsics.json`. A name `1_CC32871A004.png` belongs to the images of `CC32871A004`.
+    """
+    source = f"calibration {path}"
+    beside = path.with_name("camera_intrinsics.json")
+    shared = read_json(
+        beside, subject="calibration", remedy="keep camera_intrinsics.json beside camera_extrinsics.json"
+    )
+    K, dist = (entry(shared, "intrinsics", source=f"calibration {beside}"), shared.get("dist", []))
+    scale_file = path.with_name("camera_scale.pkl")
+    scale = as_number(safe_load(scale_file), subject=f"file {scale_file}", least=1e-6) if scale_file.is_file() else None
+    cameras: list[FileCamera] = []
+    for key, one in content.items():
+        stem = key.rsplit(".", 1)[0]
+        name = stem.split("_", 1)[1] if stem.split("_", 1)[0].isdigit() and "_" in stem else stem
+        cameras.append(file_camera(name, K, one["rotation"], one["translation"], source=source, dist=dist))
+    notes = () if scale is not None else ("no camera_scale.pkl: the unit is guessed",)
+    return RigFile(tuple(cameras), None if scale is None else 1e-3 * scale, None, notes)

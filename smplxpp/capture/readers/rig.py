@@ -1,0 +1,184 @@
+"""Read a laboratory's rig: a calibration of any known tool, and beside it keypoints, images or videos, one folder or file
+a camera, under any spelling of the cameras' names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from smplxpp.capture.calibrations import find_calibration, read_calibration
+from smplxpp.capture.calibrations.names import matched_names
+from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, subfolders
+from smplxpp.capture.keypoint_files import KeypointOptions
+from smplxpp.capture.keypoint_places import KeypointFiles, find_places
+from smplxpp.capture.readers.common import ReaderOptions, chosen_params
+from smplxpp.capture.recording import Problem, Recording
+from smplxpp.core import InputError
+from smplxpp.core.files.image_file import image_size
+
+NAME = "rig"
+LOOKS_FOR = "a calibration of a known tool, there or beside it, with keypoints, images or videos of its cameras"
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".mpg", ".mpeg")
+# Where tools put keypoints, images, masks and videos; the first folder that holds something of the cameras is taken.
+_KEYPOINTS = ("keypoints", "pose-associated", "pose-sync", "pose", "poses", "openpose", "json", ".")
+_IMAGES = ("rgbs", "images", "imgs", "images_lr", "hdImgs", "frames", ".")
+_MASKS = ("masks", "mask", "fmask_lr", "fmask", "mattes")
+_VIDEOS = ("videos", "video", "recordings", "synchronized_videos", "hdVideos", ".")
+_PARENTS = 2  # folders above in which a session's calibration is looked for
+# The last number of a name is the frame: `cam01_000012.jpg`, `0005_img.jpg`.
+_NUMBERED = rf"(?:.*\D)?(?P<frame>\d+)\D*\.(?i:{'|'.join(suffix[1:] for suffix in IMAGE_SUFFIXES)})"
+
+
+@dataclass(frozen=True, eq=False)
+class RigFiles:
+    """Files of a rig by the names of its calibration.
+
+    Attributes:
+        calibration: path of the calibration.
+        keypoints: file or folder of each camera.
+        images: images of each camera.
+        masks: masks of each camera.
+        videos: video of each camera.
+    """
+
+    calibration: Path
+    keypoints: Mapping[str, Path] = field(default_factory=dict)
+    images: Mapping[str, FileSeries] = field(default_factory=dict)
+    masks: Mapping[str, FileSeries] = field(default_factory=dict)
+    videos: Mapping[str, Path] = field(default_factory=dict)
+
+
+def detect(root: Path) -> bool:
+    """Tell whether a calibration is found, and videos, or keypoints or images in folders of cameras."""
+    calibration = _calibration_near(root)
+    if calibration is None:
+        return False
+    try:
+        names = list(read_calibration(calibration).cameras)
+    except InputError:
+        return calibration.parent == root  # its error says more than that no layout fits
+    return any((find_keypoints(root, names), find_series(root, names, _IMAGES), find_videos(root, names)))
+
+
+def read(root: Path, options: ReaderOptions) -> Recording:
+    """Find the files of a rig. Videos are named by a note: `smplxpp capture convert` decodes them.
+
+    Raises:
+        InputError: no calibration, or nothing of its cameras.
+    """
+    calibration = options.rig.calibration or _calibration_near(root)
+    if calibration is None:
+        raise InputError(
+            f"rig {root}",
+            expected="a calibration in the folder, in one whose name has `calib`, or beside it",
+            received=", ".join(sorted(path.name for path in root.iterdir())[:8]) or "nothing",
+            remedy="name it with --calibration",
+        )
+    calibrated = read_calibration(calibration, units=options.rig.units, up=options.rig.up)
+    names = list(calibrated.cameras)
+    images, videos = find_series(root, names, _IMAGES), find_videos(root, names)
+    places, masks = find_keypoints(root, names), find_series(root, names, _MASKS)
+    if not (places or images or videos):
+        raise InputError(
+            f"rig {root}",
+            expected=f"keypoints, images or videos whose names tell the cameras {', '.join(names[:6])}",
+            received=", ".join(sorted(path.name for path in root.iterdir())[:8]) or "nothing",
+        )
+    if images:
+        # The images may have another resolution than the calibration's.
+        sizes = {name: image_size(series.required(int(series.numbers[0]))) for name, series in images.items()}
+        calibrated = read_calibration(calibration, units=options.rig.units, up=options.rig.up, sizes=sizes)
+    notes = [f"calibration {calibrated.path.name} ({calibrated.format}): {note}" for note in calibrated.notes]
+    if videos and not images:
+        notes.append(f"{len(videos)} videos, which `smplxpp capture convert` decodes to images")
+    for what, found in (("keypoints", places), ("images", images)):
+        missing = [name for name in names if name not in found]
+        if found and missing:
+            notes.append(f"no {what} of the cameras {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
+    cameras = calibrated.cameras
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+    return Recording(
+        name=root.name,
+        root=root,
+        format=NAME,
+        cameras=cameras,
+        distortions=calibrated.distortions,
+        files={"image": images, "mask": masks},
+        params=chosen_params(options),
+        keypoints=KeypointFiles(places, KeypointOptions(person=options.person), sizes) if places else None,
+        problems=tuple(Problem(note) for note in notes),
+    )
+
+
+def rig_files(root: Path, options: ReaderOptions) -> RigFiles:
+    """Find the files of a rig without reading them.
+
+    Raises:
+        InputError: no calibration.
+    """
+    recording = read(root, options)
+    names = list(recording.cameras)
+    calibration = options.rig.calibration or _calibration_near(root)
+    assert calibration is not None  # `read` refuses a rig without one
+    return RigFiles(
+        calibration,
+        find_keypoints(root, names),
+        recording.files["image"],
+        recording.files["mask"],
+        find_videos(root, names),
+    )
+
+
+def find_keypoints(root: Path, names: list[str]) -> dict[str, Path]:
+    """Return the keypoints of each camera in the first folder that has those of two cameras."""
+
+    def there(folder: Path) -> dict[str, Path]:
+        found = find_places(folder, names)
+        return {name: path for name, path in found.items() if path.is_file() or any(path.glob("*.json"))}
+
+    return _first(root, _KEYPOINTS, there)
+
+
+def find_series(root: Path, names: list[str], folders: tuple[str, ...]) -> dict[str, FileSeries]:
+    """Return the numbered images of each camera in the first folder that has those of two cameras."""
+
+    def there(folder: Path) -> dict[str, FileSeries]:
+        matched = matched_names(names, subfolders(folder))
+        found = {name: FileSeries.find(folder / inside, _NUMBERED) for name, inside in matched.items()}
+        return {name: series for name, series in found.items() if len(series)}
+
+    return _first(root, folders, there)
+
+
+def find_videos(root: Path, names: list[str]) -> dict[str, Path]:
+    """Return the video of each camera in the first folder that has those of two cameras."""
+
+    def there(folder: Path) -> dict[str, Path]:
+        files = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()}
+        return {name: files[stem] for name, stem in matched_names(names, list(files)).items()}
+
+    return _first(root, _VIDEOS, there)
+
+
+def _first(root: Path, folders: tuple[str, ...], there: Callable[[Path], dict]) -> dict:
+    """Return what the first of some folders holds of at least two cameras; nothing without one."""
+    for name in folders:
+        folder = root / name
+        if folder.is_dir() and len(found := there(folder)) >= 2:
+            return found
+    return {}
+
+
+def _calibration_near(root: Path) -> Path | None:
+    """Return the calibration in a folder, in its folders with `calib` in the name, or in those of the folders above."""
+    found = find_calibration(root)
+    if found is not None:
+        return found
+    for folder in (root, *list(root.parents)[:_PARENTS]):
+        for name in subfolders(folder):
+            if re.search("calib", name, re.IGNORECASE) and (found := find_calibration(folder / name)) is not None:
+                return found
+    # Some tools keep it beside the takes.
+    return next((f for folder in list(root.parents)[:1] if (f := find_calibration(folder)) is not None), None)
