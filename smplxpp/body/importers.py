@@ -12,6 +12,7 @@ import numpy as np
 
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
+from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise, without_holes
 from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.files.json_file import read_json
@@ -65,14 +66,15 @@ def load_params(
         flat_hand_mean: overrides what the layout implies (see `BodyParams`).
         max_betas: number of betas to keep, for a body that has no more; None keeps all.
         holes: takes the frames of a file of several that hold NaN or infinity; another frame stands in each of them.
-            None: they are refused.
+            None: they are refused, except frames that hold nothing at all, which are interpolated (`register` writes
+            them for frames that it was not asked for).
 
     Raises:
         InputError: nothing readable, an unknown or ambiguous layout, several people and none chosen, wrong shapes, or
             what the body refuses that is needed.
 
     Warns:
-        GeometryWarning: frames without the chosen person, which are left out; betas that are cut and not zero, with
+        GeometryWarning: frames that were interpolated; frames without the chosen person, which are left out; betas that are cut and not zero, with
             their share; what a layout has that is not read.
 
     Example:
@@ -94,6 +96,8 @@ def load_params(
         if holes is not None and len(files) == 1:
             content, empty = without_holes(content)
             holes += empty
+        elif len(files) == 1:
+            content = without_gaps(content, source=f"file {file}")
         frames = _read_content(content, name, person, f"file {file}")
         if frames:
             parts.append(frames)

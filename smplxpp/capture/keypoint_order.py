@@ -28,7 +28,7 @@ _LEAST_POINTS, _LEAST_LIMBS, _LEAST_CONFIDENCE = 3, 4, 0.05
 _MOST_PEOPLE = 400  # people that are looked at; the median over them decides
 
 Body25 = Literal["openpose", "openpose-25b", "unclear", "none"]
-"""The order of 25 points: the name of its format; "unclear" where people do not tell; "none" without such people."""
+"""The order of 25 points: the name of its format; "unclear" where both orders make people of like sizes; "none" without people of whom enough is seen."""
 
 
 def body_25_order(people: Iterable[Any]) -> Body25:
@@ -37,20 +37,18 @@ def body_25_order(people: Iterable[Any]) -> Body25:
     Args:
         people: `pose_keypoints_2d` of people in any views and frames; lists of another length are ignored.
     """
-    ratios, seen = [], False
+    ratios: list[float] = []
     for numbers in people:
         points = np.asarray(numbers, dtype=np.float64).reshape(-1)
         if points.size != 75 or not np.isfinite(points).all():
             continue
-        seen = seen or bool((points[2::3] > _LEAST_CONFIDENCE).any())
         ratio = _size_ratio(points.reshape(25, 3))
         if ratio is not None:
             ratios.append(ratio)
         if len(ratios) >= _MOST_PEOPLE:
             break
     if not ratios:
-        # Without faces and limbs the order cannot be told; without any point it does not matter.
-        return "unclear" if seen else "none"
+        return "none"
     middle = float(np.median(ratios))
     if 1 / _DECISIVE < middle < _DECISIVE:
         return "unclear"

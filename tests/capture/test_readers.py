@@ -15,7 +15,7 @@ from tests.capture.scene import SKIN, make_scene, overlap
 from tests.capture.writers import WRITERS
 
 # COLMAP's and NeuS2's folders hold no body parameters; NeuS2's and 4D-Dress's number their frames in their own way.
-WITHOUT_PARAMS = {"neus2", "instant-ngp", "colmap-text", "colmap-binary"}
+WITHOUT_PARAMS = {"neus2", "instant-ngp", "colmap-text", "colmap-binary", "rig"}
 FIRST_FRAME = {"4ddress": 11}
 CAMERA_NAMES = {"thuman4": ("cam00", "cam01", "cam02"), "neus2": ("image_c_000", "image_c_001", "image_c_002")}
 

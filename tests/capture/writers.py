@@ -303,6 +303,24 @@ def write_colmap_binary(scene: Scene, root: Path) -> Path:
     return root
 
 
+def write_rig(scene: Scene, root: Path) -> Path:
+    """A laboratory's rig: Pose2Sim's TOML with z up, folders named otherwise than its cameras, no parameters."""
+    root.mkdir(parents=True, exist_ok=True)
+    z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # y of this package from the file's axes
+    text = ""
+    for name, camera in scene.cameras.items():
+        R, T = camera.cam_from_world[:3, :3] @ z_up, camera.cam_from_world[:3, 3]
+        text += f'[{name}]\nname = "{name}"\nsize = [ {camera.width}.0, {camera.height}.0]\n'
+        text += f"matrix = {_opencv_K(camera).tolist()}\ndistortions = {list(scene.lens or (0.0,) * 4)}\n"
+        text += f"rotation = {_rotvec(R).tolist()}\ntranslation = {T.tolist()}\nfisheye = false\n\n"
+    (root / "calibration").mkdir()
+    (root / "calibration" / "Calib_board.toml").write_text(text + "[metadata]\nadjusted = false\nerror = 0.0\n")
+    for (name, frame), image in scene.photographs.items():
+        _save(root / "images" / f"{name.lower()}_img" / f"{name}_{frame:06d}.jpg", image)
+        _save(root / "masks" / f"{name.lower()}" / f"{frame:06d}.png", scene.masks[name, frame])
+    return root
+
+
 # Format, writer, and the lens that the layout can express.
 WRITERS: dict[str, tuple[str, Callable[[Scene, Path], Path], tuple[float, ...] | None]] = {
     "simple": ("simple", write_simple, LENS),
@@ -316,4 +334,5 @@ WRITERS: dict[str, tuple[str, Callable[[Scene, Path], Path], tuple[float, ...] |
     "easymocap": ("easymocap", write_easymocap, LENS),
     "colmap-text": ("colmap", write_colmap_text, (*LENS[:4], 0.0)),
     "colmap-binary": ("colmap", write_colmap_binary, None),
+    "rig": ("rig", write_rig, LENS),
 }
