@@ -12,8 +12,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+<<<<<<< HEAD
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.commands.terminal import print_checks, print_notes, print_paths
+=======
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
+from pipelines.report.model import CheckRow
+>>>>>>> 8ed1ce7 (Test calibrations, the subject and frames without parameters)
 from smplxpp.core import InputError, require_at_least
 from smplxpp.core.files.json_file import as_object, read_json
 
@@ -39,6 +44,9 @@ class Register:
     """Body parameters to start from, in the place of the capture's own."""
     keypoints: OptionalPath = None
     """Folder of keypoints, of `smplxpp keypoints detect` or any other detector, in the place of the capture's own."""
+    subject: OptionalInt = None
+    """Person to register where several are in view, by the number that a note gives; by default the first: whom most
+    views agree on, large in the pictures and near the middle."""
     masks: OptionalPath = None
     """Folder of masks, in the place of the capture's own."""
     initial: Literal["params", "none"] = "params"
@@ -129,7 +137,7 @@ class Register:
             path = getattr(self, name)
             if path is not None and not path.exists():
                 raise InputError(f"option {name}", expected="an existing file", received=str(path))
-        for name in ("keypoints", "masks"):
+        for name in ("keypoints", "masks", "subject"):
             if getattr(self, name) is not None and self.capture is None:
                 raise InputError(f"option {name}", expected="a --capture whose cameras they are of", received="none")
         if self.scans is not None and (self.capture is None or self.scan is not None):
@@ -161,6 +169,7 @@ class Register:
             keypoints=self.keypoints,
             masks=self.masks,
             scans=self.scans,
+            subject=self.subject,
         )
 
     def _report(self, record: StageRecord) -> Path:

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise, without_holes
 from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.files.json_file import read_json
@@ -74,8 +74,8 @@ def load_params(
             what the body refuses that is needed.
 
     Warns:
-        GeometryWarning: frames that were interpolated; frames without the chosen person, which are left out; betas that are cut and not zero, with
-            their share; what a layout has that is not read.
+        GeometryWarning: frames that were interpolated; frames without the chosen person, which are left out; betas that
+            are cut and not zero, with their share; what a layout has that is not read.
 
     Example:
         >>> params = smplxpp.load_params("data/fixtures/person/params/params.npz")

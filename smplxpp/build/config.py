@@ -209,6 +209,7 @@ class RegisterInputs:
         keypoints: folder of keypoints that replaces the capture's own.
         masks: folder of masks that replaces the capture's own.
         scans: folder of a scan a frame that replaces the capture's own.
+        subject: place of the person whose keypoints are taken, where several are in view; None: the first.
     """
 
     capture: Path | Capture | None = None
@@ -228,6 +229,7 @@ class RegisterInputs:
     keypoints: Path | None = None
     masks: Path | None = None
     scans: Path | None = None
+    subject: int | None = None
 
     @property
     def root(self) -> Path | None:

@@ -229,6 +229,7 @@ def open_inputs(inputs: RegisterInputs, body: BodyModel) -> Capture:
         protocol=inputs.protocol,
         keypoints=inputs.keypoints,
         masks=inputs.masks,
+        subject=inputs.subject,
     )
 
 
@@ -250,7 +251,8 @@ def _keypoints(capture: Capture, cameras: Sequence[str]) -> tuple[dict[str, Keyp
             found[name] = points
     if errors and not found:
         raise next(iter(errors.values()))
-    return found, [f"camera {name}: keypoints left out: {error}" for name, error in errors.items()]
+    left_out = [f"camera {name}: keypoints left out: {error}" for name, error in errors.items()]
+    return found, [*capture.keypoint_notes(), *left_out]
 
 
 def _training_cameras(capture: Capture, inputs: RegisterInputs) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ def opened(
     protocol: str | None = None,
     keypoints: Path | None = None,
     masks: Path | None = None,
+    subject: int | None = None,
 ) -> Capture:
     """Open a capture with the files that a build names; an open one is taken as it is.
 
@@ -37,6 +38,7 @@ def opened(
         protocol: of the capture.
         keypoints: folder that replaces the capture's own.
         masks: folder that replaces the capture's own.
+        subject: place of the person whose keypoints are taken, where several are in view.
 
     Raises:
         InputError: no capture, or files named beside an open one that was opened with others.
@@ -46,19 +48,21 @@ def opened(
     if isinstance(capture, Capture):
         if protocol not in (None, capture.protocol):
             raise InputError("protocol", expected=f"that of the capture, {capture.protocol}", received=str(protocol))
-        for name, value in (("keypoints", keypoints), ("masks", masks)):
+        for name, value in (("keypoints", keypoints), ("masks", masks), ("subject", subject)):
             if value is not None:
                 raise InputError(
                     name,
-                    expected=f"a folder of a capture, or open_capture(..., {name}=...)",
-                    received="a folder beside an open capture",
+                    expected=f"the folder of a capture beside it, or open_capture(..., {name}=...)",
+                    received="an open capture",
                 )
         if file is not None:
             # Only the parameters are exchanged: images, masks and keypoints of the open capture stay as they are.
             again = open_capture(capture.root, params=file, body=body, protocol=protocol)
             capture = replace(capture, recording=replace(capture.recording, params=again.recording.params))
     else:
-        capture = open_capture(capture, params=file, body=body, protocol=protocol, keypoints=keypoints, masks=masks)
+        capture = open_capture(
+            capture, params=file, body=body, protocol=protocol, keypoints=keypoints, masks=masks, subject=subject
+        )
     if isinstance(params, BodyParams):
         # One row belongs to the reference frame; several rows are the frames from 0 on.
         frames = (frame,) if len(params) == 1 else tuple(range(len(params)))

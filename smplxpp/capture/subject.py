@@ -16,20 +16,17 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.optimize import linear_sum_assignment
 
-from smplxpp.capture.calibrations.world import focus_of
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.keypoint_files import joined, read_people
 from smplxpp.capture.keypoint_people import Person, chosen_person
 from smplxpp.capture.keypoint_places import KeypointFiles
-from smplxpp.capture.subject_geometry import PersonInSpace, Sighted, people_in_space, typical_distance
+from smplxpp.capture.subject_geometry import PersonInSpace, people_in_space, typical_distance
+from smplxpp.capture.subject_views import Views
 from smplxpp.core import Camera, InputError, Keypoints2D
 
 MaskReader = Callable[[str, int], "np.ndarray | None"]
 """Reads the mask of a camera and a frame as (H, W) opacity of the image on disk; None without one."""
 
-# Points that are compared: the body's and the feet's. Fingers and faces are many and small.
-_PARTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe", "heel", "nose", "eye", "ear")
-_LEAST_CONFIDENCE = 0.05
 # A person moves at most so far between two frames, metres, and is taken up again within the larger one after a gap.
 _STEP, _REACH = 0.6, 2.0
 # Distance of rays, metres, up to which a view joins a person known from the other views or frames.
@@ -140,7 +137,7 @@ def choose_subject(
     """
     names = [name for name in cameras if name in people]
     frames = sorted({frame for name in names for frame in people[name]})
-    views = _Views.of(people, {name: cameras[name] for name in names}, distortions, frames)
+    views = Views.of(people, {name: cameras[name] for name in names}, distortions, frames)
     found = {frame: people_in_space(views.sighted[frame]) for frame in frames}
     tracks = sorted(_scored(_followed(found), views, mask), key=lambda track: -track.score)
     if not tracks:
@@ -156,94 +153,6 @@ def choose_subject(
         for name in names
     }
     return out, _described(tracks, place)
-
-
-@dataclass(frozen=True, eq=False)
-class _Views:
-    """People of all views as rays, and where they are in the files.
-
-    Attributes:
-        names: of the cameras.
-        sighted: people of each frame.
-        place: index of each of them in its list, by frame.
-        height: of each in its image, a share of the image's height, by frame.
-        focus: point that the cameras look at, metres.
-        reach: median distance of the cameras from it.
-        points: pixels of each, by frame, for masks.
-    """
-
-    names: tuple[str, ...]
-    sighted: Mapping[int, Sighted]
-    place: Mapping[int, list[int]]
-    height: Mapping[int, list[float]]
-    focus: Float64[np.ndarray, " 3"]
-    reach: float
-    points: Mapping[int, list[Float64[np.ndarray, "n 2"]]]
-
-    @staticmethod
-    def of(
-        people: Mapping[str, Mapping[int, Sequence[Person]]],
-        cameras: Mapping[str, Camera],
-        distortions: Mapping[str, Distortion],
-        frames: Sequence[int],
-    ) -> _Views:
-        """Turn the points of all people into rays of the world."""
-        listed = [
-            (c, frame, k, one)
-            for c, name in enumerate(cameras)
-            for frame, own in people[name].items()
-            for k, one in enumerate(own)
-        ]
-        points = tuple(
-            dict.fromkeys(
-                n for *_, one in listed for n in one.points if any(p in n for p in _PARTS) and "face" not in n
-            )
-        )
-        table = np.zeros((len(listed), len(points), 3))
-        for row, (*_, one) in enumerate(listed):
-            for column, name in enumerate(points):
-                table[row, column] = one.points.get(name, 0.0)
-        table[table[..., 2] < _LEAST_CONFIDENCE] = 0.0
-        rays, origin = np.zeros((*table.shape[:2], 3)), np.zeros((len(listed), 3))
-        camera_of = np.array([c for c, *_ in listed], dtype=np.int64)
-        for c, (name, camera) in enumerate(cameras.items()):
-            rows = np.flatnonzero(camera_of == c)
-            there = table[rows, :, 2] > 0
-            plane = (table[rows][there][:, :2] - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-            if name in distortions:
-                plane = distortions[name].undistort(plane)
-            lost = ~np.isfinite(plane).all(axis=1)
-            own = np.concatenate([np.where(lost[:, None], 0.0, plane), np.ones((len(plane), 1))], axis=1)
-            own = own @ camera.cam_from_world[:3, :3]
-            full = np.zeros((len(rows), len(points), 3))
-            full[there] = own / np.linalg.norm(own, axis=1, keepdims=True)
-            rays[rows], origin[rows] = full, camera.position
-            seen = table[rows, :, 2]
-            seen[there] = np.where(lost, 0.0, seen[there])
-            table[rows, :, 2] = seen
-        by_frame = {frame: [row for row, item in enumerate(listed) if item[1] == frame] for frame in ()}
-        for row, item in enumerate(listed):
-            by_frame.setdefault(item[1], []).append(row)
-        heights = [camera.height for camera in cameras.values()]
-        sizes = [_height(one) / heights[c] for c, one in zip(camera_of.tolist(), table, strict=True)]
-        centres = np.stack([camera.position for camera in cameras.values()])
-        focus = focus_of(centres, np.stack([camera.cam_from_world[2, :3] for camera in cameras.values()]))
-        rows_of = {frame: by_frame.get(frame, []) for frame in frames}
-        return _Views(
-            tuple(cameras),
-            {f: Sighted(camera_of[r], origin[r], rays[r], table[r, :, 2]) for f, r in rows_of.items()},
-            {f: [listed[row][2] for row in r] for f, r in rows_of.items()},
-            {f: [sizes[row] for row in r] for f, r in rows_of.items()},
-            focus,
-            float(np.median(np.linalg.norm(centres - focus, axis=1))),
-            {f: [table[row][table[row, :, 2] > 0, :2] for row in r] for f, r in rows_of.items()},
-        )
-
-
-def _height(points: Float64[np.ndarray, "K 3"]) -> float:
-    """Return the height in pixels of the seen points; 0 for fewer than two."""
-    seen = points[points[:, 2] > 0]
-    return float(np.ptp(seen[:, 1])) if len(seen) > 1 else 0.0
 
 
 def _followed(found: Mapping[int, Sequence[PersonInSpace]]) -> list[Track]:
@@ -270,7 +179,7 @@ def _followed(found: Mapping[int, Sequence[PersonInSpace]]) -> list[Track]:
     return [Track(one) for one in places]
 
 
-def _scored(tracks: Sequence[Track], views: _Views, mask: MaskReader | None) -> list[Track]:
+def _scored(tracks: Sequence[Track], views: Views, mask: MaskReader | None) -> list[Track]:
     """Return the people with their scores."""
     total = max(1, (len(views.names) - 1) * len(views.sighted))
     out = []
@@ -286,7 +195,7 @@ def _scored(tracks: Sequence[Track], views: _Views, mask: MaskReader | None) -> 
     return [Track(t.places, t.score * (0.05 + _inside(t, views, mask)), t.views) for t in out]
 
 
-def _inside(track: Track, views: _Views, mask: MaskReader) -> float:
+def _inside(track: Track, views: Views, mask: MaskReader) -> float:
     """Return the share of a person's points inside the masks of a few frames; 0.5 without any mask."""
     inside, count = 0, 0
     for frame in list(track.places)[:: max(1, len(track.places) // _MASKED_FRAMES)][:_MASKED_FRAMES]:
@@ -301,7 +210,7 @@ def _inside(track: Track, views: _Views, mask: MaskReader) -> float:
     return inside / count if count else 0.5
 
 
-def _members(track: Track, tracks: Sequence[Track], views: _Views) -> dict[str, dict[int, int]]:
+def _members(track: Track, tracks: Sequence[Track], views: Views) -> dict[str, dict[int, int]]:
     """Return the place in its list of the subject of each camera and frame, also where two views alone do not tell."""
     agreeing = np.zeros(len(views.names))
     for frame, place in track.places.items():
@@ -327,7 +236,7 @@ def _members(track: Track, tracks: Sequence[Track], views: _Views) -> dict[str, 
 
 
 def _points_at(track: Track, frame: int) -> Float64[np.ndarray, "K 3"] | None:
-    """Return the person's points in a frame, interpolated between the frames around it; those of the nearest at the ends."""
+    """Return the person's points in a frame, interpolated between those around it, at the ends those of the nearest."""
     if frame in track.places:
         return track.places[frame].points
     known = np.array(sorted(track.places))

@@ -21,9 +21,9 @@ from smplxpp.register.priors import Priors
 from smplxpp.register.scan_term import ScanTerm
 from smplxpp.register.silhouette_term import SilhouetteTerm
 
-# Standard deviation in metres at which a joint's confidence is 1/2. It separates joints that are seen from those that the
-# priors fill in: 20 to 45 mm in a laboratory's four views with a calibration that is off by 15 pixels, 2 to 12 mm with
-# exact ones; at least 144 mm for the elbow, 300 mm for the wrist or ankle of a hidden limb.
+# Standard deviation in metres at which a joint's confidence is 1/2. It separates joints that are seen from those that
+# the priors fill in: 20 to 45 mm in a laboratory's four views with a calibration that is off by 15 pixels, 2 to 12 mm
+# with exact ones; at least 144 mm for the elbow, 300 mm for the wrist or ankle of a hidden limb.
 _HALF_KNOWN = 0.08
 
 

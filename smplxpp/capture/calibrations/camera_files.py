@@ -71,7 +71,7 @@ def read_opencap(path: Path, content: Any) -> RigFile:
 
 
 def read_opencv_cameras(path: Path, content: Any) -> RigFile:
-    """OpenCV's `FileStorage`: a file a camera, each with intrinsics and pose; or EasyMocap's intri.yml and extri.yml."""
+    """OpenCV's `FileStorage`: a file a camera with intrinsics and pose; or EasyMocap's intri.yml and extri.yml."""
     if "names" in content:
         return _read_pair(path)
     cameras = []

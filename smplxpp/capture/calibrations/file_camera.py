@@ -121,7 +121,7 @@ def file_camera(
     return FileCamera(name, intrinsics.reshape(3, 3), R, shift, width_height, lens, **more)
 
 
-def numbers_of(value: Any, *, subject: str) -> Float64[np.ndarray, "..."]:
+def numbers_of(value: Any, *, subject: str) -> np.ndarray:
     """Return numbers, or texts that hold them with blanks between, as an array.
 
     Raises:

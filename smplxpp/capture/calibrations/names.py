@@ -1,9 +1,9 @@
-"""Match the names of calibrated cameras to those of files and folders: `cam_01` is `cam01_json`, `cam01.mp4`, `int_cam1`."""
+"""Match the names of calibrated cameras to those of files and folders: `cam_01` is `cam01_json`, `cam01.mp4`."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 # What tools add to a camera's name: folders of keypoints, images and videos, results of detectors.
 _ADDED = (
@@ -29,18 +29,19 @@ def matched_names(cameras: Sequence[str], files: Sequence[str]) -> dict[str, str
         for camera in cameras:
             if camera in out:
                 continue
-            fitting = [file for file in free if same(camera, file)]
             # Additions make names longer: of several the shortest is the camera's own.
-            fitting.sort(key=lambda name: (len(name), name))
-            rivals = (
-                [other for other in cameras if other != camera and other not in out and same(other, fitting[0])]
-                if fitting
-                else []
-            )
-            if fitting and not (same is _by_number and (len(fitting) > 1 or rivals)):
-                out[camera] = fitting[0]
-                free.remove(fitting[0])
+            fitting = sorted((file for file in free if same(camera, file)), key=lambda name: (len(name), name))
+            if not fitting or (same is _by_number and _shared(camera, fitting, cameras, out)):
+                continue
+            out[camera] = fitting[0]
+            free.remove(fitting[0])
     return {camera: out[camera] for camera in cameras if camera in out}
+
+
+def _shared(camera: str, fitting: Sequence[str], cameras: Sequence[str], matched: Mapping[str, str]) -> bool:
+    """Tell whether several files, or several cameras without one, have the number."""
+    others = (other for other in cameras if other != camera and other not in matched)
+    return len(fitting) > 1 or any(_by_number(other, fitting[0]) for other in others)
 
 
 def _tokens(name: str) -> tuple[str, ...]:

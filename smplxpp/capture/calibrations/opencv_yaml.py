@@ -34,8 +34,8 @@ def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | s
     return {key: _value(key, block, path) for key, block in blocks.items()}
 
 
-# Matrices, numbers, texts, and lists in either of YAML's notations.
 def _value(key: str, block: list[str], path: Path) -> np.ndarray | list[str] | float | str:
+    # The four forms that occur: an OpenCV matrix, a scalar, a list in brackets, and a list of dashed lines.
     if block[0].startswith("!!opencv-matrix"):
         return _matrix(key, " ".join(block[1:]), path)
     if len(block) == 1 and block[0] and not block[0].startswith("["):

@@ -114,13 +114,13 @@ def read_calibration(
 
     Args:
         path: the file, or a folder with one.
-        units: unit of its lengths (m, cm, mm, inch); None: that of the format, else guessed from the cameras' distances.
-        up: axis of its world that points up (x, y, z, -x, -y, -z); None: that of the format, else what the pictures say.
+        units: unit of its lengths (m, cm, mm, inch); None: that of the format, else guessed by the cameras' distances.
+        up: axis of its world that points up (x, y, z, -x, -y, -z); None: that of the format, else of the pictures.
         sizes: width and height of the images by a name that tells the camera. Intrinsics follow images of another
             resolution; images that are up to 2 % larger or smaller on one side keep those of the file.
 
     Raises:
-        InputError: no calibration, a broken one, a camera without an image size, images of another shape than calibrated.
+        InputError: no calibration, a broken one, images of another shape than calibrated.
 
     Example:
         >>> calibration = read_calibration("session/calibration")  # doctest: +SKIP

@@ -23,8 +23,8 @@ _EPS = 1e-9
 def metres_of(rig: RigFile, units: str | None, *, source: str) -> tuple[float, list[str]]:
     """Return the length of the file's unit in metres, with a note where it was guessed.
 
-    Without a unit of the format or the user, it is the one of mm, m, cm, inch (in this order) in which the cameras stand
-    0.6 to 30 m from the middle of what they look at.
+    Without a unit of the format or the user, it is the first of m, mm, cm, inch in which the cameras stand 0.6 to 30 m
+    from the middle of what they look at.
 
     Raises:
         InputError: no unit makes a rig for a person.
@@ -86,8 +86,8 @@ def upright_from_world(rig: RigFile, up: str | None, *, source: str) -> tuple[Fl
 def _seen_up(cameras: Sequence[FileCamera]) -> Float64[np.ndarray, " 3"] | None:
     """Return the direction that is up by the cameras' pictures; None where they contradict each other.
 
-    The rows of most cameras are level, so that up is perpendicular to all of them: it is the direction with the least sum
-    of squares along the rows, if the cameras look in different directions; else the mean of the upper edges.
+    The rows of most cameras are level, so that up is perpendicular to all of them: it is the direction with the least
+    sum of squares along the rows, if the cameras look in different directions; else the mean of the upper edges.
     """
     rights, ups = (np.stack([sign * camera.R[row] for camera in cameras]) for row, sign in ((0, 1.0), (1, -1.0)))
     mean = ups.mean(axis=0)

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from smplxpp.capture.calibrations.file_camera import FileCamera, RigFile, file_camera, numbers_of
 from smplxpp.core.errors import InputError
 
-
 # Qualisys counts 64 subpixels a pixel.
 _SUBPIXELS = 64.0
 # From axes with y up and z backwards (OpenGL's) to those of OpenCV.
@@ -87,8 +86,8 @@ def read_vicon(path: Path, content: Element) -> RigFile:
     """Vicon Nexus and Shogun: `*.xcp`, millimetres, z up; the video cameras if any are marked as such.
 
     ORIENTATION is the quaternion x, y, z, w of the rotation from the world to the camera, POSITION the camera's place.
-    VICON_RADIAL2 holds a model's name, the centre of distortion and k1, k2, k3, VICON_RADIAL k1, k2: Vicon's polynomials
-    take a distorted radius in pixels to the undistorted one, which is inverted by least squares over the image.
+    VICON_RADIAL2 holds a model's name, the centre of distortion and k1, k2, k3, VICON_RADIAL k1, k2: Vicon's polynomial
+    takes a distorted radius in pixels to the undistorted one, which is inverted by least squares over the image.
     """
     everything = content.findall("Camera")
     video = [camera for camera in everything if "video" in camera.get("TYPE", "").lower()]

@@ -1,5 +1,5 @@
-"""Read a laboratory's rig: a calibration of any known tool, and beside it keypoints, images or videos, one folder or file
-a camera, under any spelling of the cameras' names."""
+"""Read a laboratory's rig: a calibration of any known tool, and beside it keypoints, images or videos, one folder or
+file a camera, under any spelling of the cameras' names."""
 
 from __future__ import annotations
 
