@@ -12,13 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-<<<<<<< HEAD
-from pipelines.commands.options import OptionalPath, OptionalText
-from pipelines.commands.terminal import print_checks, print_notes, print_paths
-=======
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
-from pipelines.report.model import CheckRow
->>>>>>> 8ed1ce7 (Test calibrations, the subject and frames without parameters)
+from pipelines.commands.terminal import print_checks, print_notes, print_paths
 from smplxpp.core import InputError, require_at_least
 from smplxpp.core.files.json_file import as_object, read_json
 
