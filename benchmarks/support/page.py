@@ -1,8 +1,8 @@
-"""Fill the tables of docs/benchmarks.md from the stored results.
+"""Fill the tables of docs/benchmarks.md and docs/real.md from the stored results.
 
     python -m benchmarks.support.page [--check]
 
-The page is written by hand, except its tables. A comment before each table says what it shows:
+The pages are written by hand, except their tables. A comment before each table says what it shows:
 
     <!-- table | from NAME / KEY only A ; B | show KEY / KEY as TITLE .2f ; KEY | sort -TITLE -->
 
@@ -28,6 +28,7 @@ from benchmarks.support.results import RESULTS, ROOT
 from smplxpp.core.files.atomic import atomic_write_text
 
 PAGE = ROOT / "docs" / "benchmarks.md"
+PAGES = (PAGE, ROOT / "docs" / "real.md")
 DIRECTIVE = re.compile(r"^<!-- table \| (.*) -->$")
 
 
@@ -160,13 +161,16 @@ def _at(value: Any, keys: Sequence[str]) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the page, or with `--check` return 1 where it differs from the stored results."""
-    text = PAGE.read_text()
-    made = page(text)
-    if "--check" in (sys.argv[1:] if arguments is None else arguments):
-        return int(made != text)
-    atomic_write_text(PAGE, made)
-    return 0
+    """Write the pages, or with `--check` return 1 where one differs from the stored results."""
+    check = "--check" in (sys.argv[1:] if arguments is None else arguments)
+    differs = False
+    for path in PAGES:
+        text = path.read_text()
+        made = page(text)
+        differs |= made != text
+        if not check:
+            atomic_write_text(path, made)
+    return int(check and differs)
 
 
 if __name__ == "__main__":

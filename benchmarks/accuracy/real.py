@@ -1,0 +1,163 @@
+"""Give public recordings of real people to the commands that a user would type, and store what comes of it.
+
+    python -m benchmarks real --sources DIR [--out DIR] [--only KEY ...] [--again]
+
+`benchmarks.support.real_sources` lists the recordings, their licences, and where their files are expected below DIR.
+Nothing of them is stored: the result has figures, outcomes in words, and an assessment by eye, which a person writes
+into benchmarks/results/real.json by hand and which stays while the template that it speaks of is the same. Every
+command runs to its end, one at a time; a sheet of pictures a row is written to OUT/KEY/sheet.png.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from benchmarks.support.real_runs import Ran, outcome, run_command
+from benchmarks.support.real_sheets import write_sheet
+from benchmarks.support.real_sources import SOURCES, Source, chosen_sources
+from benchmarks.support.real_truth import distances, fingerprint
+from benchmarks.support.results import RESULTS, store_results
+from smplxpp.body import BodyModel, load_body
+from smplxpp.core import InputError
+
+COMMAND = "python -m benchmarks real --sources DIR"
+RECORD = "ran.json"
+
+
+@dataclass(frozen=True)
+class Real:
+    """Run, measure, draw, store; one recording after the other."""
+
+    sources: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Folder with the files of the sources."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/real")
+    """Folder for runs, what they print, and sheets."""
+    only: tuple[str, ...] = ()
+    """These sources alone, by their keys; the stored rows of the others are kept."""
+    again: bool = False
+    """Measure and draw the runs that are there again, without running them."""
+    store: bool = True
+    """Write benchmarks/results/real.json after every row."""
+    results: Path = RESULTS
+    """Folder of the result."""
+
+    def run(self) -> None:
+        """Print a table and store the rows."""
+        there, absent = chosen_sources(self.sources, self.only)
+        body, rows = load_body(), stored_rows(self.results)
+        for source in there:
+            row = self._row(source, body)
+            rows[source.key] = with_assessment(row, rows.get(source.key, {}))
+            if self.store:
+                self._store(rows)
+            print(line(rows[source.key]), flush=True)
+        if absent:
+            print("not there: " + ", ".join(source.key for source in absent))
+
+    def _row(self, source: Source, body: BodyModel) -> dict[str, Any]:
+        """Run the command of a source, or take up its run, and measure what it made."""
+        folder = self.out / source.key.replace(" ", "_").replace(",", "")
+        run = folder / "run"
+        record = folder / RECORD
+        if not self.again:
+            # Stages that stand from an earlier run would be skipped, and the minutes would be none.
+            if folder.exists() and not record.is_file() and any(folder.iterdir()):
+                raise InputError(
+                    f"folder for {source.key}",
+                    expected=f"a run of this benchmark with its {RECORD}, or none",
+                    received=f"{folder} without it",
+                    remedy="remove it, or give another --out",
+                )
+            shutil.rmtree(folder, ignore_errors=True)
+            run_command(self._words(source, folder), folder / "log.txt").save(record)
+        elif not record.is_file():
+            raise InputError(f"run of {source.key}", expected=f"{record}", received="none", remedy="omit --again")
+        ran = Ran.load(record)
+        row = {**described(source), **outcome(ran, run)}
+        row |= {"minutes": round(ran.minutes, 1), "cpu_minutes": round(ran.cpu_minutes, 1)}
+        row["memory_gib"] = round(ran.memory_gib, 2)
+        if source.truth is not None:
+            row["truth_mm"] = distances(run, self.sources, source.truth, body)
+        row["made"] = fingerprint(run, row["outcome"])
+        if source.kind == "scan":
+            write_sheet(folder / "sheet.png", run, self.sources / source.files[0], body)
+        return row
+
+    def _words(self, source: Source, folder: Path) -> list[str]:
+        before = self.out / source.after.replace(" ", "_").replace(",", "") / "run"
+        places = {"file": self.sources / source.files[0], "out": folder, "run": folder / "run", "before": before}
+        return [word.format(**places) for word in source.command.split()]
+
+    def _store(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
+        ordered = [rows[source.key] for source in SOURCES if source.key in rows]
+        store_results("real", COMMAND, {"rows": ordered, "summary": summary(ordered)}, folder=self.results)
+
+
+def described(source: Source) -> dict[str, Any]:
+    """Return what a row says of its source."""
+    command = source.command.format(file=Path(source.files[0]).name, out="OUT", run="RUN", before="RUN")
+    return {
+        "source": source.key,
+        "kind": source.kind,
+        "person": source.person,
+        "origin": source.origin,
+        "licence": source.licence,
+        "command": f"smplxpp {command}",
+        "should_stop": source.should_stop,
+    }
+
+
+def stored_rows(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the rows of the stored result by their sources."""
+    path = folder / "real.json"
+    rows = json.loads(path.read_text())["figures"]["rows"] if path.is_file() else []
+    return {row["source"]: row for row in rows}
+
+
+def with_assessment(row: dict[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row with the assessment by eye of an earlier one, if both speak of the same template.
+
+    An assessment has `verdict`, `words`, `who` and `when`. It is lost with the template that it was made of, because
+    nobody has looked at the new one.
+    """
+    same = before.get("made") == row["made"]
+    return {**row, "assessment": before.get("assessment") if same else None}
+
+
+def summary(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Count scans, templates, templates without a failed check, and what looked right."""
+    scans = [row for row in rows if row["kind"] == "scan"]
+    made = [row for row in scans if "checks" in row and row["outcome"].startswith("a template")]
+    verdicts = [(row["assessment"] or {}).get("verdict") for row in scans]
+    return {
+        "scans": len(scans),
+        "templates": len(made),
+        "without_a_failed_check": sum(row["checks"]["fail"] == 0 for row in made),
+        "rightly_stopped": sum(row["should_stop"] and row not in made for row in scans),
+        "right_by_eye": verdicts.count("right"),
+        "usable_by_eye": verdicts.count("usable"),
+        "wrong_by_eye": verdicts.count("wrong"),
+    }
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """Say a row in words."""
+    truth = row.get("truth_mm")
+    known = "" if not truth else "; known body: " + ", ".join(f"{name} {value} mm" for name, value in truth.items())
+    seen = row["assessment"]
+    eye = "" if seen is None else f"; by eye: {seen['verdict']}, {seen['words']}"
+    return (
+        f"{row['source']} ({row['command']}): {row['outcome']}{known}; {row['minutes']} min, "
+        f"{row['cpu_minutes']} of CPU, {row['memory_gib']} GiB{eye}"
+    )
+
+
+if __name__ == "__main__":
+    tyro.cli(Real, prog="python -m benchmarks real").run()
