@@ -65,11 +65,9 @@ def run_command(words: Sequence[str], log: Path) -> Ran:
             [sys.executable, "-m", "pipelines.cli", *words], stdout=stream, stderr=subprocess.STDOUT
         )
         # The kernel tells time and memory of a child only to the call that collects it, which `Popen.wait` would be.
-        pid, code, usage = 0, 0, None
-        while not pid:
-            pid, code, usage = os.wait4(process.pid, os.WNOHANG)
-            if not pid:
-                time.sleep(_POLL)
+        while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+            time.sleep(_POLL)
+    _, code, usage = ended
     process.returncode = os.waitstatus_to_exitcode(code)
     # Linux counts resident memory in KiB, macOS in bytes.
     unit = 1 if sys.platform == "darwin" else 1024
