@@ -66,7 +66,7 @@ class Source:
         return all((folder / name).exists() for name in (*self.files, *truth))
 
 
-_POLYGON = "polygonjs/polygonjs-assets, models/resources/renderpeople.com"
+_POLYGON = "polygonjs/polygonjs-assets, models/resources/renderpeople.com, with an MTL that names the texture"
 _RENDERPEOPLE = "RenderPeople free sample: terms of renderpeople.com, no redistribution"
 _CRAGL = "CraGL/Hyperspectral-Inverse-Skinning, models (Vlasic et al. 2008, performance capture from silhouettes)"
 _FAUST = "DavidBoja/SMPL-Fitting, data/demo"
@@ -92,7 +92,7 @@ SOURCES: tuple[Source, ...] = (
         _POLYGON,
         _RENDERPEOPLE,
         "scan",
-        ("renderpeople/rp_dennis_posed_004_OBJ/rp_dennis_posed_004_30k.obj",),
+        ("scans/rp_dennis_posed_004_30k.obj",),
     ),
     Source(
         "Mei",
@@ -100,7 +100,7 @@ SOURCES: tuple[Source, ...] = (
         _POLYGON,
         _RENDERPEOPLE,
         "scan",
-        ("renderpeople/rp_mei_posed_001_OBJ/rp_mei_posed_001_30k.obj",),
+        ("scans/rp_mei_posed_001_30k.obj",),
     ),
     Source(
         "Fabienne and Percy",
@@ -108,7 +108,7 @@ SOURCES: tuple[Source, ...] = (
         _POLYGON,
         _RENDERPEOPLE,
         "scan",
-        ("renderpeople/rp_fabienne_percy_posed_001_OBJ/rp_fabienne_percy_posed_001_5k.obj",),
+        ("scans/rp_fabienne_percy_posed_001_5k.obj",),
         should_stop=True,
     ),
     Source(
@@ -118,6 +118,14 @@ SOURCES: tuple[Source, ...] = (
         "Common Public Attribution License 1.0 (of the repository)",
         "scan",
         ("volumetric/liam_00000.obj",),
+    ),
+    Source(
+        "Liam, frame 200",
+        "the same man eight seconds later",
+        "XRFoundation/UniversalVolumetric, example/public/liam, Draco decoded",
+        "Common Public Attribution License 1.0 (of the repository)",
+        "scan",
+        ("volumetric/liam_00200.obj",),
     ),
     Source(
         "samba, frame 0",
