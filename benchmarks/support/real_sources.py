@@ -72,6 +72,7 @@ _CRAGL = "CraGL/Hyperspectral-Inverse-Skinning, models (Vlasic et al. 2008, perf
 _FAUST = "DavidBoja/SMPL-Fitting, data/demo"
 _MPI = "MPI FAUST: non-commercial research"
 _ETCH = "boqian-li/ETCH, datafolder/4D-DRESS/data_processed"
+_FILM = "animate {before} --params {file} --step 24 --stop 1200 --view three-quarter --height 480 --out {out}/film.mp4"
 _SPEECH = "Uberi/speech_recognition, tests"
 
 SOURCES: tuple[Source, ...] = (
@@ -196,14 +197,34 @@ SOURCES: tuple[Source, ...] = (
         command="capture check {file}",
     ),
     Source(
-        "CMU 01_01",
-        "a man climbs and jumps down, BVH",
+        "a climb, played by the 4D-Dress man",
+        "BVH 01_01 of CMU: a man climbs and jumps down; 50 frames of 10 seconds",
         "facebookresearch/fairmotion, tests/data",
         "CMU motion capture: free for any use",
         "motion",
         ("bvh/fairmotion_01_01.bvh",),
-        command="animate {before} --params {file} --view three-quarter --height 480 --out {out}/film.mp4",
+        command=_FILM,
         after="4D-Dress man",
+    ),
+    Source(
+        "a climb, played by Liam",
+        "the same motion",
+        "facebookresearch/fairmotion, tests/data",
+        "CMU motion capture: free for any use",
+        "motion",
+        ("bvh/fairmotion_01_01.bvh",),
+        command=_FILM,
+        after="Liam",
+    ),
+    Source(
+        "a dance, played by the man of crane",
+        "the BVH of aitviewer; 50 frames of 30 seconds",
+        "eth-ait/aitviewer, examples/resources",
+        "MIT (of the repository)",
+        "motion",
+        ("bvh/aitviewer_sample.bvh",),
+        command=_FILM,
+        after="crane, frame 0",
     ),
     Source(
         "English",
