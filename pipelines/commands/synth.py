@@ -27,7 +27,8 @@ class Synth:
     out: Path
     """Folder to write; it must not exist, or be empty."""
     motion: str = "turning"
-    """Motion: turning (gestures, a turn with steps, arms overhead) or talking (standing, with gestures)."""
+    """Motion: turning (gestures, a turn with steps, arms overhead), talking (standing, with gestures) or turntable (a
+    turn on the spot before one camera)."""
     frames: int = 24
     """Length of the motion; the last fifth of the frames is held out."""
     cameras: OptionalInt = None

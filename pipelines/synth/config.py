@@ -11,6 +11,8 @@ from pipelines.synth.patterns import SKIRT_PATTERNS
 from pipelines.synth.person import CLOTHES
 from pipelines.synth.simulate import SimulationConfig
 from pipelines.synth.talking import Talking
+from pipelines.synth.turntable import Turntable
+from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
 from smplxpp.raster.soft_light import LightConfig
 
@@ -28,6 +30,8 @@ class MotionKind:
         normals_step: normal maps are written for every n-th frame.
         texel: side of a cell of the texture atlas, metres; 0: no atlas.
         least_frames: smallest number of frames.
+        kind: kind of the capture by one camera (`smplxpp.capture.recording`), of which no frame is held out; None:
+            cameras of a rig.
     """
 
     make: Callable[..., Motion]
@@ -38,6 +42,7 @@ class MotionKind:
     normals_step: int = 1
     texel: float = 0.0
     least_frames: int = 1
+    kind: str | None = None
 
 
 # Truth of every second frame and normal maps of every fourth keep a capture of 400 frames at a usual size.
@@ -53,6 +58,7 @@ MOTIONS = {
         texel=0.0007,
         least_frames=2,
     ),
+    "turntable": MotionKind(Turntable, clothes="trousers", cameras=1, aspect=0.6, least_frames=4, kind=TURNTABLE),
 }
 
 

@@ -229,7 +229,8 @@ def _write_view(root: Path, camera: str, frame: int, view: RenderedView, config:
 
 
 def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig, environment: Environment | None) -> dict:
-    train, novel = split_frames(config.frames)
+    kind = motion_kind(config.motion).kind if len(rig) == 1 else None
+    train, novel = split_frames(config.frames) if kind is None else (config.frames, 0)
     everything, normals = list(range(config.frames)), list(range(0, config.frames, config.normals_step))
     names = [item.camera.name for item in rig]
     # Held-out frames follow the training frames; short captures have none.
@@ -244,6 +245,7 @@ def _manifest(out: Path, rig: list[RigCamera], config: SynthConfig, environment:
         "seed": config.seed,
         "background": [0, 0, 0],
         "label_set": "capture",
+        **({} if kind is None else {"kind": kind}),
         "inputs": INPUTS,
         **light,
         **splits,

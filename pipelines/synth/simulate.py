@@ -195,7 +195,7 @@ class _Stage:
         layers[..., 1] += up[:, None]
         transforms = posed_from_rest.copy()
         transforms[:, :, 1, 3] += up[:, None]
-        transl = np.stack([0 * up, up, 0 * up], axis=1)
+        transl = params.transl + np.stack([0 * up, up, 0 * up], axis=1)
         # Feet that stay: shift the body so that the ankles keep their place.
         if self.performance.feet_stay:
             aside = self._aside(transforms)

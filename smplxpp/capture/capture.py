@@ -81,6 +81,11 @@ class Capture:
         return self.recording.protocol
 
     @property
+    def kind(self) -> str | None:
+        """`recording.TURNTABLE` for a person who turns before one camera; None: all cameras see the same moment."""
+        return self.recording.kind
+
+    @property
     def label_set(self) -> str:
         """Name of the label set that defines the numbers of `labels`."""
         return self.recording.label_set

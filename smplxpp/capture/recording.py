@@ -17,6 +17,8 @@ from smplxpp.core import BodyParams, Camera, Keypoints2D, TriangleMesh
 
 KINDS = ("image", "mask", "label", "normal")
 """Kinds of image files of a view."""
+TURNTABLE = "turntable"
+"""Kind of a capture by one camera that stands still, before which a person turns and holds the pose roughly."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class Recording:
         problems: defects that the reader found.
         protocol: name of the protocol whose files these are; None without one.
         protocols: names of the protocols of the capture.
+        kind: `TURNTABLE` for a person who turns before one camera; None: all cameras see the same moment.
     """
 
     name: str
@@ -109,6 +112,7 @@ class Recording:
     problems: tuple[Problem, ...] = field(default=())
     protocol: str | None = None
     protocols: tuple[str, ...] = ()
+    kind: str | None = None
 
     def __repr__(self) -> str:
         """One paragraph: a recording has millions of files."""

@@ -131,7 +131,7 @@ class Priors:
         """
         # An update d acts as `exp(d) R`; the inverse left Jacobian gives the change of the axis-angle vector by d.
         vectors = rotvec_from_matrix(state.rotations[:, self.columns.joints])
-        inverse = _left_jacobian_inverse(vectors)
+        inverse = left_jacobian_inverse(vectors)
         for row in range(len(state)):
             self._add_pose(equations, row, vectors[row].reshape(-1), inverse[row])
             self._add_expression(equations, row, state.expression[row])
@@ -177,7 +177,7 @@ class Priors:
             off = rotvec_from_matrix(
                 state.rotations[row, joints] @ start.state.rotations[row, joints].transpose(0, 2, 1)
             )
-            jacobian = _left_jacobian_inverse(off)
+            jacobian = left_jacobian_inverse(off)
             # Cauchy kernel of three standard deviations, so that a joint that the fit has wrong can leave it.
             weight = 1.0 / (start.pose**2 * (1.0 + (off**2).sum(axis=1) / (3 * start.pose) ** 2))
             for k, (each, vector) in enumerate(zip(jacobian, off, strict=True)):
@@ -229,7 +229,7 @@ class Priors:
             equations.add_smoothness(first, weight, difference)
 
 
-def _left_jacobian_inverse(vectors: Float64[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 3 3"]:
+def left_jacobian_inverse(vectors: Float64[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 3 3"]:
     """Return the derivative of `log(exp(d) exp(v))` by d at 0 (Sola et al. 2018, "A micro Lie theory", eq. 146)."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     cross = np.zeros((*vectors.shape[:-1], 3, 3))

@@ -176,6 +176,7 @@ class SilhouetteTerm:
         # The nearest sampled vertex of each vertex, whose gap it takes.
         _, self._nearest = cKDTree(surface.points.rest[index]).query(surface.points.rest)
         self.reach = self.first_reach = config.silhouette_reach_m
+        self.least_sightings = 8
         self._distances: list[tuple[np.ndarray, np.ndarray]] = []
 
     def add(
@@ -194,10 +195,10 @@ class SilhouetteTerm:
         equations.add(row, rows * root[:, None], residual * root, shape=shape)
 
     def estimate_gaps(self) -> None:
-        """Estimate the gaps from the distances of the last step; a vertex needs eight of them."""
+        """Estimate the gaps from the distances of the last step; a vertex needs `least_sightings` of them."""
         if self._distances:
             place, distance = (np.concatenate(parts) for parts in zip(*self._distances, strict=True))
-            self.gaps = Gaps.estimated(place, distance, len(self.index), least=8, tight=self.config.tight_m)
+            self.gaps = Gaps.estimated(place, distance, len(self.index), least=self.least_sightings, tight=self.config.tight_m)
         self._distances = []
 
     def residual_px(self, row: int, kinematics: Kinematics, posture: Posture) -> float:

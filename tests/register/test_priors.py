@@ -10,7 +10,7 @@ from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.register import RegisterConfig
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.normal_equations import Columns, NormalEquations
-from smplxpp.register.priors import Anatomy, Priors, _left_jacobian_inverse
+from smplxpp.register.priors import Anatomy, Priors, left_jacobian_inverse
 from smplxpp.register.start import white_noise
 from tests.register.people import disturbed, moving
 
@@ -31,7 +31,7 @@ def test_ranges_are_mirrored():
 def test_derivative_of_the_logarithm():
     rng, step = np.random.default_rng(0), 1e-6
     for vector in (rng.normal(0, 1, 3), rng.normal(0, 1e-5, 3)):
-        inverse = _left_jacobian_inverse(vector)
+        inverse = left_jacobian_inverse(vector)
         for axis in range(3):
             turn = np.zeros(3)
             turn[axis] = step

@@ -22,7 +22,7 @@ from smplxpp.capture.protocols import (
     read_protocols,
 )
 from smplxpp.capture.readers.common import ReaderOptions
-from smplxpp.capture.recording import ParamSource, Problem, Recording
+from smplxpp.capture.recording import TURNTABLE, ParamSource, Problem, Recording
 from smplxpp.capture.sources import ParamFiles, PosedTopology, find_params
 from smplxpp.capture.splits import Splits
 from smplxpp.core import Camera, InputError
@@ -100,8 +100,21 @@ def _described(
         problems=tuple(problems),
         protocol=protocol.name,
         protocols=tuple(read_protocols(description)),
+        kind=_kind(description, cameras),
     )
     return replace(recording, splits=_splits(recording, description)) if description else recording
+
+
+def _kind(description: Mapping[str, Any], cameras: Mapping[str, Camera]) -> str | None:
+    """Return the kind of capture that a description states; a person who turns does so before one camera."""
+    kind = description.get("kind")
+    if kind is not None and (kind != TURNTABLE or len(cameras) != 1):
+        raise InputError(
+            "kind in capture.json",
+            expected=f'"{TURNTABLE}" with one camera, or null',
+            received=f"{kind!r} with {len(cameras)} cameras",
+        )
+    return kind
 
 
 def _keypoints(
