@@ -50,9 +50,9 @@ def _sampled(mesh: TriangleMesh, seen: Sight, pyramids: Pyramids) -> tuple[Float
     """Sample the views at the vertices bilinearly; return colours, and whether all four pixels are the person's."""
     shape = (mesh.vertex_count, len(pyramids.cameras))
     samples, opaque = np.zeros((*shape, 3), np.float32), np.zeros(shape, dtype=bool)
-    for k, camera in enumerate(pyramids.cameras):
+    for k in range(len(pyramids.cameras)):
         rows = np.flatnonzero(seen.cosine[:, k] > LEAST_COSINE)
-        screen = camera.screen_from_world(mesh.vertices[rows])
+        screen = pyramids.screen(k, mesh.vertices)[rows]
         start, (height, width) = pyramids.starts[k, 0], pyramids.sizes[k, 0]
         image = pyramids.values[start : start + 4 * int(height) * int(width)].reshape(height, width, 4)
         # Pixel centres lie at half-integers. The clamp keeps the right and lower neighbour inside the image.

@@ -60,6 +60,21 @@ class Pyramids:
         )
 
 
+    def sight(self, mesh: TriangleMesh, normals: Float[np.ndarray, "N 3"]) -> Sight:
+        """Compute which vertices of a surface each view sees."""
+        return sight(mesh, normals, self.cameras)
+
+    def screen(self, view: int, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:
+        """Project points of the surface into a view."""
+        return self.cameras[view].screen_from_world(points)
+
+    def projections_of(
+        self, points: Float64[np.ndarray, "N 3"]
+    ) -> list[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "V 3 4"]]]:
+        """Group points by the projections of all views that hold near them: rows, and one projection a view."""
+        return [(np.arange(len(points)), self.projections)]
+
+
 @dataclass(frozen=True, eq=False)
 class Sight:
     """The visibility of a surface's vertices in V cameras.
@@ -93,22 +108,29 @@ def sight(mesh: TriangleMesh, normals: Float[np.ndarray, "N 3"], cameras: Sequen
     A vertex may lie 2 mm and 1.5 pixels of the surface's slope behind the z-buffer, because the depth of a pixel is
     that of its centre.
     """
-    cosine = np.zeros((mesh.vertex_count, len(cameras)), np.float32)
-    pixel = np.zeros_like(cosine)
-    for k, camera in enumerate(cameras):
-        screen = camera.screen_from_world(mesh.vertices)
-        to_camera = normalize_rows(camera.position - mesh.vertices)
-        facing = np.einsum("ij,ij->i", to_camera, normals)
-        pixel[:, k] = np.abs(screen[:, 2]) * 2.0 / (camera.K[0, 0] + camera.K[1, 1])
-        # Visible: in the image, facing the camera, and not behind the z-buffer.
-        shown = _in_image(screen, camera) & (facing > 0)
-        depth = rasterize_mesh(mesh, camera).depth
-        column, row = screen[shown, 0].astype(np.int64), screen[shown, 1].astype(np.int64)
-        behind = screen[shown, 2] - depth[row, column]
-        slope = pixel[shown, k] / np.maximum(facing[shown], 0.1)
-        visible = behind <= 2e-3 + 1.5 * slope
-        cosine[np.flatnonzero(shown)[visible], k] = facing[shown][visible]
+    columns = [sight_of_camera(mesh, normals, camera) for camera in cameras]
+    cosine, pixel = (np.stack([column[part] for column in columns], axis=1) for part in (0, 1))
     return Sight(cosine, pixel)
+
+
+def sight_of_camera(
+    mesh: TriangleMesh, normals: Float[np.ndarray, "N 3"], camera: Camera
+) -> tuple[Float32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
+    """Return the cosine at each vertex, 0 where it is hidden, and the size of a pixel there (`Sight`)."""
+    cosine = np.zeros(mesh.vertex_count, np.float32)
+    screen = camera.screen_from_world(mesh.vertices)
+    to_camera = normalize_rows(camera.position - mesh.vertices)
+    facing = np.einsum("ij,ij->i", to_camera, normals)
+    pixel = (np.abs(screen[:, 2]) * 2.0 / (camera.K[0, 0] + camera.K[1, 1])).astype(np.float32)
+    # Visible: in the image, facing the camera, and not behind the z-buffer.
+    shown = _in_image(screen, camera) & (facing > 0)
+    depth = rasterize_mesh(mesh, camera).depth
+    column, row = screen[shown, 0].astype(np.int64), screen[shown, 1].astype(np.int64)
+    behind = screen[shown, 2] - depth[row, column]
+    slope = pixel[shown] / np.maximum(facing[shown], 0.1)
+    visible = behind <= 2e-3 + 1.5 * slope
+    cosine[np.flatnonzero(shown)[visible]] = facing[shown][visible]
+    return cosine, pixel
 
 
 def _in_image(screen: Float64[np.ndarray, "N 4"], camera: Camera) -> Bool[np.ndarray, " N"]:

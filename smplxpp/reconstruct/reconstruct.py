@@ -19,9 +19,9 @@ from jaxtyping import Float32, Int64, UInt8
 from smplxpp.core import TriangleMesh, require_at_least, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
 from smplxpp.reconstruct.colors import blend_colors
-from smplxpp.reconstruct.hull import main_body, pixel_footprint, soft_hull, solid_status
+from smplxpp.reconstruct.hull import Field, main_body, pixel_footprint, soft_hull, solid_status
 from smplxpp.reconstruct.mask_consensus import Consensus, find_consensus
-from smplxpp.reconstruct.photographs import Pyramids, sight
+from smplxpp.reconstruct.photographs import Pyramids
 from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
 from smplxpp.reconstruct.sweep import (
     PatchConfig,
@@ -141,17 +141,48 @@ def reconstruct(
     notes += [one_sided] if one_sided else []
     # The hull of the component of largest volume, with cells of two pixels between 3 and 6 mm.
     pixel = pixel_footprint(silhouettes, center)
-    cell = config.cell or float(np.clip(2.0 * pixel, 3e-3, 6e-3))
+    cell = cell_size(pixel, config)
     progress("hull", 0.0)
     hull, more = main_body(soft_hull(silhouettes, consensus.box, cell=cell, dissent=config.dissent))
     notes += more
-    hull = taubin(hull, mean_of_neighbours(hull), steps=3)
-    pyramids = Pyramids.of(trusted)
-    levels = config.levels if config.refine else ()
 
     def inside(points: np.ndarray) -> np.ndarray:
         return smallest_depths(silhouettes, points, count=config.dissent + 1)[:, config.dissent]
 
+    numbers = _numbers(usable, faults, consensus, pixel, cell)
+    return refined(hull, Pyramids.of(trusted), inside, config, (notes, numbers), progress=progress)
+
+
+def cell_size(pixel: float, config: ReconstructConfig) -> float:
+    """Return the size of the grid's cells, metres: as configured, or two pixels within 3 to 6 mm."""
+    return config.cell or float(np.clip(2.0 * pixel, 3e-3, 6e-3))
+
+
+def refined(
+    hull: TriangleMesh,
+    pyramids: Pyramids,
+    inside: Field,
+    config: ReconstructConfig,
+    said: tuple[list[str], dict[str, Any]],
+    *,
+    progress: ProgressCallback = ignore_progress,
+) -> Reconstruction:
+    """Sweep a hull along its normals, level by level, and give it colours and a confidence.
+
+    Args:
+        hull: closed surface.
+        pyramids: of the photographs.
+        inside: depth of points inside the silhouettes, metres.
+        config: options.
+        said: notes and numbers so far.
+        progress: called with the running step and its share done.
+
+    Raises:
+        InputError: the result is no closed manifold.
+    """
+    notes, numbers = said
+    hull = taubin(hull, mean_of_neighbours(hull), steps=3)
+    levels = config.levels if config.refine else ()
     # The sweep, level by level, each followed by one Taubin step against the noise of the displacements.
     mesh = hull
     for k, level in enumerate(levels):
@@ -164,7 +195,7 @@ def reconstruct(
     if status != "NoError":
         raise InputError("reconstructed surface", expected="a closed manifold", received=f"manifold3d: {status}")
     progress("colours", 0.0)
-    return _finished(mesh, hull, pyramids, config, notes, _numbers(usable, faults, consensus, pixel, cell))
+    return _finished(mesh, hull, pyramids, config, notes, numbers)
 
 
 def adopt_surface(
@@ -230,7 +261,7 @@ def look_at(
     mean = mean_of_neighbours(mesh)
     normals = smooth_normals(mesh, mean)
     # Depth tests from every camera; then the photometric agreement of patches at the surface itself (offset 0).
-    sights = sight(mesh, normals, pyramids.cameras)
+    sights = pyramids.sight(mesh, normals)
     seen = sights.seen()
     scores = sweep_scores(mesh.vertices, normals, sights, pyramids, np.zeros(1), PatchConfig(most_views=most_views))[
         :, 0

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import cg
 
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
 from smplxpp.native import address, native_library, thread_count
-from smplxpp.reconstruct.photographs import Pyramids, Sight, sight
+from smplxpp.reconstruct.photographs import Pyramids, Sight
 
 LEAST_COSINE = 0.3
 """Cosine between normal and ray below which a view is too oblique to be compared."""
@@ -107,7 +107,7 @@ def refine_surface(
     # Offsets outside the silhouettes are excluded; vertices that fewer than two views see are not watched.
     mean = mean_of_neighbours(mesh)
     normals = smooth_normals(mesh, mean)
-    seen = sight(mesh, normals, pyramids.cameras)
+    seen = pyramids.sight(mesh, normals)
     offsets = np.arange(-level.inward, level.outward + 1e-9, level.step)
     watched = (seen.cosine > LEAST_COSINE).sum(axis=1) >= 2
     outside = np.zeros((mesh.vertex_count, len(offsets)), dtype=bool)
@@ -162,30 +162,34 @@ def sweep_scores(
     across = np.where(np.abs(normals[:, [2]]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangents = np.ascontiguousarray(normalize_rows(np.cross(across, normals)))
     noise = 0.006  # standard deviation of a channel in [0, 1]; patches with less texture agree with nothing
+    weight = 3 * noise**2 / patches.coarseness**2
     scores = np.empty((len(points), len(offsets)), np.float32)
-    native_library().smplxpp_patch_sweep(
-        address(pyramids.values),
-        ctypes.c_int64(len(pyramids.values)),
-        address(pyramids.starts, "int64"),
-        address(pyramids.sizes, "int32"),
-        ctypes.c_int64(len(pyramids.starts)),
-        ctypes.c_int64(pyramids.starts.shape[1]),
-        address(np.ascontiguousarray(pyramids.projections), "float64"),
-        address(np.ascontiguousarray(points), "float64"),
-        address(np.ascontiguousarray(normals), "float64"),
-        address(tangents, "float64"),
-        address(np.ascontiguousarray(patches.coarseness * pixel, dtype=np.float64), "float64"),
-        address(chosen, "int32"),
-        ctypes.c_int64(len(points)),
-        ctypes.c_int64(chosen.shape[1]),
-        address(np.ascontiguousarray(offsets), "float64"),
-        ctypes.c_int64(len(offsets)),
-        patches.half,
-        ctypes.c_double(3 * noise**2 / patches.coarseness**2),
-        ctypes.c_double(LEAST_OPACITY),
-        address(scores),
-        thread_count(),
-    )
+    for rows, projections in pyramids.projections_of(points):
+        found = np.empty((len(rows), len(offsets)), np.float32)
+        native_library().smplxpp_patch_sweep(
+            address(pyramids.values),
+            ctypes.c_int64(len(pyramids.values)),
+            address(pyramids.starts, "int64"),
+            address(pyramids.sizes, "int32"),
+            ctypes.c_int64(len(pyramids.starts)),
+            ctypes.c_int64(pyramids.starts.shape[1]),
+            address(np.ascontiguousarray(projections), "float64"),
+            address(np.ascontiguousarray(points[rows]), "float64"),
+            address(np.ascontiguousarray(normals[rows]), "float64"),
+            address(np.ascontiguousarray(tangents[rows]), "float64"),
+            address(np.ascontiguousarray(patches.coarseness * pixel[rows], dtype=np.float64), "float64"),
+            address(np.ascontiguousarray(chosen[rows]), "int32"),
+            ctypes.c_int64(len(rows)),
+            ctypes.c_int64(chosen.shape[1]),
+            address(np.ascontiguousarray(offsets), "float64"),
+            ctypes.c_int64(len(offsets)),
+            patches.half,
+            ctypes.c_double(weight),
+            ctypes.c_double(LEAST_OPACITY),
+            address(found),
+            thread_count(),
+        )
+        scores[rows] = found
     return scores
 
 
