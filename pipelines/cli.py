@@ -108,6 +108,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "CaptureConvertCommand",
         "any capture that can be opened, to our layout or ActorsHQ's",
     ),
+    "capture turntable": (
+        "pipelines.commands.turntable",
+        "CaptureTurntable",
+        "photographs or a video of a person who turns before one camera, to a capture with camera and poses",
+    ),
     "capture masks": (
         "pipelines.commands.capture",
         "CaptureMasks",

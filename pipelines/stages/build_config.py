@@ -25,7 +25,7 @@ _T = TypeVar("_T")
 _BUILD_PATHS = ("scan", "params", "labels", "cameras", "motion", "body")
 _CHOICE_PATHS = ("keypoints", "masks", "landmarks", "corrections")
 _REGISTER_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks", "scans")
-_RECONSTRUCT_PATHS = ("capture", "masks", "mesh")
+_RECONSTRUCT_PATHS = ("capture", "masks", "mesh", "body")
 
 
 @dataclass(frozen=True)

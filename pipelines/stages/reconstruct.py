@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,10 +18,12 @@ from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import RECONSTRUCT_STAGE
 from pipelines.runs.stage import Stage, StageRecord, run_stage
 from pipelines.stages.build_config import ReconstructInputs, save_reconstruct
+from smplxpp.body import load_body
 from smplxpp.build.reconstruct import (
     Maker,
     check_masks,
     config_of,
+    frames_read,
     open_photographs,
     reconstruct_frame,
     reconstruction_output,
@@ -31,9 +33,13 @@ from smplxpp.build.reconstruct import (
     write_surface,
 )
 from smplxpp.capture import Capture
+from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core import GeometryWarning, InputError, ProgressCallback, StageOutput, ignore_progress
 from smplxpp.core.files import as_object, atomic_folder, jsonable, read_json
+from smplxpp.reconstruct import Reconstruction
 
+FrameMaker = Callable[..., tuple[Reconstruction, dict[str, Any]]]
+"""`surface(frame=..., progress=...)`: the surface of a frame and its numbers."""
 _SHARES = {"masks": 0.0, "hull": 0.1, "photographs": 0.2, "colours": 0.9}
 """Progress within a frame, from 0 to 1, at which each step begins."""
 
@@ -83,7 +89,14 @@ def reconstruct_capture(
     check_masks(capture, cameras, frames)
     config = config_of(inputs)
     # The key: cameras and photographs, the settings, and the code that makes the surface.
-    digests = photograph_digests(capture, cameras, frames)
+    body = load_body(inputs.body) if capture.kind == TURNTABLE else None
+    digests = photograph_digests(capture, cameras, frames_read(capture, frames))
+    if body is not None:
+        if method is not None:
+            raise InputError(
+                "--method", expected="cameras that see one moment", received="a person who turns before one camera"
+            )
+        digests |= pose_digests(capture, inputs.body)
     if inputs.mesh is not None:
         if len(frames) != 1:
             raise InputError("--mesh", expected="one --frame, the mesh's", received=f"{len(frames)} frames")
@@ -105,7 +118,10 @@ def reconstruct_capture(
     # Finished frames lie in the work folder, whose name contains the key. A changed setting therefore starts from none.
     state = run / stage.work_name
     make = surface_maker(inputs) if method is None else method.make
-    work = partial(_work, state=state, capture=capture, cameras=cameras, frames=frames, make=make, progress=progress)
+    surface = partial(reconstruct_frame, capture, cameras, make=make, body=body)
+    work = partial(
+        _work, state=state, capture=capture, cameras=cameras, frames=frames, surface=surface, progress=progress
+    )
     return run_stage(run, stage, work, force=force)
 
 
@@ -116,7 +132,7 @@ def _work(
     capture: Capture,
     cameras: tuple[str, ...],
     frames: tuple[int, ...],
-    make: Maker,
+    surface: FrameMaker,
     progress: ProgressCallback,
 ) -> StageOutput:
     """Write `scan_FFFFFF.ply`, `scan_FFFFFF.npz` of every frame, and `reconstruction.json`."""
@@ -134,7 +150,7 @@ def _work(
         # The folder appears at once when its frame is complete, so that its existence means finished.
         if not made.is_dir():
             try:
-                _keep_frame(made, capture, cameras, frame, make, report)
+                _keep_frame(made, frame, surface, report)
             except InputError as error:
                 # A single frame that fails has no result at all.
                 if len(frames) == 1:
@@ -164,11 +180,9 @@ def _work(
     return reconstruction_output(found, notes, cameras)
 
 
-def _keep_frame(
-    made: Path, capture: Capture, cameras: tuple[str, ...], frame: int, make: Maker, progress: ProgressCallback
-) -> None:
+def _keep_frame(made: Path, frame: int, surface: FrameMaker, progress: ProgressCallback) -> None:
     """Reconstruct a frame and keep it in a folder: the scan, arrays for each vertex, and numbers."""
-    result, numbers = reconstruct_frame(capture, cameras, frame, make, progress)
+    result, numbers = surface(frame=frame, progress=progress)
     # Write into a temporary folder and rename it, see `_work`.
     with atomic_folder(made) as temporary:
         write_surface(temporary / "scan.ply", result)
@@ -180,6 +194,18 @@ def _keep_frame(
             hull_faces=result.hull.faces.astype(np.int32),
         )
         (temporary / "numbers.json").write_text(json.dumps(jsonable(numbers)) + "\n")
+
+
+def pose_digests(capture: Capture, body: Path | None) -> dict[str, str]:
+    """Return SHA-256 of the poses of a turning person, and of the body file that they are for."""
+    poses = hashlib.sha256()
+    for frame in usable_frames(capture, None):
+        params = capture.params(frame)
+        if params is not None:
+            for name, values in sorted(params.as_dict().items()):
+                poses.update(name.encode() + np.asarray(values).tobytes())
+    digests = {"capture/params": poses.hexdigest()}
+    return digests if body is None else digests | {"body": sha256_file(body)}
 
 
 def photograph_digests(capture: Capture, cameras: tuple[str, ...], frames: tuple[int, ...]) -> dict[str, str]:

@@ -256,6 +256,7 @@ class ReconstructInputs:
         cell_mm: cell size of the grid, millimetres; None: by the photographs' resolution.
         mesh: another program's surface of the one frame, which replaces ours.
         dissent: number of views that may see background at a point of the surface.
+        body: SMPL-X-layout body file that a turning person's poses are for; None for the open body.
     """
 
     capture: Path | Capture
@@ -267,6 +268,7 @@ class ReconstructInputs:
     cell_mm: float | None = None
     dissent: int = 0
     mesh: Path | None = None
+    body: Path | None = None
 
     @property
     def root(self) -> Path:

@@ -15,6 +15,7 @@ from smplxpp.capture import Capture, ReferenceFrame, find_reference
 from smplxpp.capture.declared import DeclaredInputs
 from smplxpp.capture.protocols import TRACKED, choose_protocol, read_description
 from smplxpp.capture.readers.simple import stacked_params
+from smplxpp.capture.recording import TURNTABLE
 from smplxpp.clean.scan_frame import AUTO
 from smplxpp.core import BodyParams, InputError, MeshLike, spread
 from smplxpp.core.files.paths import same_place
@@ -209,6 +210,9 @@ def _registers(request: BuildRequest) -> bool:
         return request.config.register == "on"
     if _standing_registration(request) is not None:
         return True
+    # The poses of a person who turns are found when the capture is made; its surface needs them before a registration.
+    if _turns(request):
+        return False
     # Parameters in memory are a fit already, and a capture without a folder has no declaration of its sources.
     if isinstance(request.params, BodyParams) or not root.is_dir():
         return False
@@ -216,6 +220,14 @@ def _registers(request: BuildRequest) -> bool:
     # Estimated parameters only start a registration; exact ones are used unchanged.
     params = declared.own_parameters() if request.params is None else request.named_params
     return params is None or declared.given_parameters(params) == TRACKED
+
+
+def _turns(request: BuildRequest) -> bool:
+    """Whether the capture shows a person who turns before one camera."""
+    if isinstance(request.capture, Capture):
+        return request.capture.kind == TURNTABLE
+    assert request.root is not None
+    return request.root.is_dir() and read_description(request.root).get("kind") == TURNTABLE
 
 
 def _starts(request: BuildRequest, found: ReferenceFrame) -> bool:
@@ -285,12 +297,23 @@ def _reconstruction(request: BuildRequest, inputs: BuildInputs) -> ReconstructIn
     if found is not None and made and isinstance(found.capture, Path) and same_place(found.capture, root):
         return found
     asked = ReconstructInputs(
-        request.capture, frames=(request.config.frame,), masks=request.config.masks, protocol=request.protocol
+        request.capture,
+        frames=(request.config.frame,),
+        masks=request.config.masks,
+        protocol=request.protocol,
+        body=request.body_file,
     )
     # Open the capture and check cameras and frames now, because the reconstruction itself runs for minutes.
     capture = open_photographs(asked)
     usable_cameras(capture, ())
     usable_frames(capture, asked.frames)
+    if capture.kind == TURNTABLE and capture.recording.params is None:
+        raise InputError(
+            f"capture {capture.name}",
+            expected="poses of the person who turns",
+            received="none",
+            remedy="make the capture with `smplxpp capture turntable`, which finds them",
+        )
     return asked
 
 

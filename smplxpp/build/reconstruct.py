@@ -15,12 +15,16 @@ import numpy as np
 from smplxpp.build.config import ReconstructInputs
 from smplxpp.build.limits import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
 from smplxpp.build.opened import opened
+from smplxpp.build.turning import turn_agreement, turning_person
+from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture
+from smplxpp.capture.recording import TURNTABLE
 from smplxpp.clean import sanitize
 from smplxpp.core import Check, InputError, ProgressCallback, StageOutput
 from smplxpp.core.files.json_file import as_number, as_numbers, as_object, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.reconstruct import ReconstructConfig, Reconstruction, adopt_surface, reconstruct
+from smplxpp.reconstruct.turntable import PosedPerson, reconstruct_turntable
 from smplxpp.reconstruct.neus2 import UnitCube, mesh_in_world
 from smplxpp.reconstruct.views import PhotoView, silhouette_agreement, usable_views
 
@@ -138,6 +142,11 @@ def photographs(capture: Capture, cameras: tuple[str, ...], frame: int) -> tuple
     return views, notes
 
 
+def frames_read(capture: Capture, frames: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the frames whose photographs a surface is made of: of a turning person, all that are trained on."""
+    return usable_frames(capture, None) if capture.kind == TURNTABLE else frames
+
+
 def config_of(inputs: ReconstructInputs) -> ReconstructConfig:
     """Return the settings of the surface that the inputs ask for."""
     cell = None if inputs.cell_mm is None else 1e-3 * inputs.cell_mm
@@ -152,9 +161,23 @@ def surface_maker(inputs: ReconstructInputs) -> Maker:
 
 
 def reconstruct_frame(
-    capture: Capture, cameras: tuple[str, ...], frame: int, make: Maker, progress: ProgressCallback
+    capture: Capture,
+    cameras: tuple[str, ...],
+    frame: int,
+    make: Maker,
+    progress: ProgressCallback,
+    *,
+    body: BodyModel | None = None,
 ) -> tuple[Reconstruction, dict[str, Any]]:
     """Reconstruct one frame, and measure its silhouettes against the masks.
+
+    Args:
+        capture: the photographs; of a person who turns before one camera, all frames are read.
+        cameras: that may be used.
+        frame: its number.
+        make: gives the surface.
+        progress: called with the running step and its share done.
+        body: the model of a turning person's poses; None: the open body.
 
     Returns:
         The surface, and its numbers with notes under "problems".
@@ -162,6 +185,11 @@ def reconstruct_frame(
     Raises:
         InputError: photographs that no surface can be made of.
     """
+    if capture.kind == TURNTABLE:
+        turn, notes = turning_person(capture, cameras[0], frame, body or load_body())
+        result = make(turn.views, person=turn.person, progress=progress)
+        agreement = turn_agreement(result, turn)
+        return result, {**result.numbers, "silhouettes": agreement, "problems": [*notes, *result.notes]}
     views, notes = photographs(capture, cameras, frame)
     result = make(views, progress=progress)
     # Intersection over union of the rendered surface and the mask, for the views that the reconstruction used.
@@ -169,12 +197,25 @@ def reconstruct_frame(
     return result, {**result.numbers, "silhouettes": agreement, "problems": [*notes, *result.notes]}
 
 
-def _sweep(views: list[PhotoView], *, config: ReconstructConfig, progress: ProgressCallback) -> Reconstruction:
+def _sweep(
+    views: list[PhotoView], *, config: ReconstructConfig, progress: ProgressCallback, person: PosedPerson | None = None
+) -> Reconstruction:
+    if person is not None:
+        return reconstruct_turntable(views, person, config, progress=progress)
     return reconstruct(views, config, progress=progress)
 
 
-def _adopt(views: list[PhotoView], *, mesh: Path, root: Path, progress: ProgressCallback) -> Reconstruction:
+def _adopt(
+    views: list[PhotoView], *, mesh: Path, root: Path, progress: ProgressCallback, person: PosedPerson | None = None
+) -> Reconstruction:
     """Bring another program's surface to the cameras' world and colour it."""
+    if person is not None:
+        raise InputError(
+            "option mesh",
+            expected="cameras that see one moment",
+            received="a person who turns before one camera",
+            remedy="build with --scan, and name the mesh there",
+        )
     progress("masks", 0.0)
     raw = read_raw_mesh(mesh)
     # Other programs centre and scale the scene. Try the known normalisations and keep that whose silhouettes agree

@@ -11,8 +11,10 @@ from jaxtyping import Float64
 
 from smplxpp.body import BodyModel
 from smplxpp.build.observe import Observed
+from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core import ARRAY_NAMES, BodyParams, Check, InputError, ProgressCallback, StageOutput, ignore_progress
 from smplxpp.register import BodyFit, LandmarkModel, Observations, RegisterConfig, follow, lost_frames, register
+from smplxpp.register.turntable import TurntableConfig, register_turntable
 
 CONFIDENT = 0.5
 """Mean confidence of the body's joints from which a frame counts as observed, not filled in by the priors."""
@@ -89,8 +91,13 @@ def register_observed(
         initial = follow(body, observations, observed.found, at=at, config=config, progress=progress)
         lost = lost_frames(body, observations, initial, at=at)
         observations = replace(observations, initial=initial)
-    # Gauss-Newton over pose, translation and one shape for all frames, from keypoints, masks, scans and priors.
-    fit = register(body, observations, config, progress=progress)
+    if observed.capture is not None and observed.capture.kind == TURNTABLE:
+        # One camera sees no depth: the pose that all frames share gives it. The camera is known, and stands upright.
+        turn = TurntableConfig(up_spread=3.0, solver=config)
+        fit = register_turntable(body, observations, turn, progress=progress).fit
+    else:
+        # Gauss-Newton over pose, translation and one shape for all frames, from keypoints, masks, scans and priors.
+        fit = register(body, observations, config, progress=progress)
     if not fit.frames:
         raise InputError(
             "registration",

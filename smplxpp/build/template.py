@@ -198,7 +198,9 @@ class _Build:
             # The plan asks for the reference frame alone.
             (frame,) = usable_frames(capture, asked.frames)
             check_masks(capture, cameras, (frame,))
-            surface, numbers = reconstruct_frame(capture, cameras, frame, surface_maker(asked), ignore_progress)
+            surface, numbers = reconstruct_frame(
+                capture, cameras, frame, surface_maker(asked), ignore_progress, body=self.body
+            )
             assert self.request.surface is not None
             write_surface(self.request.surface, surface)
             step.output = reconstruction_output({frame: numbers}, {}, cameras)

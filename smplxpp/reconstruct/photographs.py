@@ -59,7 +59,6 @@ class Pyramids:
             tuple(view.camera for view in views),
         )
 
-
     def sight(self, mesh: TriangleMesh, normals: Float[np.ndarray, "N 3"]) -> Sight:
         """Compute which vertices of a surface each view sees."""
         return sight(mesh, normals, self.cameras)

@@ -175,7 +175,7 @@ def reconstruct_turntable(
     box = Box(person.vertices.min(axis=0) - _REACH_M, person.vertices.max(axis=0) + _REACH_M)
     progress("hull", 0.0)
     # A coarse hull shows which frames do not fit; the fine one is made of the others.
-    shares = _agreements(_hull(views, person, config, box, cell=0.01)[0], views, person)
+    shares = agreements(_hull(views, person, config, box, cell=0.01)[0], views, person)
     kept = np.flatnonzero(shares >= np.median(shares) - _WORSE_IOU)
     for row in np.setdiff1d(np.arange(len(views)), kept):
         faults[views[row].name] = f"the posed surface covers {100 * shares[row]:.0f} % of its union with the mask"
@@ -192,7 +192,6 @@ def reconstruct_turntable(
         "explained": {},
         "pixel_mm": 1e3 * pixel,
         "cell_mm": 1e3 * cell,
-        "agreement": {view.name: float(share) for view, share in zip(views, shares[kept], strict=True)},
     }
     pyramids = CarriedPyramids.of_turn(views, person.carrier())
     return refined(hull, pyramids, inside, config, (notes, numbers), progress=progress)
@@ -244,9 +243,7 @@ def _hull(
     return zero_surface(inside, box, cell=cell), inside
 
 
-def _agreements(
-    surface: TriangleMesh, views: Sequence[PhotoView], person: PosedPerson
-) -> Float64[np.ndarray, " T"]:
+def agreements(surface: TriangleMesh, views: Sequence[PhotoView], person: PosedPerson) -> Float64[np.ndarray, " T"]:
     """Return the intersection over union of the posed surface and the mask of each frame, at some 320 rows."""
     carrier = person.carrier()
     features = carrier.features(surface.vertices, carrier.weights_at(surface.vertices))
@@ -267,4 +264,6 @@ def _pixel(views: Sequence[PhotoView], person: PosedPerson) -> float:
     middle = np.append(person.vertices.mean(axis=0), 1.0)
     places = person.transforms[:, 0] @ middle
     depths = [float((view.camera.cam_from_world @ place)[2]) for view, place in zip(views, places, strict=True)]
-    return float(np.median([2.0 * z / (v.camera.K[0, 0] + v.camera.K[1, 1]) for v, z in zip(views, depths, strict=True)]))
+    return float(
+        np.median([2.0 * z / (v.camera.K[0, 0] + v.camera.K[1, 1]) for v, z in zip(views, depths, strict=True)])
+    )

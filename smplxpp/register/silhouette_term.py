@@ -198,7 +198,9 @@ class SilhouetteTerm:
         """Estimate the gaps from the distances of the last step; a vertex needs `least_sightings` of them."""
         if self._distances:
             place, distance = (np.concatenate(parts) for parts in zip(*self._distances, strict=True))
-            self.gaps = Gaps.estimated(place, distance, len(self.index), least=self.least_sightings, tight=self.config.tight_m)
+            self.gaps = Gaps.estimated(
+                place, distance, len(self.index), least=self.least_sightings, tight=self.config.tight_m
+            )
         self._distances = []
 
     def residual_px(self, row: int, kinematics: Kinematics, posture: Posture) -> float:

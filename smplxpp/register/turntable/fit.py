@@ -14,7 +14,7 @@ prior of the shape, or from the stature that is told.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -55,7 +55,7 @@ class TurntableConfig:
     up_spread: float = 15.0
     keypoint_steps: int = 30
     surface_steps: int = 10
-    solver: RegisterConfig = RegisterConfig()
+    solver: RegisterConfig = field(default_factory=RegisterConfig)
 
     def __post_init__(self) -> None:
         if self.stature is not None:
@@ -166,9 +166,7 @@ class FocalKeypoints(KeypointTerm):
         rows = jacobian @ self.landmarks.combined(columns.jacobian(motion))
         rows[:, :, columns.count + columns.focal] = pixels - camera.K[:2, 2]
         rows *= root[:, None, None]
-        equations.add(
-            row, rows.reshape(-1, rows.shape[2]), (root[:, None] * residual).reshape(-1), shape=shape
-        )
+        equations.add(row, rows.reshape(-1, rows.shape[2]), (root[:, None] * residual).reshape(-1), shape=shape)
 
 
 class _Turn:
@@ -182,9 +180,10 @@ class _Turn:
         (self.name, self.camera), *_ = observed.cameras.items()
         seen = prepare_keypoints(body, observed, config.solver)
         assert seen is not None  # `check_turn` has looked
-        self.keypoints: Keypoints2D = seen.keypoints[self.name]
+        self.keypoints = _trusted(seen.keypoints[self.name])
         self.notes = list(seen.notes)
-        self.term = FocalKeypoints(body, seen.landmarks, observed.cameras, seen.keypoints, seen.noise_px)
+        given = {self.name: self.keypoints}
+        self.term = FocalKeypoints(body, seen.landmarks, observed.cameras, given, seen.noise_px)
         self.landmarks = seen.landmarks
         self.columns = SharedColumns.of(body, self._free_joints())
         shape_frames = observed.shape_frames or observed.frames
@@ -332,6 +331,12 @@ class _Turn:
         focal_spread, cost = numbers
         turned = degrees_turned(state.rotations[:, self.root], shared.up)
         return TurntableFit(fit, self.term.cameras[0], shared.up, focal_spread, turned, cost)
+
+
+def _trusted(keypoints: Keypoints2D) -> Keypoints2D:
+    """Return keypoints without those of a confidence below 0.05: no second view shows that they are imagined."""
+    confidence = np.where(keypoints.confidence < 0.05, 0.0, keypoints.confidence)
+    return replace(keypoints, confidence=confidence)
 
 
 def degrees_turned(roots: Float64[np.ndarray, "T 3 3"], up: Float64[np.ndarray, " 3"]) -> float:

@@ -261,7 +261,7 @@ def _held_degrees(name: str) -> float:
 
 
 def _stature(body: BodyModel) -> tuple[float, Float64[np.ndarray, " B"]]:
-    """Return the height of the mean shape at rest, from the lowest vertex to the highest, and its derivative by betas."""
+    """Return the height of the mean shape at rest from its lowest to its highest vertex, and the derivative by betas."""
     low, high = int(body.v_template[:, 1].argmin()), int(body.v_template[:, 1].argmax())
     height = float(body.v_template[high, 1] - body.v_template[low, 1])
     return height, body.shapedirs[high, 1] - body.shapedirs[low, 1]

@@ -19,7 +19,21 @@ from smplxpp.register.landmarks import LandmarkModel, is_finger
 
 _TURNS = 36  # candidates of a frame, 10 degrees apart
 # Points that keep their place on a standing body, by parts of their names.
-_STEADY = ("hip", "shoulder", "collar", "pelvis", "spine", "neck", "head", "nose", "eye", "ear", "knee", "ankle", "heel")
+_STEADY = (
+    "hip",
+    "shoulder",
+    "collar",
+    "pelvis",
+    "spine",
+    "neck",
+    "head",
+    "nose",
+    "eye",
+    "ear",
+    "knee",
+    "ankle",
+    "heel",
+)
 _FACE = ("nose", "left_eye", "right_eye", "face_30")
 _SEEN = 0.3  # confidence from which a detector means that it sees a point
 

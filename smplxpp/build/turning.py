@@ -1,0 +1,89 @@
+"""Open a person who turns before one camera for a reconstruction: photographs of all frames, and the body in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.body import BodyModel
+from smplxpp.capture import Capture
+from smplxpp.core import BodyParams, InputError
+from smplxpp.reconstruct import PhotoView, Reconstruction
+from smplxpp.reconstruct.turntable import PosedPerson, agreements
+
+_BODY_JOINTS = 22  # joints that carry the space around a body; fingers and face follow wrists and head
+
+
+@dataclass(frozen=True, eq=False)
+class TurningPerson:
+    """The photographs of a turn and the body in them, row by row.
+
+    Attributes:
+        views: a photograph a frame, called by its number.
+        person: the body that carries points from the reference pose to these frames.
+    """
+
+    views: list[PhotoView]
+    person: PosedPerson
+
+
+def turning_person(
+    capture: Capture, camera: str, frame: int, body: BodyModel
+) -> tuple[TurningPerson, list[str]]:
+    """Read the frames of a turn that are trained on, and pose the body in them, with notes on those left out.
+
+    Args:
+        capture: of a person who turns, with a pose a frame.
+        camera: its name.
+        frame: the reference frame, in whose pose the surface will be.
+        body: the model of the poses.
+
+    Raises:
+        InputError: no pose of the reference frame.
+    """
+    frames = [number for number in capture.splits.train_frames if number in set(capture.frames)]
+    views, rows, notes = [], [], []
+    for number in [frame, *(other for other in frames if other != frame)]:
+        try:
+            params, opacity = capture.params(number), capture.mask(camera, number)
+            color = capture.image(camera, number)
+        except InputError as error:
+            notes.append(f"frame {number} left out: {error}")
+            continue
+        if params is None or opacity is None:
+            notes.append(f"frame {number} left out: no {'pose' if params is None else 'mask'}")
+            continue
+        views.append(PhotoView(str(number), capture.cameras[camera], color, opacity))
+        rows.append(params)
+    if not views or views[0].name != str(frame):
+        raise InputError(
+            f"capture {capture.name}",
+            expected=f"photograph, mask and pose of the reference frame {frame}",
+            received="; ".join(notes[:3]) or "none",
+            remedy="`smplxpp capture turntable` finds the poses; choose another frame with --frame",
+        )
+    return TurningPerson(views, posed_person(body, BodyParams.concatenate(rows))), notes
+
+
+def posed_person(body: BodyModel, params: BodyParams) -> PosedPerson:
+    """Return the body in some frames, with the first of them as the reference pose."""
+    posed = body.forward(params)
+    transforms = np.asarray(posed.posed_from_rest, dtype=np.float64)
+    # Joints beyond the body's own follow their nearest ancestor among these.
+    carrier = np.arange(body.joint_count)
+    for joint in range(body.joint_count):
+        while carrier[joint] >= _BODY_JOINTS:
+            carrier[joint] = body.parents[carrier[joint]]
+    weights = np.zeros((min(_BODY_JOINTS, body.joint_count), body.vertex_count))
+    np.add.at(weights, carrier, body.weights.T)
+    moved = transforms[:, : len(weights)] @ np.linalg.inv(transforms[0, : len(weights)])
+    return PosedPerson(np.asarray(posed.vertices[0], dtype=np.float64), weights.T, moved)
+
+
+def turn_agreement(result: Reconstruction, turn: TurningPerson) -> dict[str, float]:
+    """Return the intersection over union of the posed surface and the mask of every frame that was used."""
+    used = [row for row, view in enumerate(turn.views) if view.name in result.numbers["views"]]
+    views = [turn.views[row] for row in used]
+    shares = agreements(result.mesh, views, turn.person.select(used))
+    return {view.name: float(share) for view, share in zip(views, shares, strict=True)}
