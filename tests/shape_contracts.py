@@ -80,10 +80,15 @@ def _checked_dataclass(cls: type) -> None:
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
         made(self, *args, **kwargs)
         if not hints:
-            hints.update({name: _resolved(text, cls) for name, text in shaped.items()})
+            hints.update({name: _resolved(text, _declaring(cls, name)) for name, text in shaped.items()})
         _hold(cls.__qualname__, {name: (hint, getattr(self, name)) for name, hint in hints.items()})
 
     cls.__init__ = init
+
+
+def _declaring(cls: type, name: str) -> type:
+    """The class that declares a field, whose module has the names in its annotation."""
+    return next(one for one in cls.__mro__ if name in vars(one).get("__annotations__", {}))
 
 
 def _annotations(function: Callable[..., Any]) -> dict[str, str]:

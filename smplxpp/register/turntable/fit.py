@@ -293,7 +293,7 @@ class _Turn:
             self.term.add(equations, row, self.kinematics, posture, shape=shape)
             if surface is not None:
                 surface.add(equations, row, self.kinematics, posture, shape=shape)
-        HeldPose(self.kinematics, self.columns, priors, len(state)).add(equations, state, shared)
+        HeldPose(self.kinematics, self.columns, priors, self.tells_shape).add(equations, state, shared)
         step = equations.solve(damping=1e-3, solve_shape=True).limited(angle=0.35, length=0.25)
         c = self.columns
         state = self.kinematics.updated(state, step.rotvecs, step.transl, step.betas[: c.shape], step.expression)

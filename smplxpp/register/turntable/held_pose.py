@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from smplxpp.body import BodyModel
 from smplxpp.core import matrix_from_rotvec, rotvec_from_matrix
@@ -142,11 +142,13 @@ class HeldPose:
         kinematics: of the body.
         columns: order of the unknowns.
         priors: of the shared unknowns.
-        frames: number of frames.
+        tells: whether a frame may change what all frames share; held-out frames may not.
     """
 
-    def __init__(self, kinematics: Kinematics, columns: SharedColumns, priors: SharedPriors, frames: int) -> None:
-        self.kinematics, self.columns, self.priors, self.frames = kinematics, columns, priors, frames
+    def __init__(
+        self, kinematics: Kinematics, columns: SharedColumns, priors: SharedPriors, tells: Bool[np.ndarray, " T"]
+    ) -> None:
+        self.kinematics, self.columns, self.priors, self.tells = kinematics, columns, priors, tells
         names = [kinematics.body.joint_names[j] for j in columns.joints]
         self.root = names.index("pelvis")
         self.spread = priors.held * np.radians([_held_degrees(name) for name in names])
@@ -157,7 +159,7 @@ class HeldPose:
     def add(self, equations: NormalEquations, state: BodyState, shared: Shared) -> None:
         """Add all terms to the normal equations."""
         pelvis = state.transl + self._root_joint(state)
-        middle = pelvis.mean(axis=0)
+        middle = pelvis[self.tells].mean(axis=0)
         for row in range(len(state)):
             self._add_limbs(equations, row, state, shared)
             self._add_place(equations, row, pelvis[row], middle, shared)
@@ -186,7 +188,9 @@ class HeldPose:
             first = P + c.mean_pose.start + 3 * k
             rows[k, :, first : first + 3] = weight[k] * by_mean[k]
         rows[self.root, :, P + c.vertical.start : P + c.vertical.stop] = weight[self.root] * cross_matrix(shared.up)
-        equations.add(row, rows.reshape(-1, rows.shape[2]), (weight[:, None] * vectors).reshape(-1))
+        equations.add(
+            row, rows.reshape(-1, rows.shape[2]), (weight[:, None] * vectors).reshape(-1), shape=bool(self.tells[row])
+        )
 
     def _add_place(
         self, equations: NormalEquations, row: int, pelvis: np.ndarray, middle: np.ndarray, shared: Shared
@@ -200,7 +204,7 @@ class HeldPose:
         across = (np.eye(3) - np.outer(shared.up, shared.up)) / _PLACE_M
         rows[1:, c.transl] = across
         residual = np.array([(shared.up @ pelvis - shared.height) / _PELVIS_HEIGHT_M, *(across @ (pelvis - middle))])
-        equations.add(row, rows, residual)
+        equations.add(row, rows, residual, shape=bool(self.tells[row]))
 
     def _add_mean(self, equations: NormalEquations, shared: Shared) -> None:
         """Add the pose prior and the joint limits of the mean pose."""
@@ -209,7 +213,7 @@ class HeldPose:
         vectors = rotvec_from_matrix(shared.mean[c.joints])
         inverse = left_jacobian_inverse(vectors)
         # Observations grow with the frames; eight views of one pose are what the prior was weighed against.
-        prior = max(1.0, self.frames / 8.0)
+        prior = max(1.0, float(self.tells.sum()) / 8.0)
         over = np.maximum(vectors - highest, 0.0) + np.minimum(vectors - lowest, 0.0)
         weight = prior / spread**2 + prior * (over != 0) / soft**2
         gradient = prior * vectors / spread**2 + prior * over / soft**2
@@ -261,7 +265,7 @@ def _held_degrees(name: str) -> float:
 
 
 def _stature(body: BodyModel) -> tuple[float, Float64[np.ndarray, " B"]]:
-    """Return the height of the mean shape at rest from its lowest to its highest vertex, and the derivative by betas."""
+    """Return the height of the mean shape from its lowest to its highest vertex, and the derivative by betas."""
     low, high = int(body.v_template[:, 1].argmin()), int(body.v_template[:, 1].argmax())
     height = float(body.v_template[high, 1] - body.v_template[low, 1])
     return height, body.shapedirs[high, 1] - body.shapedirs[low, 1]
