@@ -212,6 +212,7 @@ def _registers(request: BuildRequest) -> bool:
         return True
     # The poses of a person who turns are found when the capture is made; its surface needs them before a registration.
     if _turns(request):
+        _require_poses(request)
         return False
     # Parameters in memory are a fit already, and a capture without a folder has no declaration of its sources.
     if isinstance(request.params, BodyParams) or not root.is_dir():
@@ -228,6 +229,23 @@ def _turns(request: BuildRequest) -> bool:
         return request.capture.kind == TURNTABLE
     assert request.root is not None
     return request.root.is_dir() and read_description(request.root).get("kind") == TURNTABLE
+
+
+def _require_poses(request: BuildRequest) -> None:
+    """Refuse a capture of a person who turns without a pose a frame."""
+    root = request.root
+    assert root is not None
+    if isinstance(request.capture, Capture):
+        found = request.capture.recording.params is not None
+    else:
+        found = DeclaredInputs.of_folder(root, request.protocol).own_parameters() is not None
+    if not found and request.params is None:
+        raise InputError(
+            f"capture {root.name}",
+            expected="poses of the person who turns",
+            received="none",
+            remedy="make the capture with `smplxpp capture turntable`, which finds them",
+        )
 
 
 def _starts(request: BuildRequest, found: ReferenceFrame) -> bool:
@@ -307,13 +325,6 @@ def _reconstruction(request: BuildRequest, inputs: BuildInputs) -> ReconstructIn
     capture = open_photographs(asked)
     usable_cameras(capture, ())
     usable_frames(capture, asked.frames)
-    if capture.kind == TURNTABLE and capture.recording.params is None:
-        raise InputError(
-            f"capture {capture.name}",
-            expected="poses of the person who turns",
-            received="none",
-            remedy="make the capture with `smplxpp capture turntable`, which finds them",
-        )
     return asked
 
 

@@ -46,11 +46,17 @@ def soft_hull(silhouettes: Sequence[Silhouette], box: Box, *, cell: float, disse
     return zero_surface(field, box, cell=cell)
 
 
-def zero_surface(field: Field, box: Box, *, cell: float) -> TriangleMesh:
+def zero_surface(field: Field, box: Box, *, cell: float, coarsest: float = 0.02) -> TriangleMesh:
     """Return the closed, outward surface on which a field is zero, by marching cubes on cells refined around it.
 
     A cell is refined if the field at its centre is below half the cell's diagonal, with 5 % to spare. For a Lipschitz
     field no other cell can contain the surface.
+
+    Args:
+        field: depth inside the surface.
+        box: that holds the surface.
+        cell: size of the finest cells, metres.
+        coarsest: size of the first cells, metres; larger ones save time where the field is Lipschitz everywhere.
 
     Raises:
         InputError: the field is positive nowhere.
@@ -61,8 +67,8 @@ def zero_surface(field: Field, box: Box, *, cell: float) -> TriangleMesh:
         to_side = np.minimum(points - box.low.astype(np.float32), box.high.astype(np.float32) - points).min(axis=1)
         return np.minimum(field(points), to_side)
 
-    # Start with cells of about 2 cm and halve them until they have the requested size.
-    halvings = max(0, round(float(np.log2(0.02 / cell))))
+    # Start with coarse cells and halve them until they have the requested size.
+    halvings = max(0, round(float(np.log2(coarsest / cell))))
     size = cell * 2**halvings
     # One more layer of cells on every side closes the surface.
     counts = np.ceil((box.high - box.low) / size).astype(np.int64) + 2

@@ -69,7 +69,7 @@ class Pyramids:
 
     def projections_of(
         self, points: Float64[np.ndarray, "N 3"]
-    ) -> list[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "V 3 4"]]]:
+    ) -> list[tuple[Int64[np.ndarray, " _"], Float64[np.ndarray, "V 3 4"]]]:
         """Group points by the projections of all views that hold near them: rows, and one projection a view."""
         return [(np.arange(len(points)), self.projections)]
 

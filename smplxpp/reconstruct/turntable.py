@@ -7,10 +7,12 @@ the skinning weights of the body near it,
 
 with G_tj the transforms of the joints in frame t and G_j those in the reference pose (after Alldieck et al. 2018,
 "Video Based Reconstruction of 3D People Models", who carry the rays of silhouettes instead). There the photograph of
-frame t says whether the point lies inside its silhouette, and what colour it has. The hull, the sweep and the colours
-are those of `reconstruct`, with all views looking at points that are carried.
+frame t says whether the point lies inside its silhouette, and what colour it has. Hull and colours are those of
+`reconstruct`, with all views looking at points that are carried.
 
-Poses are wrong by some degrees, and each wrong one cuts into the surface. So a share of the frames may reject a point.
+Poses are wrong by some degrees, and each wrong one cuts into the surface. So a share of the frames may reject a point,
+and the surface is smoothed. It is not swept along its normals to where photographs agree: at poses that are off by
+millimetres, in views 15 degrees apart, stripes agree with their neighbours, and plain cloth with anything.
 """
 
 from __future__ import annotations
@@ -30,12 +32,17 @@ from smplxpp.reconstruct.hull import Field, main_body, zero_surface
 from smplxpp.reconstruct.photographs import Pyramids, Sight, sight_of_camera
 from smplxpp.reconstruct.reconstruct import ReconstructConfig, Reconstruction, cell_size, refined
 from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette, least_shown
+from smplxpp.reconstruct.sweep import mean_of_neighbours, taubin
 from smplxpp.reconstruct.views import INSIDE, LEAST_VIEWS, Box, PhotoView, mask_fault
 
-# Share of the frames that may reject a point. It trades thin limbs, which wrong poses cut off, against fat ones.
-_DISSENT = 0.06
+# Share of the frames that may reject a point of the surface, and of the first hull, which a wrong frame must not spoil.
+# It trades thin limbs, which wrong poses cut off, against fat ones.
+_DISSENT, _FIRST_DISSENT = 0.03, 0.15
+_SMOOTHING = 15  # Taubin steps, against the edges that few silhouettes leave
 # Frames whose mask and surface agree less than the median frame by this much were posed wrongly.
 _WORSE_IOU = 0.08
+_COARSE_M = 0.012  # cells of the first hull
+_COARSEST_M = 0.08  # cells with which a hull is begun: the box around spread arms is mostly air
 _MOST_FRAMES = 60  # more, evenly spread, add minutes and no side
 _REACH_M = 0.25  # from the body's surface to its farthest clothes and hair
 
@@ -77,17 +84,30 @@ class Carrier:
     weights: Float32[np.ndarray, "V J"]
     transforms: Float64[np.ndarray, "T J 4 4"]
 
-    def weights_at(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N J"]:
-        """Return the mean weights of the eight nearest vertices, by the inverse square of distance plus 1 cm."""
-        near, soft = 8, 0.01
-        distance, index = self.tree.query(points, k=near)
+    def neighbours(
+        self, points: Float[np.ndarray, "N 3"], *, reach: float = np.inf
+    ) -> tuple[Float64[np.ndarray, "N K"], Int64[np.ndarray, "N K"]]:
+        """Return distances and indices of the four nearest vertices within reach; farther ones are at infinity."""
+        distance, index = self.tree.query(points, k=4, distance_upper_bound=reach)
+        return distance, index.astype(np.int64)
+
+    def weights_of(
+        self, distance: Float64[np.ndarray, "N K"], index: Int64[np.ndarray, "N K"]
+    ) -> Float32[np.ndarray, "N J"]:
+        """Return the mean weights of neighbours, by the inverse square of distance plus 1 cm."""
+        soft = 0.01
         share = 1.0 / (distance + soft) ** 2
         share /= share.sum(axis=1, keepdims=True)
-        rows = np.repeat(np.arange(len(points)), near)
+        rows = np.repeat(np.arange(len(index)), index.shape[1])
+        known = np.minimum(index, len(self.weights) - 1).ravel()  # those at infinity have no share
         matrix = sparse.csr_matrix(
-            (share.astype(np.float32).ravel(), (rows, index.ravel())), shape=(len(points), len(self.weights))
+            (share.astype(np.float32).ravel(), (rows, known)), shape=(len(index), len(self.weights))
         )
         return np.asarray(matrix @ self.weights)
+
+    def weights_at(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N J"]:
+        """Return the mean weights of the vertices near points."""
+        return self.weights_of(*self.neighbours(points))
 
     def features(
         self, points: Float[np.ndarray, "N 3"], weights: Float32[np.ndarray, "N J"]
@@ -138,7 +158,7 @@ class CarriedPyramids(Pyramids):
 
     def projections_of(
         self, points: Float64[np.ndarray, "N 3"]
-    ) -> list[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "V 3 4"]]]:
+    ) -> list[tuple[Int64[np.ndarray, " _"], Float64[np.ndarray, "V 3 4"]]]:
         """Group points by their heaviest joint, whose rigid motion they follow: patches are small against limbs."""
         heaviest = self.carrier.weights_at(points).argmax(axis=1)
         return [
@@ -159,7 +179,7 @@ def reconstruct_turntable(
     Args:
         views: a photograph and a mask a frame, through the camera that stands still.
         person: the body in these frames.
-        config: options; `dissent` counts frames in addition to 6 % of them.
+        config: `cell`, and `dissent` in frames, in addition to 3 % of them; there is no sweep.
         progress: called with the running step and its share done.
 
     Raises:
@@ -168,14 +188,15 @@ def reconstruct_turntable(
     Example:
         >>> found = reconstruct_turntable([PhotoView("0", camera, image, mask), ...], person)  # doctest: +SKIP
     """
-    config = config or ReconstructConfig()
+    config = replace(config or ReconstructConfig(), refine=False)
     progress("masks", 0.0)
     views, person, faults = _usable(views, person)
     notes = [f"mask of {name} left out: {why}" for name, why in faults.items()]
     box = Box(person.vertices.min(axis=0) - _REACH_M, person.vertices.max(axis=0) + _REACH_M)
     progress("hull", 0.0)
     # A coarse hull shows which frames do not fit; the fine one is made of the others.
-    shares = agreements(_hull(views, person, config, box, cell=0.01)[0], views, person)
+    first = max(1, round(_FIRST_DISSENT * len(views)))
+    shares = agreements(_hull(views, person, box, cell=_COARSE_M, dissent=first)[0], views, person)
     kept = np.flatnonzero(shares >= np.median(shares) - _WORSE_IOU)
     for row in np.setdiff1d(np.arange(len(views)), kept):
         faults[views[row].name] = f"the posed surface covers {100 * shares[row]:.0f} % of its union with the mask"
@@ -183,9 +204,10 @@ def reconstruct_turntable(
     views, person = [views[row] for row in kept], person.select(kept.tolist())
     pixel = _pixel(views, person)
     cell = cell_size(pixel, config)
-    hull, inside = _hull(views, person, config, box, cell=cell)
+    hull, inside = _hull(views, person, box, cell=cell, dissent=config.dissent + int(_DISSENT * len(views)))
     hull, more = main_body(hull)
     notes += more
+    hull = taubin(hull, mean_of_neighbours(hull), steps=_SMOOTHING)
     numbers: dict[str, Any] = {
         "views": [view.name for view in views],
         "left_out": faults,
@@ -216,11 +238,11 @@ def _usable(views: Sequence[PhotoView], person: PosedPerson) -> tuple[list[Photo
 
 
 def _hull(
-    views: Sequence[PhotoView], person: PosedPerson, config: ReconstructConfig, box: Box, *, cell: float
+    views: Sequence[PhotoView], person: PosedPerson, box: Box, *, cell: float, dissent: int
 ) -> tuple[TriangleMesh, Field]:
     """Return the surface of the points that enough frames accept, and the field that it is the zero set of."""
     silhouettes, carrier = [Silhouette.of(view) for view in views], person.carrier()
-    dissent, least = config.dissent + int(_DISSENT * len(views)), least_shown(len(views))
+    least = least_shown(len(views))
 
     def inside(points: np.ndarray) -> np.ndarray:
         chunk = 1 << 16  # points at once, which bounds the memory
@@ -228,10 +250,10 @@ def _hull(
         for first in range(0, len(points), chunk):
             part = points[first : first + chunk]
             # Far from the body there is nothing of the person, whatever the silhouettes hold.
-            near, _ = carrier.tree.query(part, distance_upper_bound=_REACH_M)
-            out[first : first + chunk] = _REACH_M - np.minimum(near, 2 * _REACH_M)
-            rows = np.flatnonzero(near < _REACH_M)
-            features = carrier.features(part[rows], carrier.weights_at(part[rows]))
+            distance, index = carrier.neighbours(part, reach=_REACH_M)
+            out[first : first + chunk] = _REACH_M - np.minimum(distance[:, 0], 2 * _REACH_M)
+            rows = np.flatnonzero(distance[:, 0] < _REACH_M)
+            features = carrier.features(part[rows], carrier.weights_of(distance[rows], index[rows]))
             depths = np.empty((len(silhouettes), len(rows)), np.float32)
             for frame, silhouette in enumerate(silhouettes):
                 depths[frame] = silhouette.depth(carrier.carried(features, frame).astype(np.float32))
@@ -240,7 +262,7 @@ def _hull(
             out[first + rows] = np.minimum(out[first + rows], depth)
         return out
 
-    return zero_surface(inside, box, cell=cell), inside
+    return zero_surface(inside, box, cell=cell, coarsest=_COARSEST_M), inside
 
 
 def agreements(surface: TriangleMesh, views: Sequence[PhotoView], person: PosedPerson) -> Float64[np.ndarray, " T"]:

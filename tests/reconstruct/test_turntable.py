@@ -1,0 +1,70 @@
+"""A person who sways while turning before one camera: silhouettes of different poses carve one surface."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from smplxpp.body import load_body
+from smplxpp.build.turning import posed_person
+from smplxpp.core import InputError
+from smplxpp.reconstruct import PhotoView, ReconstructConfig
+from smplxpp.reconstruct.turntable import reconstruct_turntable
+from tests.register.turns import turned_person
+
+BODY = load_body()
+COARSE = ReconstructConfig(cell=0.016)
+
+
+@pytest.fixture(scope="module")
+def turn():
+    return turned_person(BODY, 6, sway=8.0, height=160)
+
+
+@pytest.fixture(scope="module")
+def views(turn):
+    """Photographs whose red is the share of the height, so that colours tell where they come from."""
+    height, width = turn.masks[0].shape
+    red = np.broadcast_to(np.linspace(255, 0, height)[:, None], (height, width))
+    color = np.stack([red, 0 * red, 0 * red], axis=2).astype(np.uint8)
+    return [PhotoView(str(k), turn.camera, color, mask) for k, mask in enumerate(turn.masks)]
+
+
+def forearms(turn) -> np.ndarray:
+    joints = [BODY.joint_names.index(f"{side}_elbow") for side in ("left", "right")]
+    near = BODY.weights[:, joints].sum(axis=1) > 0.8
+    return np.asarray(BODY.forward(turn.params.frame(0)).vertices[0])[near]
+
+
+def test_limbs_that_sway_are_not_cut_off(turn, views):
+    person = posed_person(BODY, turn.params)
+    found = reconstruct_turntable(views, person, COARSE)
+    # Without carrying the limbs, every point of an arm is outside some silhouette: all joints follow the pelvis.
+    rigid = replace(person, transforms=np.repeat(person.transforms[:, :1], person.transforms.shape[1], axis=1))
+    stiff = reconstruct_turntable(views, rigid, COARSE)
+    away = [1e3 * cKDTree(one.mesh.vertices).query(forearms(turn))[0].mean() for one in (found, stiff)]
+    assert away[0] < 20.0 and away[1] > 2 * away[0]
+    # The trunk and the legs as a whole: within a voxel and a half of the body.
+    true = np.asarray(BODY.forward(turn.params.frame(0)).vertices[0])
+    assert 1e3 * np.median(cKDTree(true).query(found.mesh.vertices)[0]) < 24.0
+    # Colours come from where a vertex is seen.
+    top, bottom = found.mesh.vertices[:, 1] > 1.3, found.mesh.vertices[:, 1] < 0.4
+    assert found.colors[top, 0].mean() > found.colors[bottom, 0].mean() + 50
+
+
+def test_a_frame_of_another_pose_is_left_out_and_named(turn, views):
+    person = posed_person(BODY, turn.params)
+    moved = views[3]
+    wrong = replace(moved, opacity=np.roll(moved.opacity, 30, axis=1))
+    found = reconstruct_turntable([*views[:3], wrong, *views[4:]], person, COARSE)
+    assert list(found.numbers["left_out"]) == ["3"] and "3" not in found.numbers["views"]
+    assert any("frame 3 left out" in note for note in found.notes)
+
+
+def test_masks_of_nobody_are_refused(turn, views):
+    empty = [replace(view, opacity=np.zeros_like(view.opacity)) for view in views]
+    with pytest.raises(InputError, match="at least 4 with a photograph"):
+        reconstruct_turntable(empty, posed_person(BODY, turn.params), COARSE)
