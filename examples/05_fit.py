@@ -1,11 +1,10 @@
 """One frame's photographs become textured Gaussians on a template: what `smplxpp fit` does, in Python.
 
-Without --run it builds the template first.
+Without --template it builds the template first.
 """
 
 import argparse
 import tempfile
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,24 +12,23 @@ from PIL import Image
 
 import avatar
 import smplxpp
-from pipelines.commands.build import Build
-from pipelines.stages.build import build
-from smplxpp.capture import open_capture
-from smplxpp.core.errors import GeometryWarning
 
 PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, help="folder of `smplxpp build --capture data/fixtures/person`")
+    parser.add_argument("--template", type=Path, help="smplxpp.npz of the embedded person, of `smplxpp build`")
     parser.add_argument("--out", type=Path, help="folder of the result; by default a new temporary one")
     options = parser.parse_args()
     out = options.out or Path(tempfile.mkdtemp(prefix="smplxpp_"))
 
-    capture = open_capture(PERSON)
+    capture = smplxpp.open_capture(PERSON)
     splits = capture.splits
-    template = smplxpp.Template.load((options.run or built(out / "run")) / "60_assemble" / "smplxpp.npz")
+    if options.template:
+        template = smplxpp.Template.load(options.template)
+    else:
+        template = smplxpp.build_template(capture=capture).template
     train, held_out = (
         avatar.read_views(capture, 0, names) for names in (splits.train_cameras, splits.novel_view_cameras)
     )
@@ -45,15 +43,6 @@ def main() -> None:
         Image.fromarray(pair).save(out / f"{view.name}.png")
     mean = avatar.mean_quality({view.name: result.quality[view.name] for view in held_out})
     print(f"held out: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.4f}\nwritten {out}/splats.ply and pictures")
-
-
-def built(run: Path) -> Path:
-    command = Build(run_folder=run, capture=PERSON)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GeometryWarning)  # the small scan is repaired here and there
-        plan = command.plan()
-        build(run, plan.inputs, plan.config, last="60_assemble")
-    return run
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ FILES = {
     "02_transfer_weights": {"as_published.ply", "default.ply", "default_for_lower_clothes.ply"},
     "03_metrics": {"comparison.json"},
     "04_animate": {"motion.glb", "squat.ply", "squat.png", "high_step.png", "arms_overhead.png", "twist.png"},
-    "05_fit": {"run", "metrics.jsonl", "splats.ply", "Cam004.png"},
+    "05_fit": {"metrics.jsonl", "splats.ply", "Cam004.png"},
 }
 
 SHORT = {"00_main_job": ("--share", "0.02")}
@@ -66,10 +66,21 @@ def test_every_example_is_listed_and_short() -> None:
     assert main.end_lineno - main.lineno <= 10
 
 
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """What the example of the build prints and where it writes: the fit takes its template."""
+    out = tmp_path_factory.mktemp("built") / "out"
+    return run_example("01_build_from_a_scan", out), out
+
+
 @pytest.mark.parametrize("name", FILES)
-def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path) -> None:
-    text = run_example(name, tmp_path / "out", *SHORT.get(name, ()))
-    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES[name]
+def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path, built: tuple[str, Path]) -> None:
+    text, out = built
+    if name != "01_build_from_a_scan":
+        out = tmp_path / "out"
+        given = ("--template", str(built[1] / "smplxpp.npz")) if name == "05_fit" else SHORT.get(name, ())
+        text = run_example(name, out, *given)
+    assert {path.name for path in out.iterdir()} == FILES[name]
     check = {
         "00": check_main_job,
         "01": check_build,
@@ -78,7 +89,7 @@ def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path) -> No
         "04": check_animate,
         "05": check_fit,
     }[name[:2]]
-    check(text, tmp_path / "out")
+    check(text, out)
 
 
 def check_build(text: str, out: Path) -> None:

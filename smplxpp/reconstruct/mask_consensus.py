@@ -127,8 +127,8 @@ class _Votes:
 
     Attributes:
         shape: of the grid of voxels.
-        inside: (N, V) whether a view accepts the voxel or does not show it.
-        place: (N, V) the coarse pixel in which a view shows the voxel; -1 if it does not.
+        inside: (V, N) whether a view accepts the voxel or does not show it.
+        place: (V, N) int32, the coarse pixel in which a view shows the voxel; -1 if it does not.
         pixels: number of coarse pixels of each view.
         masks: coarse pixels of each view that are well inside its mask.
     """
@@ -157,10 +157,10 @@ class _Votes:
             rows = int(one.camera.height / step) + 1
             x = np.where(shown, screen[:, 0], 0) / step
             y = np.where(shown, screen[:, 1], 0) / step
-            place.append(np.where(shown, y.astype(np.int64) * columns + x.astype(np.int64), -1))
+            place.append(np.where(shown, y.astype(np.int32) * columns + x.astype(np.int32), -1))
             counts.append(rows * columns)
             masks.append(_coarse_mask(one, step, rows, columns))
-        return _Votes(shape, np.stack(inside, axis=1), np.stack(place, axis=1), tuple(counts), tuple(masks))
+        return _Votes(shape, np.stack(inside), np.stack(place, dtype=np.int32), tuple(counts), tuple(masks))
 
     def accepted(self, trusted: np.ndarray, dissent: int) -> np.ndarray:
         """Return (N,) the voxels that all but `dissent` of the trusted views accept, where enough views show them.
@@ -168,8 +168,8 @@ class _Votes:
         Of several connected components, the one that most views show is kept; the others lie in front of single
         cameras, where the other views do not reach.
         """
-        shown = (self.place[:, trusted] >= 0).sum(axis=1)
-        kept = (shown >= least_shown(int(trusted.sum()))) & ((~self.inside[:, trusted]).sum(axis=1) <= dissent)
+        shown = (self.place[trusted] >= 0).sum(axis=0)
+        kept = (shown >= least_shown(int(trusted.sum()))) & ((~self.inside[trusted]).sum(axis=0) <= dissent)
         piece, count = ndimage.label(kept.reshape(self.shape))
         if count < 2:
             return kept
@@ -178,10 +178,10 @@ class _Votes:
 
     def explained(self, kept: np.ndarray) -> np.ndarray:
         """Return (V,) the share of each mask that the kept voxels cover; 1 for a mask outside the box."""
-        out = np.ones(len(self.masks))
+        out, voxels = np.ones(len(self.masks)), np.flatnonzero(kept)
         for v, mask in enumerate(self.masks):
             covered = np.zeros(self.pixels[v] + 1, dtype=bool)
-            covered[self.place[kept, v]] = True
+            covered[self.place[v, voxels]] = True
             if mask.any():
                 out[v] = covered[:-1][mask].mean()
         return out
@@ -221,7 +221,7 @@ def _agreeing(votes: _Votes, silhouettes: Sequence[Silhouette]) -> tuple[np.ndar
         for v in np.flatnonzero(trusted):
             others = trusted.copy()
             others[v] = False
-            lost = 1.0 - votes.explained(accepted & votes.inside[:, v])[others]
+            lost = 1.0 - votes.explained(accepted & votes.inside[v])[others]
             cost[v] = lost.mean()
         worst = int(cost.argmax())
         trusted[worst] = False

@@ -34,9 +34,10 @@ def turned() -> tuple[np.ndarray, np.ndarray]:
 def principal(count: int) -> np.ndarray:
     """Principal directions of faces drawn at random, scaled to standard deviations, as SMPL-X's are."""
     drawn = np.random.default_rng(1).gamma(0.5, 0.4, size=(400, 52)).clip(0.0, 1.0)
-    faces = (drawn - drawn.mean(axis=0)) @ BODY.exprdirs.reshape(-1, 52).T
-    _, size, parts = np.linalg.svd(faces, full_matrices=False)
-    return (parts[:count] * size[:count, None] / 20.0).T.reshape(-1, 3, count)
+    # Faces are drawn @ directions.T. With directions = q r, their singular vectors are q times those of drawn @ r.T.
+    q, r = np.linalg.qr(BODY.exprdirs.reshape(-1, 52))
+    _, size, parts = np.linalg.svd((drawn - drawn.mean(axis=0)) @ r.T, full_matrices=False)
+    return (q @ (parts[:count] * size[:count, None] / 20.0).T).reshape(-1, 3, count)
 
 
 def test_arkit_has_the_names_of_the_embedded_body():
