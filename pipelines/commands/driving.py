@@ -10,9 +10,10 @@ import numpy as np
 
 from pipelines.commands.options import OptionalPath
 from pipelines.runs.layout import TEMPLATE
-from smplxpp.body import BodyModel, UpAxis, load_body, load_params
+from smplxpp.body import BodyModel, UpAxis, Whose, load_body, load_motion
 from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.retarget import Skeleton, retarget
+from smplxpp.body.smpl_params import FAMILY_NAMES, retarget_smpl
 from smplxpp.cloth.poses import resampled
 from smplxpp.core import BodyParams, GeometryWarning, InputError
 from smplxpp.template.template import Template
@@ -32,7 +33,11 @@ class Driving:
     joint_map: OptionalPath = None
     """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
     up: UpAxis | None = None
-    """Axis that points up in the motion (AMASS: z); a .bvh tells it by its skeleton."""
+    """Axis that points up in the motion; by default the one that the file states, or z for AMASS, -y for TalkBody4D
+    and y for others. A .bvh tells it by its skeleton."""
+    whose: Whose = "auto"
+    """Whose parameters they are. auto: as the file tells; turns of SMPL, SMPL-H and SMPL-X are brought to an avatar of
+    the open body. body: the avatar's own, whatever they look like."""
 
     def load(self, path: Path, body: BodyModel) -> BodyParams:
         """Read a motion for a body; frames with NaN get poses interpolated between their neighbours.
@@ -47,14 +52,15 @@ class Driving:
         if path.suffix.lower() == BVH:
             self._refuse("retarget-from", self.retarget_from, f"{path}, which has a skeleton of its own")
             self._refuse("up", self.up, f"{path}, which tells it by its skeleton")
+            self._refuse("whose", None if self.whose == "auto" else self.whose, f"{path}, which has a skeleton")
             names = None if self.joint_map is None else read_joint_map(self.joint_map)
             return load_bvh(path, Skeleton.of(body), joint_map=names)
         self._refuse("joint-map", self.joint_map, f"{path}, whose joints have SMPL's names")
         if self.retarget_from is None:
-            return _whole(path, body, self.up)
-        # Read the motion for its own body, then transfer it to the person's skeleton.
+            return _whole(path, body, self.up, self.whose)
+        # Read the motion for its own body, then transfer it to the person's skeleton. `open` says whose it is.
         source, shaped = self._source()
-        params = _whole(path, source, self.up)
+        params = _whole(path, source, self.up, "body" if self.whose == "auto" else self.whose)
         betas = params.betas[0] if shaped else None
         return retarget(params, Skeleton.of(source, betas), Skeleton.of(body))
 
@@ -78,10 +84,25 @@ class Driving:
             raise InputError(f"option {name}", expected="a motion that needs it", received=received)
 
 
-def _whole(path: Path, body: BodyModel, up: UpAxis | None) -> BodyParams:
-    """Read a motion and interpolate frames without a pose between their neighbours, or copy the nearest at the ends."""
-    holes: list[int] = []
-    params = load_params(path, body=body, up=up, holes=holes)
+def _whole(path: Path, body: BodyModel, up: UpAxis | None, whose: Whose) -> BodyParams:
+    """Read a motion for a body; frames without a pose get one between their neighbours."""
+    params, family, holes = load_motion(path, body, up=up, whose=whose)
+    params = _without_holes(params, holes, path)
+    if family is None:
+        return params
+    if whose == "auto":
+        warnings.warn(
+            f"{path}: a motion of {FAMILY_NAMES[family]}: its turns are brought to the open body's joints, its steps "
+            "scaled by the legs. With its model's file (--retarget-from) its shape counts, too; if it is the open "
+            "body's, say --whose body",
+            GeometryWarning,
+            stacklevel=3,
+        )
+    return retarget_smpl(params, family, Skeleton.of(body))
+
+
+def _without_holes(params: BodyParams, holes: list[int], path: Path) -> BodyParams:
+    """Interpolate poses in frames without one between their neighbours, or copy the nearest at the ends."""
     if not holes:
         return params
     count = len(params)
@@ -89,7 +110,7 @@ def _whole(path: Path, body: BodyModel, up: UpAxis | None) -> BodyParams:
         f"{path}: {len(holes)} of {count} frames hold NaN or infinity, the first {holes[0]}: poses between those "
         "before and behind stand there",
         GeometryWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
     # Interpolate at the holes; times outside the known frames are clamped to the nearest one.
     known = np.setdiff1d(np.arange(count), holes)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from pipelines.commands.driving import BVH, Driving
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
-from smplxpp.body import LayoutName, detect_layout, load_body, load_params
+from smplxpp.body import LayoutName, UpAxis, Whose, detect_layout, load_body, load_params
 from smplxpp.core import BodyParams, InputError, require_positive
 
 log = logging.getLogger(__name__)
@@ -35,8 +34,12 @@ class ParamsConvert:
     """Frames a second of the input, for a file that states none or a wrong rate (None: as it says)."""
     person: OptionalInt = None
     """Id of the person, for files with several."""
-    up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
-    """Axis that points up in the input (AMASS: z); the output has y up. None: -y for TalkBody4D, else y."""
+    up: UpAxis | None = None
+    """Axis that points up in the input; the output has y up. None: as the input states, z for AMASS, -y for TalkBody4D,
+    else y."""
+    whose: Whose = "auto"
+    """Whose parameters the input has. auto: as its counts and keys tell. body: those of --body. Parameters of SMPL,
+    SMPL-H or SMPL-X are brought to the open body without their shape, as a start for a registration."""
     betas: OptionalInt = None
     """Number of leading betas to keep, for a body that has no more; the lost share is logged (None: all)."""
     flat_hand_mean: bool | None = None
@@ -65,6 +68,7 @@ class ParamsConvert:
                 up=self.up,
                 flat_hand_mean=self.flat_hand_mean,
                 max_betas=self.betas,
+                whose=self.whose,
             )
         # The stated rate is the input's; keeping every n-th frame divides it.
         params = (params if self.fps is None else replace(params, fps=self.fps)).select(kept)

@@ -6,26 +6,37 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float64
 
 from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.body.param_layouts import LAYOUTS, Frames, recognise, without_holes
-from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, without_holes
+from smplxpp.body.retarget import Skeleton
+from smplxpp.body.smpl_joints import is_open_body
+from smplxpp.body.smpl_params import FAMILY_NAMES, from_smpl, rests_like_smpl, smpl_skeleton
+from smplxpp.core import (
+    BodyParams,
+    GeometryWarning,
+    InputError,
+    matrix_from_rotvec,
+    require_choice,
+    rotvec_from_matrix,
+)
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import safe_load, safe_npy, safe_npz
 
-LayoutName = Literal["auto", "smplx", "amass", "easymocap", "avatarrex", "talkbody4d"]
+LayoutName = Literal["auto", "smplx", "smpl", "amass", "easymocap", "avatarrex", "talkbody4d"]
 _SERIES = (".npz", ".json", ".pkl")
 _SUFFIXES = (*_SERIES, ".npy")
 # Files of torch are programs, which only torch reads.
 _TORCH = (".pt", ".pth")
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 # Axis-angle of the rotation about x or z that takes an axis to +y; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
-_Y_UP_FROM: dict[UpAxis, tuple[float, float, float]] = {
+_Y_UP_FROM: dict[str, tuple[float, float, float]] = {
     "x": (0.0, 0.0, np.pi / 2),
     "-x": (0.0, 0.0, -np.pi / 2),
     "-y": (np.pi, 0.0, 0.0),
@@ -34,6 +45,8 @@ _Y_UP_FROM: dict[UpAxis, tuple[float, float, float]] = {
 }
 # The axis that points up in a layout's own files, where that is always the same and not y.
 _OWN_UP: dict[str, UpAxis] = {"talkbody4d": "-y"}
+Whose = Literal["auto", "body", "smpl", "smplh", "smplx"]
+"""Whose parameters a file has: those of the body that they will pose, of a family, or as the file tells."""
 
 
 def load_params(
@@ -45,13 +58,17 @@ def load_params(
     up: UpAxis | None = None,
     flat_hand_mean: bool | None = None,
     max_betas: int | None = None,
-    holes: list[int] | None = None,
+    whose: Whose = "auto",
 ) -> BodyParams:
     """Read body parameters of any known layout.
 
-    Layouts, told apart by their keys: `smplx` (SMPL-X names in npz or pickle: our own files, 4D-Dress), `amass`
-    (SMPL+H and SMPL-X), `easymocap`, `avatarrex` (and THuman4), `talkbody4d`. A folder is read as one frame (or more)
-    a file: all files whose names differ in their numbers alone, in the order of these; other files are ignored.
+    Layouts, told apart by their keys: `smplx` (SMPL-X names in npz or pickle: our own files, 4D-Dress), `smpl` (`pose`,
+    `shape`), `amass` (SMPL+H and SMPL-X), `easymocap`, `avatarrex` (and THuman4), `talkbody4d`. A folder is read as one
+    frame (or more) a file: all files whose names differ in their numbers alone, in their order; others are ignored.
+
+    Parameters of SMPL, SMPL-H and SMPL-X, where counts and keys tell them (docs/inputs.md), are exact for a model of
+    that family. For the open body their turns are kept, the pelvis stands where theirs does, and their shape is dropped
+    (`smplxpp.body.smpl_params.from_smpl`): a start for a registration, or a motion.
 
     EasyMocap and TalkBody4D rotate and translate the posed body about the origin, `x = R(Rh) X + Th`, SMPL-X about its
     root joint J0. With the inner pose (R_g, t): `global_orient = R(Rh) R_g`, `transl = R(Rh) (J0 + t) + Th - J0`.
@@ -61,29 +78,84 @@ def load_params(
         layout: name of the layout, or "auto".
         body: the body that the parameters will pose; gives J0 where it is needed. None: the open body.
         person: id of the person, for files with several.
-        up: the axis that points up in the file, which is rotated to y; None for that of the layout, which is -y for
-            TalkBody4D and y for all others (AMASS has z up, but other users of its layout have not).
+        up: the axis that points up in the file, which is rotated to y; None for the one that the file states (`up`), or
+            that of the layout, which is z for AMASS, -y for TalkBody4D and y for all others.
         flat_hand_mean: overrides what the layout implies (see `BodyParams`).
         max_betas: number of betas to keep, for a body that has no more; None keeps all.
-        holes: takes the frames of a file of several that hold NaN or infinity; another frame stands in each of them.
-            None: they are refused, except frames that hold nothing at all, which are interpolated (`register` writes
-            them for frames that it was not asked for).
+        whose: "body": the parameters are those of `body`, whatever they look like; a family: of that one; "auto": as
+            the file's counts and keys tell.
 
     Raises:
         InputError: nothing readable, an unknown or ambiguous layout, several people and none chosen, wrong shapes, or
             what the body refuses that is needed.
 
     Warns:
-        GeometryWarning: frames that were interpolated; frames without the chosen person, which are left out; betas that
-            are cut and not zero, with their share; what a layout has that is not read.
+        GeometryWarning: frames that hold nothing, which are interpolated (`register` writes them for frames that it was
+            not asked for); frames without the chosen person, which are left out; betas that are cut and not zero, with
+            their share; what a layout has that is not read; parameters of another body than the open body's; an AMASS
+            file in which people stand along y.
 
     Example:
         >>> params = smplxpp.load_params("data/fixtures/person/params/params.npz")
         >>> len(params)
         16
     """
+    parts, name = _read_parts(Path(path), layout, person, holes=None)
+    params = _joined(_cut(parts, max_betas), body, up or _OWN_UP.get(name), whose, str(path))
+    return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
+
+
+def load_motion(
+    path: str | Path, body: BodyModel, *, up: UpAxis | None = None, whose: Whose = "auto"
+) -> tuple[BodyParams, Family | None, list[int]]:
+    """Read a motion to be retargeted, with another frame in the place of those that hold NaN or infinity.
+
+    Args:
+        path: a file or a folder, as `load_params` takes it.
+        body: that shall move, of any kind with SMPL's joint names.
+        up: axis that points up in the file; None: as `load_params` finds it.
+        whose: whose parameters they are, as in `load_params`.
+
+    Returns:
+        The parameters, y up; the family that they are of, None where they are the body's or the body has the family's
+        joints; and the frames of a single file in which another stands.
+
+    Raises:
+        InputError: as `load_params`.
+    """
+    holes: list[int] = []
+    parts, name = _read_parts(Path(path), "auto", None, holes=holes)
+    family = _told(parts, whose)
+    foreign = family
+    if family is not None and not is_open_body(body) and rests_like_smpl(Skeleton.of(body)):
+        foreign = None
+    return _upright(parts, body, up or _OWN_UP.get(name), foreign, str(path)), foreign, holes
+
+
+def family_of_params(path: str | Path, *, layout: LayoutName = "auto") -> Family | None:
+    """Return whose parameters a file's counts and keys tell, SMPL's, SMPL-H's or SMPL-X's; None where they do not tell.
+
+    Raises:
+        InputError: as `load_params`.
+    """
+    file = _frame_files(Path(path))[0]
+    content, source = _content(file), f"file {file}"
+    content, _ = without_holes(content)
+    name = recognise(content, source=source) if layout == "auto" else layout
+    # Of several people the first tells; a frame without any tells nothing.
+    if isinstance(content, list):
+        content = content[:1]
+    if isinstance(content, list) and not content:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # told when it is read for use
+        frames = _read_content(content, name, None, source)
+    return None if frames is None else frames.family
+
+
+def _read_parts(path: Path, layout: str, person: int | None, *, holes: list[int] | None) -> tuple[list[Frames], str]:
+    """Read all files of a path, and return their frames and the layout; `holes` takes those filled by others."""
     # Files of the frames, and the layout that the first of them has.
-    path = Path(path)
     files = _frame_files(path)
     name = detect_layout(path) if layout == "auto" else layout
     if name not in LAYOUTS:
@@ -109,14 +181,13 @@ def load_params(
         warnings.warn(
             f"{path}: person {person} is missing in {len(absent)} of {len(files)} frames, left out (first {absent[0]})",
             GeometryWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    params = _joined(_cut(parts, max_betas), body, up or _OWN_UP.get(name, "y"))
-    return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
+    return parts, name
 
 
 def params_from_content(
-    content: Any, *, source: str, layout: LayoutName = "auto", body: BodyModel | None = None
+    content: Any, *, source: str, layout: LayoutName = "auto", body: BodyModel | None = None, whose: Whose = "auto"
 ) -> BodyParams:
     """Convert the content of a file that was read already, arrays by name or JSON, to body parameters; see
     `load_params`.
@@ -132,7 +203,7 @@ def params_from_content(
     frames = _read_content(content, name, None, source)
     if frames is None:
         raise InputError(source, expected="frames of a person", received="none")
-    return _joined([frames], body, _OWN_UP.get(name, "y"))
+    return _joined([frames], body, _OWN_UP.get(name), whose, source)
 
 
 def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
@@ -157,21 +228,78 @@ def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
     return [replace(part, params=replace(part.params, betas=part.params.betas[:, :max_betas])) for part in parts]
 
 
-def _joined(parts: list[Frames], body: BodyModel | None, up: UpAxis) -> BodyParams:
+def _joined(parts: list[Frames], body: BodyModel | None, up: str | None, whose: Whose, source: str) -> BodyParams:
+    """Return all frames in one world, y up, for the body: composed with outer motions, turned, brought to it."""
+    family = _told(parts, whose)
+    body = load_body() if body is None and family is not None else body
+    foreign = family if family is not None and body is not None and is_open_body(body) else None
+    params = _upright(parts, body, up, foreign, source)
+    if foreign is None:
+        return params
+    assert body is not None
+    if whose == "auto":
+        _warn_of_another_body(params, foreign, source)
+    return from_smpl(params, foreign, body)
+
+
+def _told(parts: list[Frames], whose: Whose) -> Family | None:
+    """Return the family that parameters are of: as the caller says, or as the file tells."""
+    require_choice("option whose", whose, get_args(Whose))
+    if whose == "auto":
+        return parts[0].family
+    return None if whose == "body" else whose
+
+
+def _upright(
+    parts: list[Frames], body: BodyModel | None, up: str | None, foreign: Family | None, source: str
+) -> BodyParams:
+    """Return all frames with y up, as parameters of the body, or of the family `foreign` that its file is of."""
     params = BodyParams.concatenate([part.params for part in parts])
     outer = [part.outer for part in parts if part.outer]
-    if up != "y" and up not in _Y_UP_FROM:
-        raise InputError("axis that points up", expected=f"y, {', '.join(_Y_UP_FROM)}", received=str(up))
-    if not outer and up == "y":
+    # An axis stated by the caller, by the file, or by the layout's definition; only the last may not hold for a file.
+    stated = up or parts[0].up or "y"
+    if stated != "y" and stated not in _Y_UP_FROM:
+        raise InputError("axis that points up", expected=f"y, {', '.join(_Y_UP_FROM)}", received=str(stated))
+    if up is None and stated == "z":
+        _warn_of_people_along_y(params, source)
+    if not outer and stated == "y":
         return params
-    body = body or load_body()
-    # Rigid motions are about the world's origin, parameters turn about the root joint: `_moved` needs the body for
-    # that.
+    # Motion about the origin needs the root joint of the body that the parameters are of.
+    if foreign is not None:
+        root = np.repeat(smpl_skeleton(foreign).places[:1], len(params), axis=0)
+    else:
+        root = (body or load_body()).rest_joints(params)[:, 0]
     if outer:
-        params = _moved(params, body, *(np.concatenate(values) for values in zip(*outer, strict=True)))
-    if up != "y":
-        params = _moved(params, body, np.array(_Y_UP_FROM[up]), np.zeros(3))
+        params = _moved(params, root, *(np.concatenate(values) for values in zip(*outer, strict=True)))
+    if stated != "y":
+        params = _moved(params, root, np.array(_Y_UP_FROM[stated]), np.zeros(3))
     return params
+
+
+def _warn_of_another_body(params: BodyParams, family: Family, source: str) -> None:
+    """Say what is kept of parameters of a family, and how they are exact."""
+    # Files of frames get one text, so that it is shown once.
+    source = re.sub(r"\d{4,}", "#", source)
+    warnings.warn(
+        f"{source}: parameters of {FAMILY_NAMES[family]}, not of the open body: their turns and the pelvis' place are "
+        f"kept, their shape ({params.betas.shape[1]} betas) and expression are not. With the model's file (--body, "
+        "body=) they are exact; if they are the open body's, say --whose body (whose='body')",
+        GeometryWarning,
+        stacklevel=4,
+    )
+
+
+def _warn_of_people_along_y(params: BodyParams, source: str) -> None:
+    """Warn where a layout has z up by definition and the bodies' own upward axis points along y."""
+    upward = matrix_from_rotvec(params.global_orient)[:, :, 1]
+    along_y, along_z = np.abs(upward[:, 1:]).mean(axis=0)
+    if along_y > 0.8 and along_z < 0.4:
+        warnings.warn(
+            f"{source}: this layout has z up, which is turned to y, but its people stand along y: if the file has y "
+            "up, state it with --up y (up='y')",
+            GeometryWarning,
+            stacklevel=4,
+        )
 
 
 def detect_layout(path: str | Path) -> str:
@@ -184,10 +312,9 @@ def detect_layout(path: str | Path) -> str:
     return recognise(_content(file), source=f"file {file}")
 
 
-def _moved(params: BodyParams, body: BodyModel, rotvec: np.ndarray, shift: np.ndarray) -> BodyParams:
-    """Return the parameters of the posed body after `x -> R x + t` about the origin."""
+def _moved(params: BodyParams, root: Float64[np.ndarray, "T 3"], rotvec: np.ndarray, shift: np.ndarray) -> BodyParams:
+    """Return the parameters of the posed body after `x -> R x + t` about the origin; `root` is its root at rest."""
     rotation = matrix_from_rotvec(rotvec)
-    root = body.rest_joints(params)[:, 0]
     turned = (rotation @ (root + params.transl)[..., None])[..., 0]
     return replace(
         params,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,21 @@ _FARTHEST = 1e6
 _STACKED = ("global_orient", "body_pose", "poses")
 # Poses with all fingers: of SMPL-H and of SMPL-X. VPoser's numbers, which some of its models write instead.
 _EASYMOCAP_COMPLETE, _EASYMOCAP_EMBEDDING = (156, 165), 32
+# 66 numbers, a body without hands, are of any family.
+_EASYMOCAP_FAMILIES: dict[int, Family] = {
+    63: "smplh",
+    69: "smpl",
+    72: "smpl",
+    78: "smplh",
+    87: "smplx",
+    156: "smplh",
+    165: "smplx",
+}
+_SMPL_SHAPE, _SMPL_PLACE = ("betas", "shape", "shapes", "beta"), ("trans", "transl", "translation")
+OPEN_BODY = "open_body"
+"""What a file states as its `body` whose parameters are of the open body."""
+Family = Literal["smpl", "smplh", "smplx"]
+"""Body models whose joints and shape directions are not the open body's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +50,14 @@ class Frames:
         params: T frames.
         outer: (T, 3) axis-angle and (T, 3) metres of `x_world = R x + t` about the origin, applied to the posed
             body; None where the layout has none.
+        family: of the body that the parameters are of, as the layout's counts and keys tell; None: they do not.
+        up: axis that points up, where the file states it or the layout defines it; None: they do not.
     """
 
     params: BodyParams
     outer: tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]] | None = None
+    family: Family | None = None
+    up: str | None = None
 
 
 def without_holes(content: Any) -> tuple[Any, list[int]]:
@@ -79,10 +98,18 @@ class Layout:
 
 
 def _read_smplx(content: Mapping[str, Any], person: int | None) -> Frames:
-    """SMPL-X names: our own files, per-frame files, 4D-Dress."""
+    """SMPL-X names: our own files, per-frame files, 4D-Dress; also SMPL's, whose body pose has two joints more."""
     values = {name: _flat_joints(name, content[name]) for name in ARRAY_NAMES if name in content}
+    family: Family | None = None
+    body_pose = np.asarray(content["body_pose"])
+    if body_pose.shape[-1] == 69 or body_pose.shape[-2:] == (23, 3) or body_pose.shape[-3:] == (23, 3, 3):
+        matrices = body_pose.shape[-3:] == (23, 3, 3)
+        joints = body_pose.reshape(-1, 23, *((3, 3) if matrices else (3,)))
+        values["body_pose"] = _flat_joints("body_pose", joints[:, :21])
+        family = "smpl"
     extras = {name: content[name] for name in ("fps", "flat_hand_mean", "v_shape") if content.get(name) is not None}
-    return Frames(BodyParams.from_mapping(values | extras))
+    up = _text(content, "up", "up_axis")
+    return Frames(BodyParams.from_mapping(values | extras), family=_family(content, family), up=up)
 
 
 def _read_avatarrex(content: Mapping[str, Any], person: int | None) -> Frames:
@@ -103,17 +130,72 @@ def _read_talkbody4d(content: Mapping[str, Any], person: int | None) -> Frames:
 
 
 def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
-    """AMASS: `poses` of SMPL+H (156) or of SMPL-X (165); complete hands."""
+    """AMASS: `poses` of SMPL+H (156) or of SMPL-X (165), complete hands, z up by definition; SMPL's 72 in its names.
+
+    Our own files state the body that they are of and their axis (`body`, `up`), which other programs may do as well.
+    """
     poses = np.atleast_2d(np.asarray(content["poses"], dtype=np.float64))
-    if poses.shape[-1] not in (156, 165):
-        raise InputError("poses", expected="shape (T, 156) or (T, 165)", received=f"shape {poses.shape}")
-    rate = content.get("mocap_framerate", content.get("mocap_frame_rate"))
-    blocks = _split(poses, face_first=True)
+    families: dict[int, Family] = {72: "smpl", 156: "smplh", 165: "smplx"}
+    family = families.get(poses.shape[-1])
+    if family is None:
+        raise InputError(
+            "poses", expected="shape (T, 156), (T, 165) or, of SMPL, (T, 72)", received=f"shape {poses.shape}"
+        )
+    rate = content.get("mocap_framerate", content.get("mocap_frame_rate", content.get("fps")))
+    blocks = _split(_without_smpl_hands(poses, "poses"), face_first=True)
     params = BodyParams.from_mapping(
         {**blocks, "betas": content["betas"], "transl": content["trans"], "flat_hand_mean": True}
         | ({} if rate is None else {"fps": rate})
     )
-    return Frames(params)
+    up = _text(content, "up", "up_axis")
+    return Frames(params, family=_family(content, family), up=up or (None if family == "smpl" else "z"))
+
+
+def _read_smpl(content: Mapping[str, Any], person: int | None) -> Frames:
+    """SMPL as fits of images and scans write it: `pose` (72; SMPL-H 156, SMPL-X 165), `betas` or `shape`, `trans`."""
+    pose = np.atleast_2d(np.asarray(content["pose"], dtype=np.float64))
+    pose = pose.reshape(len(pose), -1) if pose.ndim == 3 else pose
+    families: dict[int, Family] = {72: "smpl", 156: "smplh", 165: "smplx"}
+    family = families.get(pose.shape[-1])
+    if family is None:
+        raise InputError("pose", expected="shape (T, 72), (T, 156) or (T, 165)", received=f"shape {pose.shape}")
+    scale = np.asarray(content.get("scale", 1.0), dtype=np.float64)
+    if np.abs(scale - 1.0).max(initial=0.0) > 1e-6:
+        warnings.warn(
+            f"parameters with a scale of {float(scale.ravel()[0]):.4g}, which the body has not: it is left out",
+            GeometryWarning,
+            stacklevel=2,
+        )
+    shape, place = (next(content[k] for k in keys if k in content) for keys in (_SMPL_SHAPE, _SMPL_PLACE))
+    blocks = _split(_without_smpl_hands(pose, "pose"), face_first=True)
+    values = {**blocks, "betas": shape, "transl": place, "flat_hand_mean": family != "smpl"}
+    values |= {"fps": content["fps"]} if content.get("fps") is not None else {}
+    return Frames(BodyParams.from_mapping(values), family=_family(content, family), up=_text(content, "up", "up_axis"))
+
+
+def _without_smpl_hands(poses: np.ndarray, name: str) -> np.ndarray:
+    """Return 66 of the 72 numbers of SMPL's poses, without its two hand joints; others as they are."""
+    if poses.shape[1] != 72:
+        return poses
+    if poses[:, 66:].any():
+        warnings.warn(f"{name}: the rotations of SMPL's two hand joints are dropped", GeometryWarning, stacklevel=4)
+    return poses[:, :66]
+
+
+def _family(content: Mapping[str, Any], family: Family | None) -> Family | None:
+    """Return the family of a file's counts, unless the file states that its parameters are of the open body."""
+    return None if _text(content, "body") == OPEN_BODY else family
+
+
+def _text(content: Mapping[str, Any], *names: str) -> str | None:
+    """Return the first of these entries that is a text, in lower case; None without one."""
+    for name in names:
+        value = content.get(name)
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.item()
+        if isinstance(value, str):
+            return value.strip().lower()
+    return None
 
 
 def _read_easymocap(content: Any, person: int | None) -> Frames | None:
@@ -142,7 +224,8 @@ def _read_easymocap(content: Any, person: int | None) -> Frames | None:
     values = {**blocks, "betas": record["shapes"], "transl": np.zeros(3), "flat_hand_mean": full}
     if "expression" in record:
         values["expression"] = record["expression"]
-    return Frames(BodyParams.from_mapping(values), _outer(record, 1))
+    family = _family(record, _EASYMOCAP_FAMILIES.get(poses.shape[1]))
+    return Frames(BodyParams.from_mapping(values), _outer(record, 1), family)
 
 
 def _easymocap_poses(poses: np.ndarray) -> np.ndarray:
@@ -157,12 +240,8 @@ def _easymocap_poses(poses: np.ndarray) -> np.ndarray:
             received=f"{width}",
             remedy="decode the pose embedding first" if width == _EASYMOCAP_EMBEDDING else "",
         )
-    if poses.shape[1] != 72:
-        return poses
     # SMPL: its two hand joints have no counterpart.
-    if poses[:, 66:].any():
-        warnings.warn("EasyMocap: the rotations of SMPL's two hand joints are dropped", GeometryWarning, stacklevel=3)
-    return poses[:, :66]
+    return _without_smpl_hands(poses, "EasyMocap")
 
 
 LAYOUTS: dict[str, Layout] = {
@@ -189,6 +268,13 @@ LAYOUTS: dict[str, Layout] = {
             "talkbody4d",
             lambda keys, is_list: {"body_pose", "betas", "Rh", "Th"} <= keys and not is_list,
             _read_talkbody4d,
+        ),
+        Layout(
+            "smpl",
+            lambda keys, is_list: (
+                "pose" in keys and bool(keys & {*_SMPL_SHAPE}) and bool(keys & {*_SMPL_PLACE}) and not is_list
+            ),
+            _read_smpl,
         ),
         Layout("amass", lambda keys, is_list: {"poses", "trans", "betas"} <= keys and not is_list, _read_amass),
         Layout(

@@ -1,6 +1,7 @@
 """Retarget a motion: copy joint rotations, scale root translation by leg length, keep planted feet planted.
 
-Bodies of the SMPL family share their rest pose, so that joint rotations are copied. Steps differ in length: the root's
+Models of one family share their rest pose, so that joint rotations are copied (of SMPL's to the open body they are not:
+`smplxpp.body.smpl_params`). Steps differ in length: the root's
 translation is scaled by the ratio of the legs' lengths, and where a foot is planted on the source, the sliding that
 other proportions would cause on the target is subtracted from the root.
 """
@@ -98,12 +99,24 @@ def retarget(params: BodyParams, source: Skeleton, target: Skeleton) -> BodyPara
     places = start + scale * (pelvis - start)
     moved = places - target.places[0]
     out = replace(params.without_shape(), transl=moved)
+    return planted(out, scale * own[:, source.at(*FEET)], target, floor)
+
+
+def planted(params: BodyParams, theirs: Float64[np.ndarray, "T K 3"], target: Skeleton, floor: float) -> BodyParams:
+    """Return a motion whose planted feet move as the source's do, and whose lowest foot stands on the floor.
+
+    Args:
+        params: T frames of the target.
+        theirs: `FEET` of the source, scaled to the target's size, metres.
+        target: skeleton that moves.
+        floor: height of the source's lowest foot, metres.
+    """
     # Keep planted feet planted, then put the lowest foot on the floor.
-    feet, theirs = target.pose(out)[:, target.at(*FEET)], scale * own[:, source.at(*FEET)]
-    moved = moved + held_feet(theirs, feet, target.leg, params.fps or DEFAULT_FPS)
-    lowest = target.pose(replace(out, transl=moved))[:, target.at(*FEET), 1].min()
+    feet = target.pose(params)[:, target.at(*FEET)]
+    moved = params.transl + held_feet(theirs, feet, target.leg, params.fps or DEFAULT_FPS)
+    lowest = target.pose(replace(params, transl=moved))[:, target.at(*FEET), 1].min()
     moved[:, 1] += floor - lowest
-    return replace(out, transl=moved)
+    return replace(params, transl=moved)
 
 
 def standing(feet: Float64[np.ndarray, "T K 3"], leg: float, fps: float) -> Float64[np.ndarray, "T-1 K"]:

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from smplxpp.body.model import BodyModel
+from smplxpp.body.param_layouts import OPEN_BODY
+from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, matrix_from_rotvec, require_positive, rotvec_from_matrix
 from smplxpp.core.files.atomic import atomic_write_bytes
 
@@ -23,7 +25,8 @@ def write_amass(path: str | Path, body: BodyModel, params: BodyParams) -> None:
     Keys of SMPL-X: `poses (T, 165)`, `root_orient, pose_body, pose_hand, pose_jaw, pose_eye`, `trans`, `betas (16)`,
     `num_betas`, `gender`, `surface_model_type`, `mocap_frame_rate`, `mocap_time_length`; of SMPL+H: `poses (T, 156)`,
     `trans`, `betas`, `dmpls`, `gender`, `mocap_framerate`. Axis-angle in radians, metres, **+Z up**, hands complete
-    (without their mean). The turn is about the root joint of this body. Left out: expressions.
+    (without their mean). The turn is about the root joint of this body. `up` states the axis; `body` says "open_body"
+    where the parameters are of that and of no model of the family, as our reader understands. Left out: expressions.
 
     Args:
         body: completes the hands, and says where the root is.
@@ -53,7 +56,9 @@ def write_amass(path: str | Path, body: BodyModel, params: BodyParams) -> None:
     turned = _z_up(body, params)
     # Complete axis-angle vectors in the order of the model's joints: hand PCA and mean hand are expanded here.
     poses = body.axis_angles(turned).reshape(len(params), -1)
-    arrays: dict[str, object] = {"gender": "neutral", "trans": turned.transl, "betas": betas, "poses": poses}
+    arrays: dict[str, object] = {"up": "z", "gender": "neutral", "trans": turned.transl, "betas": betas, "poses": poses}
+    if is_open_body(body):
+        arrays["body"] = OPEN_BODY
     if body.joint_count == 52:
         arrays |= {"mocap_framerate": fps, "dmpls": np.zeros((len(params), 8))}
     else:

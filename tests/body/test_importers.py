@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smplxpp.body import detect_layout, load_params
+from smplxpp.body import detect_layout, load_body, load_motion, load_params
 from smplxpp.core import ARRAY_NAMES, BodyParams, GeometryWarning, InputError, matrix_from_rotvec
 
 FRAMES = 3
@@ -103,7 +103,7 @@ def test_amass(tmp_path, params, pca_body, kind):
         dmpls=np.zeros((FRAMES, 8)),
         **rate,
     )
-    read = load_params(tmp_path / "walk_poses.npz")
+    read = load_params(tmp_path / "walk_poses.npz", body=pca_body, up="y")
     expected = replace(params, expression=np.zeros((FRAMES, 10)), flat_hand_mean=True)
     if not face:
         expected = replace(expected, **{name: np.zeros((FRAMES, 3)) for name in ("jaw_pose", "leye_pose", "reye_pose")})
@@ -359,9 +359,9 @@ def test_unreadable_inputs_are_named(tmp_path, params):
         load_params(tmp_path)
     bad = params.as_dict() | {"body_pose": np.full((FRAMES, 63), np.nan)}
     np.savez(tmp_path / "bad.npz", **bad)
-    for holes in (None, []):  # nothing can stand in for all of them
+    for read in (load_params, lambda path: load_motion(path, load_body())):  # nothing can stand in for all of them
         with pytest.raises(InputError, match=r"bad\.npz: parameter body_pose"):
-            load_params(tmp_path / "bad.npz", holes=holes)
+            read(tmp_path / "bad.npz")
 
 
 def test_frames_without_a_pose_are_told_where_that_is_asked_for(params, tmp_path):
@@ -371,9 +371,9 @@ def test_frames_without_a_pose_are_told_where_that_is_asked_for(params, tmp_path
         for row in bad:
             arrays["body_pose"][row, 5] = np.nan
         np.savez(tmp_path / "holes.npz", **arrays)
-        holes: list[int] = []
-        assert_same(load_params(tmp_path / "holes.npz", holes=holes), params.select(list(stand)))
-        assert tuple(holes) == bad
+        read, family, holes = load_motion(tmp_path / "holes.npz", load_body())
+        assert_same(read, params.select(list(stand)))
+        assert tuple(holes) == bad and family is None
         if bad:
             with pytest.raises(InputError, match="body_pose"):
                 load_params(tmp_path / "holes.npz")

@@ -250,7 +250,7 @@ def write_easymocap(scene: Scene, root: Path) -> Path:
         shift = p.transl[frame] + joint[frame] - turn.apply(joint[frame])
         poses = np.concatenate([np.zeros(3), p.body_pose[frame], np.zeros(6)])
         record = {"id": 0, "Rh": [p.global_orient[frame].tolist()], "Th": [shift.tolist()]}
-        record |= {"poses": [poses.tolist()], "shapes": [p.betas[frame].tolist()]}
+        record |= {"poses": [poses.tolist()], "shapes": [p.betas[frame].tolist()], "body": "open_body"}
         _json(root / "output" / "smpl" / "smpl" / f"{frame:06d}.json", [record])
     return root
 

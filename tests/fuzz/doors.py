@@ -81,6 +81,7 @@ def _params_doors() -> list[Door]:
 
     amass = {"poses": numbers(T, 156), "trans": numbers(T, 3), "betas": numbers(16), "gender": "neutral"}
     amass |= {"mocap_framerate": 30.0}
+    smpl = {"pose": np.pad(numbers(T, 66), ((0, 0), (0, 6))), "shape": numbers(10), "trans": numbers(T, 3)}
     avatarrex = {"betas": numbers(1, 10), "global_orient": numbers(T, 3), "transl": numbers(T, 3)}
     avatarrex |= {"body_pose": numbers(T, 63), "jaw_pose": numbers(T, 3), "expression": numbers(T, 10)}
     avatarrex |= {f"{side}_hand_pose": numbers(T, 45) for side in ("left", "right")}
@@ -95,6 +96,7 @@ def _params_doors() -> list[Door]:
         "smplx npz": ("p.npz", lambda path: np.savez(path, **ours)),
         "smplx pkl": ("p.pkl", lambda path: path.write_bytes(pickle.dumps(ours, protocol=4))),
         "amass": ("p.npz", lambda path: np.savez(path, **amass)),
+        "smpl": ("p.npz", lambda path: np.savez(path, **smpl)),
         "avatarrex": ("p.npz", lambda path: np.savez(path, **avatarrex)),
         "easymocap": ("000000.json", lambda path: _write_json(path, [person])),
         "talkbody4d": ("000000.json", lambda path: _write_json(path, talk)),
@@ -103,7 +105,7 @@ def _params_doors() -> list[Door]:
         Door(
             f"params {name}",
             lambda folder, file=file, write=write: write(folder / file),
-            lambda folder, file=file: load_params(folder / file).frame(0),
+            lambda folder, file=file: load_params(folder / file, whose="body", up="y").frame(0),
         )
         for name, (file, write) in makers.items()
     ]

@@ -21,9 +21,9 @@ def amass_file(tmp_path):
 
 def test_a_range_of_frames_is_converted(tmp_path, amass_file):
     out = tmp_path / "new" / "params.npz"
-    summary = ParamsConvert(input=amass_file, out=out, frames="2:8:3").run()
+    summary = ParamsConvert(input=amass_file, out=out, frames="2:8:3", whose="body", up="y").run()
     assert (summary["layout"], summary["frames"], summary["fps"], summary["betas"]) == ("amass", 2, 20.0, 16)
-    expected = load_params(amass_file).select([2, 5])
+    expected = load_params(amass_file, whose="body", up="y").select([2, 5])
     with np.load(out) as file:
         read = BodyParams.from_mapping(file)
     assert read.flat_hand_mean
@@ -32,14 +32,15 @@ def test_a_range_of_frames_is_converted(tmp_path, amass_file):
 
 
 def test_the_command_prints_json(tmp_path, amass_file, capsys):
-    assert main(["params", "convert", str(amass_file), "--out", str(tmp_path / "o.npz"), "--up", "z", "--json"]) == 0
+    options = ["--out", str(tmp_path / "o.npz"), "--whose", "body", "--json"]
+    assert main(["params", "convert", str(amass_file), *options]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 10
 
 
 @pytest.mark.parametrize("frames", ["3", "a:b", "0:5:0", "1:2:3:4", "20:30"])
 def test_bad_ranges_write_nothing(tmp_path, amass_file, frames):
     with pytest.raises(InputError, match="--frames"):
-        ParamsConvert(input=amass_file, out=tmp_path / "o.npz", frames=frames).run()
+        ParamsConvert(input=amass_file, out=tmp_path / "o.npz", frames=frames, whose="body").run()
     with pytest.raises(InputError, match="--out"):
         ParamsConvert(input=amass_file, out=tmp_path / "o.pkl").run()
     assert not list(tmp_path.glob("o.*"))
