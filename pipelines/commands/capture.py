@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -17,10 +17,11 @@ from smplxpp.core.errors import InputError
 if TYPE_CHECKING:
     from pipelines.captures.masks import MatteModel
     from smplxpp.capture import Capture
+    from smplxpp.capture.convert import Conversion
 
 
 FormatName = Literal[
-    "auto", "simple", "actorshq", "talkbody4d", "avatarrex", "thuman4", "4ddress", "neus2", "easymocap", "colmap"
+    "auto", "simple", "actorshq", "talkbody4d", "avatarrex", "thuman4", "4ddress", "neus2", "easymocap", "colmap", "rig"
 ]
 _FRAMES = "numbers and ranges START:STOP or START:STOP:STEP (STOP not included), with commas between"
 
@@ -110,7 +111,22 @@ class CaptureConvertCommand:
     keypoints: OptionalPath = None
     """Folder of keypoints of any detector (docs/captures.md) to take instead of the capture's own."""
     person: OptionalInt = None
-    """Person whose keypoints to take, where there are several; by default the most confident of each frame."""
+    """Id in the keypoint files of the person to take, in each view by itself."""
+    subject: OptionalInt = None
+    """Person to take where several are in view, by the number that a note gives; by default the first: whom most views
+    agree on, large in the pictures and near the middle."""
+    calibration: OptionalPath = None
+    """Calibration file of a rig (formats: docs/captures.md), or a folder with one; by default looked for in DIR and
+    beside it."""
+    units: OptionalText = None
+    """Unit of the calibration: m, cm, mm or inch; by default that of its format, else guessed by the distances."""
+    up: OptionalText = None
+    """Axis of the calibration's world that points up: x, y, z, -x, -y or -z; by default that of its format, else what
+    the pictures say."""
+    offset: OptionalText = None
+    """Seconds at which cameras of a rig of videos started, CAM=SECONDS with commas between; others started at 0."""
+    sync: Literal["none", "sound", "motion"] = "none"
+    """Find these offsets by the videos' sound, or by the motion in them."""
     matting: OptionalPath = None
     """ONNX model of your own that makes the mattes. They go into the folder of --masks; existing ones are kept."""
     params: OptionalPath = None
@@ -128,6 +144,8 @@ class CaptureConvertCommand:
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
         from smplxpp.capture.convert import ConvertConfig, convert_capture
+        from smplxpp.capture.readers.common import RigOptions
+        from smplxpp.capture.readers.rig import find_videos
 
         # Make the mattes first: the capture is opened with them.
         body = None if self.body is None else load_body(self.body)
@@ -141,9 +159,16 @@ class CaptureConvertCommand:
             params=self.params,
             keypoints=self.keypoints,
             person=self.person,
+            subject=self.subject,
+            rig=RigOptions(self.calibration, self.units, self.up),
             body=body,
             cache_bytes=0,
         )
+        videos = find_videos(capture.root, list(capture.cameras)) if capture.format == "rig" else {}
+        if videos and not capture.views():
+            return self._decode(capture, videos)
+        if self.offset is not None or self.sync != "none":
+            raise InputError("--offset and --sync", expected="a rig of videos", received=repr(capture))
         config = ConvertConfig(
             layout=self.layout,
             scale=self.scale,
@@ -154,12 +179,43 @@ class CaptureConvertCommand:
         # The same command resumes an interrupted conversion, so that files of the first call count as kept.
         with shared_progress(enabled=not self.json) as progress:
             done = convert_capture(capture, self.out, config, progress=progress)
-        if not self.json:
-            console = Console()
-            print_notes(done.left_out, console, title="left out")
-            files = f"{done.copied} files copied, {done.encoded} encoded again, {done.kept} there already"
-            console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False, markup=False)
+        self._print(capture, done)
         return {**vars(done), "exit_status": int(bool(done.left_out))}
+
+    def _decode(self, capture: Capture, videos: Mapping[str, Path]) -> dict:
+        """Decode the videos of a rig; its notes are no reason for another exit status."""
+        from pipelines.commands.progress import shared_progress
+        from smplxpp.capture.convert_videos import VideoConfig, convert_videos
+
+        for option, value, default in (("--layout", self.layout, "simple"), ("--scale", self.scale, 1.0)):
+            if value != default:
+                raise InputError(
+                    option,
+                    expected=f"{default} for videos",
+                    received=str(value),
+                    remedy="convert the result again with other options",
+                )
+        config = VideoConfig(
+            offsets=_offsets(self.offset),
+            sync=self.sync,
+            frames=_numbers(self.frames),
+            cameras=None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(",")),
+            quality=self.quality,
+        )
+        with shared_progress(enabled=not self.json) as progress:
+            done = convert_videos(capture, videos, self.out, config, progress=progress)
+        self._print(capture, done)
+        return vars(done)
+
+    def _print(self, capture: Capture, done: Conversion) -> None:
+        """Print what was written, and what is worth knowing."""
+        if self.json:
+            return
+        console = Console()
+        print_notes(capture.keypoint_notes(), console)
+        print_notes(done.left_out, console, title="note" if capture.format == "rig" else "left out")
+        files = f"{done.copied} files copied, {done.encoded} encoded, {done.kept} there already"
+        console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False, markup=False)
 
     def _matte(self, model_file: Path) -> None:
         """Run the model over every image that has no matte yet."""
@@ -174,6 +230,41 @@ class CaptureConvertCommand:
         with shared_progress(enabled=not self.json) as progress:
             for done, _ in enumerate(write_mattes(capture, model, self.masks), start=1):
                 progress("mattes", done / total)
+
+
+def _offsets(text: str | None) -> dict[str, float]:
+    """Return the offsets that a text names: `cam1=0.2,cam2=-1`.
+
+    Raises:
+        InputError: not understood.
+    """
+    out: dict[str, float] = {}
+    for part in text.split(",") if text else ():
+        name, _, seconds = part.strip().rpartition("=")
+        try:
+            out[name.strip()] = float(seconds)
+            if not name.strip() or not abs(out[name.strip()]) < 1e6:
+                raise ValueError
+        except ValueError:
+            raise InputError("--offset", expected="CAM=SECONDS with commas between", received=part) from None
+    return out
+
+
+def _numbers(text: str | None) -> tuple[int, ...] | None:
+    """Return the frames that a text names, which no capture bounds yet: `0,5`, `0:100:10`; None for None or all."""
+    if text is None or text.strip() == "all":
+        return None
+    chosen: list[int] = []
+    for part in text.split(","):
+        try:
+            numbers = [int(n) for n in part.split(":")]
+            if len(numbers) > 3 or min(numbers) < 0 or numbers[2:] == [0]:
+                raise ValueError
+            found = list(range(*numbers)) if len(numbers) > 1 else numbers
+        except ValueError:
+            raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
+        chosen += found
+    return tuple(sorted(set(chosen)))
 
 
 def _reader(format: FormatName) -> str | None:

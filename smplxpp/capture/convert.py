@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -103,7 +103,7 @@ def convert_capture(
     # Check the request and claim the folder before anything is written.
     cameras, frames = _chosen(capture, config)
     out = Path(out).absolute()
-    _claim(capture, out, config)
+    claim_folder(capture, out, asdict(config))
     source = capture if config.scale == 1.0 else capture.resized(config.scale)
     # Views come first, then everything else, so that an interruption can be continued.
     views = source.views(cameras, frames)
@@ -185,13 +185,22 @@ def _chosen(capture: Capture, config: ConvertConfig) -> tuple[list[str], list[in
     return cameras, frames
 
 
-def _claim(capture: Capture, out: Path, config: ConvertConfig) -> None:
-    """Refuse a folder of anything but this conversion, and record the conversion in it."""
+def claim_folder(capture: Capture, out: Path, choices: Mapping[str, object]) -> None:
+    """Refuse a folder of anything but this conversion, and record the conversion in it.
+
+    Args:
+        capture: that is converted.
+        out: the folder.
+        choices: values that make another conversion where they differ.
+
+    Raises:
+        InputError: a folder in the capture's or around it, one with other files, or one of another conversion.
+    """
     # Neither folder may lie in the other.
     root = capture.root.resolve()
     if out.resolve() == root or root in out.resolve().parents or out.resolve() in root.parents:
         raise InputError("--out", expected="a folder apart from the capture's", received=str(out))
-    record = jsonable({"source": str(root), "format": capture.format, **asdict(config)})
+    record = jsonable({"source": str(root), "format": capture.format, **choices})
     path = out / _RECORD
     # A record of the same conversion continues it; any other file is refused.
     if path.is_file():

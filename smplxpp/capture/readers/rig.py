@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from smplxpp.capture.calibrations import find_calibration, read_calibration
@@ -15,7 +14,9 @@ from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoint_places import KeypointFiles, find_places
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params
 from smplxpp.capture.recording import Problem, Recording
-from smplxpp.core import InputError
+from smplxpp.capture.video_files import probe_video
+from smplxpp.core import Camera, InputError
+from smplxpp.core.errors import MissingExtraError
 from smplxpp.core.files.image_file import image_size
 
 NAME = "rig"
@@ -29,25 +30,6 @@ _VIDEOS = ("videos", "video", "recordings", "synchronized_videos", "hdVideos", "
 _PARENTS = 2  # folders above in which a session's calibration is looked for
 # The last number of a name is the frame: `cam01_000012.jpg`, `0005_img.jpg`.
 _NUMBERED = rf"(?:.*\D)?(?P<frame>\d+)\D*\.(?i:{'|'.join(suffix[1:] for suffix in IMAGE_SUFFIXES)})"
-
-
-@dataclass(frozen=True, eq=False)
-class RigFiles:
-    """Files of a rig by the names of its calibration.
-
-    Attributes:
-        calibration: path of the calibration.
-        keypoints: file or folder of each camera.
-        images: images of each camera.
-        masks: masks of each camera.
-        videos: video of each camera.
-    """
-
-    calibration: Path
-    keypoints: Mapping[str, Path] = field(default_factory=dict)
-    images: Mapping[str, FileSeries] = field(default_factory=dict)
-    masks: Mapping[str, FileSeries] = field(default_factory=dict)
-    videos: Mapping[str, Path] = field(default_factory=dict)
 
 
 def detect(root: Path) -> bool:
@@ -86,9 +68,10 @@ def read(root: Path, options: ReaderOptions) -> Recording:
             expected=f"keypoints, images or videos whose names tell the cameras {', '.join(names[:6])}",
             received=", ".join(sorted(path.name for path in root.iterdir())[:8]) or "nothing",
         )
-    if images:
-        # The images may have another resolution than the calibration's.
-        sizes = {name: image_size(series.required(int(series.numbers[0]))) for name, series in images.items()}
+    # Images may have another resolution than the calibration's.
+    sizes = {name: image_size(series.required(int(series.numbers[0]))) for name, series in images.items()}
+    sizes = sizes or _video_sizes(videos, calibrated.cameras)
+    if sizes:
         calibrated = read_calibration(calibration, units=options.rig.units, up=options.rig.up, sizes=sizes)
     notes = [f"calibration {calibrated.path.name} ({calibrated.format}): {note}" for note in calibrated.notes]
     if videos and not images:
@@ -112,23 +95,18 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     )
 
 
-def rig_files(root: Path, options: ReaderOptions) -> RigFiles:
-    """Find the files of a rig without reading them.
-
-    Raises:
-        InputError: no calibration.
-    """
-    recording = read(root, options)
-    names = list(recording.cameras)
-    calibration = options.rig.calibration or _calibration_near(root)
-    assert calibration is not None  # `read` refuses a rig without one
-    return RigFiles(
-        calibration,
-        find_keypoints(root, names),
-        recording.files["image"],
-        recording.files["mask"],
-        find_videos(root, names),
-    )
+def _video_sizes(videos: Mapping[str, Path], cameras: Mapping[str, Camera]) -> dict[str, tuple[int, int]]:
+    """Return the sizes of videos, in the orientation of their camera; nothing where ffmpeg is not installed."""
+    try:
+        probed = {name: probe_video(path) for name, path in videos.items()}
+    except (MissingExtraError, InputError):
+        return {}  # the conversion of the videos says why
+    out = {}
+    for name, video in probed.items():
+        # A video that asks to be turned may have been calibrated as it is stored.
+        swapped = video.turned and (video.width > video.height) != (cameras[name].width > cameras[name].height)
+        out[name] = (video.height, video.width) if swapped else (video.width, video.height)
+    return out
 
 
 def find_keypoints(root: Path, names: list[str]) -> dict[str, Path]:

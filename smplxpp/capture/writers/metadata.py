@@ -12,6 +12,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from smplxpp.capture.distortion import (
+    FISHEYE,
+    FOV,
+    Distortion,
+    FisheyeDistortion,
+    FovDistortion,
+    RationalDistortion,
+)
 from smplxpp.capture.recording import Recording
 from smplxpp.capture.splits import Splits
 from smplxpp.core import Camera, rotvec_from_matrix
@@ -49,6 +57,16 @@ def camera_entry(camera: Camera, name: str) -> dict[str, object]:
         "R": camera.cam_from_world[:3, :3].tolist(),
         "T": camera.cam_from_world[:3, 3].tolist(),
     }
+
+
+def lens_entry(distortion: Distortion | None) -> dict[str, object]:
+    """Return what cameras.json says of a lens; nothing for a pinhole."""
+    if isinstance(distortion, RationalDistortion):
+        (k1, k2, k3, *rest), (p1, p2) = distortion.radial, distortion.tangential
+        return {"dist": [k1, k2, p1, p2, k3, *rest]}
+    if isinstance(distortion, FisheyeDistortion):
+        return {"dist": list(distortion.k), "dist_model": FISHEYE}
+    return {"dist": [distortion.omega], "dist_model": FOV} if isinstance(distortion, FovDistortion) else {}
 
 
 def write_calibration_csv(path: Path, rig: list[RigCamera]) -> None:
