@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from pipelines.report.model import CheckRow
+from smplxpp.core.errors import InputError
 
 STDOUT = "standard output"
 CLOSED_PIPE = 128 + 13
@@ -130,9 +131,12 @@ def print_paths(paths: Mapping[str, str | Path | None], console: Console) -> Non
 
 
 def print_error(error: Exception, console: Console) -> None:
-    """Print an error in words, on one line however long."""
-    line = " ".join(error_in_words(error).split())
-    console.print(Text("error: ", style="red") + Text(line), soft_wrap=True)
+    """Print an error in words, on one line however long, and what is listed with it on lines of their own."""
+    listed = getattr(error, "__notes__", ()) if isinstance(error, InputError) else ()
+    words = str(error) if listed else error_in_words(error)
+    console.print(Text("error: ", style="red") + Text(" ".join(words.split())), soft_wrap=True)
+    for line in listed:
+        console.print(Text("  " + " ".join(line.split())), soft_wrap=True)
 
 
 def error_in_words(error: Exception) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import numpy as np
 from smplxpp.body import BodyModel
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
+from smplxpp.capture.files import subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoint_places import KeypointFiles
 from smplxpp.capture.keypoints import with_keypoints
@@ -36,6 +39,10 @@ from smplxpp.capture.window import Window
 from smplxpp.core import InputError, require_choice
 
 _MODULES = (simple, actorshq, talkbody4d, avatarrex, thuman4, dress4d, neus2, easymocap, colmap, rig)
+# Names in an error: entries of a folder, files of its folders that are looked at, layouts that are shown.
+_LISTED, _MOST_NAMES, _NEAREST = 12, 200, 3
+# Words of `LOOKS_FOR` that name files (`intri.yml`, `transform*.json`) or folders (`rgbs/`).
+_FILE_WORD = re.compile(r"(?<![\w/.])(?:[\w*]+\.\w+|[\w*]+/)(?!\w)")
 READERS = {reader.NAME: reader for reader in _MODULES}
 FORMATS: tuple[str, ...] = tuple(READERS)
 
@@ -96,7 +103,9 @@ def open_capture(
         rig=rig or RigOptions(),
     )
     try:
-        recording = READERS[format or detect_format(root)].read(root, options)
+        # A calibration that is named makes a rig of the folder.
+        name = format or ("rig" if options.rig.calibration is not None else detect_format(root))
+        recording = READERS[name].read(root, options)
     except OSError as error:  # folders that may not be listed, names that are too long for a file
         raise InputError(f"capture {root}", expected="files that can be listed", received=str(error)[:300]) from None
     if recording.protocol != protocol:
@@ -148,12 +157,43 @@ def detect_format(path: str | Path) -> str:
     fitting = [name for name in fitting if name != rig.NAME] or fitting
     if len(fitting) == 1:
         return fitting[0]
-    looked_for = "; ".join(f"{name}: {reader.LOOKS_FOR}" for name, reader in READERS.items())
     have = sorted(entry.name for entry in root.iterdir())
-    raise InputError(
+    received = ", ".join(have[:_LISTED]) + (f" and {len(have) - _LISTED} more" if len(have) > _LISTED else "")
+    if fitting:
+        raise InputError(
+            f"capture {root}",
+            expected="the files of one layout",
+            received=f"a folder with {received}, which fits {' and '.join(fitting)}",
+            remedy="name the layout: --format",
+        )
+    error = InputError(
         f"capture {root}",
-        expected=f"the files of one layout ({looked_for})",
-        received=f"a folder with {', '.join(have[:12]) or 'nothing'}"
-        + (f", which fits {' and '.join(fitting)}" if fitting else ""),
-        remedy="name the layout (format=...)" if fitting else "see docs/captures.md for what each layout needs",
+        expected="the files of one layout",
+        received=f"a folder with {received or 'nothing'}",
+        remedy="docs/captures.md has all layouts; the nearest follow",
     )
+    for line in _nearest(root):
+        error.add_note(line)
+    raise error
+
+
+def _nearest(root: Path) -> list[str]:
+    """Return a line for each of the layouts of whose files most are there: name, what it looks for, what is missing.
+
+    The words of a reader's `LOOKS_FOR` that name files or folders are looked for in the folder and in its folders.
+    """
+    inside = [path.name for path in root.iterdir()]
+    for folder in subfolders(root)[:_LISTED]:
+        inside += [path.name for path in (root / folder).iterdir()][:_MOST_NAMES]
+    ranked = []
+    for place, (name, reader) in enumerate(READERS.items()):
+        files = _FILE_WORD.findall(reader.LOOKS_FOR)
+        there = [word for word in files if any(fnmatch(one.lower(), word.rstrip("/").lower()) for one in inside)]
+        ranked.append((-len(there) / max(1, len(files)), place, name, there))
+    ranked.sort()
+    missing = rig.what_is_missing(root)
+    lines = [f"{rig.NAME}: {missing}"] if missing else []
+    for _, _, name, there in ranked[: _NEAREST - len(lines)]:
+        found = f" (there: {', '.join(there)})" if there else ""
+        lines.append(f"{name}: {READERS[name].LOOKS_FOR}{found}")
+    return lines

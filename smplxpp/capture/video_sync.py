@@ -19,9 +19,11 @@ from smplxpp.core.errors import InputError
 _SOUND_RATE = 8000  # samples a second: speech and claps
 _RATE = 200  # values a second of both kinds of signals, which bounds the precision to 5 ms
 _SMALL = 64  # pixels of the longer side of pictures that are compared
-# The best lag must correlate this much better than any that is 0.15 s and more away from it.
-_CLEARLY, _APART = 1.15, 0.15
+# The best lag must correlate this much better than any that is 0.15 s and more away from it, and lie so many standard
+# deviations of a chance correlation above 0.
+_CLEARLY, _APART, _DEVIATIONS = 1.15, 0.15, 3.0
 _LEAST_OVERLAP = 1.0  # seconds that two recordings must share
+_SLOW = 1.0  # seconds over which signals are compared to their own mean: light and gain change slowly
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +93,11 @@ def found_offsets(videos: Mapping[str, Video], by: str) -> dict[str, float]:
     offsets = {reference: 0.0}
     for name in others:
         lag, clearness = best_lag(signals[reference], signals[name])
-        if clearness < _CLEARLY:
+        if clearness < 1.0:
             raise InputError(
                 f"--sync {by}",
                 expected=f"an event that {reference} and {name} share, such as a clap",
-                received=f"two lags that fit almost equally well ({lag / _RATE:.2f} s and another)",
+                received=f"none that is clear (the best lag is {lag / _RATE:.2f} s)",
                 remedy="name the offsets: --offset CAM=SECONDS,...",
             )
         offsets[name] = lag / _RATE
@@ -104,17 +106,19 @@ def found_offsets(videos: Mapping[str, Video], by: str) -> dict[str, float]:
 
 
 def best_lag(a: Float64[np.ndarray, " N"], b: Float64[np.ndarray, " M"]) -> tuple[float, float]:
-    """Return by how many values b starts after a, and how much better this lag correlates than any other.
+    """Return by how many values b starts after a, and how clear that is: 1 and more is beyond chance.
 
-    The correlation is normalised by the energies of the parts that overlap, which have at least one second.
+    The correlation is normalised by the energies of the parts that overlap, which have at least one second. It is clear
+    if it is 1.15 times as high as that of any other lag, and three times the standard deviation `1 / sqrt(n)` of a
+    chance correlation of n independent values: the length of the overlap by that of the signals' own correlation.
 
     Example:
         >>> event = np.random.default_rng(0).normal(size=2000)
         >>> lag, clearness = best_lag(event, event[300:])
-        >>> round(lag), clearness > 2
+        >>> round(lag), clearness > 1
         (300, True)
     """
-    a, b = a - a.mean(), b - b.mean()
+    a, b = _without_trend(a), _without_trend(b)
     size = 1 << int(np.ceil(np.log2(len(a) + len(b))))
     spectrum = np.conj(np.fft.rfft(b, size))
 
@@ -136,7 +140,25 @@ def best_lag(a: Float64[np.ndarray, " N"], b: Float64[np.ndarray, " M"]) -> tupl
     best = int(np.argmax(score))
     away = np.abs(lags - lags[best]) > _APART * _RATE
     rival = float(score[away].max(initial=1e-3))
-    return float(lags[best]), float(score[best]) / max(rival, 1e-3)
+    independent = float(overlap[best]) / max(_correlation_length(a), _correlation_length(b))
+    beyond_chance = float(score[best]) * np.sqrt(independent) / _DEVIATIONS
+    return float(lags[best]), float(min(score[best] / max(rival, 1e-3) / _CLEARLY, beyond_chance))
+
+
+def _without_trend(signal: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+    """Return a signal less its mean over the second around each value."""
+    width = min(len(signal), int(_SLOW * _RATE)) | 1
+    padded = np.pad(signal, width // 2, mode="reflect") if len(signal) > width // 2 else signal
+    mean = np.convolve(padded, np.full(width, 1.0 / width), mode="same")[width // 2 : width // 2 + len(signal)]
+    return signal - (mean if len(mean) == len(signal) else signal.mean())
+
+
+def _correlation_length(signal: Float64[np.ndarray, " N"]) -> float:
+    """Return over how many values a signal resembles itself: twice the lag at which its correlation falls below 0.3."""
+    size = 1 << int(np.ceil(np.log2(2 * len(signal))))
+    own = np.fft.irfft(np.abs(np.fft.rfft(signal, size)) ** 2, size)[: len(signal)]
+    below = np.flatnonzero(own < 0.3 * own[0])
+    return 2.0 * float(below[0] if len(below) else len(signal))
 
 
 def _sound(video: Video) -> Float64[np.ndarray, " N"]:

@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
+from pipelines.cli import main
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.writers.arrays import save_params_by_row
@@ -165,3 +166,24 @@ def test_a_calibration_table_without_names_is_refused(tmp_path):
     table.write_text(table.read_text().replace("name,", "nome,"))
     with pytest.raises(InputError, match=r"calibration\.csv: expected ActorsHQ columns name, .*'name'"):
         open_capture(root)
+
+
+def test_an_unknown_folder_is_told_the_nearest_layouts_a_line_each(tmp_path, capsys):
+    """All layouts in one line of 700 characters said nothing."""
+    (tmp_path / "images" / "cam1").mkdir(parents=True)
+    (tmp_path / "intri.yml").write_text("%YAML:1.0\n")
+    with pytest.raises(InputError) as found:
+        open_capture(tmp_path)
+    assert len(str(found.value)) < 300 and len(found.value.__notes__) == 3
+    assert found.value.__notes__[0] == "easymocap: intri.yml and extri.yml (there: intri.yml)"
+    assert main(["capture", "check", str(tmp_path)]) == 2
+    shown = capsys.readouterr()
+    assert "\n  easymocap: intri.yml and extri.yml (there: intri.yml)\n" in shown.out + shown.err
+
+
+def test_videos_without_a_calibration_are_told_so(tmp_path):
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "cam1.mp4").write_bytes(b"")
+    with pytest.raises(InputError) as found:
+        open_capture(tmp_path)
+    assert found.value.__notes__[0].startswith("rig: videos or folders of keypoints are there; a calibration")

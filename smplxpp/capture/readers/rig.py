@@ -95,6 +95,21 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     )
 
 
+def what_is_missing(root: Path) -> str | None:
+    """Return what a folder lacks to be a rig, where something of a rig is there; None elsewhere."""
+    calibration = _calibration_near(root)
+    if calibration is not None:
+        names = ", ".join(list(read_calibration(calibration).cameras)[:6])
+        return f"the calibration {calibration.name} is there; keypoints, images or videos named like {names} are not"
+    videos = [p for name in _VIDEOS if (root / name).is_dir() for p in (root / name).iterdir()]
+    folders = [folder for name in _KEYPOINTS if (root / name).is_dir() for folder in subfolders(root / name)]
+    count = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos)
+    count = count or sum(name.lower().endswith("_json") for name in folders)
+    if not count:
+        return None
+    return "videos or folders of keypoints are there; a calibration (docs/captures.md) is not: --calibration names it"
+
+
 def _video_sizes(videos: Mapping[str, Path], cameras: Mapping[str, Camera]) -> dict[str, tuple[int, int]]:
     """Return the sizes of videos, in the orientation of their camera; nothing where ffmpeg is not installed."""
     try:
