@@ -15,6 +15,7 @@ from pipelines.runs.folders import keep_out_of_capture
 from pipelines.runs.layout import BUILD_STAGES, CORRECTIONS_FILE, LANDMARKS_FILE, REGISTER_STAGE, reconstructed_scan
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import load_reconstruct, load_register
+from smplxpp.body import Whose
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.inputs import BuildPlan, BuildRequest, plan_build
 from smplxpp.clean.remesh import require_remesher
@@ -75,6 +76,9 @@ class Build:
     height: OptionalFloat = None
     """The person's stature in metres (1.75), for a scan that comes alone and has no unit: voxels, data scaled to 1,
     photogrammetry. In any pose: the body that is found in the scan gets it."""
+    whose: Whose = "auto"
+    """With --scan: whose --params are. auto: as their counts and keys tell. SMPL's, SMPL-H's and SMPL-X's are a start
+    where the body is the open body: limbs and front are taken from them, shape and place are found in the scan."""
     detector: OptionalText = None
     """Keypoint model that tells front and limbs of a scan without parameters: `mediapipe` (extra detect), or a
     pose model in ONNX."""

@@ -22,7 +22,7 @@ from smplxpp.core.files.paths import absolute
 log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 # Fields that are paths, by the record that they stand in.
-_BUILD_PATHS = ("scan", "params", "labels", "cameras", "motion", "body")
+_BUILD_PATHS = ("scan", "params", "start", "labels", "cameras", "motion", "body")
 _CHOICE_PATHS = ("keypoints", "masks", "landmarks", "corrections")
 _REGISTER_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks", "scans")
 _RECONSTRUCT_PATHS = ("capture", "masks", "mesh", "body")
@@ -154,6 +154,8 @@ def _build_inputs(written: Mapping[str, Any]) -> BuildInputs:
         "label_source": "auto",
         "reconstructs": False,
         "locates": False,
+        "start": None,
+        "whose": "auto",
     }
     values = {**added, **written}
     values = {"registers": values.get("params") is None, **values}

@@ -45,7 +45,7 @@ from smplxpp.build.assemble import assemble_parts
 from smplxpp.build.data import RestPart
 from smplxpp.build.locate import locate_in_scan
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
-from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame
+from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces, vertex_labels
 from smplxpp.build.validate import validate_template
@@ -59,12 +59,14 @@ from smplxpp.template.template import Template
 def locate(folder: Path, build: BuildContext) -> StageOutput:
     """Write the parameters of the body found in the scan, what else it might have been, and how certain it is."""
     placed = build.run / LANDMARKS_FILE
+    body = load_body(build.inputs.body)
     found, output = locate_in_scan(
         _read_scan(build),
-        load_body(build.inputs.body),
+        body,
         landmarks=placed if placed.exists() else None,
         detector=build.config.detector,
         height=build.config.height,
+        start=start_params(build.inputs, body),
     )
     save_located(folder, found)
     (folder / LOCATION_FILE).write_text(json.dumps(output.numbers, indent=1) + "\n")

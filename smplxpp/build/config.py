@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from smplxpp.assemble import FillHolesConfig
+from smplxpp.body import Whose
 from smplxpp.capture import Capture
 from smplxpp.clean import BridgeConfig
 from smplxpp.clean.scan_frame import AUTO, check_height
@@ -23,6 +24,7 @@ STEPS = (
 # Automatic units and axes are found from the person's shape (`smplxpp.clean.scan_frame`).
 UNITS = (AUTO, "m", "cm", "mm", "inch")
 UP_AXES = (AUTO, "y", "z", "x", "-y", "-z", "-x")
+WHOSE: tuple[str, ...] = get_args(Whose)
 LABEL_SOURCES = (AUTO, "scan", "views", "body")
 
 
@@ -40,6 +42,8 @@ class BuildConfig:
         up: upward axis of the scan, one of `UP_AXES`. "auto": found where the scan comes alone, else +Y.
         height: the person's stature in metres, standing upright, for a scan that comes alone and has no unit. The scan
             is scaled until the body that is found in it, in whatever pose, has it. None: units tell the size.
+        whose: whose parameters are given with a scan, one of `WHOSE`. "auto": as their file tells. Those of a family are a
+            start for the search where the body is the open body, because their shape is not its.
         frame: number of the reference frame, near the T-pose.
         protocol: the capture's protocol, which names the files that are read. None: without one.
         keypoints: folder of keypoints that replaces the capture's own.
@@ -72,6 +76,7 @@ class BuildConfig:
     units: str = AUTO
     up: str = AUTO
     height: float | None = None
+    whose: Whose = "auto"
     frame: int = 0
     protocol: str | None = None
     keypoints: Path | None = None
@@ -99,6 +104,7 @@ class BuildConfig:
             require_choice(f"option {name}", getattr(self, name), choices)
         if self.height is not None:
             check_height(self.height, self.units)
+        require_choice("option whose", self.whose, WHOSE)
         require_choice("option register", self.register, (AUTO, "on", "off"))
         require_choice("option method", self.method, ("ours", "paper"))
         parts = _default_budgets()
@@ -139,6 +145,8 @@ class BuildInputs:
         locates: whether the body has to be found in the scan.
         registers: whether the parameters come from a registration.
         motion: parameters of the capture's frames, for validation; may be None.
+        start: parameters of another body of the family in the scan, which tell where limbs are and no shape.
+        whose: whose `params`, `motion` or `start` are, one of `WHOSE`.
         body: SMPL-X-layout body file; None for the open body.
         protocol: protocol of the capture that names these files; None without one.
     """
@@ -158,6 +166,8 @@ class BuildInputs:
     locates: bool = False
     registers: bool = False
     motion: Path | BodyParams | None = None
+    start: Path | BodyParams | None = None
+    whose: Whose = "auto"
     body: Path | None = None
     protocol: str | None = None
 

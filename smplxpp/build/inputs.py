@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.body import BodyModel, family_of_params, load_body, load_params
+from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs, resolved
 from smplxpp.build.reconstruct import open_photographs, usable_cameras, usable_frames
 from smplxpp.capture import Capture, ReferenceFrame, find_reference
@@ -120,6 +121,8 @@ def _of_capture(request: BuildRequest) -> BuildInputs:
     root, config = request.root, request.config
     assert root is not None
     _refuse_height(config, "a capture, whose cameras state the size")
+    if config.whose != AUTO:
+        raise InputError("option whose", expected="with --scan", received="with --capture")
     # Decide first who makes the parameters, because the search for the reference frame only asks for a fit if one is
     # used.
     registers = _registers(request)
@@ -174,21 +177,43 @@ def _of_scan(request: BuildRequest) -> BuildInputs:
             raise InputError(f"option {name}", expected="with --capture", received="with --scan")
     if request.params is not None:
         _refuse_height(config, "parameters, which state the size")
+    # Parameters of a licensed model are no parameters of the open body: the search for the body starts from them.
+    foreign = request.params is not None and config.register != "on" and _of_a_family(request)
+    if foreign and config.register == "off":
+        raise InputError(
+            "option register",
+            expected="auto, since parameters of another body than the open one are a start and no fit",
+            received="off",
+            remedy="name the model's file with --body, or state with --whose body that they are the open body's",
+        )
     # Parameters beside a lone scan are used unchanged, unless the user asks for a registration that starts from them.
     registers = request.params is not None and config.register == "on"
     return BuildInputs(
         subject=request.scan.stem if isinstance(request.scan, Path) else "scan",
         scan=request.scan,
-        params=None if registers else request.params,
+        params=None if registers or foreign else request.params,
         registers=registers,
-        locates=request.params is None,
+        locates=request.params is None or foreign,
         frame=config.frame,
         params_row=config.frame,
+        start=request.params if foreign else None,
+        whose=config.whose,
         labels=request.labels,
         label_set="4ddress" if config.label_set == AUTO else config.label_set,
         label_source="body" if config.label_source == "body" else "auto",
         body=request.body_file,
     )
+
+
+def _of_a_family(request: BuildRequest) -> bool:
+    """Whether the parameters are SMPL's, SMPL-H's or SMPL-X's and the body is the open body."""
+    whose, params = request.config.whose, request.params
+    if whose == "body" or (whose == AUTO and not isinstance(params, Path)):
+        return False
+    body = request.body if isinstance(request.body, BodyModel) else load_body(request.body)
+    if not is_open_body(body):
+        return False
+    return whose != AUTO or (isinstance(params, Path) and family_of_params(params) is not None)
 
 
 def _refuse_height(config: BuildConfig, received: str) -> None:
@@ -220,7 +245,10 @@ def _registers(request: BuildRequest) -> bool:
     declared = DeclaredInputs.of_folder(root, request.protocol)
     # Estimated parameters only start a registration; exact ones are used unchanged.
     params = declared.own_parameters() if request.params is None else request.named_params
-    return params is None or declared.given_parameters(params) == TRACKED
+    if params is None or declared.given_parameters(params) == TRACKED:
+        return True
+    # Those of a licensed model start a registration of the open body, too.
+    return _of_a_family(replace(request, params=params))
 
 
 def _turns(request: BuildRequest) -> bool:
@@ -370,7 +398,7 @@ def check_inputs(inputs: BuildInputs, body: BodyModel | None = None) -> BodyMode
         InputError: it names the option.
     """
     # A reconstructed scan does not exist yet, so that its file is not looked for.
-    for name in ("scan", "params", "labels", "cameras", "motion", "body"):
+    for name in ("scan", "params", "start", "labels", "cameras", "motion", "body"):
         value = None if name == "scan" and inputs.reconstructs else getattr(inputs, name)
         if isinstance(value, Path) and not value.exists():
             raise InputError(f"option {name}", expected="an existing file", received=str(value))
@@ -392,5 +420,5 @@ def check_inputs(inputs: BuildInputs, body: BodyModel | None = None) -> BodyMode
 def given_motion(inputs: BuildInputs, body: BodyModel) -> BodyParams | None:
     """Return the motion of the capture that the inputs name, None where they name none."""
     if isinstance(inputs.motion, Path):
-        return load_params(inputs.motion, body=body)
+        return load_params(inputs.motion, body=body, whose=inputs.whose)
     return inputs.motion

@@ -43,6 +43,7 @@ def locate_in_scan(
     landmarks: Path | Mapping[str, Any] | None = None,
     detector: str | None = None,
     height: float | None = None,
+    start: BodyParams | None = None,
 ) -> tuple[LocatedInScan, StageOutput]:
     """Find the body in a scan, and say what else it might have been and how certain it is.
 
@@ -54,12 +55,14 @@ def locate_in_scan(
         landmarks: points placed by hand, which are trusted.
         detector: keypoint model that is asked for the front and for limbs; see `BuildConfig`. Not used beside landmarks.
         height: the person's stature, metres; None: the scan has its size.
+        start: one frame of a body of another shape in the scan, whose limbs and front are proposed as a detector's
+            keypoints are; it takes the place of the detector.
 
     Raises:
         InputError: no person, or landmarks that the body does not have.
     """
     placed = landmark_points(landmarks)
-    found, output = _located(scan, body, placed, detector)
+    found, output = _located(scan, body, placed, detector, start)
     if height is None:
         return found, output
     # Poses, shoes and hair make the scan's extent another length than the stature. The body's shape prior draws a
@@ -71,7 +74,7 @@ def locate_in_scan(
             break
         scale *= lacks
         there = None if placed is None else {name: scale * point for name, point in placed.items()}
-        found, output = _located(scan.scaled(scale), body, there, detector)
+        found, output = _located(scan.scaled(scale), body, there, detector, None)
     numbers = {"height": height, "stature": stature(body, found.params), "scale": scale}
     return replace(found, scale=scale), StageOutput(output.checks, {**output.numbers, **numbers})
 
@@ -83,17 +86,25 @@ def stature(body: BodyModel, params: BodyParams) -> float:
 
 
 def _located(
-    scan: ScanFile, body: BodyModel, landmarks: dict[str, np.ndarray] | None, detector: str | None
+    scan: ScanFile,
+    body: BodyModel,
+    landmarks: dict[str, np.ndarray] | None,
+    detector: str | None,
+    start: BodyParams | None,
 ) -> tuple[LocatedInScan, StageOutput]:
     """Find the body in a scan of known size; see `locate_in_scan`."""
     # Search on the surface that the template will be made of: smoothed where the scan is rough.
     mesh, colors = smooth_if_rough(scan.clean.mesh).mesh, scan.colors
     labeller = partial(certain_labels, mesh, body, colors)
     search = partial(locate_body, body, mesh, colors=colors, labeller=labeller)
-    # Search the surface, because it is precise; a detector's keypoints propose limbs and can correct the front.
-    note = ""
-    if detector is not None and landmarks is None:
+    # Search the surface, because it is precise; a detector's keypoints, or those of a body of another shape, propose
+    # limbs and can correct the front.
+    note, seen = "", None
+    if start is not None:
+        seen = _points_of(body, start)
+    elif detector is not None and landmarks is None:
         seen = keypoints_of_scan(mesh, colors, load_detector(detector))
+    if seen is not None and landmarks is None:
         found = search(hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
         found, note = _confirmed(found, search, seen)
     else:
@@ -131,6 +142,12 @@ def _located(
         + "".join(f"; {problem}" for problem in found.notes),
     )
     return LocatedInScan(found.params, labels, bare), StageOutput([check], jsonable(numbers))
+
+
+def _points_of(body: BodyModel, start: BodyParams) -> dict[str, tuple[np.ndarray, float]]:
+    """Return where a posed body has the points that detectors mark, by name, each with a confidence of 1."""
+    vertices = body.forward(start).vertices[0]
+    return {name: (weights @ vertices[index], 1.0) for name, (index, weights) in body.landmarks.items()}
 
 
 def _confirmed(

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+from jaxtyping import Float
 
 from smplxpp.body import BodyModel, load_params
+from smplxpp.body.smpl_joints import is_open_body
+from smplxpp.body.smpl_params import FAMILY_NAMES, from_smpl
 from smplxpp.build.config import BuildInputs
 from smplxpp.build.data import PosedFit, PreparedScan
 from smplxpp.build.limits import ROUGHNESS
@@ -40,7 +45,19 @@ def given_params(inputs: BuildInputs, body: BodyModel) -> BodyParams | None:
     """Return the reference frame's parameters that the user or the capture gives; None where they are made."""
     if inputs.params is None:
         return None
-    params = inputs.params if isinstance(inputs.params, BodyParams) else load_params(inputs.params, body=body)
+    return _frame_of(inputs.params, inputs, body)
+
+
+def start_params(inputs: BuildInputs, body: BodyModel) -> BodyParams | None:
+    """Return the reference frame's parameters of another body, brought to the open body; None where there are none."""
+    return None if inputs.start is None else _frame_of(inputs.start, inputs, body)
+
+
+def _frame_of(given: Path | BodyParams, inputs: BuildInputs, body: BodyModel) -> BodyParams:
+    if isinstance(given, BodyParams):
+        params = from_smpl(given, inputs.whose, body) if inputs.whose in FAMILY_NAMES else given
+    else:
+        params = load_params(given, body=body, whose=inputs.whose)
     return params.frame(inputs.params_row if len(params) > 1 else 0)
 
 
@@ -66,7 +83,7 @@ def pose_fit(scan: TriangleMesh, body: BodyModel, params: BodyParams) -> tuple[P
     A scan is never deeper inside the body than its noise. The share that is tells a bad fit without any labels.
 
     Raises:
-        InputError: the body stands elsewhere than the scan.
+        InputError: the body stands elsewhere than the scan, or the parameters are of another body of the family.
     """
     posed = body.forward(params).frame(0)
     # Rest and pose together: transfer works on the posed body, unposing needs the transforms, webs need both
@@ -106,6 +123,8 @@ def pose_fit(scan: TriangleMesh, body: BodyModel, params: BodyParams) -> tuple[P
             explanation="deeper than 5 mm; high: the fit is off by centimetres",
         ),
     ]
+    if overlap < 0.8 and is_open_body(body):
+        _refuse_another_body(scan.vertices[::50], body, params, overlap)
     # Below a fifth nothing after this step makes sense, so that the build ends here instead of warning.
     if overlap < 0.2:
         raise InputError(
@@ -115,3 +134,29 @@ def pose_fit(scan: TriangleMesh, body: BodyModel, params: BodyParams) -> tuple[P
             remedy="check --frame, --units and --up, and that scan and parameters share one world",
         )
     return fit, StageOutput(checks, {"distance_median_mm": float(np.median(distance))})
+
+
+def _refuse_another_body(
+    points: Float[np.ndarray, "N 3"], body: BodyModel, params: BodyParams, overlap: float
+) -> None:
+    """Refuse parameters that do not stand in the scan as the open body's and do so as a family's.
+
+    Raises:
+        InputError: naming the family.
+    """
+    # Distances of the scan to the mean body with each family's turns; their pelves are 2 to 13 cm apart in height.
+    distances = {}
+    for family in FAMILY_NAMES:
+        mesh = body.mesh(body.forward(from_smpl(params, family, body)).vertices[0])
+        distances[family] = np.abs(SignedDistanceField(mesh, solid=True).query(points).distance)
+    best = min(distances, key=lambda family: float(np.minimum(distances[family], 0.25).mean()))
+    share = float(np.mean(distances[best] < 0.25))
+    if share < max(0.9, overlap + 0.1):
+        return
+    raise InputError(
+        "body parameters",
+        expected="those of the open body, which stands in the scan",
+        received=f"{100 * overlap:.0f} % of the scan within 25 cm of it, but {100 * share:.0f} % as "
+        f"{FAMILY_NAMES[best]}'s parameters",
+        remedy=f"give the model's file with --body, or state --whose {best}: the search for the body starts from them",
+    )

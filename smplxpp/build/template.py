@@ -20,7 +20,7 @@ from smplxpp.build.locate import locate_in_scan
 from smplxpp.build.observe import observe
 from smplxpp.build.opened import opened, with_params
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
-from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame
+from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
 from smplxpp.build.reconstruct import (
     check_masks,
     open_photographs,
@@ -143,7 +143,12 @@ class _Build:
             with self._step("locate") as step:
                 file = self._read_scan()
                 located, step.output = locate_in_scan(
-                    file, body, landmarks=config.landmarks, detector=config.detector, height=config.height
+                    file,
+                    body,
+                    landmarks=config.landmarks,
+                    detector=config.detector,
+                    height=config.height,
+                    start=start_params(inputs, body),
                 )
                 file = file.scaled(located.scale)
         if self.plan.registration is not None:

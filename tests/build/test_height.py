@@ -33,7 +33,7 @@ def test_the_stature_is_the_bodys_and_not_the_scans_extent(body, monkeypatch):
     """With raised hands the extent is 1.25 statures: the scan has to grow by that, and landmarks with it."""
     seen: list[float] = []
 
-    def found(scan, body, landmarks, detector):
+    def found(scan, body, landmarks, detector, start):
         extent = float(np.ptp(scan.clean.mesh.vertices[:, 1]))
         seen.append(float(landmarks["nose"][1]) / extent)
         # A shape prior draws the stature by a third towards the mean's.
@@ -55,14 +55,14 @@ def test_the_stature_is_the_bodys_and_not_the_scans_extent(body, monkeypatch):
 
 def test_a_height_beside_what_states_the_size_is_refused():
     config = BuildConfig(height=1.75)
-    with pytest.raises(InputError, match="option height.*a capture"):
+    with pytest.raises(InputError, match=r"option height.*a capture"):
         plan_build(BuildRequest(capture=FIXTURE, config=config))
     scan = FIXTURE / "scans" / "scan_000000.ply"
-    with pytest.raises(InputError, match="option height.*parameters"):
+    with pytest.raises(InputError, match=r"option height.*parameters"):
         plan_build(BuildRequest(scan=scan, params=FIXTURE / "params" / "params.npz", config=config))
     assert plan_build(BuildRequest(scan=scan, config=config)).config.height == 1.75
     for wrong in (BuildConfig, lambda **options: smplxpp.read_scan(scan, **options)):
-        with pytest.raises(InputError, match="1.75 is one metre"):
+        with pytest.raises(InputError, match=r"1\.75 is one metre"):
             wrong(height=175.0)
 
 
