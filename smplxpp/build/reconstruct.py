@@ -24,7 +24,8 @@ from smplxpp.core import Check, InputError, ProgressCallback, StageOutput
 from smplxpp.core.files.json_file import as_number, as_numbers, as_object, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.reconstruct import ReconstructConfig, Reconstruction, adopt_surface, reconstruct
-from smplxpp.reconstruct.turntable import PosedPerson, reconstruct_turntable
+from smplxpp.reconstruct.carried import PosedPerson
+from smplxpp.reconstruct.turntable import reconstruct_turntable
 from smplxpp.reconstruct.neus2 import UnitCube, mesh_in_world
 from smplxpp.reconstruct.views import PhotoView, silhouette_agreement, usable_views
 

@@ -9,8 +9,10 @@ import numpy as np
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
 from smplxpp.core import BodyParams, InputError
+from smplxpp.register.landmarks import visible_vertices
 from smplxpp.reconstruct import PhotoView, Reconstruction
-from smplxpp.reconstruct.turntable import PosedPerson, agreements
+from smplxpp.reconstruct.carried import PosedPerson
+from smplxpp.reconstruct.turntable import coverage
 
 _BODY_JOINTS = 22  # joints that carry the space around a body; fingers and face follow wrists and head
 
@@ -78,12 +80,14 @@ def posed_person(body: BodyModel, params: BodyParams) -> PosedPerson:
     weights = np.zeros((min(_BODY_JOINTS, body.joint_count), body.vertex_count))
     np.add.at(weights, carrier, body.weights.T)
     moved = transforms[:, : len(weights)] @ np.linalg.inv(transforms[0, : len(weights)])
-    return PosedPerson(np.asarray(posed.vertices[0], dtype=np.float64), weights.T, moved)
+    mesh = body.mesh(np.asarray(posed.vertices[0], dtype=np.float64))
+    shown = visible_vertices(body)
+    return PosedPerson(mesh.vertices[shown], mesh.vertex_normals[shown], weights.T[shown], moved)
 
 
 def turn_agreement(result: Reconstruction, turn: TurningPerson) -> dict[str, float]:
     """Return the intersection over union of the posed surface and the mask of every frame that was used."""
     used = [row for row, view in enumerate(turn.views) if view.name in result.numbers["views"]]
     views = [turn.views[row] for row in used]
-    shares = agreements(result.mesh, views, turn.person.select(used))
+    shares = coverage(result.mesh, views, turn.person.select(used))[:, 1]
     return {view.name: float(share) for view, share in zip(views, shares, strict=True)}

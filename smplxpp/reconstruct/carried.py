@@ -1,0 +1,168 @@
+"""Carry points near a body from a reference pose to the poses of other frames by its skinning weights.
+
+A point x of the space around the body follows the weights w_j(x) of the body near it,
+`x_t = sum_j w_j(x) G_tj G_j^-1 x`, with G_tj the transforms of the joints in frame t, G_j those in the reference pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from smplxpp.core import TriangleMesh
+from smplxpp.reconstruct.photographs import Pyramids, Sight, sight_of_camera
+from smplxpp.reconstruct.views import PhotoView
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPerson:
+    """The body that carries the space around it from the reference pose to the poses of T frames.
+
+    Attributes:
+        vertices: of the body's surface in the reference pose, metres.
+        normals: of these vertices, outward unit vectors.
+        weights: skinning weights.
+        transforms: of the joints, from the reference pose to that of each frame.
+    """
+
+    vertices: Float64[np.ndarray, "V 3"]
+    normals: Float64[np.ndarray, "V 3"]
+    weights: Float[np.ndarray, "V J"]
+    transforms: Float64[np.ndarray, "T J 4 4"]
+
+    def select(self, rows: Sequence[int]) -> PosedPerson:
+        """Return the person in some of the frames."""
+        return replace(self, transforms=self.transforms[list(rows)])
+
+    def room(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        distance: Float64[np.ndarray, "N K"],
+        index: Int64[np.ndarray, "N K"],
+        limits: Float64[np.ndarray, " V"],
+    ) -> Float32[np.ndarray, " N"]:
+        """Return how far points lie inside the surface that stands off the body by a limit a vertex, metres.
+
+        Args:
+            points: in the reference pose.
+            distance: to the nearest vertices, as `Carrier.neighbours` gives them.
+            index: of these vertices.
+            limits: distance of the surface from each vertex.
+        """
+        found = np.isfinite(distance[:, 0])
+        near = index[found]
+        known = np.minimum(near, len(limits) - 1)
+        share = 1.0 / (distance[found] + 0.01) ** 2
+        share /= share.sum(axis=1, keepdims=True)
+        # The signed distance is the mean of those from the nearest vertices' planes (implicit moving least squares).
+        along = np.einsum("nkx,nkx->nk", points[found][:, None] - self.vertices[known], self.normals[known])
+        limit = (share * limits[known]).sum(axis=1)
+        out = np.full(len(points), -float(limits.max()), np.float32)
+        out[found] = limit - (share * along).sum(axis=1)
+        return out
+
+    def carrier(self) -> Carrier:
+        """Return what finds weights near points."""
+        return Carrier(cKDTree(self.vertices), np.asarray(self.weights, np.float32), self.transforms)
+
+
+@dataclass(frozen=True, eq=False)
+class Carrier:
+    """Skinning of points near a body.
+
+    Attributes:
+        tree: of the body's vertices in the reference pose.
+        weights: skinning weights of the vertices.
+        transforms: of the joints, from the reference pose to that of each frame.
+    """
+
+    tree: cKDTree
+    weights: Float32[np.ndarray, "V J"]
+    transforms: Float64[np.ndarray, "T J 4 4"]
+
+    def neighbours(
+        self, points: Float[np.ndarray, "N 3"], *, reach: float = np.inf
+    ) -> tuple[Float64[np.ndarray, "N K"], Int64[np.ndarray, "N K"]]:
+        """Return distances and indices of the six nearest vertices within reach; farther ones are at infinity."""
+        distance, index = self.tree.query(points, k=6, distance_upper_bound=reach)
+        return distance, index.astype(np.int64)
+
+    def weights_of(
+        self, distance: Float64[np.ndarray, "N K"], index: Int64[np.ndarray, "N K"]
+    ) -> Float32[np.ndarray, "N J"]:
+        """Return the mean weights of neighbours, by the inverse square of distance plus 1 cm."""
+        soft = 0.01
+        share = 1.0 / (distance + soft) ** 2
+        share /= share.sum(axis=1, keepdims=True)
+        rows = np.repeat(np.arange(len(index)), index.shape[1])
+        known = np.minimum(index, len(self.weights) - 1).ravel()  # those at infinity have no share
+        matrix = sparse.csr_matrix(
+            (share.astype(np.float32).ravel(), (rows, known)), shape=(len(index), len(self.weights))
+        )
+        return np.asarray(matrix @ self.weights)
+
+    def weights_at(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N J"]:
+        """Return the mean weights of the vertices near points."""
+        return self.weights_of(*self.neighbours(points))
+
+    def features(
+        self, points: Float[np.ndarray, "N 3"], weights: Float32[np.ndarray, "N J"]
+    ) -> Float32[np.ndarray, "N _"]:
+        """Return each weight times each homogeneous coordinate, of which carried points are linear functions."""
+        homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1).astype(np.float32)
+        return (weights[:, :, None] * homogeneous[:, None, :]).reshape(len(points), 4 * weights.shape[1])
+
+    def carried(self, features: Float32[np.ndarray, "N _"], frame: int) -> Float64[np.ndarray, "N 3"]:
+        """Return the points of some features carried to a frame."""
+        matrix = self.transforms[frame, :, :3].transpose(0, 2, 1).reshape(-1, 3)
+        return (features @ matrix.astype(np.float32)).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedPyramids(Pyramids):
+    """Photographs of one camera in T poses, which see points that are carried from the reference pose.
+
+    Attributes:
+        carrier: of the points.
+    """
+
+    carrier: Carrier
+
+    @staticmethod
+    def of_turn(views: Sequence[PhotoView], carrier: Carrier) -> CarriedPyramids:
+        """Return the pyramids of the views, one a frame of the carrier."""
+        plain = Pyramids.of(views)
+        return CarriedPyramids(plain.values, plain.starts, plain.sizes, plain.projections, plain.cameras, carrier)
+
+    def sight(self, mesh: TriangleMesh, normals: Float[np.ndarray, "N 3"]) -> Sight:
+        """Compute which vertices of a surface each frame sees, on the surface in the pose of that frame."""
+        weights = self.carrier.weights_at(mesh.vertices)
+        features = self.carrier.features(mesh.vertices, weights)
+        columns = []
+        for frame, camera in enumerate(self.cameras):
+            posed = mesh.with_vertices(self.carrier.carried(features, frame))
+            flat = self.carrier.transforms[frame, :, :3, :3].reshape(-1, 9)
+            turned = np.einsum("nij,nj->ni", (weights @ flat).reshape(-1, 3, 3), normals)
+            turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
+            columns.append(sight_of_camera(posed, turned, camera))
+        return Sight(*(np.stack([column[part] for column in columns], axis=1) for part in (0, 1)))
+
+    def screen(self, view: int, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:
+        """Project points of the surface into a frame."""
+        features = self.carrier.features(points, self.carrier.weights_at(points))
+        return self.cameras[view].screen_from_world(self.carrier.carried(features, view))
+
+    def projections_of(
+        self, points: Float64[np.ndarray, "N 3"]
+    ) -> list[tuple[Int64[np.ndarray, " _"], Float64[np.ndarray, "V 3 4"]]]:
+        """Group points by their heaviest joint, whose rigid motion they follow: patches are small against limbs."""
+        heaviest = self.carrier.weights_at(points).argmax(axis=1)
+        return [
+            (np.flatnonzero(heaviest == joint), self.projections @ self.carrier.transforms[:, joint])
+            for joint in np.unique(heaviest)
+        ]
