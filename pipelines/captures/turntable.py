@@ -99,7 +99,7 @@ class TurntableCapture:
             "focal_px": float(self.found.camera.K[0, 0]),
             "focal_spread": self.found.focal_spread,
             "focal_told_by": self.lens.told_by,
-            "height_m": None,
+            "height_m": round(self.found.stature, 3),
             **residuals,
         }
 

@@ -52,6 +52,7 @@ def test_poses_and_shape_of_one_view_a_pose(turn, found):
     assert max(errors) < 30.0 and np.mean(errors) < 20.0
     assert np.median(found.fit.residuals["keypoints_px"]) < 1.5
     assert np.median(found.fit.residuals["silhouette_px"]) < 1.5
+    assert found.stature == pytest.approx(turn.stature, abs=0.01)
     assert found.turned == pytest.approx(360.0 * (FRAMES - 1) / FRAMES, abs=6.0)
 
 

@@ -30,7 +30,7 @@ from smplxpp.register.normal_equations import NormalEquations
 from smplxpp.register.observations import BodyFit, Observations, RegisterConfig
 from smplxpp.register.silhouette_term import Outline, SilhouetteTerm, Surface
 from smplxpp.register.solver import joint_confidence
-from smplxpp.register.turntable.held_pose import HeldPose, Shared, SharedColumns, SharedPriors
+from smplxpp.register.turntable.held_pose import HeldPose, Shared, SharedColumns, SharedPriors, stature_of
 from smplxpp.register.turntable.start import start_of_turn
 
 LEAST_FRAMES = 4
@@ -75,6 +75,7 @@ class TurntableFit:
         camera: with the focal length that was found, in the world of `fit`.
         up: vertical in that world, a unit vector.
         focal_spread: standard deviation of the logarithm of the focal length, from the normal equations.
+        stature: height of the body in the T-pose, metres.
         turned: degrees by which the body turned in total, positive to its left.
         start_cost: mean truncated error of the starting poses, from 0 to about 1.
     """
@@ -83,6 +84,7 @@ class TurntableFit:
     camera: Camera
     up: Float64[np.ndarray, " 3"]
     focal_spread: float
+    stature: float
     turned: float
     start_cost: float
 
@@ -330,7 +332,9 @@ class _Turn:
         fit = BodyFit(tuple(self.observed.frames), params, confidence, residuals, notes=tuple(self.notes))
         focal_spread, cost = numbers
         turned = degrees_turned(state.rotations[:, self.root], shared.up)
-        return TurntableFit(fit, self.term.cameras[0], shared.up, focal_spread, turned, cost)
+        height, by_betas = stature_of(self.body)
+        stature = height + float(by_betas @ state.betas)
+        return TurntableFit(fit, self.term.cameras[0], shared.up, focal_spread, stature, turned, cost)
 
 
 def _trusted(keypoints: Keypoints2D) -> Keypoints2D:

@@ -154,7 +154,7 @@ class HeldPose:
         self.spread = priors.held * np.radians([_held_degrees(name) for name in names])
         anatomy = Anatomy.of(kinematics.body.joint_count)
         self.anatomy = tuple(getattr(anatomy, name)[columns.joints] for name in ("spread", "lowest", "highest"))
-        self.rest_height, self.height_dirs = _stature(kinematics.body)
+        self.rest_height, self.height_dirs = stature_of(kinematics.body)
 
     def add(self, equations: NormalEquations, state: BodyState, shared: Shared) -> None:
         """Add all terms to the normal equations."""
@@ -264,8 +264,8 @@ def _held_degrees(name: str) -> float:
     return next((degrees for part, degrees in HELD_DEGREES if part in name), _FINGER_DEGREES)
 
 
-def _stature(body: BodyModel) -> tuple[float, Float64[np.ndarray, " B"]]:
-    """Return the height of the mean shape from its lowest to its highest vertex, and the derivative by betas."""
+def stature_of(body: BodyModel) -> tuple[float, Float64[np.ndarray, " B"]]:
+    """Return the height of the mean shape in the T-pose, lowest to highest vertex, and its derivative by betas."""
     low, high = int(body.v_template[:, 1].argmin()), int(body.v_template[:, 1].argmax())
     height = float(body.v_template[high, 1] - body.v_template[low, 1])
     return height, body.shapedirs[high, 1] - body.shapedirs[low, 1]
