@@ -12,7 +12,7 @@ from jaxtyping import Integer
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
-from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges
+from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
 from smplxpp.core import Check, LABELS, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
 from smplxpp.metrics.distance import MM
@@ -93,13 +93,14 @@ def _without_bridges(
     """
     source = np.arange(part.vertex_count)
     weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
-    for _ in range(config.rounds):
-        # The limits of the inversion are lifted here: the next stage checks them on the part that is left.
-        limits = UnposeConfig(warn_below=0.0, fail_below=1e-9)
+    # The limits of the inversion are lifted here: the next stage checks them on the part that is left.
+    limits = UnposeConfig(warn_below=0.0, fail_below=1e-9)
+    # Bridges in folds first, because these are cut where the scan lacks the gap; then what still tears.
+    for find in [*(find_bridges,) * config.rounds, *(find_tears,) * config.rounds]:
         rest = unpose(part.vertices, weights, fit.posed_from_rest, config=limits)
-        bridge = find_bridges(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
+        bridge = find(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
         if not bridge.any():
-            break
+            continue
         part, kept = cut_bridges(part, bridge, config=config)
         source = source[kept]
         weights = transfer_weights(fit.mesh, body.weights, part, config=settings)

@@ -14,7 +14,7 @@ from smplxpp.build.config import BuildInputs
 from smplxpp.build.data import PreparedScan
 from smplxpp.build.scan import ScanFile, scan_file_labels
 from smplxpp.capture import read_cameras
-from smplxpp.core import SKIN, BodyParams, Check, GeometryWarning, InputError, StageOutput, TriangleMesh
+from smplxpp.core import LABELS, SKIN, BodyParams, Check, GeometryWarning, InputError, StageOutput, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh
 from smplxpp.segment import SegmentedScan, holds_labels, label_by_body, read_label_map, segment_scan, vote_in_agreement
@@ -127,7 +127,7 @@ def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str) -> Stage
         "labels_from": source,
         "notes": list(labelled.before.notes),
         "corrected_by_hand": float(areas @ result.corrected),
-        "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(6)},
+        "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(len(LABELS))},
     }
     return StageOutput([confidence, coverage], numbers)
 

@@ -1,6 +1,6 @@
 """Clean raw scans to manifold meshes, and labelled scans to loose parts within a face budget."""
 
-from smplxpp.clean.bridges import BridgeConfig, cut_bridges, find_bridges
+from smplxpp.clean.bridges import BridgeConfig, cut_bridges, find_bridges, find_tears
 from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_parts
 from smplxpp.clean.poisson import PointSurface, PoissonConfig, estimate_normals, surface_from_points
@@ -37,6 +37,7 @@ __all__ = [
     "estimate_normals",
     "fill_pinholes",
     "find_bridges",
+    "find_tears",
     "find_scan_frame",
     "loop_lengths",
     "remesh",

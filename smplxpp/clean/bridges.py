@@ -32,18 +32,21 @@ class BridgeConfig:
             length. It is about 1 along cloth that follows the body.
         stretch: factor of the edge's length in the T-pose. Loose cloth, whose weights change slowly, stretches less,
             however far apart the limbs under it are.
+        tear: factor of the edge's length in the T-pose from which an edge is torn (`find_tears`), however its sides lie.
         speck_area: area fraction of the part below which pieces that the cut leaves are removed, too.
-        rounds: largest number of cuts; after each the weights are computed again without the cut faces. 0 cuts nothing.
+        rounds: largest number of cuts of bridges, and of tears; after each the weights are computed again without the
+            cut faces. 0 cuts nothing.
     """
 
     valley: float = 0.1
     jump: float = 3.0
     stretch: float = 2.0
+    tear: float = 4.0
     speck_area: float = 1e-3
     rounds: int = 3
 
     def __post_init__(self) -> None:
-        for name, least in (("valley", 0.0), ("jump", 1.0), ("stretch", 1.0), ("speck_area", 0.0), ("rounds", 0)):
+        for name, least in (("valley", 0.0), ("jump", 1.0), ("stretch", 1.0), ("tear", 1.0), ("speck_area", 0.0), ("rounds", 0)):
             require_at_least(f"bridges: {name}", getattr(self, name), least)
 
 
@@ -72,17 +75,56 @@ def find_bridges(
     length, at_rest, apart = (
         row_lengths(points[ends[:, 1]] - points[ends[:, 0]]) for points in (posed.vertices, rest.vertices, place)
     )
-    # The body's surfaces face each other if each normal points towards the other surface.
     across = nearest[ends[:, 1]] - nearest[ends[:, 0]]
-    facing = (np.einsum("ij,ij->i", across, normal[ends[:, 0]]) > 0) & (
-        np.einsum("ij,ij->i", across, normal[ends[:, 1]]) < 0
-    )
+    facing = _facing(nearest, normal, ends)
     bridge = np.flatnonzero(facing & (apart > config.jump * length) & (at_rest > config.stretch * length))
     # The sides of a fold are two distances from the body wide, and at least two edges.
     away = row_lengths(posed.vertices - nearest)[ends].mean(axis=1)
     reach = np.maximum(2.0 * away, 2.0 * length)
     bridge = bridge[_fold_depth(posed, ends[bridge], across[bridge], reach[bridge]) > config.valley]
     return _faces_with(posed.faces, ends[bridge], posed.vertex_count)
+
+
+def find_tears(
+    posed: TriangleMesh,
+    rest: TriangleMesh,
+    body: TriangleMesh,
+    body_rest: TriangleMesh,
+    *,
+    config: BridgeConfig | None = None,
+) -> Bool[np.ndarray, " M"]:
+    """Find the faces of a part that unposing tears, where no fold shows a bridge.
+
+    A coarse scan joins a sleeve and a jacket, a hand's cuff and a pocket, or two trouser legs without a fold, and leaves
+    faces beside a cut whose weights mix two limbs. Edges that leave one limb and arrive at another, as `find_bridges`
+    has them, come first; where there are none, every torn edge counts, because the scan's cloth is lost there in any
+    case. Arguments as for `find_bridges`.
+    """
+    config = config or BridgeConfig()
+    ends = posed.edges
+    nearest, place, normal = _nearest_on_body(posed.vertices, body, body_rest)
+    length, at_rest, apart = (
+        row_lengths(points[ends[:, 1]] - points[ends[:, 0]]) for points in (posed.vertices, rest.vertices, place)
+    )
+    # Edges that grow by less than half a centimetre are tiny edges, which a little noise of the weights stretches.
+    torn = (at_rest > config.tear * length) & (at_rest - length > _LEAST_GROWTH * _extent(body))
+    across = torn & (apart > config.jump * length) & _facing(nearest, normal, ends)
+    return _faces_with(posed.faces, ends[across if across.any() else torn], posed.vertex_count)
+
+
+_LEAST_GROWTH = 0.003
+"""Growth of a torn edge, as a share of the body's extent: 5 mm of a person."""
+
+
+def _extent(body: TriangleMesh) -> float:
+    return float(np.ptp(body.vertices, axis=0).max())
+
+
+def _facing(nearest: np.ndarray, normal: np.ndarray, ends: Int[np.ndarray, "E 2"]) -> Bool[np.ndarray, " E"]:
+    """Return whether the body's surfaces nearest to the ends of edges face each other: each normal points across."""
+    across = nearest[ends[:, 1]] - nearest[ends[:, 0]]
+    leaves = np.einsum("ij,ij->i", across, normal[ends[:, 0]]) > 0
+    return np.asarray(leaves & (np.einsum("ij,ij->i", across, normal[ends[:, 1]]) < 0))
 
 
 def cut_bridges(

@@ -122,7 +122,7 @@ def clean_parts(
     # Labels must be known; -1 is the background.
     unknown = np.setdiff1d(face_labels, [-1] + [label.id for label in LABELS])
     if len(unknown):
-        raise InputError("face labels", expected="label ids -1 to 5", received=f"{unknown.tolist()}")
+        raise InputError("face labels", expected=f"label ids -1 to {LABELS[-1].id}", received=f"{unknown.tolist()}")
     parts = {}
     for label in LABELS:
         selected = face_labels == label.id
@@ -136,7 +136,7 @@ def clean_parts(
     if not parts:
         raise InputError(
             "face labels",
-            expected="at least one of hair, shoe, upper, lower, outer",
+            expected="at least one of hair, shoe, upper, lower, outer, object",
             received="only skin and background",
             remedy="check that the label set is the right one",
         )

@@ -1,4 +1,4 @@
-"""Define the semantic labels of a clothed person: the classes of 4D-Dress, with names and colours."""
+"""Define the semantic labels of a clothed person: the classes of 4D-Dress and things in hands, with names and colours."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Label:
     """A semantic class of the surface of a clothed person.
 
     Attributes:
-        id: number of the class in 4D-Dress.
+        id: number of the class in 4D-Dress; `object` follows its classes.
         name: name of the class in this project.
         display_rgb: colour in pictures, that of 4D-Dress.
         semantic_rgb: colour in the label maps that a training reads (TaoAvatar: hair yellow, clothes red).
@@ -33,8 +33,10 @@ SHOE = Label(2, "shoe", (128, 0, 255), (128, 0, 255), 2_000)
 UPPER = Label(3, "upper", (180, 50, 50), (255, 0, 0), 20_000)
 LOWER = Label(4, "lower", (50, 180, 50), (255, 0, 0), 20_000)
 OUTER = Label(5, "outer", (0, 128, 255), (255, 0, 0), 20_000)
+OBJECT = Label(6, "object", (240, 200, 0), (0, 128, 255), 4_000)
+"""A thing that a person holds or carries: a bag, a binder. It is rigid, follows one joint, and is no layer of clothes."""
 
-LABELS: tuple[Label, ...] = (SKIN, HAIR, SHOE, UPPER, LOWER, OUTER)
+LABELS: tuple[Label, ...] = (SKIN, HAIR, SHOE, UPPER, LOWER, OUTER, OBJECT)
 BACKGROUND = -1
 """Label id of pixels and faces that show no part of the person."""
 CLOTH_LABELS: tuple[Label, ...] = (UPPER, LOWER, OUTER)

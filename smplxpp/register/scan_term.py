@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
-from smplxpp.core import SKIN, TriangleMesh
+from smplxpp.core import OBJECT, SKIN, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 from smplxpp.register.clothing import Gaps
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
@@ -61,6 +61,9 @@ class ScanSample:
         # A vertex stands for a third of the area of each of its faces, so that dense regions of a scan count no more
         # than coarse ones. Vertices without any area cannot be drawn.
         area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas / 3, 3), minlength=mesh.vertex_count)
+        # A thing in a hand says nothing about the body.
+        if scan.labels is not None and (np.asarray(scan.labels) != OBJECT.id).any():
+            area = np.where(np.asarray(scan.labels) == OBJECT.id, 0.0, area)
         rng = np.random.default_rng(seed)
         count = min(samples, int((area > 0).sum()))
         index = np.sort(rng.choice(mesh.vertex_count, count, replace=False, p=area / area.sum()))

@@ -11,16 +11,17 @@ The terms are found one after the other:
    along the arm, azimuth, signed distance) from the body vertex that is nearest in position and normal.
 2. `by_body_colors`: a palette of the scan (k-means in OKLab), and a normal distribution of this person's skin colour
    from the face and the hands, whose log-likelihood ratio tells skin from other colours.
-3. `by_body_layers`: long hair, open coats and bibs, as connected faces whose colours are nearer to the layer's
+3. `by_body_objects`: things in hands, by a cut of their own; they are left out of all other steps.
+4. `by_body_layers`: long hair, open coats and bibs, as connected faces whose colours are nearer to the layer's
    histogram than to all others; they are left out of the next step, which they would disturb.
-4. `by_body_outfit`: the outline of the clothes. The unknowns are the four borders between shoe, skin, lower, skin and
+5. `by_body_outfit`: the outline of the clothes. The unknowns are the four borders between shoe, skin, lower, skin and
    upper along the column, and the end of the sleeve. Their cost sums the KL divergence of each ring's colours from its
    run's, likelihood ratios of skin by colour and distance, and priors on usual clothes. Dynamic programming over rings
    gives the exact minimum; the sum over all outlines (forward-backward) gives P(label) of every ring.
-5. `by_body_prior`: P(label | place), the outline softened by the uncertainty of its borders.
-6. `by_body_colors.label_costs`: P(colour | label) by expectation maximisation, averaged over neighbours of like colour.
-7. `graph_cut`: alpha-expansion of the energy, with weights w that prefer concave folds and edges of colour.
-8. `by_body_confidence`: confidence of each face, at most the probability of the outline that it depends on, and notes.
+6. `by_body_prior`: P(label | place), the outline softened by the uncertainty of its borders.
+7. `by_body_colors.label_costs`: P(colour | label) by expectation maximisation, averaged over neighbours of like colour.
+8. `graph_cut`: alpha-expansion of the energy, with weights w that prefer concave folds and edges of colour.
+9. `by_body_confidence`: confidence of each face, at most the probability of the outline that it depends on, and notes.
 """
 
 from __future__ import annotations
@@ -31,13 +32,23 @@ import numpy as np
 from jaxtyping import Float64, Num
 
 from smplxpp.body import BodyModel
-from smplxpp.core import BodyParams, InputError, MeshLike, TriangleMesh, as_mesh, require_at_least, require_positive
+from smplxpp.core import (
+    OBJECT,
+    BodyParams,
+    InputError,
+    MeshLike,
+    TriangleMesh,
+    as_mesh,
+    require_at_least,
+    require_positive,
+)
 from smplxpp.core.topology import face_adjacency
 from smplxpp.raster import outer_visible_points
 from smplxpp.segment.by_body_chart import TRUNK, BodyChart, chart_of_scan, in_arm, in_column
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
 from smplxpp.segment.by_body_layers import Layers, find_layers
+from smplxpp.segment.by_body_objects import FoundObjects, find_objects
 from smplxpp.segment.by_body_outfit import ARM_END, ARM_START, COLUMN_END, Outfit, OutfitConfig, Rings, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
@@ -88,6 +99,7 @@ class Evidence:
         outfit: outline of the clothes.
         skin: model of skin colour; None without colours.
         layers: layers over other clothes.
+        objects: things in hands.
         misfit: robust standard deviation, in metres, of bare skin's distance to the body.
         costs: unary costs of all labels, nats.
     """
@@ -96,6 +108,7 @@ class Evidence:
     outfit: Outfit
     skin: SkinModel | None
     layers: Layers
+    objects: FoundObjects
     misfit: float
     costs: Float64[np.ndarray, "M L"]
 
@@ -136,7 +149,7 @@ def label_by_body(
     # Minimise the Potts energy. Unary costs are capped at 12 nats, so that a single face can be overruled by its patch.
     cost = found.costs - found.costs.min(axis=1, keepdims=True)
     weights = edge_weights(mesh, pairs, ends, config.smoothing, lab=lab)
-    problem = PottsProblem.from_costs(np.minimum(cost, 12.0), pairs, weights)
+    problem = PottsProblem.from_costs(np.minimum(cost, _CERTAIN), pairs, weights)
     before = problem.energy(cost.argmin(axis=1))
     cut, after = minimize_potts(problem)
     # Posterior of each label at a temperature; patches that are too small take their neighbours' label.
@@ -150,6 +163,7 @@ def label_by_body(
     confidence = own * min(1.0, BODY_ELSEWHERE / max(found.misfit, 1e-9))
     seen = outer_visible_points(mesh, mesh.face_centers, tolerance=0.005)
     notes = notes_on_labels(mesh, labels, confidence, found.outfit, found.skin, misfit=found.misfit)
+    notes = (*found.objects.notes, *notes)
     return SegmentedScan(
         labels, confidence, seen, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE, notes=notes
     )
@@ -165,9 +179,11 @@ def weigh_evidence(
     """Return the unary costs of all labels at all faces with their ingredients; `lab` is (M, 3) colours in OKLab."""
     # The misfit of the body is the robust spread (1.4826 MAD) of the distances of face and hands.
     chart = chart_of_scan(mesh, body, params)
-    area = mesh.face_areas
     pairs, _ = face_adjacency(mesh.faces)
-    bare = chart.face_core | chart.hand_core
+    # What the person holds says nothing about her clothes, so that it has no area in the steps that follow.
+    objects = find_objects(mesh, body, params, lab=lab)
+    area = np.where(objects.faces, 0.0, mesh.face_areas)
+    bare = (chart.face_core | chart.hand_core) & ~objects.faces
     misfit = float(1.4826 * np.median(np.abs(chart.distance[bare if bare.any() else slice(None)])))
     misplaced = float(np.clip(misfit, 0.003, 0.02))
     # Colours: the palette, the skin model, and layers that hang over other clothes.
@@ -192,7 +208,7 @@ def weigh_evidence(
             color_count=1 if palette is None else palette.size,
             skin=ratio[mask],
             distance=chart.distance[mask],
-            used=~over[mask],
+            used=~(over | objects.faces)[mask],
         )
 
     # The outline of the clothes, from rings of the column and the arms. Without colours, habits of dress replace them.
@@ -222,7 +238,14 @@ def weigh_evidence(
         rounds=config.rounds,
         cap=config.color_cap,
     )
-    return Evidence(chart, outfit, skin, layers, misfit, costs)
+    # Nothing but the cut that found them makes faces of objects.
+    costs[objects.faces] += _CERTAIN
+    costs[:, OBJECT.id] = np.where(objects.faces, 0.0, _CERTAIN)
+    return Evidence(chart, outfit, skin, layers, objects, misfit, costs)
+
+
+_CERTAIN = 12.0
+"""Nats, the largest cost of a label at a face."""
 
 
 def _cloth_by_distance(distance: np.ndarray, misfit: float) -> np.ndarray:

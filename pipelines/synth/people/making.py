@@ -18,6 +18,7 @@ from pipelines.synth.people.bodies import Posing, betas_of, fitting_mannequin
 from pipelines.synth.people.cast import Member, Wear
 from pipelines.synth.people.paint import cloth_paint, hair_paint, photographed, skin_paint
 from pipelines.synth.people.person_scan import PersonScan, face_majority
+from pipelines.synth.people.things import Thing, thing_mesh
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from smplxpp.body import BodyModel, PosedBody
 from smplxpp.core import LABEL_BY_NAME, BodyParams, TriangleMesh, concatenate_meshes
@@ -60,7 +61,9 @@ class Dressed:
     layers: list[Layer]
 
 
-def make_person(name: str, member: Member, body: BodyModel, *, seed: int, scan: ScanConfig = _SCAN) -> PersonScan:
+def make_person(
+    name: str, member: Member, body: BodyModel, *, seed: int, scan: ScanConfig = _SCAN, thing: Thing | None = None
+) -> PersonScan:
     """Make the scan of one member; another seed gives another person of that build, in that stance and dress.
 
     Args:
@@ -69,6 +72,7 @@ def make_person(name: str, member: Member, body: BodyModel, *, seed: int, scan: 
         body: the body model.
         seed: of shape, pose, folds, patterns and noise.
         scan: settings of the simulated scan.
+        thing: what she holds; its faces have the label "object".
     """
     # Dress her, then pose her as far along her stance as the clothes let her hands come.
     digest = hashlib.sha256(name.encode()).digest()
@@ -88,22 +92,28 @@ def make_person(name: str, member: Member, body: BodyModel, *, seed: int, scan: 
     meshes: list[TriangleMesh] = []
     for mesh in (body.mesh(posed.vertices[0] + place), *cloths):
         meshes = [*(_kept_under(inner, mesh) for inner in meshes), mesh]
+    sheets_end = len(meshes)
+    if thing is not None:
+        held = thing_mesh(thing, body, posed)
+        meshes.append(held.with_vertices(held.vertices + place))
     owner = np.repeat(np.arange(len(meshes)), [mesh.face_count for mesh in meshes])
     layers = concatenate_meshes(meshes)
     taken = simulate_scan(
         layers,
-        [owner == k for k in range(1, len(meshes))],
+        [owner == k for k in range(1, sheets_end)],
         replace(scan, detail_above=0.84 * float(np.ptp(layers.vertices[:, 1])), seed=int(rng.integers(2**31))),
     )
     # A vertex takes the label of the layer that it shows, small islands that of their surroundings.
     shown = owner[taken.face]
     merged = merge_islands(taken.mesh, shown.astype(np.uint8))
-    ids = np.array([LABEL_BY_NAME["skin"].id, *(one.label for one in dressed.layers)])
+    ids = np.array([LABEL_BY_NAME["skin"].id, *(one.label for one in dressed.layers), LABEL_BY_NAME["object"].id])
     labels = ids[merged]
     colors = None
     if member.colored:
         # Where an island was relabelled, the colour comes from the nearest vertex that shows its own layer.
         albedo = _albedo(dressed, member, taken, shown, rng)
+        if thing is not None:
+            albedo[shown == sheets_end] = thing.color
         own = np.flatnonzero(merged == shown)
         albedo = albedo[own[cKDTree(taken.mesh.vertices[own]).query(taken.mesh.vertices)[1]]]
         colors = photographed(taken.mesh, albedo, rng=rng)
@@ -215,7 +225,10 @@ def _albedo(
     """Return the unlit colour (0 to 255) of what each vertex shows, by its place on the T-pose."""
     body = dressed.body
     rest = body.forward(BodyParams.rest(betas=dressed.betas, expressions=body.num_expressions))
-    points = taken.shown_on(concatenate_meshes([body.mesh(rest.vertices[0]), *(o.cloth.mesh for o in dressed.layers)]))
+    sewn = concatenate_meshes([body.mesh(rest.vertices[0]), *(o.cloth.mesh for o in dressed.layers)])
+    worn = shown <= len(dressed.layers)
+    points = np.zeros((len(shown), 3))
+    points[worn] = np.einsum("pk,pkx->px", taken.barycentric[worn], sewn.triangles[taken.face[worn]])
     out = np.zeros((len(points), 3))
     # Skin and eyeballs are layer 0.
     own = shown == 0
