@@ -21,7 +21,16 @@ from smplxpp.assemble.layers import (
 )
 from smplxpp.assemble.push_out import PushConfig, flipped_faces, push_out, stand_off
 from smplxpp.body.model import BodyModel
-from smplxpp.core import SKIN, BodyParams, GeometryWarning, InputError, SkinWeights, TriangleMesh, concatenate_meshes
+from smplxpp.core import (
+    OBJECT,
+    SKIN,
+    BodyParams,
+    GeometryWarning,
+    InputError,
+    SkinWeights,
+    TriangleMesh,
+    concatenate_meshes,
+)
 from smplxpp.core.labels import LAYER_ORDER
 from smplxpp.template.template import BODY_PART, Template
 
@@ -52,7 +61,7 @@ class AssemblyConfig:
     Attributes:
         clearance: distance between layers after the repair, metres.
         push: the other options of the repair.
-        layer_order: label ids from the skin outwards.
+        layer_order: label ids from the skin outwards; things (`object`) are no layers and stay where they are.
         skin_color: sRGB of the body's vertices.
     """
 
@@ -182,7 +191,11 @@ def _check_part(name: str, part: CanonicalPart, body: BodyModel, config: Assembl
     count = part.mesh.vertex_count
     checks = [
         (name != BODY_PART, "another name than the body's", repr(name)),
-        (part.label in config.layer_order, f"a label of {config.layer_order}", str(part.label)),
+        (
+            part.label in (*config.layer_order, OBJECT.id),
+            f"a label of {(*config.layer_order, OBJECT.id)}",
+            str(part.label),
+        ),
         (part.mesh.face_count > 0, "a mesh with faces", "none"),
         (len(part.weights) == count, f"weights of {count} vertices", str(len(part.weights))),
         (part.weights.joint_count == body.joint_count, f"{body.joint_count} joints", str(part.weights.joint_count)),
@@ -200,7 +213,9 @@ def _separate(
     """Push every part out of the body and of the layers inside it; return the meshes by name, and the report."""
     push = replace(config.push, clearance=config.clearance)
     obstacles = [Obstacle(BODY_PART, body_mesh, solid=True, max_depth=push.max_depth)]
-    meshes, reports = {}, {}
+    # Fingers close round a thing in a hand, so that it is no layer, and pushing it out would bend it.
+    meshes = {name: part.mesh for name, part in parts.items() if part.label == OBJECT.id}
+    reports = {}
     # Parts of one label lie side by side and are no obstacles to each other.
     for label in config.layer_order:
         layer = [name for name, part in parts.items() if part.label == label]

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from smplxpp.assemble.build import CanonicalPart
 from smplxpp.assemble.patch import Patch, patch_loop
@@ -20,10 +20,10 @@ class FillHolesConfig:
 
     Attributes:
         width: largest mean width of a patch, metres: twice its area divided by its perimeter. A wider one, such as a
-            sail between a long sleeve and the side, is not made. 0 fills nothing.
+            sail between both legs, is not made. 0 fills nothing.
     """
 
-    width: float = 0.08
+    width: float = 0.15
 
     def __post_init__(self) -> None:
         require_at_least("fill_holes: width", self.width, 0.0)
@@ -55,6 +55,8 @@ def cut_holes(
     before_index: Int[np.ndarray, " N"],
     after: TriangleMesh,
     after_index: Int[np.ndarray, " M"],
+    *,
+    taken: Bool[np.ndarray, " S"] | None = None,
 ) -> list[Int[np.ndarray, " _"]]:
     """Return the border loops of `after` without a vertex that lay on a border of `before`.
 
@@ -65,11 +67,88 @@ def cut_holes(
         before_index: the scan's vertex of each of its vertices.
         after: the part after the cut.
         after_index: the scan's vertex of each of its vertices, which identifies vertices of both.
+        taken: the scan's vertices at which a thing was taken off the part, which leaves no opening either.
     """
-    # Scan vertices on the borders before the cut.
-    openings = border_loops(before.faces)
-    at_openings = before_index[np.concatenate(openings)] if openings else np.zeros(0, dtype=np.int64)
+    at_openings = _at_openings(before, before_index, taken)
     return [loop for loop in border_loops(after.faces) if not np.isin(after_index[loop], at_openings).any()]
+
+
+def _at_openings(
+    before: TriangleMesh, before_index: Int[np.ndarray, " N"], taken: Bool[np.ndarray, " S"] | None
+) -> Int[np.ndarray, " O"]:
+    """Return the scan's vertices on the openings of a part before the cut."""
+    openings = border_loops(before.faces)
+    found = before_index[np.concatenate(openings)] if openings else np.zeros(0, dtype=np.int64)
+    return found if taken is None else found[~taken[found]]
+
+
+def cut_slits(
+    before: TriangleMesh,
+    before_index: Int[np.ndarray, " N"],
+    after: TriangleMesh,
+    after_index: Int[np.ndarray, " M"],
+    *,
+    taken: Bool[np.ndarray, " S"] | None = None,
+    longest: float = 0.25,
+) -> list[Int[np.ndarray, " _"]]:
+    """Return polygons that close what cuts have opened towards openings: a sleeve and the side that it was fused with.
+
+    A border after the cut is a cycle of runs along cuts and of segments of old openings. Where a sleeve was fused with
+    the side from armpit to hem, the cut runs from the hem over the armpit to the cuff in front, round the rest of the
+    cuff, and back behind the arm. A polygon joins such runs: it leaves out the segments between them, across whose ends
+    it goes straight, and is closed straight, too, so that hem and cuff stay open. Segments with ends farther apart than
+    `longest` (the hem round the person) separate polygons.
+
+    Args:
+        before: the part before the cut.
+        before_index: the scan's vertex of each of its vertices.
+        after: the part after the cut, in the T-pose.
+        after_index: the scan's vertex of each of its vertices.
+        taken: as for `cut_holes`.
+        longest: largest length of a straight edge, metres.
+    """
+    at_openings = _at_openings(before, before_index, taken)
+    linked = {(int(a), int(b)) for a, b in after.edges}
+    out: list[np.ndarray] = []
+    for loop in border_loops(after.faces):
+        old = np.isin(after_index[loop], at_openings)
+        if old.all() or not old.any():
+            continue
+        # Start at an old segment; then segments and the runs that follow them alternate.
+        start = int(np.flatnonzero(old & ~np.roll(old, 1))[0])
+        pieces = np.split(np.roll(loop, -start), np.flatnonzero(np.diff(np.roll(old, -start))) + 1)
+        segments, runs = pieces[0::2], pieces[1::2]
+        if max(map(len, segments)) <= _FEW:
+            out.append(loop)
+            continue
+        # Segments that separate polygons: those with distant ends; where there is none, the longest.
+        apart = [_span(after.vertices, segment) > longest for segment in segments]
+        apart = apart if any(apart) else [len(one) == max(map(len, segments)) for one in segments]
+        for first in np.flatnonzero(apart):
+            polygon, k = [segments[first][-1:], runs[first]], (first + 1) % len(runs)
+            while not apart[k]:
+                # A few vertices become part of the polygon; of longer segments only the two ends do.
+                polygon += [segments[k] if len(segments[k]) <= _FEW else segments[k][[0, -1]], runs[k]]
+                k = (k + 1) % len(runs)
+            out.append(np.concatenate([*polygon, segments[k][:1]]))
+            if not _closable(after.vertices, out[-1], linked, longest):
+                out.pop()
+    return out
+
+
+_FEW = 3
+"""Vertices of an old segment up to which it is part of the polygon: the opening that was left would be a pinhole."""
+
+
+def _span(vertices: np.ndarray, segment: Int[np.ndarray, " S"]) -> float:
+    return float(np.linalg.norm(vertices[segment[0]] - vertices[segment[-1]]))
+
+
+def _closable(vertices: np.ndarray, polygon: np.ndarray, linked: set[tuple[int, int]], longest: float) -> bool:
+    """Return whether no vertex occurs twice, and the closing edge is new and short enough."""
+    ends = min(int(polygon[0]), int(polygon[-1])), max(int(polygon[0]), int(polygon[-1]))
+    alone = len(np.unique(polygon)) == len(polygon) >= 3 and ends not in linked
+    return alone and _span(vertices, polygon) <= longest
 
 
 def fill_holes(

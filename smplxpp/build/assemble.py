@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Integer
 
-from smplxpp.assemble import body_colors_from_scan, cut_holes, fill_holes
+from smplxpp.assemble import body_colors_from_scan, cut_holes, cut_slits, fill_holes
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
-from smplxpp.core import SKIN, BodyParams, Check, InputError, StageOutput
+from smplxpp.core import OBJECT, SKIN, BodyParams, Check, InputError, StageOutput
 from smplxpp.metrics.distance import MM
 from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
 from smplxpp.template.template import Template
@@ -42,6 +42,9 @@ def assemble_parts(
         config: choices of the build.
     """
     canonical, filled = {}, {}
+    # Where a thing was taken off, the scan lacks the cloth behind it, and the thing's own back.
+    taken = np.zeros(scan.mesh.vertex_count, dtype=bool)
+    taken[scan.mesh.faces[face_labels == OBJECT.id]] = True
     for name, before in cleaned.items():
         # A part's vertices at rest come from the inverse skinning of its posed mesh. The faces are the same in both
         # poses.
@@ -54,7 +57,8 @@ def assemble_parts(
             scan_index=_of_file(scan, part.source_vertex),
         )
         # Close the holes that cut bridges left. Cuffs and hems were open before and stay open.
-        holes = cut_holes(before.mesh, before.source_vertex, part.mesh, part.source_vertex)
+        borders = (before.mesh, before.source_vertex, made.mesh, part.source_vertex)
+        holes = [*cut_holes(*borders, taken=taken), *cut_slits(*borders, taken=taken)]
         canonical[name], filled[name] = fill_holes(made, holes, config=config.fill_holes)
     # The clearance is given in millimetres by the user; every length inside the package is in metres.
     settings = AssemblyConfig(clearance=config.clearance_mm / MM)

@@ -13,11 +13,11 @@ from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
-from smplxpp.core import Check, LABELS, SkinWeights, StageOutput, TriangleMesh
+from smplxpp.core import LABELS, OBJECT, Check, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
 from smplxpp.metrics.distance import MM
 from smplxpp.skinning import UnposeConfig, Unposed, unpose
-from smplxpp.transfer import TransferConfig, transfer_weights
+from smplxpp.transfer import TransferConfig, rigid_weights, transfer_weights
 
 
 def clean_scan(
@@ -47,6 +47,8 @@ def transfer_to_parts(
 ) -> tuple[dict[str, Part], dict[str, SkinWeights], StageOutput]:
     """Transfer skin weights from the posed body to every part, and cut the bridges that the weights show.
 
+    Things in hands get no weights of the body's surface: each is rigid (`rigid_weights`).
+
     Returns:
         The parts without bridges, their weights, checks and numbers.
     """
@@ -55,8 +57,13 @@ def transfer_to_parts(
     checks: list[Check] = []
     numbers: dict[str, Any] = {}
     for name, part in cleaned.items():
-        settings = transfer_config(LABELS[part.label].name, body, config)
-        mesh, source, found = _without_bridges(part.mesh, fit, body, settings, config.bridges)
+        if part.label == OBJECT.id:
+            # A thing is rigid: it has no bridges, and follows one joint.
+            mesh, source = part.mesh, np.arange(part.mesh.vertex_count)
+            found = rigid_weights(fit.mesh, body.weights, mesh, joint_names=body.joint_names)
+        else:
+            settings = transfer_config(LABELS[part.label].name, body, config)
+            mesh, source, found = _without_bridges(part.mesh, fit, body, settings, config.bridges)
         parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
         weights[name] = found
         # Rows must sum to one, or blended transforms scale the part: T = sum_j w_j T_j is affine only then.

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.cloth.cloth_mesh import coarsen
 from smplxpp.cloth.solver import Collider
-from smplxpp.core.labels import HAIR, LABEL_BY_NAME, LAYER_ORDER
+from smplxpp.core.labels import HAIR, LABEL_BY_NAME, LAYER_ORDER, OBJECT
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.template.template import BODY_PART, Template
 
@@ -97,7 +97,8 @@ def _layers_under(template: Template, part: str) -> list[str]:
         label = LABEL_BY_NAME.get(name)
         return order.get(label.id, 0) if label else 0
 
-    others = [name for name in template.part_names if name not in (BODY_PART, part)]
+    # A thing in a hand is no layer: it may lie against cloth on either side.
+    others = [name for name in template.part_names if name not in (BODY_PART, OBJECT.name, part)]
     return sorted((name for name in others if place(name) < place(part)), key=place)
 
 

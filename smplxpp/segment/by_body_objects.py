@@ -22,17 +22,19 @@ from scipy.spatial import cKDTree
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.topology import component_labels, face_adjacency
-from smplxpp.segment.by_body_chart import ARM, HAND, HEAD, NECK, chart_of_body
+from smplxpp.segment.by_body_chart import ARM, HAND, HEAD, NECK, TRUNK, chart_of_body
 from smplxpp.segment.graph_cut import PottsProblem, minimize_potts
 from smplxpp.segment.smoothing import SmoothingConfig, edge_weights
 
 _CM2 = 1e4  # square centimetres in a square metre
 # Evidence of faces by their distance, in metres, from the nearest part of the body, interpolated. A fist, or fingers
 # that the fit bends otherwise, stand up to 2.5 cm off the fitted hand; wide sleeves 10 cm off an arm.
-_AT_HAND = ((0.012, 0.025, 0.05), (-1.0, 0.0, 1.0))
-_AT_ARM = ((0.02, 0.10, 0.16), (-1.0, -0.2, 0.2))
-_ELSEWHERE = ((0.015, 0.06, 0.25, 0.35), (-1.0, -0.08, -0.04, 0.1))
+_AT_HAND = ((0.012, 0.025, 0.05), (-0.3, 0.0, 1.0))
+_AT_ARM = ((0.015, 0.04, 0.08, 0.14), (-1.0, -0.1, 0.0, 0.3))
+_ELSEWHERE = ((0.015, 0.05, 0.25, 0.35), (-1.0, -0.05, -0.03, 0.1))
+_ON_CHEST = ((0.015, 0.05, 0.09, 0.14), (-1.0, -0.1, 0.0, 0.4))
 _ON_HEAD = ((0.0, 1.0), (-0.5, -0.5))
+_WAIST = 1.05  # height of the standard person above which no cloth stands far off the trunk, metres
 _LENGTH_COST = 2.0  # square centimetres of evidence for one centimetre of a cut through smooth, plain surface
 
 
@@ -74,11 +76,12 @@ def find_objects(
     distance, nearest = cKDTree(posed).query(mesh.face_centers)
     to_hand = cKDTree(posed[hand]).query(mesh.face_centers)[0]
     region = own.region[nearest]
-    evidence = _evidence(distance, region)
+    chest = (region == TRUNK) & (own.height[nearest] > _WAIST)
+    evidence = _evidence(distance, region, chest)
     if not (mesh.face_areas[evidence > 0].sum() * _CM2 > _LEAST_AREA):
         return nothing
     # Minimise E by one cut; both terms are in square centimetres, so that finer meshes give the same cut.
-    relative = edge_weights(mesh, pairs, ends, SmoothingConfig(smoothness=1.0, floor=0.0), lab=lab)
+    relative = edge_weights(mesh, pairs, ends, SmoothingConfig(smoothness=1.0, floor=0.0, eta_convex=0.0), lab=lab)
     length = 100.0 * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
     cost = _LENGTH_COST * relative * (length.mean() if len(length) else 1.0)
     unary = np.stack([np.zeros(mesh.face_count), -evidence * mesh.face_areas * _CM2], axis=1)
@@ -97,10 +100,11 @@ _SMOOTH_BORDER = 0.6
 """Mean cost of the cut, as a share of that through smooth and plain surface, from which it is no border of a thing."""
 
 
-def _evidence(distance: np.ndarray, region: np.ndarray) -> Float64[np.ndarray, " M"]:
+def _evidence(distance: np.ndarray, region: np.ndarray, chest: np.ndarray) -> Float64[np.ndarray, " M"]:
     """Return the evidence of each face that it belongs to a thing, a square centimetre for each of its own."""
     out = np.interp(distance, *_ELSEWHERE)
-    for where, curve in ((region == HAND, _AT_HAND), (region == ARM, _AT_ARM), (np.isin(region, (HEAD, NECK)), _ON_HEAD)):
+    head = np.isin(region, (HEAD, NECK))
+    for where, curve in ((region == HAND, _AT_HAND), (region == ARM, _AT_ARM), (chest, _ON_CHEST), (head, _ON_HEAD)):
         out[where] = np.interp(distance[where], *curve)
     return out
 

@@ -6,12 +6,12 @@ Some of their classes are finer than ours, or differ from them:
 |---|---|---|
 | socks, shoes | shoe | worn over the foot, move with it |
 | hat | hair | rigid on the head, as hair is |
-| gloves, glasses, face, limbs, feet, hands, mouth | skin | lie on the body, which the body model represents |
+| gloves, face, limbs, feet, hands, mouth | skin | lie on the body, which the body model represents |
 | scarf, apparel | outer | worn over the upper clothes |
 | coat | outer | |
 | dress, jumpsuit | upper | one garment from the shoulders; it stays whole |
 | pants, skirt, belt | lower | |
-| bag | background | not worn; it does not vote, the surface takes its neighbours' label |
+| bag, sunglasses | object | rigid, follow one joint |
 | undefined background, ignored (255) | background | |
 """
 
@@ -62,7 +62,7 @@ _LIP = (
     ("hat", "hair"),
     ("hair", "hair"),
     ("glove", "skin"),
-    ("sunglasses", "skin"),
+    ("sunglasses", "object"),
     ("upper clothes", "upper"),
     ("dress", "upper"),
     ("coat", "outer"),
@@ -114,7 +114,7 @@ LABEL_SETS: dict[str, LabelSet] = {
             ("background", "background"),
             ("hat", "hair"),
             ("hair", "hair"),
-            ("sunglasses", "skin"),
+            ("sunglasses", "object"),
             ("upper clothes", "upper"),
             ("skirt", "lower"),
             ("pants", "lower"),
@@ -127,7 +127,7 @@ LABEL_SETS: dict[str, LabelSet] = {
             ("right leg", "skin"),
             ("left arm", "skin"),
             ("right arm", "skin"),
-            ("bag", "background"),
+            ("bag", "object"),
             ("scarf", "outer"),
         ),
         _parser(
@@ -154,7 +154,7 @@ LABEL_SETS: dict[str, LabelSet] = {
 def find_label_set(name: str | Path | LabelSet) -> LabelSet:
     """Return a label set by its name, or from a JSON file `{"<their id>": "<our name>", ...}`.
 
-    Our names: skin, hair, shoe, upper, lower, outer, background.
+    Our names: skin, hair, shoe, upper, lower, outer, object, background.
 
     Raises:
         InputError: an unknown name, or a file that is not such a mapping.

@@ -1,0 +1,76 @@
+"""Bind a rigid thing to one joint: a bag or a binder to the hand that holds it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from smplxpp.core import SkinWeights, TriangleMesh
+from smplxpp.transfer.correspond import vertex_components
+
+_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+_HOLDS = 0.03
+"""Metres from a hand within which a piece is held by it, whatever else it touches."""
+
+
+def rigid_weights(
+    source: TriangleMesh, source_weights: Float[np.ndarray, "V J"], target: TriangleMesh, *, joint_names: tuple[str, ...]
+) -> SkinWeights:
+    """Return skin weights with which every piece of `target` follows one joint of the body, as it is in the scan.
+
+    A piece that comes within 3 cm of a hand is held by it and follows its wrist, because fingers that bend would tear
+    it; of two hands, the one that is near to more of it holds it. Every other piece (a bag on the shoulder, a hat)
+    follows the joint with the largest weight in the body nearest to it.
+
+    Args:
+        source: the posed body.
+        source_weights: its skin weights.
+        target: the thing, in the same place, one or several connected pieces.
+        joint_names: names of the J joints, for which hands are looked for.
+
+    Example:
+        >>> body = smplxpp.load_body()
+        >>> box = body.mesh().submesh(np.arange(100))[0]
+        >>> weights = rigid_weights(body.mesh(), body.weights, box, joint_names=body.joint_names)
+        >>> len(np.unique(weights.dense().argmax(axis=1)))
+        1
+    """
+    # Fingers count as the wrist that they belong to.
+    names = list(joint_names)
+    owner = np.arange(len(names))
+    for k, name in enumerate(names):
+        side = name.partition("_")[0]
+        if any(finger in name for finger in _FINGERS) and f"{side}_wrist" in names:
+            owner[k] = names.index(f"{side}_wrist")
+    folded = np.zeros((len(source_weights), len(names)))
+    np.add.at(folded.T, owner, np.asarray(source_weights, dtype=np.float64).T)
+    limb = folded.argmax(axis=1)
+    distance, nearest = cKDTree(source.vertices).query(target.vertices)
+    hands = [k for k, name in enumerate(names) if name.endswith("_wrist") and (limb == k).any()]
+    held = np.stack([cKDTree(source.vertices[limb == k]).query(target.vertices)[0] < _HOLDS for k in hands] or [distance < 0])
+    # One joint for every connected piece.
+    component = vertex_components(target)
+    joint = np.zeros(target.vertex_count, dtype=np.int64)
+    policies = []
+    for piece in range(int(component.max(initial=-1)) + 1):
+        own = component == piece
+        touches = held[:, own].sum(axis=1)
+        if touches.max() > 0:
+            joint[own] = hands[int(touches.argmax())]
+        else:
+            # The tenth of it that is nearest to the body, by the sum of the weights there.
+            close = own & (distance <= np.quantile(distance[own], 0.1))
+            joint[own] = int(folded[nearest[close]].sum(axis=0).argmax())
+        policies.append(f"rigid:{names[joint[own][0]]}")
+    dense = np.zeros((target.vertex_count, len(names)))
+    dense[np.arange(len(joint)), joint] = 1.0
+    return SkinWeights.from_dense(
+        dense,
+        max_influences=1,
+        matched=np.zeros(len(joint), dtype=bool),
+        distance=distance,
+        angle=np.full(len(joint), np.nan),
+        component=component,
+        policies=tuple(policies),
+    )
