@@ -46,7 +46,14 @@ class BridgeConfig:
     rounds: int = 3
 
     def __post_init__(self) -> None:
-        for name, least in (("valley", 0.0), ("jump", 1.0), ("stretch", 1.0), ("tear", 1.0), ("speck_area", 0.0), ("rounds", 0)):
+        for name, least in (
+            ("valley", 0.0),
+            ("jump", 1.0),
+            ("stretch", 1.0),
+            ("tear", 1.0),
+            ("speck_area", 0.0),
+            ("rounds", 0),
+        ):
             require_at_least(f"bridges: {name}", getattr(self, name), least)
 
 

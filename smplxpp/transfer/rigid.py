@@ -15,7 +15,11 @@ _HOLDS = 0.03
 
 
 def rigid_weights(
-    source: TriangleMesh, source_weights: Float[np.ndarray, "V J"], target: TriangleMesh, *, joint_names: tuple[str, ...]
+    source: TriangleMesh,
+    source_weights: Float[np.ndarray, "V J"],
+    target: TriangleMesh,
+    *,
+    joint_names: tuple[str, ...],
 ) -> SkinWeights:
     """Return skin weights with which every piece of `target` follows one joint of the body, as it is in the scan.
 
@@ -48,7 +52,9 @@ def rigid_weights(
     limb = folded.argmax(axis=1)
     distance, nearest = cKDTree(source.vertices).query(target.vertices)
     hands = [k for k, name in enumerate(names) if name.endswith("_wrist") and (limb == k).any()]
-    held = np.stack([cKDTree(source.vertices[limb == k]).query(target.vertices)[0] < _HOLDS for k in hands] or [distance < 0])
+    held = np.stack(
+        [cKDTree(source.vertices[limb == k]).query(target.vertices)[0] < _HOLDS for k in hands] or [distance < 0]
+    )
     # One joint for every connected piece.
     component = vertex_components(target)
     joint = np.zeros(target.vertex_count, dtype=np.int64)

@@ -102,7 +102,7 @@ def test_a_bald_person_with_bare_feet_has_neither_hair_nor_shoes(body):
     mesh, colors, params = painted(body, {"shirt": _BLUE, "trousers": _GREY})
     labels = label_by_body(mesh, body, params, colors=colors).face_labels
     area = mesh.face_areas / mesh.face_areas.sum()
-    share = np.array([area[labels == k].sum() for k in range(6)])
+    share = np.array([area[labels == k].sum() for k in range(len(LABELS))])
     assert share[HAIR.id] < 0.002 and share[SHOE.id] < 0.002
     assert share[UPPER.id] > 0.2 and share[LOWER.id] > 0.2 and share[SKIN.id] > 0.15
 
@@ -138,7 +138,7 @@ def test_shares_of_labels_are_sums_over_all_outlines():
     rings = 5
     there = np.triu(np.ones((rings + 1, rings + 1), dtype=bool))
     order = [np.where(there, rng.uniform(0, 20, there.shape), np.inf) for _ in RUNS]
-    expected, total = np.zeros((rings, 6)), 0.0
+    expected, total = np.zeros((rings, len(LABELS))), 0.0
     for inner in combinations_with_replacement(range(rings + 1), len(RUNS) - 1):
         cuts = (0, *inner, rings)
         weight = np.exp(-sum(cost[a, b] for cost, a, b in zip(order, cuts[:-1], cuts[1:], strict=True)) / NAT)
@@ -181,7 +181,7 @@ def test_a_head_alone_is_labelled_and_nothing_at_all_is_refused(body, scanned):
 
 def test_votes_of_few_views_are_completed_by_the_body(body, scanned):
     mesh, colors, truth, params = scanned
-    votes = np.zeros((mesh.face_count, 6))
+    votes = np.zeros((mesh.face_count, len(LABELS)))
     front = mesh.face_normals[:, 2] > 0.3
     votes[np.flatnonzero(front), truth[front]] = 3.0
     prior = label_by_body(mesh, body, params, colors=colors)

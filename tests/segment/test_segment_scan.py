@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.core import LOWER, OUTER, SHOE, SKIN, UPPER, Camera, InputError, TriangleMesh
+from smplxpp.core import LABELS, LOWER, OUTER, SHOE, SKIN, UPPER, Camera, InputError, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.segment import SegmentConfig, SegmentedScan, map_labels, segment_scan, vote_on_faces
 from tests.segment.views import halves, sphere, views_of
@@ -47,7 +47,7 @@ def test_noisy_views_are_outvoted_and_smoothed(ball):
 
 def test_unseen_faces_are_flagged_and_take_the_neighbours_label(ball):
     truth = halves(ball)
-    votes = np.zeros((ball.face_count, 6))
+    votes = np.zeros((ball.face_count, len(LABELS)))
     votes[np.arange(ball.face_count), truth] = 3.0
     unseen = np.linalg.norm(ball.triangles.mean(1) - [0, 1, 0], axis=1) < 0.4
     votes[unseen] = 0.0
@@ -62,7 +62,7 @@ def test_unseen_faces_are_flagged_and_take_the_neighbours_label(ball):
 def test_faces_smaller_than_a_pixel_are_as_sure_as_their_surroundings(ball):
     """Once a scan of 80k faces in images of 256 x 320 had a confidence of 0.35 with 99.6 % of its labels right."""
     truth, rng = halves(ball), np.random.default_rng(0)
-    votes = np.zeros((ball.face_count, 6))
+    votes = np.zeros((ball.face_count, len(LABELS)))
     hit = rng.random(ball.face_count) < 0.4
     votes[hit, truth[hit]] = 1.0
     result = segment_scan(ball, votes=votes)
@@ -83,14 +83,14 @@ def test_the_surface_that_closes_a_skirt_from_below_is_no_cloth(subdivisions):
     middle = skirt.face_centers
     truth = np.where(np.hypot(middle[:, 0], middle[:, 2]) < 0.25, SKIN.id, LOWER.id)  # a leg below
     truth[middle[:, 1] > 0] = LOWER.id
-    votes = np.zeros((skirt.face_count, 6))
+    votes = np.zeros((skirt.face_count, len(LABELS)))
     votes[np.arange(skirt.face_count), truth] = 3.0
     under = (middle[:, 1] < -0.6) & (truth == LOWER.id)
     votes[under] = 0.0
     found = segment_scan(skirt, votes=votes).face_labels
     assert (found[under] == SKIN.id).mean() > 0.9
     # A sole has no skin beside it and stays a shoe's.
-    votes = np.zeros((skirt.face_count, 6))
+    votes = np.zeros((skirt.face_count, len(LABELS)))
     ankle = middle[:, 1] > 0.3
     votes[ankle, SKIN.id] = 3.0
     votes[~ankle & (middle[:, 1] > -0.8), SHOE.id] = 3.0
@@ -119,7 +119,7 @@ def test_a_bit_of_cloth_on_a_hand_goes_a_strap_and_a_hole_stay():
     hole = (np.hypot(x, z) < 0.09) & (y < 0)
     assert island.sum() > 20
     truth = np.where((worn & ~hole) | strap, LOWER.id, SKIN.id)
-    votes = np.zeros((ball.face_count, 6))
+    votes = np.zeros((ball.face_count, len(LABELS)))
     votes[np.arange(ball.face_count), np.where(island, LOWER.id, truth)] = 3.0
     found = segment_scan(ball, votes=votes).face_labels
     assert (found[island] == SKIN.id).all()
@@ -133,7 +133,7 @@ def test_a_patch_that_the_votes_doubt_goes_whatever_its_label(ball):
     patch = np.hypot(ball.face_centers[:, 0], ball.face_centers[:, 2]) < 0.1
     patch &= ball.face_centers[:, 1] > 0
     for clear, expected in ((3.0, SKIN.id), (1.6, LOWER.id)):
-        votes = np.zeros((ball.face_count, 6))
+        votes = np.zeros((ball.face_count, len(LABELS)))
         votes[np.arange(ball.face_count), truth] = 3.0
         votes[patch] = 0.0
         votes[patch, SKIN.id] = clear
@@ -202,7 +202,7 @@ def test_maps_of_every_parser_vote_for_the_same(ball, name):
 
 def test_a_parser_without_coats_leaves_them_to_the_prior(ball):
     """Votes say upper for a coat and a shirt alike; the prior tells them apart."""
-    votes = np.zeros((ball.face_count, 6))
+    votes = np.zeros((ball.face_count, len(LABELS)))
     votes[:, UPPER.id] = 3.0
     coat = ball.face_centers[:, 0] > 0
     labels = np.where(coat, OUTER.id, UPPER.id)
@@ -221,7 +221,7 @@ def test_a_prior_is_read_as_the_views_call_its_labels(ball):
     front, upper = ball.face_centers[:, 2] > 0, ball.face_centers[:, 1] > 0
 
     def found(truth: np.ndarray, **given) -> np.ndarray:
-        votes = np.zeros((ball.face_count, 6))
+        votes = np.zeros((ball.face_count, len(LABELS)))
         votes[np.flatnonzero(front), truth[front]] = 3.0
         return segment_scan(ball, votes=votes, **given).face_labels
 
@@ -233,7 +233,7 @@ def test_a_prior_is_read_as_the_views_call_its_labels(ball):
 def test_borders_settle_on_edges_of_colour(ball):
     """Votes that wander about the true border; on a sphere no fold says where it is."""
     truth = halves(ball)
-    votes = np.zeros((ball.face_count, 6))
+    votes = np.zeros((ball.face_count, len(LABELS)))
     height = ball.face_centers[:, 1]
     wandering = np.where(height > 0.12 * np.sin(7 * np.arctan2(*ball.face_centers[:, [0, 2]].T)), 3, 4)
     near = np.abs(height) < 0.15
