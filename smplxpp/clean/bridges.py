@@ -32,7 +32,8 @@ class BridgeConfig:
             length. It is about 1 along cloth that follows the body.
         stretch: factor of the edge's length in the T-pose. Loose cloth, whose weights change slowly, stretches less,
             however far apart the limbs under it are.
-        tear: factor of the edge's length in the T-pose from which an edge is torn (`find_tears`), however its sides lie.
+        tear: factor of the edge's length in the T-pose from which an edge is torn, however its sides lie; see
+            `find_tears`.
         speck_area: area fraction of the part below which pieces that the cut leaves are removed, too.
         rounds: largest number of cuts of bridges, and of tears; after each the weights are computed again without the
             cut faces. 0 cuts nothing.
@@ -46,14 +47,8 @@ class BridgeConfig:
     rounds: int = 3
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("valley", 0.0),
-            ("jump", 1.0),
-            ("stretch", 1.0),
-            ("tear", 1.0),
-            ("speck_area", 0.0),
-            ("rounds", 0),
-        ):
+        least_of = {"valley": 0.0, "jump": 1.0, "stretch": 1.0, "tear": 1.0, "speck_area": 0.0, "rounds": 0}
+        for name, least in least_of.items():
             require_at_least(f"bridges: {name}", getattr(self, name), least)
 
 
@@ -102,10 +97,10 @@ def find_tears(
 ) -> Bool[np.ndarray, " M"]:
     """Find the faces of a part that unposing tears, where no fold shows a bridge.
 
-    A coarse scan joins a sleeve and a jacket, a hand's cuff and a pocket, or two trouser legs without a fold, and leaves
-    faces beside a cut whose weights mix two limbs. Edges that leave one limb and arrive at another, as `find_bridges`
-    has them, come first; where there are none, every torn edge counts, because the scan's cloth is lost there in any
-    case. Arguments as for `find_bridges`.
+    A coarse scan joins a sleeve and a jacket, a cuff and a pocket, or two trouser legs without a fold, and leaves faces
+    beside a cut whose weights mix two limbs. Edges that leave one limb and arrive at another, as `find_bridges` has
+    them, come first; where there are none, every torn edge counts, because the scan's cloth is lost there in any case.
+    Arguments as for `find_bridges`.
     """
     config = config or BridgeConfig()
     ends = posed.edges

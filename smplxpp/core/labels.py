@@ -1,4 +1,4 @@
-"""Define the semantic labels of a clothed person: the classes of 4D-Dress and things in hands, with names and colours."""
+"""Define the semantic labels of a clothed person: the classes of 4D-Dress, and things that are carried."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ UPPER = Label(3, "upper", (180, 50, 50), (255, 0, 0), 20_000)
 LOWER = Label(4, "lower", (50, 180, 50), (255, 0, 0), 20_000)
 OUTER = Label(5, "outer", (0, 128, 255), (255, 0, 0), 20_000)
 OBJECT = Label(6, "object", (240, 200, 0), (0, 128, 255), 4_000)
-"""A thing that a person holds or carries: a bag, a binder. It is rigid, follows one joint, and is no layer of clothes."""
+"""A thing that a person holds or carries, such as a bag: rigid, bound to one joint, and no layer of clothes."""
 
 LABELS: tuple[Label, ...] = (SKIN, HAIR, SHOE, UPPER, LOWER, OUTER, OBJECT)
 BACKGROUND = -1

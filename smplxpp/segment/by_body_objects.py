@@ -87,7 +87,7 @@ def find_objects(
     unary = np.stack([np.zeros(mesh.face_count), -evidence * mesh.face_areas * _CM2], axis=1)
     unary -= unary.min(axis=1, keepdims=True)
     cut = minimize_potts(PottsProblem.from_costs(unary, pairs, cost))[0].astype(bool)
-    return _accepted(mesh, cut, pairs, (length, cost), (distance, to_hand, region))
+    return _accepted(mesh, cut, pairs, (length, cost), (distance, to_hand))
 
 
 _LEAST_AREA = 60.0
@@ -114,10 +114,18 @@ def _accepted(
     cut: Bool[np.ndarray, " M"],
     pairs: Int64[np.ndarray, "P 2"],
     edges: tuple[np.ndarray, np.ndarray],
-    where: tuple[np.ndarray, np.ndarray, np.ndarray],
+    where: tuple[np.ndarray, np.ndarray],
 ) -> FoundObjects:
-    """Keep the pieces of a cut that are things; `where` is each face's distance, that to the hands, and the region."""
-    distance, to_hand, region = where
+    """Keep the pieces of a cut that are things.
+
+    Args:
+        mesh: the scan.
+        cut: faces on the side of things.
+        pairs: the two faces of each edge.
+        edges: length, in centimetres, and cost of each edge.
+        where: distance of each face to the body and to its hands, metres.
+    """
+    distance, to_hand = where
     length, cost = edges
     inside = cut[pairs]
     piece = component_labels(pairs[inside.all(axis=1)], len(cut))

@@ -52,9 +52,9 @@ def rigid_weights(
     limb = folded.argmax(axis=1)
     distance, nearest = cKDTree(source.vertices).query(target.vertices)
     hands = [k for k, name in enumerate(names) if name.endswith("_wrist") and (limb == k).any()]
-    held = np.stack(
-        [cKDTree(source.vertices[limb == k]).query(target.vertices)[0] < _HOLDS for k in hands] or [distance < 0]
-    )
+    held = np.zeros((len(hands), target.vertex_count), dtype=bool)
+    for row, hand in enumerate(hands):
+        held[row] = cKDTree(source.vertices[limb == hand]).query(target.vertices)[0] < _HOLDS
     # One joint for every connected piece.
     component = vertex_components(target)
     joint = np.zeros(target.vertex_count, dtype=np.int64)
@@ -62,7 +62,7 @@ def rigid_weights(
     for piece in range(int(component.max(initial=-1)) + 1):
         own = component == piece
         touches = held[:, own].sum(axis=1)
-        if touches.max() > 0:
+        if touches.any():
             joint[own] = hands[int(touches.argmax())]
         else:
             # The tenth of it that is nearest to the body, by the sum of the weights there.

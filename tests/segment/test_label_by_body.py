@@ -12,7 +12,7 @@ import pytest
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.core.errors import InputError
-from smplxpp.core.labels import HAIR, LOWER, SHOE, SKIN, UPPER
+from smplxpp.core.labels import HAIR, LABELS, LOWER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams

@@ -60,15 +60,11 @@ def thing_mesh(thing: Thing, body: BodyModel, posed: PosedBody) -> TriangleMesh:
 
 
 def _hull(points: Float[np.ndarray, "N 3"]) -> TriangleMesh:
-    """Return the convex hull of points, wound outwards, its faces split to edges of about 1 cm."""
+    """Return the convex hull of points, wound outwards."""
     hull = ConvexHull(points)
     corners = points[hull.simplices]
-    inwards = (
-        np.einsum(
-            "ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), hull.equations[:, :3]
-        )
-        < 0
-    )
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inwards = np.einsum("ij,ij->i", normal, hull.equations[:, :3]) < 0
     faces = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
     used, index = np.unique(faces, return_inverse=True)
     return TriangleMesh(points[used], index.reshape(-1, 3))
