@@ -20,10 +20,10 @@ class FillHolesConfig:
 
     Attributes:
         width: largest mean width of a patch, metres: twice its area divided by its perimeter. A wider one, such as a
-            sail between both legs, is not made. 0 fills nothing.
+            sail between a long sleeve and the side, is not made. 0 fills nothing.
     """
 
-    width: float = 0.15
+    width: float = 0.08
 
     def __post_init__(self) -> None:
         require_at_least("fill_holes: width", self.width, 0.0)
@@ -44,6 +44,9 @@ class FilledHoles:
     closed: int = 0
     faces: int = 0
     area: float = 0.0
+
+    def __add__(self, other: FilledHoles) -> FilledHoles:
+        return FilledHoles(*(a + b for a, b in zip(asdict(self).values(), asdict(other).values(), strict=True)))
 
     def as_dict(self) -> dict[str, float]:
         """Return the counts as plain numbers, for JSON."""
@@ -123,7 +126,8 @@ def cut_slits(
             continue
         # Segments that separate polygons: those with distant ends; where there is none, the longest.
         apart = [_span(after.vertices, segment) > longest for segment in segments]
-        apart = apart if any(apart) else [len(one) == max(map(len, segments)) for one in segments]
+        if not any(apart):
+            apart[int(np.argmax([len(segment) for segment in segments]))] = True
         for first in np.flatnonzero(apart):
             polygon, k = [segments[first][-1:], runs[first]], (first + 1) % len(runs)
             while not apart[k]:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Bool, Integer
 
-from smplxpp.assemble import body_colors_from_scan, cut_holes, cut_slits, fill_holes
+from smplxpp.assemble import FilledHoles, FillHolesConfig, body_colors_from_scan, cut_holes, cut_slits, fill_holes
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
@@ -56,10 +56,7 @@ def assemble_parts(
             vertex_colors=part.colors,
             scan_index=_of_file(scan, part.source_vertex),
         )
-        # Close the holes that cut bridges left. Cuffs and hems were open before and stay open.
-        borders = (before.mesh, before.source_vertex, made.mesh, part.source_vertex)
-        holes = [*cut_holes(*borders, taken=taken), *cut_slits(*borders, taken=taken)]
-        canonical[name], filled[name] = fill_holes(made, holes, config=config.fill_holes)
+        canonical[name], filled[name] = _filled(made, before, part, taken, config.fill_holes)
     # The clearance is given in millimetres by the user; every length inside the package is in metres.
     settings = AssemblyConfig(clearance=config.clearance_mm / MM)
     template, report = assemble_template(body, params, canonical, config=settings)
@@ -100,6 +97,28 @@ def assemble_parts(
     ]
     numbers = report.as_dict() | {"darned": {name: one.as_dict() for name, one in filled.items()}}
     return template, StageOutput(checks, numbers)
+
+
+def _filled(
+    made: CanonicalPart, before: Part, part: Part, taken: Bool[np.ndarray, " N"], config: FillHolesConfig
+) -> tuple[CanonicalPart, FilledHoles]:
+    """Close the holes and slits that cut bridges left in a part; cuffs and hems were open before and stay open.
+
+    Args:
+        made: the part at rest.
+        before: the cleaned part, before bridges were cut.
+        part: the same without bridges.
+        taken: the scan's vertices at which a thing was taken off.
+        config: options.
+    """
+    borders = (before.mesh, before.source_vertex, made.mesh, part.source_vertex)
+    holes = cut_holes(*borders, taken=taken)
+    behind = [bool(taken[part.source_vertex[hole]].any()) for hole in holes]
+    out, narrow = fill_holes(made, [hole for hole, wide in zip(holes, behind, strict=True) if not wide], config=config)
+    # Slits have straight ends across a hem or a cuff, and a thing is as wide as it is: neither can become a sail.
+    wide = [*(hole for hole, wide in zip(holes, behind, strict=True) if wide), *cut_slits(*borders, taken=taken)]
+    out, others = fill_holes(out, wide, config=replace(config, width=2.0 * config.width))
+    return out, narrow + others
 
 
 def _of_file(scan: PreparedScan, vertices: Integer[np.ndarray, " n"]) -> Integer[np.ndarray, " n"]:

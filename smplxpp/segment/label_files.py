@@ -173,7 +173,11 @@ def holds_labels(path: str | Path) -> bool:
     raw = read_raw_mesh(path, clouds=True)
     if any(key in properties for properties in (raw.vertex_properties, raw.face_properties) for key in _KEYS):
         return True
-    return raw.vertex_colors is not None and _of_the_table(labels_from_colors(raw.vertex_colors))
+    if raw.vertex_colors is None:
+        return False
+    # One colour throughout is a material without a texture; the grey of many tools is the colour of skin.
+    labels = labels_from_colors(raw.vertex_colors)
+    return _of_the_table(labels) and len(np.unique(labels[labels != BACKGROUND])) > 1
 
 
 def _of_the_table(labels: np.ndarray) -> bool:

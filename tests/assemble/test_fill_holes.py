@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.assemble import CanonicalPart, FillHolesConfig, cut_holes, fill_holes
+from smplxpp.assemble import CanonicalPart, FillHolesConfig, cut_holes, cut_slits, fill_holes
 from smplxpp.core import UPPER, InputError, SkinWeights, TriangleMesh
-from smplxpp.core.topology import border_loops
+from smplxpp.core.topology import border_loops, edge_groups
 
 ROWS, COLUMNS, CELL = 21, 40, 0.01
 
@@ -73,6 +73,48 @@ def test_a_cut_that_reaches_an_opening_is_part_of_it(tube):
     assert holes_of(part, tube) == []
     filled, report = fill_holes(part, [])
     assert filled is part and report.holes == 0
+
+
+def slits_of(part: CanonicalPart, before: CanonicalPart, **options) -> list[np.ndarray]:
+    return cut_slits(before.mesh, before.scan_index, part.mesh, part.scan_index, **options)
+
+
+def test_a_cut_from_the_opening_is_closed_and_the_opening_stays(tube):
+    """As where a sleeve was fused with the side up from its cuff: the cuff is a circle again."""
+    part = without(tube, ((14, 20), (3, 8)))
+    (slit,) = slits_of(part, tube)
+    filled, report = fill_holes(part, [slit])
+    assert report.closed == 1 and report.area == pytest.approx(30 * CELL**2, rel=0.25)
+    before, after = (border_loops(one.mesh.faces) for one in (tube, filled))
+    assert len(after) == len(before) == 2
+    # The straight edge over the slit is as long as the five edges that it stands for, but for their bend.
+    assert sum(map(len, after)) == sum(map(len, before)) - 4
+    assert edge_groups(filled.mesh.faces)[2].max() == 2
+
+
+def test_a_cut_from_one_opening_to_the_other_is_closed_along_its_whole_length(tube):
+    """A side seam that is gone: two runs, joined across both openings."""
+    part = without(tube, ((0, 20), (3, 8)))
+    (slit,) = slits_of(part, tube)
+    filled, report = fill_holes(part, [slit])
+    assert report.closed == 1 and report.area == pytest.approx(100 * CELL**2, rel=0.25)
+    assert len(border_loops(filled.mesh.faces)) == 2 and edge_groups(filled.mesh.faces)[2].max() == 2
+
+
+def test_ends_that_are_far_apart_are_not_joined(tube):
+    part = without(tube, ((14, 20), (3, 15)))
+    assert slits_of(part, tube, longest=0.05) == [] and len(slits_of(part, tube)) == 1
+
+
+def test_where_a_thing_was_taken_off_is_no_opening(tube):
+    """A border of the part before any cut, along which the scan shows a thing against it."""
+    part = without(tube, ((8, 13), (3, 8)))
+    assert holes_of(part, part) == [] and slits_of(part, part) == []
+    (rim,) = holes_of(part, tube)
+    taken = np.zeros(1000, dtype=bool)
+    taken[part.scan_index[rim]] = True
+    (hole,) = cut_holes(part.mesh, part.scan_index, part.mesh, part.scan_index, taken=taken)
+    np.testing.assert_array_equal(hole, rim)
 
 
 def test_two_holes_and_the_wide_one_stays(tube):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smplxpp.clean import BridgeConfig, cut_bridges, find_bridges
+from smplxpp.clean import BridgeConfig, cut_bridges, find_bridges, find_tears
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups
 
@@ -119,6 +119,27 @@ def test_loose_cloth_between_two_limbs_stays(body):
     assert not find_bridges(front, torn(front), *body).any()
 
 
+def test_flat_cloth_that_leaves_one_limb_and_arrives_at_another_is_torn(body):
+    """A coarse scan fuses sleeve and side in front of the gap without a fold; its weights jump between two columns."""
+    x = np.linspace(0.0, AXIS, 80)
+    front = sheet(np.stack([x, np.full(80, TRUNK + 0.01)], axis=1))
+    tears = find_tears(front, torn(front), *body)
+    columns = front.triangles[tears][:, :, 0]
+    middle = TRUNK + GAP / 2
+    assert tears.any() and (columns.min(axis=1) < middle).all() and (columns.max(axis=1) > middle).all()
+    # Weights that change slowly stretch it 2.4 times, which is no tear.
+    assert not find_tears(front, torn(front, width=AXIS), *body).any()
+    assert not find_tears(front, torn(front), *body, config=BridgeConfig(tear=1000.0)).any()
+
+
+def test_tiny_edges_that_noise_stretches_are_no_tears(body):
+    cloth = inside_the_gap()
+    noise = np.zeros(cloth.vertices.shape)
+    noise[::7, 1] = 1e-3
+    fine = cloth.with_vertices(0.02 * cloth.vertices)
+    assert not find_tears(fine, fine.with_vertices(fine.vertices + noise), *body).any()
+
+
 def test_a_cape_over_the_shoulder_stays(body):
     """It goes round trunk and arm from outside."""
     angle = np.linspace(1.5, -1.5, 120)
@@ -171,7 +192,9 @@ def test_specks_that_a_cut_leaves_go_with_it():
     assert len(border_loops(left.faces)) == 2
 
 
-@pytest.mark.parametrize("change", [{"jump": 0.5}, {"stretch": 0.0}, {"speck_area": -1.0}, {"rounds": -1}])
+@pytest.mark.parametrize(
+    "change", [{"jump": 0.5}, {"stretch": 0.0}, {"tear": 0.5}, {"speck_area": -1.0}, {"rounds": -1}]
+)
 def test_settings_without_meaning_are_refused(change):
     with pytest.raises(InputError, match=f"bridges: {next(iter(change))}"):
         BridgeConfig(**change)

@@ -12,7 +12,7 @@ from PIL import Image
 from smplxpp.core import BACKGROUND, LABELS, InputError, display_colors
 from smplxpp.segment import LABEL_SETS, labels_from_colors, map_labels, read_label_map, read_labels
 
-SIZES = {"lip": 20, "cihp": 20, "atr": 18, "sapiens": 28, "capture": 7, "4ddress": 7}
+SIZES = {"lip": 20, "cihp": 20, "atr": 18, "sapiens": 28, "capture": 7, "4ddress": 8}
 
 
 @pytest.mark.parametrize("name", SIZES)
@@ -29,7 +29,7 @@ def test_sets_are_complete(name: str):
     [
         ("lip", [0, 2, 5, 9, 12, 13, 18, 255], [-1, 1, 3, 4, 4, 0, 2, -1]),
         ("cihp", [10, 11, 19], [0, 5, 2]),
-        ("atr", [4, 6, 10, 11, 16], [3, 4, 2, 0, -1]),
+        ("atr", [3, 4, 6, 10, 11, 16], [6, 3, 4, 2, 0, 6]),
         ("sapiens", [2, 3, 8, 12, 16, 17, 21, 22], [0, 1, 2, 4, 0, 2, 0, 3]),
         ("capture", [0, 1, 2, 3, 4, 5, 6], [-1, 0, 1, 2, 3, 4, 0]),
         ("4ddress", [-1, 0, 5], [-1, 0, 5]),

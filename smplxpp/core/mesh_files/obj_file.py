@@ -254,7 +254,8 @@ def _material_colors(
                 wrap = (CLAMP, CLAMP) if material.clamp else (REPEAT, REPEAT)
                 at, mean = average_corner_colors(corners[chosen], sample_texture(picture, place, wrap=wrap))
                 colors[at] = mean
-                found = True
+                # A file without texture coordinates has no colours, whatever its materials name.
+                found = found or len(at) > 0
         elif material.color is not None:
             colors[corners[chosen]] = material.color
             found = True

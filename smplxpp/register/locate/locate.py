@@ -15,6 +15,7 @@ from smplxpp.body import BodyModel
 from smplxpp.core import SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.register.kinematics import Kinematics
+from smplxpp.register.locate.heels import lift_heels
 from smplxpp.register.locate.icp import PinnedLandmarks
 from smplxpp.register.locate.search import Found, LocateConfig, Search
 from smplxpp.register.locate.second_look import look_again
@@ -131,6 +132,7 @@ def locate_body(
         pinned.make_robust()
     # Limbs that the dressed body's surface does not show are searched once more before labels depend on them.
     best, moved = look_again(search, search.finished(found[0]), hints=hints)
+    best = lift_heels(search, best)
     refuse_non_persons(best)
     if labeller is not None:
         labels = labeller(best.state.to_params(body))

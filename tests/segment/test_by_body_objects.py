@@ -1,0 +1,108 @@
+"""Things in hands are found where they are, and bound to the hand that holds them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.synth.people.things import THINGS, Thing, thing_mesh
+from pipelines.synth.scan_simulation import ScanConfig, simulate_scan
+from smplxpp.body import BodyModel, PosedBody, load_body
+from smplxpp.core import OBJECT, BodyParams, InputError, concatenate_meshes
+from smplxpp.segment import label_by_body
+from smplxpp.segment.by_body_objects import find_objects
+from smplxpp.transfer import rigid_weights
+
+_COARSE = ScanConfig(cell=0.012, views=14, resolution=256, faces=6000)
+
+
+@pytest.fixture(scope="module")
+def open_body() -> BodyModel:
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def stance(open_body: BodyModel) -> tuple[BodyParams, PosedBody]:
+    """The body with its arms 40 degrees below the horizon."""
+    pose = np.zeros((1, open_body.joint_count, 3))
+    for side, sign in (("left", -1.0), ("right", 1.0)):
+        pose[0, open_body.joint_names.index(f"{side}_shoulder"), 2] = sign * np.radians(40.0)
+    params = BodyParams.from_full_pose(
+        pose,
+        betas=np.zeros(open_body.num_betas),
+        expression=np.zeros(open_body.num_expressions),
+        transl=np.zeros(3),
+    )
+    return params, open_body.forward(params)
+
+
+@pytest.fixture(scope="module")
+def scan(open_body, stance):
+    """A coarse scan of her with a case in the right hand, and which of its faces show the case."""
+    _, posed = stance
+    skin = open_body.mesh(posed.vertices[0])
+    case = thing_mesh(Thing("case", "right"), open_body, posed)
+    taken = simulate_scan(concatenate_meshes([skin, case]), [], _COARSE)
+    shown = taken.face >= skin.face_count
+    return taken.mesh, shown[taken.mesh.faces].sum(axis=1) >= 2
+
+
+def test_a_case_in_the_hand_is_found_and_nothing_else(open_body, stance, scan):
+    mesh, truth = scan
+    found = find_objects(mesh, open_body, stance[0])
+    area = mesh.face_areas
+    assert area[found.faces & truth].sum() > 0.85 * area[truth].sum()
+    assert area[found.faces & ~truth].sum() < 0.05 * area[truth].sum()
+    assert len(found.notes) == 1 and "cm2 at a hand" in found.notes[0]
+
+
+def test_the_thing_keeps_its_label_through_the_cut_and_is_no_cloth(open_body, stance, scan):
+    mesh, truth = scan
+    result = label_by_body(mesh, open_body, stance[0])
+    own = result.face_labels == OBJECT.id
+    assert mesh.face_areas[own & truth].sum() > 0.85 * mesh.face_areas[truth].sum()
+    assert any("labelled object" in note for note in result.notes)
+
+
+def test_empty_hands_hold_nothing(open_body, stance):
+    params, posed = stance
+    assert not find_objects(open_body.mesh(posed.vertices[0]), open_body, params).faces.any()
+
+
+def test_what_stands_beside_the_person_is_no_thing_in_her_hand(open_body, stance):
+    """The same case half a metre beside the hand."""
+    params, posed = stance
+    case = thing_mesh(Thing("case", "right"), open_body, posed)
+    beside = case.with_vertices(case.vertices - [0.5, 0.0, 0.0])
+    mesh = concatenate_meshes([open_body.mesh(posed.vertices[0]), beside])
+    assert not find_objects(mesh, open_body, params).faces.any()
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_thing_follows_the_wrist_that_holds_it_and_a_hat_the_head(open_body, stance, side):
+    _, posed = stance
+    skin = open_body.mesh(posed.vertices[0])
+    held = thing_mesh(Thing("ball", side), open_body, posed)
+    top = skin.vertices[skin.vertices[:, 1].argmax()]
+    hat = held.with_vertices(held.vertices - held.vertices.mean(axis=0) + top + [0.0, 0.12, 0.0])
+    weights = rigid_weights(skin, open_body.weights, concatenate_meshes([held, hat]), joint_names=open_body.joint_names)
+    names = np.array(open_body.joint_names)[weights.dense().argmax(axis=1)]
+    count = held.vertex_count
+    assert set(names[:count]) == {f"{side}_wrist"} and set(names[count:]) == {"head"}
+    assert weights.policies == (f"rigid:{side}_wrist", "rigid:head")
+    # Rigid: all distances stay whatever the wrist does.
+    assert (weights.dense().max(axis=1) == 1.0).all()
+
+
+def test_things_are_closed_and_wound_outwards(open_body, stance):
+    for kind in THINGS:
+        mesh = thing_mesh(Thing(kind), open_body, stance[1])
+        assert len(mesh.border_edges) == 0, kind
+        assert np.einsum("ij,ij->", mesh.face_centers - mesh.vertices.mean(axis=0), mesh.face_cross) > 0, kind
+
+
+def test_unknown_things_and_hands_are_refused():
+    with pytest.raises(InputError, match="thing in a hand"):
+        Thing("anvil")
+    with pytest.raises(InputError, match="hand"):
+        Thing("ball", "both")
