@@ -58,7 +58,7 @@ class Metrics:
     """Units of both meshes' coordinates."""
     labels_a: OptionalPath = None
     """Labels of A's faces or vertices (.npy, or .npz with face_labels, vertex_labels, labels or label), 0 skin, 1 hair,
-    2 shoe, 3 upper, 4 lower, 5 outer, 6 object; or a folder of such files. Without it, a PLY property `label` counts."""
+    2 shoe, 3 upper, 4 lower, 5 outer, 6 object; or a folder of them. Without it, a PLY property `label` counts."""
     labels_b: OptionalPath = None
     """Labels of B, given in the same ways."""
     out: OptionalPath = None

@@ -9,7 +9,7 @@
    its region and an unknown offset that garment, limb and side share and that is eliminated (`cloth_offsets`,
    `dressed`).
 5. *Second look*: limbs that the surface does not show there, or that a detector sees elsewhere, are searched again in
-   the surface that the rest of the dressed body leaves (`second_look`); feet in the floor are lifted on heels (`heels`).
+   the surface that the rest of the dressed body leaves (`second_look`); feet below the floor get heels (`heels`).
 6. *Decision*: the candidate with the least misfit and pose cost wins, is fitted with its fingers, and gets a confidence
    from its margin over the other facing (`locate`).
 

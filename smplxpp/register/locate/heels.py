@@ -32,14 +32,21 @@ def lift_heels(search: Search, found: Found, skin: np.ndarray | None = None) -> 
         found: the body, finished.
         skin: whether a point of `search.fine` is bare skin; None if unknown.
     """
-    for side in ("left", "right"):
-        if _below_floor(search, found.state, side) < _BELOW:
-            continue
+    low = [side for side in ("left", "right") if _below_floor(search, found.state, side) >= _BELOW]
+    # Both feet at once first, because one alone would tilt the person.
+    for sides in ([low] if len(low) == 2 else []) + [[side] for side in low]:
         for heel in _HEELS:
-            other = search.polished(found.name, on_heel(search, found.state, side, heel), skin, steps=6)
+            state = found.state
+            for side in sides:
+                state = on_heel(search, state, side, heel)
+            other = search.polished(found.name, state, skin, steps=6)
             if other.cost < found.cost - 0.05:
                 found = other
                 break
+        else:
+            continue
+        if len(sides) == 2:
+            break
     return found
 
 

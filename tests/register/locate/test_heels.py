@@ -1,0 +1,64 @@
+"""Feet that lie below the floor of the scan are lifted on heels; others stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smplxpp.body import load_body
+from smplxpp.core import BodyParams, ignore_progress
+from smplxpp.register.kinematics import BodyState, Kinematics
+from smplxpp.register.locate.heels import lift_heels, on_heel
+from smplxpp.register.locate.search import LocateConfig, Search
+
+BODY = load_body()
+FLAT = BodyState.of_params(BODY, BodyParams.rest(betas=np.zeros(BODY.num_betas), expressions=BODY.num_expressions))
+NAMES = list(BODY.joint_names)
+
+
+def _search(state: BodyState) -> Search:
+    """A search in the surface of a body without clothes."""
+    mesh = BODY.mesh(BODY.forward(state.to_params(BODY)).vertices[0])
+    config = LocateConfig(coarse_points=400, fine_points=1500)
+    return Search(Kinematics(BODY), mesh, config, None, ignore_progress)
+
+
+@pytest.fixture(scope="module")
+def flat() -> Search:
+    return _search(FLAT)
+
+
+def _places(search: Search, state: BodyState, *joints: str) -> np.ndarray:
+    return search.kinematics.posture(state, 0).joints[[NAMES.index(joint) for joint in joints]]
+
+
+def test_a_heel_raises_the_ankle_by_its_height_and_turns_the_foot_down_by_its_pitch(flat):
+    lifted = on_heel(flat, FLAT, "left", (0.06, 40.0, 0.0))
+    joints = ("left_hip", "left_ankle", "left_foot", "right_ankle")
+    (hip, ankle, foot, other), (_, ankle0, foot0, other0) = (_places(flat, one, *joints) for one in (lifted, FLAT))
+    assert np.linalg.norm(ankle - hip) == pytest.approx(np.linalg.norm(ankle0 - hip) - 0.06, abs=2e-3)
+    np.testing.assert_allclose(ankle, ankle0 + [0.0, 0.06, 0.0], atol=0.012)
+    cosine = (foot - ankle) @ (foot0 - ankle0) / (np.linalg.norm(foot - ankle) * np.linalg.norm(foot0 - ankle0))
+    assert np.degrees(np.arccos(cosine)) == pytest.approx(40.0, abs=3.0)
+    np.testing.assert_array_equal(other, other0)
+
+
+def test_feet_on_the_floor_stay(flat):
+    found = flat.polished("rest", FLAT, None, steps=1)
+    assert lift_heels(flat, found) is found
+
+
+def test_legs_that_came_out_too_long_are_lifted_on_their_heels(flat):
+    """A woman in pumps: her feet lay flat below the floor, and her legs were as long as without heels."""
+    truth = on_heel(flat, on_heel(flat, FLAT, "left", (0.10, 35.0, -25.0)), "right", (0.10, 35.0, -25.0))
+    search = _search(truth)
+    lost = search.polished("flat", FLAT, None, steps=0)
+    found = lift_heels(search, lost)
+    assert found.cost < lost.cost - 0.05
+    assert _off(search, found.state, truth) < 0.5 * _off(search, lost.state, truth) < 0.08
+
+
+def _off(search: Search, state: BodyState, truth: BodyState) -> float:
+    """Mean distance of the left ankle and foot from where they are, metres."""
+    places = [_places(search, one, "left_ankle", "left_foot") for one in (state, truth)]
+    return float(np.linalg.norm(places[0] - places[1], axis=1).mean())
