@@ -14,6 +14,7 @@ from PIL import Image
 from pipelines.captures.detect_keypoints import kept_rows
 from smplxpp.body import load_params
 from smplxpp.capture import find_problems, open_capture
+from smplxpp.capture.calibrations import read_calibration
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color, read_normals
 from smplxpp.capture.views import read_labels as read_label_image
@@ -27,7 +28,9 @@ from smplxpp.register import read_landmarks, write_landmarks
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import read_label_map, read_labels
 from smplxpp.segment.labels import find_label_set
+from tests.capture.calibration_writers import WRITERS as CALIBRATIONS
 from tests.capture.scene import make_scene
+from tests.capture.test_calibrations import rig
 from tests.capture.test_readers import CAMERA_NAMES
 from tests.capture.writers import WRITERS
 from tests.fuzz.examine import Door
@@ -59,8 +62,14 @@ def _capture_door(name: str) -> Door:
     def make(folder: Path) -> Path:
         return write(make_scene(lens=lens, square_pixels=name == "colmap-binary", names=cameras), folder / "set")
 
-    described = ("**/*.json", "**/*.csv", "**/*.yml", "**/*.txt", "**/*.bin", "**/*.pkl", "**/*.npz")
+    described = ("**/*.json", "**/*.csv", "**/*.yml", "**/*.txt", "**/*.bin", "**/*.pkl", "**/*.npz", "**/*.toml")
     return Door(f"capture {name}", make, _open_capture, described)
+
+
+def _calibration_door(name: str) -> Door:
+    """A calibration file of a rig's tool, as a user names it."""
+    described = ("**/*.toml", "**/*.txt", "**/*.xcp", "**/*.mcal", "**/*.json", "**/*.pickle", "**/*.pkl", "**/*.yml")
+    return Door(f"calibration {name}", lambda folder: CALIBRATIONS[name](rig(count=2), folder), read_calibration, described)
 
 
 @cache
@@ -350,7 +359,8 @@ def _basic_doors() -> list[Door]:
 @cache
 def doors() -> dict[str, Door]:
     """Every door by name."""
-    every = [_capture_door(name) for name in WRITERS] + _params_doors() + _keypoint_doors()
+    every = [_capture_door(name) for name in WRITERS] + [_calibration_door(name) for name in CALIBRATIONS]
+    every += _params_doors() + _keypoint_doors()
     every += (
         _mesh_doors()
         + _label_doors()
