@@ -213,7 +213,12 @@ class CaptureConvertCommand:
             return
         console = Console()
         print_notes(capture.keypoint_notes(), console)
-        print_notes(done.left_out, console, title="note" if capture.format == "rig" else "left out")
+        # What was guessed of a rig's calibration; a conversion of videos has it among its notes.
+        if capture.format == "rig":
+            known = {*done.left_out, *(problem.message for problem in capture.problems)}
+            print_notes(sorted(note for note in known if "videos, which" not in note), console)
+        else:
+            print_notes(done.left_out, console, title="left out")
         files = f"{done.copied} files copied, {done.encoded} encoded, {done.kept} there already"
         console.print(f"{self.out}: {done.views} views; {files}", soft_wrap=True, highlight=False, markup=False)
 

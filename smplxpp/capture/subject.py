@@ -34,6 +34,7 @@ _JOINS = 0.35
 # Share of a person's frames below which a camera that never agrees counts as misplaced: its nearest person is kept.
 _DISAGREES = 0.1
 _MASKED_FRAMES = 5  # frames whose masks are read
+_MOST_FRAMES = 300  # frames in which people of all views are compared, 25 ms each with four cameras
 _NAMED = 4  # people that a note describes
 
 
@@ -138,8 +139,10 @@ def choose_subject(
     names = [name for name in cameras if name in people]
     frames = sorted({frame for name in names for frame in people[name]})
     views = Views.of(people, {name: cameras[name] for name in names}, distortions, frames)
-    found = {frame: people_in_space(views.sighted[frame]) for frame in frames}
-    tracks = sorted(_scored(_followed(found), views, mask), key=lambda track: -track.score)
+    # A long take is compared at evenly spread frames; in the others people are found by where they are between these.
+    compared = frames[:: max(1, len(frames) // _MOST_FRAMES)]
+    found = {frame: people_in_space(views.sighted[frame]) for frame in compared}
+    tracks = sorted(_scored(_followed(found), views, mask, len(found)), key=lambda track: -track.score)
     if not tracks:
         # No two views agree on anybody: each view's surest person is all that is known.
         surest = {name: {f: chosen_person(own, None) for f, own in people[name].items()} for name in names}
@@ -179,9 +182,9 @@ def _followed(found: Mapping[int, Sequence[PersonInSpace]]) -> list[Track]:
     return [Track(one) for one in places]
 
 
-def _scored(tracks: Sequence[Track], views: Views, mask: MaskReader | None) -> list[Track]:
-    """Return the people with their scores."""
-    total = max(1, (len(views.names) - 1) * len(views.sighted))
+def _scored(tracks: Sequence[Track], views: Views, mask: MaskReader | None, compared: int) -> list[Track]:
+    """Return the people with their scores, of the number of frames that were compared."""
+    total = max(1, (len(views.names) - 1) * compared)
     out = []
     for track in tracks:
         # A person in two views of four has one agreement of three possible.

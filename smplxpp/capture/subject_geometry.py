@@ -17,6 +17,8 @@ _LEAST_SHARED = 5
 _LEAST_DEGREES = 3.0
 # Size of a person: distance of two points that 90 % of the pairs do not exceed, metres.
 _SMALLEST, _LARGEST = 0.25, 2.4
+# Share of all cameras from which a person needs no better proposal.
+_CLEARLY_SEEN = 0.75
 # Pairs of views that are tried as the start of a person.
 _MOST_SEEDS = 20
 
@@ -77,6 +79,9 @@ def people_in_space(seen: Sighted) -> list[PersonInSpace]:
             if best is not None and {i, j} <= set(best[0].members):
                 continue
             one = _grown(seen, (i, j), free)
+            if one is not None and len(one[0].members) > _CLEARLY_SEEN * len(np.unique(seen.camera)):
+                best = one
+                break
             if one is not None and (best is None or (len(one[0].members), -one[1]) > (len(best[0].members), -best[1])):
                 best = one
         if best is None:

@@ -69,7 +69,9 @@ def _capture_door(name: str) -> Door:
 def _calibration_door(name: str) -> Door:
     """A calibration file of a rig's tool, as a user names it."""
     described = ("**/*.toml", "**/*.txt", "**/*.xcp", "**/*.mcal", "**/*.json", "**/*.pickle", "**/*.pkl", "**/*.yml")
-    return Door(f"calibration {name}", lambda folder: CALIBRATIONS[name](rig(count=2), folder), read_calibration, described)
+    return Door(
+        f"calibration {name}", lambda folder: CALIBRATIONS[name](rig(count=2), folder), read_calibration, described
+    )
 
 
 @cache
