@@ -1,8 +1,9 @@
-"""The benchmark of real people: a folder of sources is run, measured and stored."""
+"""The benchmark of real people: a folder of sources is run, measured and stored; docs/real.md is its result."""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,13 @@ import trimesh
 from PIL import Image
 
 from benchmarks.accuracy import real as real_module
-from benchmarks.accuracy.real import Real, stored_rows, with_assessment
+from benchmarks.accuracy.real import Real, line, stored_rows, summary, with_assessment
 from benchmarks.support import real_sources
+from benchmarks.support.page import PAGES, page
 from benchmarks.support.real_runs import Ran, last_words, outcome, run_command
 from benchmarks.support.real_sources import KINDS, SOURCES, Source, Truth, chosen_sources
 from benchmarks.support.real_truth import distances
+from benchmarks.support.results import RESULTS, ROOT
 from pipelines.runs.layout import LOCATE_STAGE, LOCATED_PARAMS, LOCATION_FILE, METRICS_FILE
 from smplxpp.body import load_body
 from smplxpp.core import BodyParams, InputError
@@ -146,3 +149,26 @@ def test_a_folder_of_something_else_is_not_removed(folder, source, tmp_path):
     with pytest.raises(InputError, match="another --out"):
         Real(folder, out=tmp_path, store=False).run()
     assert (tmp_path / "doll" / "thesis.txt").read_text() == "mine"
+
+
+def test_the_page_is_what_the_stored_result_gives():
+    text = (ROOT / "docs" / "real.md").read_text()
+    assert ROOT / "docs" / "real.md" in PAGES and page(text) == text, "run `python -m benchmarks.support.page`"
+    assert text.split("\n## ")[1].startswith("What fails")
+    figures = json.loads((RESULTS / "real.json").read_text())["figures"]
+    assert figures["summary"] == summary(figures["rows"])
+    for row in figures["rows"]:
+        assert f"| {row['source']} |" in text, row["source"]
+        assert line(row).startswith(row["source"])
+
+
+def test_the_lead_of_the_readme_is_the_stored_result():
+    text = (ROOT / "README.md").read_text()
+    figures = json.loads((RESULTS / "real.json").read_text())["figures"]["summary"]
+    counts = re.search(r"Of (\d+) public scans .*?(\d+) end in a template, (\d+) of these without a failed check", text)
+    assert counts is not None
+    assert [int(n) for n in counts.groups()] == [
+        figures["scans"],
+        figures["templates"],
+        figures["without_a_failed_check"],
+    ]
