@@ -11,6 +11,7 @@ command runs to its end, one at a time; a sheet of pictures a row is written to 
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from benchmarks.support.real_sheets import write_sheet
 from benchmarks.support.real_sources import SOURCES, Source, chosen_sources
 from benchmarks.support.real_truth import distances, fingerprint
 from benchmarks.support.results import RESULTS, store_results
+from pipelines.runs.layout import TEMPLATE
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core import InputError
 
@@ -63,7 +65,7 @@ class Real:
 
     def _row(self, source: Source, body: BodyModel) -> dict[str, Any]:
         """Run the command of a source, or take up its run, and measure what it made."""
-        folder = self.out / source.key.replace(" ", "_").replace(",", "")
+        folder = self.out / folder_name(source.key)
         run = folder / "run"
         record = folder / RECORD
         if not self.again:
@@ -86,13 +88,18 @@ class Real:
         if source.truth is not None:
             row["truth_mm"] = distances(run, self.sources, source.truth, body)
         row["made"] = fingerprint(run, row["outcome"])
-        if source.kind == "scan":
+        if source.kind == "scan" or (run / TEMPLATE).is_file():
             write_sheet(folder / "sheet.png", run, self.sources / source.files[0], body)
         return row
 
     def _words(self, source: Source, folder: Path) -> list[str]:
-        before = self.out / source.after.replace(" ", "_").replace(",", "") / "run"
-        places = {"file": self.sources / source.files[0], "out": folder, "run": folder / "run", "before": before}
+        places = {
+            "file": self.sources / source.files[0],
+            "folder": self.sources,
+            "out": folder,
+            "run": folder / "run",
+            "before": self.out / folder_name(source.after) / "run",
+        }
         return [word.format(**places) for word in source.command.split()]
 
     def _store(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
@@ -100,9 +107,15 @@ class Real:
         store_results("real", COMMAND, {"rows": ordered, "summary": summary(ordered)}, folder=self.results)
 
 
+def folder_name(key: str) -> str:
+    """Return the name of a source's folder."""
+    return re.sub(r"\W+", "_", key)
+
+
 def described(source: Source) -> dict[str, Any]:
     """Return what a row says of its source."""
-    command = source.command.format(file=Path(source.files[0]).name, out="OUT", run="RUN", before="RUN")
+    places = {"file": Path(source.files[0]).name, "folder": "DIR", "out": "OUT", "run": "RUN", "before": "RUN"}
+    command = source.command.format(**places)
     return {
         "source": source.key,
         "kind": source.kind,

@@ -13,7 +13,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pipelines.runs.layout import METRICS_FILE, TEMPLATE
+import numpy as np
+
+from pipelines.runs.layout import METRICS_FILE, REGISTRATION, TEMPLATE
 from smplxpp.core.files import atomic_write_text
 
 _POLL = 0.2  # seconds between two looks at a command: short against minutes, rare enough to cost nothing
@@ -103,6 +105,11 @@ def outcome(ran: Ran, run: Path) -> dict[str, Any]:
         found["confidence"] = round(float(confidence[0]), 3)
     if (run / TEMPLATE).is_file():
         words = f"a template, {counts['pass']} checks pass, {counts['warn']} warn, {counts['fail']} fail"
+    elif (run / REGISTRATION).is_file():
+        after = json.loads((run / REGISTRATION).read_text())["residuals"]["after"].get("keypoints_px", [])
+        pixels = float(np.median(after)) if after else float("nan")
+        words = f"registered in {len(after)} frames, keypoints {pixels:.1f} px off"
+        found["keypoints_px"] = round(pixels, 1)
     elif ran.status == 0:
         words = "done"
     elif ran.status < 0:

@@ -42,9 +42,9 @@ class Source:
         licence: of the files.
         kind: what was recorded.
         files: expected below the folder of sources; the first is the recording.
-        command: words after `smplxpp`. `{file}` stands for the recording, `{out}` for the row's folder, `{run}` for the
-            run in it, `{before}` for the run of the source `after`.
-        after: source whose template the command needs.
+        command: words after `smplxpp`. `{file}` stands for the recording, `{folder}` for the folder of sources, `{out}`
+            for the row's folder, `{run}` for the run in it, `{before}` for the run of the source `after`.
+        after: source whose result the command needs.
         truth: a known body.
         should_stop: whether no template is the right answer, as for half a person.
     """
@@ -73,6 +73,7 @@ _FAUST = "DavidBoja/SMPL-Fitting, data/demo"
 _MPI = "MPI FAUST: non-commercial research"
 _ETCH = "boqian-li/ETCH, datafolder/4D-DRESS/data_processed"
 _FILM = "animate {before} --params {file} --step 24 --stop 1200 --view three-quarter --height 480 --out {out}/film.mp4"
+_POSE2SIM = "rigs/p2s/Pose2Sim/Demo/S00_Demo_Session/S00_P00_Participant"
 _SPEECH = "Uberi/speech_recognition, tests"
 
 SOURCES: tuple[Source, ...] = (
@@ -188,13 +189,44 @@ SOURCES: tuple[Source, ...] = (
         should_stop=True,
     ),
     Source(
-        "a person who turns",
-        "a man who turns before one camera, 8 photographs, masks, keypoints",
+        "a man who turns",
+        "8 photographs of a man who turns before one camera, with masks and keypoints",
+        "thmoa/octopus, data/sample (People-Snapshot), masks made white",
+        "non-commercial research",
+        "turning photographs",
+        ("turntable/octo_src/photos", "turntable/octo_src/masks", "turntable/octo_src/keypoints"),
+        command=(
+            "capture turntable {file} --masks {folder}/turntable/octo_src/masks "
+            "--keypoints {folder}/turntable/octo_src/keypoints --out {out}/capture"
+        ),
+    ),
+    Source(
+        "a man who turns, template",
+        "the same man",
         "thmoa/octopus, data/sample (People-Snapshot)",
         "non-commercial research",
         "turning photographs",
-        ("octopus",),
-        command="capture check {file}",
+        ("turntable/octo_src/photos",),
+        command="build {run} --capture {before}/../capture",
+        after="a man who turns",
+    ),
+    Source(
+        "a laboratory's balance",
+        "a man balances before four cameras: TOML calibration, OpenPose BODY_25B",
+        "pose2sim 0.6.0 (PyPI), Demo/S00_Demo_Session",
+        "BSD-3-Clause",
+        "rig",
+        (f"{_POSE2SIM}/S00_P00_T01_BalancingTrial",),
+        command="register {run} --capture {file}",
+    ),
+    Source(
+        "a laboratory's standing man",
+        "the same man stands still",
+        "pose2sim 0.6.0 (PyPI), Demo/S00_Demo_Session",
+        "BSD-3-Clause",
+        "rig",
+        (f"{_POSE2SIM}/S00_P00_T00_StaticTrial",),
+        command="register {run} --capture {file}",
     ),
     Source(
         "a climb, played by the 4D-Dress man",
