@@ -83,6 +83,9 @@ class Real:
             raise InputError(f"run of {source.key}", expected=f"{record}", received="none", remedy="omit --again")
         ran = Ran.load(record)
         row = {**described(source), **outcome(ran, run)}
+        # Errors name files: what lies where on this machine is nobody's business.
+        for place, name in ((self.sources, "DIR"), (self.out, "OUT")):
+            row["outcome"] = row["outcome"].replace(str(place.resolve()), name).replace(str(place), name)
         row |= {"minutes": round(ran.minutes, 1), "cpu_minutes": round(ran.cpu_minutes, 1)}
         row["memory_gib"] = round(ran.memory_gib, 2)
         if source.truth is not None:
@@ -98,7 +101,7 @@ class Real:
             "folder": self.sources,
             "out": folder,
             "run": folder / "run",
-            "before": self.out / folder_name(source.after) / "run",
+            "before": self.out / folder_name(source.after),
         }
         return [word.format(**places) for word in source.command.split()]
 
@@ -114,7 +117,7 @@ def folder_name(key: str) -> str:
 
 def described(source: Source) -> dict[str, Any]:
     """Return what a row says of its source."""
-    places = {"file": Path(source.files[0]).name, "folder": "DIR", "out": "OUT", "run": "RUN", "before": "RUN"}
+    places = {"file": Path(source.files[0]).name, "folder": "DIR", "out": "OUT", "run": "RUN", "before": "OTHER"}
     command = source.command.format(**places)
     return {
         "source": source.key,

@@ -43,7 +43,7 @@ class Source:
         kind: what was recorded.
         files: expected below the folder of sources; the first is the recording.
         command: words after `smplxpp`. `{file}` stands for the recording, `{folder}` for the folder of sources, `{out}`
-            for the row's folder, `{run}` for the run in it, `{before}` for the run of the source `after`.
+            for the row's folder, `{run}` for the run in it, `{before}` for the folder of the source `after`.
         after: source whose result the command needs.
         truth: a known body.
         should_stop: whether no template is the right answer, as for half a person.
@@ -72,7 +72,9 @@ _CRAGL = "CraGL/Hyperspectral-Inverse-Skinning, models (Vlasic et al. 2008, perf
 _FAUST = "DavidBoja/SMPL-Fitting, data/demo"
 _MPI = "MPI FAUST: non-commercial research"
 _ETCH = "boqian-li/ETCH, datafolder/4D-DRESS/data_processed"
-_FILM = "animate {before} --params {file} --step 24 --stop 1200 --view three-quarter --height 480 --out {out}/film.mp4"
+_FILM = (
+    "animate {before}/run --params {file} --step 24 --stop 1200 --view three-quarter --height 480 --out {out}/film.mp4"
+)
 _POSE2SIM = "rigs/p2s/Pose2Sim/Demo/S00_Demo_Session/S00_P00_Participant"
 _SPEECH = "Uberi/speech_recognition, tests"
 
@@ -197,7 +199,7 @@ SOURCES: tuple[Source, ...] = (
         ("turntable/octo_src/photos", "turntable/octo_src/masks", "turntable/octo_src/keypoints"),
         command=(
             "capture turntable {file} --masks {folder}/turntable/octo_src/masks "
-            "--keypoints {folder}/turntable/octo_src/keypoints --out {out}/capture"
+            "--keypoints {folder}/turntable/octo_src/keypoints/cam --out {out}/capture"
         ),
     ),
     Source(
@@ -207,7 +209,7 @@ SOURCES: tuple[Source, ...] = (
         "non-commercial research",
         "turning photographs",
         ("turntable/octo_src/photos",),
-        command="build {run} --capture {before}/../capture",
+        command="build {run} --capture {before}/capture",
         after="a man who turns",
     ),
     Source(
@@ -265,7 +267,7 @@ SOURCES: tuple[Source, ...] = (
         "BSD-3-Clause",
         "speech",
         ("speech/english.wav",),
-        command="talk {before} --audio {file} --out {out}/motion.npz",
+        command="talk {before}/run --audio {file} --out {out}/motion.npz",
         after="4D-Dress man",
     ),
     Source(
@@ -275,7 +277,7 @@ SOURCES: tuple[Source, ...] = (
         "BSD-3-Clause",
         "speech",
         ("speech/french.aiff",),
-        command="talk {before} --audio {file} --out {out}/motion.npz",
+        command="talk {before}/run --audio {file} --out {out}/motion.npz",
         after="4D-Dress man",
     ),
     Source(
@@ -285,7 +287,7 @@ SOURCES: tuple[Source, ...] = (
         "BSD-3-Clause",
         "speech",
         ("speech/chinese.flac",),
-        command="talk {before} --audio {file} --out {out}/motion.npz",
+        command="talk {before}/run --audio {file} --out {out}/motion.npz",
         after="4D-Dress man",
     ),
 )

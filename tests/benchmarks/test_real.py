@@ -105,6 +105,16 @@ def test_a_failed_command_is_told_in_its_own_words(tmp_path):
     assert Ran.load(tmp_path / "ran.json") == ran
 
 
+def test_an_error_is_stored_without_the_machine_s_folders(folder, source, tmp_path):
+    out, results = tmp_path / "out", tmp_path / "results"
+    words = f"error: scan {folder}/person.ply: expected a person, received {out}/doll/run"
+    (out / "doll").mkdir(parents=True)
+    Ran(("build",), 2, 0.1, 0.1, 0.5, words).save(out / "doll" / "ran.json")
+    Real(folder, out=out, again=True, results=results).run()
+    (row,) = stored_rows(results).values()
+    assert row["outcome"] == "stopped: error: scan DIR/person.ply: expected a person, received OUT/doll/run"
+
+
 def test_notes_before_an_error_are_not_taken_for_it():
     text = "03_locate: 10 s\n╭──╮\n│ error: scan x: expected a person,  │\n│ received two.  │\n╰──╯\n"
     assert last_words(text) == "error: scan x: expected a person, received two."
