@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from benchmarks.support.real_sources import Truth
 from pipelines.runs.layout import LOCATE_STAGE, LOCATED_PARAMS, LOCATION_FILE, PARAMS, TEMPLATE
 from smplxpp.body import BodyModel, load_params
+from smplxpp.body.smpl_joints import smpl_joints
 from smplxpp.clean import convert_points
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
@@ -53,8 +54,8 @@ def distances(run: Path, folder: Path, truth: Truth, body: BodyModel) -> dict[st
 
     Returns:
         `surface`: mean distance of the found skin's vertices to the known surface; `back`: of the known vertices to the
-        found skin; `p95` of both; `joints`: mean over SMPL's 22 joints of the body, where they are known. None where
-        no body was found.
+        found skin; `p95` of both; where joints are known, `joints`: mean over SMPL's 22 joints of the body, at SMPL's
+        places on the open body; `own_joints`: of the open body's own. None where no body was found.
     """
     params = found_body(run, body)
     if params is None:
@@ -75,8 +76,9 @@ def distances(run: Path, folder: Path, truth: Truth, body: BodyModel) -> dict[st
     if truth.joints:
         with np.load(folder / truth.joints, allow_pickle=False) as file:
             joints = convert_points(file["joints"][:BODY_JOINTS].astype(np.float64), units=units, up=up)
-        off = MM * np.linalg.norm(posed.joints[0, :BODY_JOINTS] - joints, axis=1)
-        found |= {"joints": float(off.mean())}
+        # The open body's own joints lie elsewhere than SMPL's; compare the same places of both bodies.
+        for name, own in (("joints", smpl_joints(body, params)[0]), ("own_joints", posed.joints[0, :BODY_JOINTS])):
+            found[name] = float(MM * np.linalg.norm(own - joints, axis=1).mean())
     return {name: round(value, 1) for name, value in found.items()}
 
 

@@ -21,6 +21,7 @@ from benchmarks.support.real_truth import distances
 from benchmarks.support.results import RESULTS, ROOT
 from pipelines.runs.layout import LOCATE_STAGE, LOCATED_PARAMS, LOCATION_FILE, METRICS_FILE
 from smplxpp.body import load_body
+from smplxpp.body.smpl_joints import smpl_joints
 from smplxpp.core import BodyParams, InputError
 from tests.dolls.standing import write_run
 
@@ -48,7 +49,7 @@ def folder(tmp_path_factory, body):
     faces = back[body.faces]
     moved = 100.0 * (posed.vertices[0][kept] + [SHIFT, 0, 0])
     trimesh.Trimesh(moved, faces[(faces >= 0).all(axis=1)], process=False).export(root / "person.ply")
-    np.savez(root / "joints.npz", joints=100.0 * (posed.joints[0, :22] + [SHIFT, 0, 0]))
+    np.savez(root / "joints.npz", joints=100.0 * (smpl_joints(body, params)[0] + [SHIFT, 0, 0]))
     return root
 
 
@@ -126,6 +127,7 @@ def test_a_known_body_is_measured_in_the_units_that_were_found(folder, source, b
     write_located_run(tmp_path / "run", body)
     found = distances(tmp_path / "run", folder, source.truth, body)
     assert found["joints"] == pytest.approx(1e3 * SHIFT, abs=0.05)
+    assert found["own_joints"] > 30.0
     assert 0.2 * SHIFT < 1e-3 * found["surface"] < SHIFT and found["back"] == pytest.approx(found["surface"], rel=0.2)
     assert distances(tmp_path / "none", folder, source.truth, body) is None
 
