@@ -18,6 +18,7 @@ import numpy as np
 from pipelines.runs.layout import METRICS_FILE, REGISTRATION, TEMPLATE
 from smplxpp.core.files import atomic_write_text
 
+CAPTURE = "capture/capture.json"
 _POLL = 0.2  # seconds between two looks at a command: short against minutes, rare enough to cost nothing
 _TAIL = 4_000  # characters of output that are kept: an error with its remedy, and the table of checks
 
@@ -110,6 +111,11 @@ def outcome(ran: Ran, run: Path) -> dict[str, Any]:
         pixels = float(np.median(after)) if after else float("nan")
         words = f"registered in {len(after)} frames, keypoints {pixels:.1f} px off"
         found["keypoints_px"] = round(pixels, 1)
+    elif ran.status == 0 and (run.parent / CAPTURE).is_file():
+        turn = json.loads((run.parent / CAPTURE).read_text())["found"]
+        words = "a capture of {frames} frames, keypoints {keypoints_px:.1f} px, contours {silhouette_px:.1f} px off"
+        words = words.format(**turn)
+        found["keypoints_px"] = round(turn["keypoints_px"], 1)
     elif ran.status == 0:
         words = "done"
     elif ran.status < 0:
