@@ -20,6 +20,7 @@ from smplxpp.core.files import atomic_write_text
 
 CAPTURE = "capture/capture.json"
 _POLL = 0.2  # seconds between two looks at a command: short against minutes, rare enough to cost nothing
+_WORDS = 300  # characters of an error or a transcript: a row of a table
 _TAIL = 4_000  # characters of output that are kept: an error with its remedy, and the table of checks
 
 
@@ -117,7 +118,9 @@ def outcome(ran: Ran, run: Path) -> dict[str, Any]:
         words = words.format(**turn)
         found["keypoints_px"] = round(turn["keypoints_px"], 1)
     elif ran.status == 0:
-        words = "done"
+        # What `talk` heard stands in its output, a line for the words and one for a note.
+        heard = [text.strip() for text in ran.tail.splitlines() if text.startswith("heard")]
+        words = "; ".join(heard)[:_WORDS] or "done"
     elif ran.status < 0:
         words = f"killed by signal {-ran.status}"
     else:
@@ -132,4 +135,4 @@ def last_words(text: str) -> str:
     # An error begins with the word; what stands before it are notes of stages that went well.
     begin = max((k for k, line in enumerate(lines) if re.match(r"(\w*Error|error)\b", line)), default=len(lines) - 1)
     words = " ".join(lines[max(begin, 0) :])
-    return words if len(words) <= 300 else words[:297] + "..."
+    return words if len(words) <= _WORDS else words[: _WORDS - 3] + "..."
