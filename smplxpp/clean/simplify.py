@@ -127,12 +127,14 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
     )
     _, _, small_from_free = fast_simplification.replay_simplification(free.vertices.copy(), faces, collapses)
     points, small_faces, small_from_free = _merge_coincident(points, small_faces, small_from_free)
-    # Map the source's vertices, and append vertices that only locked faces use.
+    # Map the source's vertices, and append vertices that only locked faces use by now.
     new_from_old = np.full(mesh.vertex_count, -1, dtype=np.int64)
     new_from_old[used] = small_from_free
     if not locked.any():
         return TriangleMesh(points, small_faces), new_from_old
-    only_locked = np.setdiff1d(mesh.faces[locked], used)
+    # Those are also free ones that vanished with a flap at the border of the locked faces.
+    needed = np.unique(mesh.faces[locked])
+    only_locked = needed[new_from_old[needed] < 0]
     new_from_old[only_locked] = len(points) + np.arange(len(only_locked))
     vertices = np.concatenate([points, mesh.vertices[only_locked]])
     return TriangleMesh(vertices, np.concatenate([small_faces, new_from_old[mesh.faces[locked]]])), new_from_old

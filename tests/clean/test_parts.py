@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from smplxpp.clean import PartsConfig, clean_parts, drop_specks, fill_pinholes, loop_lengths, sanitize, simplify
+from smplxpp.clean.simplify import _collapse
 from smplxpp.core import LOWER, SHOE, SKIN, UPPER, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.topology import border_loops, edge_groups, face_components
@@ -192,3 +193,16 @@ def test_parts_of_a_capture(captures, name: str):
         assert part.report.non_manifold_edges == part.report.flipped_faces == 0
         assert part.report.distance_mean < 5e-4 and part.report.distance_p95 < 1.5e-3
         assert (face_components(part.mesh.faces).max() == 1) == (part.label == SHOE.id)
+
+
+def test_a_flap_that_vanishes_beside_locked_faces_leaves_them_their_vertices():
+    """A build of a carved person stopped with "indices in [-1, 8958]": locked faces lost the vertices of a flap."""
+    # Faces 0 and 1 bound no volume once the edge of no length (2, 3) is merged; face 3 is locked and uses 0 and 1.
+    vertices = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 0], [1, 1, 0], [0.5, -1, 0], [5, 0, 0], [6, 0, 0], [5, 1, 0]]
+    )
+    faces = np.array([[0, 1, 2], [1, 0, 3], [2, 4, 3], [0, 5, 1], [6, 7, 8]])
+    mesh = TriangleMesh(vertices.astype(float), faces)
+    result, new_from_old = _collapse(mesh, np.array([False, False, False, True, False]), 8)
+    np.testing.assert_array_equal(result.vertices[new_from_old[faces[3]]], vertices[faces[3]])
+    assert result.face_count == 2
