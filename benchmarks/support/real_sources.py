@@ -251,8 +251,8 @@ SOURCES: tuple[Source, ...] = (
         after="Liam",
     ),
     Source(
-        "a dance, played by the man of crane",
-        "the BVH of aitviewer; 50 frames of 30 seconds",
+        "exercises, played by the man of crane",
+        "the BVH of aitviewer: a man stretches; 50 frames of 30 seconds",
         "eth-ait/aitviewer, examples/resources",
         "MIT (of the repository)",
         "motion",
