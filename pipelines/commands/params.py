@@ -6,12 +6,16 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import tyro
+from jaxtyping import Float64
 
 from pipelines.commands.driving import BVH, Driving
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
-from smplxpp.body import LayoutName, UpAxis, Whose, detect_layout, load_body, load_params
+from smplxpp.body import LayoutName, UpAxis, Whose, detect_layout, load_body, load_params, smpl_joints
+from smplxpp.body.smpl_joints import BODY_JOINTS, is_open_body
 from smplxpp.core import BodyParams, InputError, require_positive
+from smplxpp.core.files.array_file import write_arrays
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +46,9 @@ class ParamsConvert:
     SMPL-H or SMPL-X are brought to the open body without their shape, as a start for a registration."""
     betas: OptionalInt = None
     """Number of leading betas to keep, for a body that has no more; the lost share is logged (None: all)."""
+    joints: OptionalPath = None
+    """Also write an npz of SMPL's 22 joints of the posed body (`joints`, frames x 22 x 3, metres, and `joint_names`):
+    of the open body by a regressor, so that joint errors compare with those of SMPL's fits."""
     flat_hand_mean: bool | None = None
     """Whether the hands are complete without the model's mean hand (None: as the layout implies)."""
     json: bool = False
@@ -51,6 +58,8 @@ class ParamsConvert:
         """Convert and return a summary."""
         if self.out.suffix.lower() != ".npz":
             raise InputError("--out", expected="a file name ending in .npz", received=str(self.out))
+        if self.joints is not None and self.joints.suffix.lower() != ".npz":
+            raise InputError("--joints", expected="a file name ending in .npz", received=str(self.joints))
         if self.fps is not None:
             require_positive("option fps", self.fps)
         # A .bvh is retargeted to the body; all other layouts are read as they are.
@@ -75,8 +84,15 @@ class ParamsConvert:
         if not len(params):
             raise InputError("--frames", expected="a range that holds frames", received=str(self.frames))
         params.save(self.out)
+        if self.joints is not None:
+            write_arrays(self.joints, {"joints": self._joints(params), "joint_names": np.array(BODY_JOINTS)})
         log.info("%s (%s, %d frames) -> %s", self.input, layout, len(params), self.out)
         return _summary(self, layout, params)
+
+    def _joints(self, params: BodyParams) -> Float64[np.ndarray, "T 22 3"]:
+        """Return SMPL's joints of the posed body, which are a model's own in its family."""
+        body = load_body(self.body)
+        return smpl_joints(body, params) if is_open_body(body) else body.forward(params).joints[:, : len(BODY_JOINTS)]
 
 
 def _parse_frames(text: str | None) -> slice:

@@ -58,6 +58,12 @@ class Skeleton:
         return [self.names.index(name) for name in names]
 
     @property
+    def has_legs(self) -> bool:
+        """Whether the skeleton has the joints of both legs, and bones of some length between them."""
+        needed = [f"{side}_{name}" for side in ("left", "right") for name in _LEG]
+        return all(name in self.names for name in needed) and bool(np.ptp(self.places[self.at(*needed)], axis=0).any())
+
+    @property
     def leg(self) -> float:
         """The length of a leg from hip to ankle, mean of both, metres.
 

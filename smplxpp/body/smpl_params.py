@@ -134,8 +134,10 @@ def smpl_places(skeleton: Skeleton) -> Float64[np.ndarray, "22 3"]:
 def rests_like_smpl(skeleton: Skeleton) -> bool:
     """Return whether a skeleton has SMPL's joints and rest pose: its hips are near each other.
 
-    Their distance is .18 of a leg in the family's models and .26 in the open body.
+    Their distance is .18 of a leg in the family's models and .26 in the open body. A skeleton without legs has not.
     """
+    if not skeleton.has_legs:
+        return False
     left, right = skeleton.places[skeleton.at("left_hip", "right_hip")]
     return bool(np.linalg.norm(left - right) < 0.21 * skeleton.leg)
 

@@ -107,6 +107,7 @@ def _located(
     if seen is not None and landmarks is None:
         found = search(hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
         found, note = _confirmed(found, search, seen)
+        note = note if start is None else note.replace("detector's keypoints", "given parameters")
     else:
         found = search(landmarks=landmarks)
     # Keep the labels that a registration may lean on, a label for each vertex of a certain face.

@@ -10,7 +10,9 @@ import numpy as np
 
 from smplxpp.body.model import BodyModel
 from smplxpp.body.param_layouts import OPEN_BODY
+from smplxpp.body.retarget import Skeleton
 from smplxpp.body.smpl_joints import is_open_body
+from smplxpp.body.smpl_params import rests_like_smpl
 from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, matrix_from_rotvec, require_positive, rotvec_from_matrix
 from smplxpp.core.files.atomic import atomic_write_bytes
 
@@ -57,7 +59,8 @@ def write_amass(path: str | Path, body: BodyModel, params: BodyParams) -> None:
     # Complete axis-angle vectors in the order of the model's joints: hand PCA and mean hand are expanded here.
     poses = body.axis_angles(turned).reshape(len(params), -1)
     arrays: dict[str, object] = {"up": "z", "gender": "neutral", "trans": turned.transl, "betas": betas, "poses": poses}
-    if is_open_body(body):
+    # A bundle's skeleton has no vertices that tell it, but the open body's wide hips.
+    if is_open_body(body) or not rests_like_smpl(Skeleton.of(body)):
         arrays["body"] = OPEN_BODY
     if body.joint_count == 52:
         arrays |= {"mocap_framerate": fps, "dmpls": np.zeros((len(params), 8))}

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import smplxpp
+from pipelines.runs.artefacts import load_located, save_located
+from pipelines.runs.layout import LOCATE_STAGE
+from pipelines.stages import template_stages
+from pipelines.stages.build_config import BuildContext
 from smplxpp.build import locate
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import LocatedInScan
@@ -83,3 +88,23 @@ def test_gltf_is_in_metres_unless_nobody_is_that_high(tmp_path, body):
 def _write_glb(path: Path, mesh: TriangleMesh) -> None:
     trimesh = pytest.importorskip("trimesh")
     path.write_bytes(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="glb"))
+
+
+def test_a_run_scales_the_scan_as_its_search_did(tmp_path, body):
+    """The stage that prepares the scan takes the scale from the files of the stage that found the body."""
+    scan = tmp_path / "scan.npz"
+    np.savez(scan, vertices=body.v_template * 7.0, faces=body.faces)
+    run, out = tmp_path / "run", tmp_path / "out"
+    (run / LOCATE_STAGE).mkdir(parents=True)
+    out.mkdir()
+    count = body.vertex_count
+    found = LocatedInScan(BodyParams.rest(), np.zeros(count, int), np.zeros(count, bool), 1.1)
+    save_located(run / LOCATE_STAGE, found)
+    assert load_located(run / LOCATE_STAGE).params.betas.shape == (1, 10)
+    plan = plan_build(BuildRequest(scan=scan, config=BuildConfig(height=1.75, up="y")))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", smplxpp.GeometryWarning)  # the body's mesh has open borders
+        template_stages.capture(out, BuildContext(run, plan.inputs, plan.config))
+    with np.load(out / "scan.npz") as arrays:
+        vertices = arrays["scan/vertices"] if "scan/vertices" in arrays else arrays[arrays.files[0]]
+    assert np.ptp(vertices[:, 1]) == pytest.approx(1.1 * 1.75, rel=1e-3)

@@ -5,7 +5,7 @@ import pytest
 
 from pipelines.cli import main
 from pipelines.commands.params import ParamsConvert
-from smplxpp.body import load_params
+from smplxpp.body import load_body, load_params, smpl_joints
 from smplxpp.core import ARRAY_NAMES, BodyParams, InputError
 
 
@@ -44,3 +44,14 @@ def test_bad_ranges_write_nothing(tmp_path, amass_file, frames):
     with pytest.raises(InputError, match="--out"):
         ParamsConvert(input=amass_file, out=tmp_path / "o.pkl").run()
     assert not list(tmp_path.glob("o.*"))
+
+
+def test_smpls_joints_are_written_beside(tmp_path, amass_file):
+    out = tmp_path / "joints.npz"
+    ParamsConvert(input=amass_file, out=tmp_path / "o.npz", frames="0:2", whose="body", joints=out).run()
+    expected = smpl_joints(load_body(), load_params(tmp_path / "o.npz"))
+    with np.load(out) as file:
+        np.testing.assert_array_equal(file["joints"], expected)
+        assert file["joint_names"][1] == "left_hip" and file["joints"].shape == (2, 22, 3)
+    with pytest.raises(InputError, match="--joints"):
+        ParamsConvert(input=amass_file, out=tmp_path / "o.npz", whose="body", joints=tmp_path / "j.csv").run()
