@@ -32,21 +32,22 @@ def lift_heels(search: Search, found: Found, skin: np.ndarray | None = None) -> 
         found: the body, finished.
         skin: whether a point of `search.fine` is bare skin; None if unknown.
     """
-    low = [side for side in ("left", "right") if _below_floor(search, found.state, side) >= _BELOW]
+    below = {side: _below_floor(search, found.state, side) for side in ("left", "right")}
+    # Shoes come in pairs: where one foot is that low, the other may be half as low.
+    low = [side for side, depth in below.items() if depth >= 0.5 * _BELOW] if max(below.values()) >= _BELOW else []
     # Both feet at once first, because one alone would tilt the person.
     for sides in ([low] if len(low) == 2 else []) + [[side] for side in low]:
+        tried = []
         for heel in _HEELS:
             state = found.state
             for side in sides:
                 state = on_heel(search, state, side, heel)
-            other = search.polished(found.name, state, skin, steps=6)
-            if other.cost < found.cost - 0.05:
-                found = other
+            tried.append(search.polished(found.name, state, skin, steps=6))
+        best = min(tried, key=lambda one: one.cost)
+        if best.cost < found.cost - 0.05:
+            found = best
+            if len(sides) == 2:
                 break
-        else:
-            continue
-        if len(sides) == 2:
-            break
     return found
 
 
