@@ -18,6 +18,7 @@ from smplxpp.native import let_workers_sleep
 let_workers_sleep()
 _EXPORTS: dict[str, str] = {
     "BodyModel": "smplxpp.body",
+    "BodyNotFoundError": "smplxpp.register.locate",
     "BodyParams": "smplxpp.core",
     "BuildConfig": "smplxpp.build",
     "BuildReport": "smplxpp.build",

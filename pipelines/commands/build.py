@@ -107,13 +107,15 @@ class Build:
     """First stage to run; earlier ones must stand."""
     until_stage: StageName = BUILD_STAGES[-1]
     """Last stage to run."""
+    accept_failures: bool = False
+    """Build on a body that was found with too little confidence, and end with status 0 although checks fail."""
     no_report: bool = False
     """Leave out report.html, the pictures of every stage."""
     json: bool = False
     """Print the summary as JSON."""
 
     def run(self) -> dict:
-        """Build, write metrics.json and the report, print the summary."""
+        """Build, write metrics.json and the report, print the summary; the exit status is 1 where checks fail."""
         from pipelines.commands.inspect import Inspect
         from pipelines.report.sections.build import update_build_report
         from pipelines.stages.build import build
@@ -145,7 +147,7 @@ class Build:
             Inspect(run_folder=self.run_folder).run()
         metrics = read_json(self.run_folder / "metrics.json", subject="metrics")
         failed = sum(check["status"] == "fail" for check in metrics["checks"])
-        return {**metrics, "failed": failed, "exit_status": 0}
+        return {**metrics, "failed": failed, "exit_status": int(failed > 0 and not self.accept_failures)}
 
     def plan(self) -> BuildPlan:
         """Decide which inputs and stages this build uses.

@@ -10,9 +10,17 @@ from pipelines.figures.colors import (
     heat_colors,
     joint_palette,
 )
-from pipelines.figures.render import render_heat, render_overlay
+from pipelines.figures.render import render_heat
 from pipelines.figures.sheets import caption, color_bar, contact_sheet, encode_jpeg, encode_png, row
-from smplxpp.raster import VIEWS, ShadeStyle, body_cameras, fit_cameras, render_shaded, turntable_cameras
+from smplxpp.raster import (
+    VIEWS,
+    ShadeStyle,
+    body_cameras,
+    fit_cameras,
+    render_overlay,
+    render_shaded,
+    turntable_cameras,
+)
 
 __all__ = [
     "VIEWS",

@@ -10,8 +10,7 @@ from jaxtyping import Float, UInt8
 from pipelines.figures.colors import heat_colors
 from pipelines.figures.sheets import color_bar
 from smplxpp.core import Camera, InputError, TriangleMesh
-from smplxpp.core.colors import linear_from_srgb
-from smplxpp.raster.shading import ShadeStyle, render_shaded, resolve, shade_layer
+from smplxpp.raster.shading import ShadeStyle, render_shaded
 
 
 def render_heat(
@@ -46,37 +45,3 @@ def render_heat(
         return picture
     side = color_bar(cmap=cmap, limits=limits, unit=unit, height=len(picture), background=style.background)
     return np.concatenate([picture, side], axis=1)
-
-
-def render_overlay(
-    solid: TriangleMesh,
-    ghost: TriangleMesh,
-    camera: Camera,
-    *,
-    solid_colors: UInt8[np.ndarray, "N 3"] | None = None,
-    ghost_color: tuple[int, int, int] = (52, 128, 214),
-    opacity: float = 0.30,
-    style: ShadeStyle | None = None,
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw `ghost` as tinted glass over and around `solid`.
-
-    Where the ghost lies in front it tints the solid, most at its rim, where a thin shell is thickest along the view;
-    where it lies behind, it is hidden. So a solid that sticks out of the ghost keeps its own colour.
-
-    Args:
-        solid_colors: sRGB of the solid's vertices.
-        opacity: of the ghost where it faces the camera, 0 to 1.
-    """
-    style = style or ShadeStyle()
-    # Shade both layers apart, in linear light. Occlusion would darken the ghost by its own folds, so it is off there.
-    back = shade_layer(solid, camera, vertex_colors=solid_colors, style=style)
-    front = shade_layer(ghost, camera, style=ShadeStyle(**{**vars(style), "base_color": ghost_color, "occlusion": 0.0}))
-    tint = linear_from_srgb(np.array(ghost_color, np.uint8))
-    # Opacity rises to 1 at the rim by Schlick's form (1 - cos)^5 with exponent 3, and only where the ghost is
-    # nearer than the solid.
-    alpha = (opacity + (1.0 - opacity) * (1.0 - front.facing) ** 3) * (front.mask & (front.depth < back.depth))
-    # Composite ghost over solid (Porter and Duff's "over"): C = a F + (1 - a) B, for colour and coverage alike.
-    over = alpha[..., None] * (0.5 * front.color + 0.5 * tint)
-    color = over + (1.0 - alpha[..., None]) * back.color
-    coverage = alpha + (1.0 - alpha) * back.mask
-    return resolve(color, coverage, style=style)

@@ -51,6 +51,8 @@ ALL_STAGES = (*BUILD_STAGES, REFINE_STAGE, *MODEL_STAGES, EVALUATE_STAGE, RELIGH
 RECONSTRUCTION = f"{RECONSTRUCT_STAGE}/reconstruction.json"
 LOCATED_PARAMS = f"{LOCATE_STAGE}/params.npz"
 LOCATION_FILE = "location.json"
+NOT_FOUND_PICTURE = "body_not_found.png"
+"""The scan with the body that was found in it, in a run whose build stopped there."""
 REGISTERED_PARAMS = f"{REGISTER_STAGE}/params.npz"
 REGISTRATION = f"{REGISTER_STAGE}/registration.json"
 SCAN = f"{CAPTURE_STAGE}/scan.npz"

@@ -170,6 +170,7 @@ def build(
         The record of every stage up to `last`.
 
     Raises:
+        BodyNotFoundError: no person was found in the scan, or none with enough confidence; a picture lies in the run.
         InputError: unusable input; every finished stage is kept.
     """
     # Keep the user's files in the run first, so that they remain there if the build fails.
@@ -230,6 +231,9 @@ def _run_stages(
             # `_stage` needs the records so far, because the digests of earlier outputs are part of the key.
             records[name] = run_stage(context.run, _stage(name, context, records), work)
         progress(name, True)
+        # The stage stands, so that landmarks can be placed on its scan; what would be built on it does not begin.
+        if name == layout.LOCATE_STAGE:
+            template_stages.require_body(context, records[name].manifest["numbers"])
     return records
 
 

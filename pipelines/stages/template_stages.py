@@ -6,11 +6,14 @@ Nothing is computed here. A stage's key counts the code of its step and of the f
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipelines.figures.colors import blend_joint_colors
+from pipelines.figures.sheets import encode_png
 from pipelines.runs.artefacts import (
     load_canonical,
     load_cleaned_parts,
@@ -35,6 +38,7 @@ from pipelines.runs.layout import (
     LANDMARKS_FILE,
     LOCATED_PARAMS,
     LOCATION_FILE,
+    NOT_FOUND_PICTURE,
     REGISTERED_PARAMS,
     TEMPLATE,
 )
@@ -49,9 +53,12 @@ from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, register
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces, vertex_labels
 from smplxpp.build.validate import validate_template
+from smplxpp.build.verdict import LEAST_CONFIDENCE, require_found
 from smplxpp.core import BodyParams, StageOutput, display_colors, write_ply
+from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics.distance import MM
+from smplxpp.register.locate import BodyNotFoundError
 from smplxpp.segment import Corrections
 from smplxpp.template.template import Template
 
@@ -71,6 +78,34 @@ def locate(folder: Path, build: BuildContext) -> StageOutput:
     save_located(folder, found)
     (folder / LOCATION_FILE).write_text(json.dumps(output.numbers, indent=1) + "\n")
     return output
+
+
+def require_body(build: BuildContext, found: Mapping[str, Any]) -> None:
+    """Stop a build whose body was found with too little confidence, and leave a picture of it in the run.
+
+    Args:
+        build: the run and its choices.
+        found: numbers of the stage that located the body.
+
+    Raises:
+        BodyNotFoundError: the confidence is too small, and failures are not accepted.
+    """
+    picture = build.run / NOT_FOUND_PICTURE
+    picture.unlink(missing_ok=True)
+    if build.config.accept_failures or found["confidence"] >= LEAST_CONFIDENCE:
+        return
+    scan = _read_scan(build).scaled(found.get("scale", 1.0))
+    try:
+        require_found(
+            *(scan.clean.mesh, load_body(build.inputs.body), load_params(build.run / LOCATED_PARAMS)),
+            confidence=found["confidence"],
+            findings=found["findings"] or found["problems"],
+            picture_file=picture,
+        )
+    except BodyNotFoundError as error:
+        if error.picture is not None:
+            atomic_write_bytes(picture, encode_png(error.picture))
+        raise
 
 
 def capture(folder: Path, build: BuildContext) -> StageOutput:

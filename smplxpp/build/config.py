@@ -67,6 +67,8 @@ class BuildConfig:
         method: skin-weight transfer, "ours", or "paper" for robust transfer as published.
         samples: surface samples of the validation.
         seed: of the samples.
+        accept_failures: build on a body that was found with too little confidence; the command then ends with status 0
+            although checks fail.
 
     Example:
         >>> BuildConfig(budgets={"upper": 8000}).clearance_mm
@@ -96,6 +98,7 @@ class BuildConfig:
     method: str = "ours"
     samples: int = 100_000
     seed: int = 0
+    accept_failures: bool = False
 
     def __post_init__(self) -> None:
         # Check choices when the options are made: a wrong one would otherwise surface minutes later, in the step that

@@ -14,13 +14,14 @@ from jaxtyping import Int64, UInt8
 from smplxpp.body import BodyModel
 from smplxpp.build.data import LocatedInScan
 from smplxpp.build.scan import ScanFile
+from smplxpp.build.verdict import LEAST_CONFIDENCE
 from smplxpp.build.scan_keypoints import Landmarks, facing, keypoints_of_scan
 from smplxpp.clean import smooth_if_rough
-from smplxpp.core import BACKGROUND, BodyParams, Check, StageOutput, TriangleMesh
+from smplxpp.core import BACKGROUND, BodyParams, Check, InputError, StageOutput, TriangleMesh
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.detect import load_detector
 from smplxpp.register import ScanObservation, bare_of_scan, read_landmarks
-from smplxpp.register.locate import LocatedBody, locate_body
+from smplxpp.register.locate import BodyNotFoundError, LocatedBody, locate_body
 from smplxpp.segment import label_by_body
 
 _CERTAIN = 0.4
@@ -48,6 +49,7 @@ def locate_in_scan(
     """Find the body in a scan, and say what else it might have been and how certain it is.
 
     With a stature the scan is scaled by what the body found in it lacks of that, and searched again, until both agree.
+    Whether the body is certain enough is the caller's to ask (`smplxpp.build.verdict.require_found`).
 
     Args:
         scan: repaired.
@@ -59,7 +61,7 @@ def locate_in_scan(
             keypoints are; it takes the place of the detector.
 
     Raises:
-        InputError: no person, or landmarks that the body does not have.
+        InputError: a surface that is not of a person's size, or landmarks that the body does not have.
     """
     placed = landmark_points(landmarks)
     found, output = _located(scan, body, placed, detector, start)
@@ -99,21 +101,21 @@ def _located(
     search = partial(locate_body, body, mesh, colors=colors, labeller=labeller)
     # Search the surface, because it is precise; a detector's keypoints, or those of a body of another shape, propose
     # limbs and can correct the front.
-    note, seen = "", None
+    note, seen = "", Landmarks()
     if start is not None:
         seen = _points_of(body, start)
     elif detector is not None and landmarks is None:
-        seen = keypoints_of_scan(mesh, colors, load_detector(detector))
-    if seen is not None and landmarks is None:
-        found = search(hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
+        seen, note = _seen(mesh, colors, detector)
+    if seen and landmarks is None:
+        found = _found(search, hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
         found, note = _confirmed(found, search, seen)
         note = note if start is None else note.replace("detector's keypoints", "given parameters")
     else:
-        found = search(landmarks=landmarks)
+        found = _found(search, landmarks=landmarks)
     # Keep the labels that a registration may lean on, a label for each vertex of a certain face.
     labels = np.full(mesh.vertex_count, BACKGROUND, dtype=np.int64)
-    # One label a face, BACKGROUND where body and colours disagree.
-    of_faces = labeller(found.params)
+    # One label a face, BACKGROUND where body and colours disagree, and everywhere on what is no person.
+    of_faces = labeller(found.params) if found.confidence > 0 else np.full(mesh.face_count, BACKGROUND)
     known = of_faces != BACKGROUND
     # A vertex between faces with different labels takes the label of the last of them; such vertices lie on seams.
     labels[mesh.faces[known]] = of_faces[known][:, None]
@@ -127,6 +129,8 @@ def _located(
         "facing_degrees": found.candidates[0].facing_degrees,
         "confidence": found.confidence,
         "problems": list(found.notes),
+        "findings": list(found.findings),
+        "moved": list(found.moved),
         "candidates": found.candidates,
         "bare": float(bare.mean()),
     }
@@ -137,7 +141,7 @@ def _located(
         found.confidence,
         "",
         0.5,
-        0.2,
+        LEAST_CONFIDENCE,
         higher_is_better=True,
         explanation="how far the best way to stand in the scan is ahead of the best that faces another way"
         + "".join(f"; {problem}" for problem in found.notes),
@@ -145,10 +149,27 @@ def _located(
     return LocatedInScan(found.params, labels, bare), StageOutput([check], jsonable(numbers))
 
 
-def _points_of(body: BodyModel, start: BodyParams) -> dict[str, tuple[np.ndarray, float]]:
+def _points_of(body: BodyModel, start: BodyParams) -> Landmarks:
     """Return where a posed body has the points that detectors mark, by name, each with a confidence of 1."""
     vertices = body.forward(start).vertices[0]
     return {name: (weights @ vertices[index], 1.0) for name, (index, weights) in body.landmarks.items()}
+
+
+def _seen(mesh: TriangleMesh, colors: UInt8[np.ndarray, "N 3"] | None, detector: str) -> tuple[Landmarks, str]:
+    """Return a detector's keypoints of a scan; none, and the reason, where it sees nobody, which may be the colours."""
+    loaded = load_detector(detector)
+    try:
+        return keypoints_of_scan(mesh, colors, loaded), ""
+    except InputError as error:
+        return {}, f"the detector sees no person: {error.received}"
+
+
+def _found(search: Callable[..., LocatedBody], **known: Any) -> LocatedBody:
+    """Return the best body even of a surface that is no person; its confidence is 0, and `require_found` stops there."""
+    try:
+        return search(**known)
+    except BodyNotFoundError as error:
+        return error.located
 
 
 def _confirmed(
@@ -166,7 +187,7 @@ def _confirmed(
     own = np.radians(found.candidates[0].facing_degrees)
     if np.sin(own) * front[0] + np.cos(own) * front[2] > 0:
         return found, "the detector's keypoints face the same way"
-    again = search(landmarks={name: point for name, (point, _) in landmarks.items() if name.startswith("coco_")})
+    again = _found(search, landmarks={name: point for name, (point, _) in landmarks.items() if name.startswith("coco_")})
     return again, "the surface alone was taken for somebody who faces the other way than the detector's keypoints do"
 
 

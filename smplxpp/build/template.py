@@ -36,6 +36,7 @@ from smplxpp.build.report import BuildReport, BuildResult
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces
 from smplxpp.build.validate import validate_template
+from smplxpp.build.verdict import require_found
 from smplxpp.capture import Capture
 from smplxpp.clean.remesh import require_remesher
 from smplxpp.core import BodyParams, MeshLike, StageOutput, ignore_progress
@@ -80,6 +81,7 @@ def build_template(
         The template, its parts, a report with checks against limits, and the capture with the parameters used.
 
     Raises:
+        BodyNotFoundError: no person was found in the scan, or none with enough confidence; the error has a picture.
         InputError: unusable input; the message says what was expected.
 
     Example:
@@ -151,6 +153,13 @@ class _Build:
                     start=start_params(inputs, body),
                 )
                 file = file.scaled(located.scale)
+            if not config.accept_failures:
+                numbers = step.output.numbers
+                require_found(
+                    *(file.clean.mesh, body, located.params),
+                    confidence=numbers["confidence"],
+                    findings=numbers["findings"] or numbers["problems"],
+                )
         if self.plan.registration is not None:
             registration = self._register(self.plan.registration, located)
 

@@ -13,13 +13,15 @@ from pipelines.runs.artefacts import load_parts, load_weights
 from pipelines.runs.layout import METRICS_FILE, TEMPLATE
 from pipelines.stages.build import build
 from smplxpp.body import load_params
-from smplxpp.build import BuildConfig, build_template
+from smplxpp.build import BuildConfig, build_template, template
 from smplxpp.build.config import STEPS
+from smplxpp.build.data import LocatedInScan
 from smplxpp.capture import open_capture
 from smplxpp.clean import simplify
-from smplxpp.core import InputError, TriangleMesh
+from smplxpp.core import InputError, StageOutput, TriangleMesh
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
+from smplxpp.register.locate import BodyNotFoundError
 from smplxpp.template.template import Template
 
 PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -143,3 +145,21 @@ def test_the_embedded_person_is_the_same_through_both_doors(tmp_path):
     for frame in registered.frames:
         one, other = registered.params(frame), result.capture.params(frame)
         assert all(np.array_equal(a, b) for a, b in zip(one.as_dict().values(), other.as_dict().values(), strict=True))
+
+
+def test_a_build_stops_with_the_finding_where_nobody_was_surely_found(monkeypatch):
+    """A woman who carries a child became a template with an arm over her head, at a confidence of .003."""
+    fit = load_params(PARAMS).frame(0)
+
+    def located(file, body, **known):
+        numbers = {"confidence": 0.003, "findings": ["2 heads, 1.62 and 1.54 m above the lowest point"], "problems": []}
+        return LocatedInScan(fit, np.zeros(0, np.int64), np.zeros(0, bool)), StageOutput([], numbers)
+
+    monkeypatch.setattr(template, "locate_in_scan", located)
+    with pytest.raises(BodyNotFoundError, match="2 heads") as stopped:
+        build_template(SCAN)
+    error = stopped.value
+    assert error.confidence == 0.003 and "--landmarks" in str(error) and "--accept-failures" in str(error)
+    # The picture shows the scan, and the body in it from front and side.
+    assert error.picture is not None and error.picture.shape[1] > error.picture.shape[0]
+    assert (error.picture < 250).any(axis=(0, 2)).mean() > 0.5

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipelines.commands.build import Build
 from pipelines.report.sections.register import locate_section
 from pipelines.runs.artefacts import load_located
-from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, SEGMENT_STAGE
+from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, NOT_FOUND_PICTURE, SEGMENT_STAGE
 from pipelines.runs.stage import require_stage
 from smplxpp.body import load_body, load_params
 from smplxpp.build import locate
-from smplxpp.core import BACKGROUND, SKIN, InputError, TriangleMesh
+from smplxpp.core import BACKGROUND, SKIN, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
-from smplxpp.register.locate import Candidate, LocatedBody
+from smplxpp.register.locate import BodyNotFoundError, Candidate, LocatedBody
 from smplxpp.segment import read_labels
 
 PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -95,19 +97,31 @@ def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, scan, monkeyp
 
     def look(body, mesh, *, colors, landmarks, labeller):
         shown.append(landmarks)
-        return LocatedBody(fit, 0.1, ("one hand is not there",), (Candidate("by hand", 0.0, 1.0, 1.0, 1.0),))
+        sure = 0.05 if landmarks is None else 0.15
+        return LocatedBody(fit, sure, ("one hand is not there",), (Candidate("by hand", 0.0, 1.0, 1.0, 1.0),))
 
     monkeypatch.setattr(locate, "locate_body", look)
-    build = Build(run_folder=tmp_path / "run", scan=scan, until_stage=LOCATE_STAGE, json=True)
-    checks = build.run()["checks"]
-    assert checks[0]["status"] == "fail" and "one hand is not there" in checks[0]["explanation"]
-    (tmp_path / "run" / LANDMARKS_FILE).write_text(json.dumps({"nose": [0.0, 1.5, 0.1]}))
-    build.run()
+    run = tmp_path / "run"
+    build = Build(run_folder=run, scan=scan, until_stage=LOCATE_STAGE, json=True)
+    # A body that nobody would show is not built on: the run keeps it, with a picture.
+    with pytest.raises(BodyNotFoundError, match="one hand is not there") as stopped:
+        build.run()
+    assert str(run / NOT_FOUND_PICTURE) in str(stopped.value)
+    assert stopped.value.confidence == 0.05
+    with Image.open(run / NOT_FOUND_PICTURE) as picture:
+        assert np.asarray(picture).std() > 10 and picture.width > picture.height
+    # Who accepts failures gets them, and status 0.
+    answer = replace(build, accept_failures=True).run()
+    assert answer["checks"][0]["status"] == "fail" and (answer["failed"], answer["exit_status"]) == (1, 0)
+    # Landmarks make another attempt.
+    (run / LANDMARKS_FILE).write_text(json.dumps({"nose": [0.0, 1.5, 0.1]}))
+    answer = build.run()
+    assert answer["checks"][0]["status"] == "warn" and not (run / NOT_FOUND_PICTURE).exists()
     build.run()
     assert shown[0] is None and set(shown[1]) == {"nose"} and len(shown) == 2
 
 
-def test_what_is_no_person_is_refused_before_anything_is_written(tmp_path):
+def test_nothing_is_built_on_what_is_no_person(tmp_path):
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     faces = np.array(
         [
@@ -126,6 +140,7 @@ def test_what_is_no_person_is_refused_before_anything_is_written(tmp_path):
         ]
     )
     write_ply(tmp_path / "cube.ply", TriangleMesh(cube * 1.8, faces))
-    with pytest.raises(InputError):
+    with pytest.raises(BodyNotFoundError, match="one whole person"):
         Build(run_folder=tmp_path / "run", scan=tmp_path / "cube.ply", json=True).run()
-    assert not list((tmp_path / "run").glob("[0-9]*"))
+    assert [path.name for path in (tmp_path / "run").glob("[0-9]*")] == [LOCATE_STAGE]
+    assert (tmp_path / "run" / NOT_FOUND_PICTURE).is_file()

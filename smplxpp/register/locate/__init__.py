@@ -11,12 +11,13 @@
 5. *Second look*: limbs that the surface does not show there, or that a detector sees elsewhere, are searched again in
    the surface that the rest of the dressed body leaves (`second_look`); feet below the floor get heels (`heels`).
 6. *Decision*: the candidate with the least misfit and pose cost wins, is fitted with its fingers, and gets a confidence
-   from its margin over the other facing (`locate`).
+   from its margin over the other facing (`decision`); what is not one whole person is named (`persons`).
 
 Every step minimises a weighted sum of squares by damped Gauss-Newton on the normal equations of `smplxpp.register`.
 """
 
-from smplxpp.register.locate.locate import Candidate, Labeller, LocatedBody, locate_body
+from smplxpp.register.locate.locate import Labeller, locate_body
+from smplxpp.register.locate.located import BodyNotFoundError, Candidate, LocatedBody
 from smplxpp.register.locate.search import LocateConfig
 
-__all__ = ["Candidate", "Labeller", "LocateConfig", "LocatedBody", "locate_body"]
+__all__ = ["BodyNotFoundError", "Candidate", "Labeller", "LocateConfig", "LocatedBody", "locate_body"]

@@ -14,11 +14,11 @@ with p the nearest point of the surface and n its normal. GM is the robust weigh
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import igl
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
@@ -187,6 +187,7 @@ class Misfit:
         covered: share of the surface that the body explains.
         shown: share of the body's hands, face and feet that the surface shows.
         parts: share of each of `PARTS` that the surface shows.
+        unexplained: whether a point of the surface is farther from the body than any cloth.
     """
 
     surface: float
@@ -194,6 +195,7 @@ class Misfit:
     covered: float
     shown: float
     parts: Mapping[str, float]
+    unexplained: Bool[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def total(self) -> float:
@@ -232,6 +234,7 @@ def misfit(
         float((each < cap).mean()),
         float((off[shown] < cap).mean()),
         {name: float((off[rows] < cap).mean()) for name, rows in _rows_of_parts(kinematics, proxy).items()},
+        each >= cap,
     )
 
 

@@ -189,9 +189,9 @@ def _searched(
     proposals = _apart(search, limb, sorted(tried, key=lambda one: thin.score(search, one)), count=3)
     if seen:
         proposals.append(_led(search, limb, tried, seen))
-    # 2. ICP of the limb alone; only what is nearer than the present limb is worth a whole fit.
-    now = limb.score(search, _refined(search, limb, found.state))
-    ends = [_refined(search, limb, one) for one in proposals]
+    # 2. ICP of the limb alone, from where it is and from there; only what is nearer is worth a whole fit.
+    now = limb.score(search, found.state)
+    ends = [_refined(search, limb, one) for one in (found.state, *proposals)]
     scores = [limb.score(search, one) for one in ends]
     order = [k for k in np.argsort(scores) if scores[k] < now - _worth(limb)][:2]
     # 3. The best two are fitted as dressed bodies, with their hand in the place of an arm.
@@ -207,8 +207,11 @@ def _searched(
 
 
 def _worth(limb: _Limb) -> float:
-    """Return how much nearer a pose has to be, metres: a millimetre of the mean distance of the limb's own points."""
-    return 0.001 * limb.size
+    """Return how much nearer a pose has to be, metres: three millimetres of the mean distance of the limb's own points.
+
+    Less is a refinement, for which a fit of the whole body is too expensive.
+    """
+    return 0.003 * limb.size
 
 
 def _grid(state: BodyState, limb: _Limb) -> Iterator[BodyState]:

@@ -13,8 +13,8 @@ from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.locate import LocateConfig, locate_body
+from smplxpp.register.locate.decision import confidence_of
 from smplxpp.register.locate.dressed import PARTS, Misfit
-from smplxpp.register.locate.locate import confidence_of
 from smplxpp.register.locate.search import Found
 
 PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"

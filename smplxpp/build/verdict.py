@@ -1,0 +1,69 @@
+"""Stop a build whose body was not found, with a picture of what was found and what helps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from smplxpp.body import BodyModel
+from smplxpp.core import BodyParams, TriangleMesh
+from smplxpp.raster import render_within
+from smplxpp.register.locate import BodyNotFoundError, LocatedBody
+
+LEAST_CONFIDENCE = 0.1
+"""Confidence of a located body below which a build stops.
+
+Of 14 real scans and 12 procedural people, bodies with every limb in its place have .18 (fists, a raised knee, wide
+clothes) and up; two people, half a person, a bust and a statue stay below .08."""
+_HELP = (
+    "cut away everything but the person, place landmarks (`smplxpp label`, --landmarks), ask a "
+    "detector (--detector mediapipe), or give the parameters (--params). --accept-failures builds all the same"
+)
+
+
+def require_found(
+    scan: TriangleMesh,
+    body: BodyModel,
+    params: BodyParams,
+    *,
+    confidence: float,
+    findings: Sequence[str],
+    picture_file: Path | None = None,
+) -> None:
+    """Refuse to build on a body that was found with too little confidence.
+
+    Args:
+        scan: the surface, metres, +Y up.
+        body: the model.
+        params: the body that was found, one row.
+        confidence: of it, from 0 to 1.
+        findings: what speaks against one whole person, in words.
+        picture_file: where the caller will keep the error's picture, which the message names; None: nowhere.
+
+    Raises:
+        BodyNotFoundError: the confidence is below `LEAST_CONFIDENCE`.
+    """
+    if confidence >= LEAST_CONFIDENCE:
+        return
+    what = "".join(f"; {finding}" for finding in findings)
+    raise BodyNotFoundError(
+        LocatedBody(params, confidence, findings=tuple(findings)),
+        received=f"a body with a confidence of {confidence:.2g} (a build needs {LEAST_CONFIDENCE:g}){what}",
+        remedy=_HELP if picture_file is None else f"look at {picture_file}; {_HELP}",
+        picture=picture_within(scan, body, params),
+    )
+
+
+def picture_within(scan: TriangleMesh, body: BodyModel, params: BodyParams) -> np.ndarray:
+    """Draw a scan, and a body within it from its front and its side.
+
+    Args:
+        scan: the surface, metres, +Y up.
+        body: the model.
+        params: the body, one row.
+    """
+    x, _, z = body.joint_rotations(params)[0, 0][:, 2]
+    posed = body.mesh(body.forward(params).vertices[0])
+    return render_within(posed, scan, facing=float(np.arctan2(x, z)))

@@ -1,0 +1,159 @@
+"""Decide whether a found body is believed: bounds, confidence, missing parts, and what the surface shows in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.surface_points import SurfacePoints
+from smplxpp.register.locate.persons import heads, largest_piece, people_apart
+from smplxpp.register.locate.search import Found
+
+
+@dataclass(frozen=True)
+class LocateBounds:
+    """Bounds by which a located body is refused or loses confidence. They
+    trade people that are refused against chairs, boxes and half a person that are taken for one; how both fare is
+    measured by `python -m benchmarks scan_alone`.
+
+    Attributes:
+        least_covered: smallest share of the surface that a body must explain.
+        least_shown: smallest share of hands, face and feet that the surface must show.
+        largest_shape: mean square of betas above which no person exists; they have unit variance.
+        doubtful_covered: share of the surface below which the confidence falls.
+        doubtful_shape: mean square of betas above which the confidence falls.
+        margin: difference of cost, millimetres, from which two facings are clearly distinct.
+        good_cost: cost that good fits stay below, millimetres.
+    """
+
+    least_covered: float = 0.5
+    least_shown: float = 0.25
+    largest_shape: float = 30.0
+    doubtful_covered: float = 0.8
+    doubtful_shape: float = 6.0
+    margin: float = 4.0
+    good_cost: float = 18.0
+
+
+_BOUNDS = LocateBounds()
+_HEAD_SHOWN = 0.5
+"""Share of the head, from which hair and hoods hide some, below which it may be missing."""
+
+
+def no_person(found: Found) -> str:
+    """Return in words why a surface has too little in common with the body found in it; empty if it has enough."""
+    fit = found.misfit
+    if fit.covered < _BOUNDS.least_covered or fit.shown < _BOUNDS.least_shown or _shape(found) > _BOUNDS.largest_shape:
+        unlike = ", and a body unlike any person" if _shape(found) > _BOUNDS.doubtful_shape else ""
+        return (
+            f"a surface of which a body explains {fit.covered:.0%}, with {fit.shown:.0%} of its hands, face and feet"
+            + unlike
+        )
+    return ""
+
+
+def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tuple[tuple[str, ...], float]:
+    """Return in words what a surface shows that is not one whole person, and the factor that leaves of the confidence.
+
+    Args:
+        mesh: the surface.
+        surface: points of it, which the best body was compared with.
+        best: the body.
+    """
+    out, doubt = [], 1.0
+    # Several people: pieces of their size beside each other, or two heads in the upper half.
+    apart = people_apart(mesh)
+    if len(apart) > 1:
+        doubt = 0.1
+        pieces = ", ".join(str(piece) for piece in apart)
+        out.append(f"{len(apart)} pieces of a person's size beside each other ({pieces}): two people, or furniture")
+    seen = heads(surface, float(mesh.face_areas.sum()))
+    low, high = np.quantile(surface.points[:, 1], (0.0, 1.0))
+    upper = seen[seen[:, 1] > 0.5 * (low + high)]
+    if len(upper) > 1:
+        doubt = min(doubt, 0.3)
+        heights = " and ".join(f"{head[1] - low:.2f}" for head in upper[:3])
+        out.append(
+            f"{len(upper)} heads, {heights} m above the lowest point: two people, or something round that is held"
+        )
+    # Half a person: no head anywhere, or neither legs nor feet.
+    if not len(seen) and best.misfit.parts["head"] < _HEAD_SHOWN:
+        doubt = min(doubt, 0.3)
+        out.append("no head: it may be cut off above, or hidden by a hood")
+    legs = [f"{side} {part}" for side in ("left", "right") for part in ("lower leg", "foot")]
+    if all(best.misfit.parts[part] < 0.2 for part in legs):
+        doubt = min(doubt, 0.3)
+        out.append("neither lower legs nor feet: it may be cut off below")
+    if not no_person(best) and best.misfit.covered >= _BOUNDS.doubtful_covered:
+        return tuple(out), doubt
+    # Something large that is no part of a body.
+    piece = largest_piece(surface, best.misfit.unexplained)
+    if piece is not None and piece.share > 0.1:
+        what = "furniture, another person or something that is held"
+        out.append(f"{piece.share:.0%} of the surface, in one piece of {piece}, is no part of the body found: {what}")
+    if float(high - low) < 1.2:
+        out.append(
+            f"only {high - low:.2f} m from the lowest to the highest point: a small child, or a part of somebody"
+        )
+    return tuple(out), doubt
+
+
+def confidence_of(best: Found, others: Sequence[Found]) -> float:
+    """Return the confidence of the best candidate, from 0 to 1, as a product of five factors.
+
+    A logistic function of its margin over the other facing (1/2 at half of the margin that is clearly distinct), one of
+    its cost against the surface alone, the share of the surface that it explains, 0.2 for an unlikely shape, and 0.4
+    for missing parts.
+    """
+    rival = [one.cost - best.cost for one in others if one.facing @ best.facing < 0]
+    apart = min(rival) if rival else _BOUNDS.margin
+    distinct = 1.0 / (1.0 + np.exp(-(apart - _BOUNDS.margin / 2) / (_BOUNDS.margin / 4)))
+    good = 1.0 / (1.0 + np.exp((best.surface_cost - _BOUNDS.good_cost) / 1.5))
+    whole = np.clip(
+        (best.misfit.covered - _BOUNDS.least_covered) / (_BOUNDS.doubtful_covered - _BOUNDS.least_covered), 0.0, 1.0
+    )
+    likely = 1.0 if _shape(best) <= _BOUNDS.doubtful_shape else 0.2
+    return float(distinct * good * whole * likely * (0.4 if missing_parts(best) else 1.0))
+
+
+def missing_parts(found: Found) -> list[str]:
+    """Return the parts of the body of which the surface shows less than 0.4, or 0.3 of the head (hair hides it).
+
+    Skirts hide lower legs, which are therefore never missing.
+    """
+    least = {"head": 0.3, "left lower leg": 0.0, "right lower leg": 0.0}
+    return [part for part, share in found.misfit.parts.items() if share < least.get(part, 0.4)]
+
+
+def notes_of(best: Found, others: Sequence[Found]) -> tuple[str, ...]:
+    """Return sentences about what a user should inspect and how to correct it."""
+    out = []
+    rival = [one for one in others if one.facing @ best.facing < 0]
+    if rival and min(one.cost for one in rival) - best.cost < _BOUNDS.margin:
+        out.append(
+            "the person may face the other way: both facings fit about equally well; place the landmarks nose, "
+            "left_wrist and right_wrist by hand (`smplxpp label`)"
+        )
+    if best.misfit.covered < _BOUNDS.doubtful_covered:
+        out.append(
+            f"a body explains only {best.misfit.covered:.0%} of the surface; if it shows something besides one person, "
+            "cut that away"
+        )
+    missing = missing_parts(best)
+    if missing:
+        out.append(
+            f"not found in the scan: {', '.join(missing)}. If it is cut off or hidden, its place is a guess; if it is "
+            "there, place a landmark on it (`smplxpp label`)"
+        )
+    if _shape(best) > _BOUNDS.doubtful_shape:
+        out.append("the body that fits is unlike people: check --units and --up, and that the scan is whole")
+    return tuple(out)
+
+
+def _shape(found: Found) -> float:
+    """Return the mean square of a candidate's betas."""
+    betas = found.state.betas
+    return float((betas**2).mean()) if len(betas) else 0.0

@@ -1,0 +1,154 @@
+"""Name what a scan shows that is not one whole person: several people, something large beside one, a cut body.
+
+These are tests of the geometry, which need no detector. They put a weak confidence into words: a single one may be
+wrong (a helmet under an arm is a second head), so that they lower the confidence and refuse nothing by themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.spatial import cKDTree
+
+from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.surface_points import SurfacePoints
+from smplxpp.core.topology import component_labels, face_components
+from smplxpp.raster import view_directions
+
+_RADII = (0.080, 0.092, 0.104)
+"""Metres, radii of spheres like heads with their hair, of children and of adults."""
+_DIRECTIONS = 40
+"""Number of directions from a head's centre in which its surface is looked for."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A connected piece of a surface.
+
+    Attributes:
+        size: width (x), height (y) and depth (z), metres.
+        center: of its bounding box, x and z, metres.
+        share: of the surface's area.
+    """
+
+    size: tuple[float, float, float]
+    center: tuple[float, float]
+    share: float
+
+    def __str__(self) -> str:
+        return " x ".join(f"{length:.2f}" for length in self.size) + " m"
+
+
+def people_apart(mesh: TriangleMesh) -> tuple[Piece, ...]:
+    """Return the pieces of a surface that are as large as a person and stand beside each other; at most one is usual.
+
+    Garments are pieces too, which lie around the body; pieces that share most of their ground are one.
+    """
+    # Vertices at one place are one, so that seams of textures cut nothing.
+    _, same = np.unique(np.round(mesh.vertices, 5), axis=0, return_inverse=True)
+    piece = face_components(same.reshape(-1)[mesh.faces])
+    area = np.bincount(piece, mesh.face_areas)
+    tall, out = float(np.ptp(mesh.vertices[mesh.referenced, 1])), list[Piece]()
+    for k in np.argsort(-area)[:6]:
+        points = mesh.vertices[np.unique(mesh.faces[piece == k])]
+        low, high = points.min(axis=0), points.max(axis=0)
+        found = Piece(
+            (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2])),
+            (float(low[0] + high[0]) / 2, float(low[2] + high[2]) / 2),
+            float(area[k] / area.sum()),
+        )
+        # As large as a person: half as tall as the whole scan, with a sixth of its surface.
+        if found.size[1] > 0.5 * tall and found.share > 1 / 6 and all(_apart(found, other) for other in out):
+            out.append(found)
+    return tuple(out)
+
+
+def _apart(one: Piece, other: Piece) -> bool:
+    """Return whether less than 0.7 of the smaller ground of two pieces lies within the other's."""
+    shared, least = 1.0, 1.0  # square metres
+    for axis, k in ((0, 0), (2, 1)):
+        low = max(one.center[k] - one.size[axis] / 2, other.center[k] - other.size[axis] / 2)
+        high = min(one.center[k] + one.size[axis] / 2, other.center[k] + other.size[axis] / 2)
+        shared *= max(0.0, high - low)
+        least *= min(one.size[axis], other.size[axis])
+    return shared < 0.7 * least
+
+
+def heads(surface: SurfacePoints, area: float) -> Float64[np.ndarray, "K 3"]:
+    """Find heads: spheres of their size that the surface shows from nearly all sides.
+
+    Each point votes for the centres that spheres through it would have along its normal (a Hough transform). A centre
+    with many votes is a head if points of the sphere lie in at least 85 % of the directions, and in each of them or
+    in the opposite one: a limb is open at two opposite ends, a head at the neck alone.
+
+    Args:
+        surface: points of it.
+        area: of the whole surface, square metres.
+    """
+    density, spread = len(surface) / area, 0.025  # points a square metre; metres between a sphere and a head
+    found: list[tuple[float, np.ndarray]] = []
+    tree = cKDTree(surface.points)
+    rays = view_directions(_DIRECTIONS)
+    for radius in _RADII:
+        centers = surface.points - radius * surface.normals
+        votes = cKDTree(centers).query_ball_point(centers, spread, return_length=True)
+        # A quarter of a sphere's points at least, the strongest first; each centre stands for those near it.
+        order = np.argsort(-votes, kind="stable")
+        order = order[votes[order] > 0.25 * 4 * np.pi * radius**2 * density]
+        left = np.ones(len(centers), dtype=bool)
+        for k in order:
+            if not left[k]:
+                continue
+            close = np.linalg.norm(centers - centers[k], axis=1) < spread
+            left &= ~close
+            center = centers[close].mean(axis=0)
+            rows = np.array(tree.query_ball_point(center, radius + spread), dtype=np.int64)
+            share, closed = _shell(surface, rows, center, radius - spread, rays)
+            if share >= 0.85 and closed:
+                found.append((share, center))
+    # The best of all radii at a place.
+    heads: list[np.ndarray] = []
+    for _, center in sorted(found, key=lambda one: -one[0]):
+        if all(np.linalg.norm(center - other) > 0.16 for other in heads):
+            heads.append(center)
+    return np.array(heads).reshape(-1, 3)
+
+
+def _shell(
+    surface: SurfacePoints, rows: np.ndarray, center: np.ndarray, least: float, rays: np.ndarray
+) -> tuple[float, bool]:
+    """Return the share of directions in which a shell about a centre has points that face outwards, and whether every
+    direction or its opposite has some."""
+    away = surface.points[rows] - center
+    length = np.linalg.norm(away, axis=1)
+    away = away / np.maximum(length, 1e-9)[:, None]
+    facing = np.einsum("nx,nx->n", away, surface.normals[rows]) > 0.75
+    kept = away[facing & (length > least)]
+    if not len(kept):
+        return 0.0, False
+    # Half of the angle between neighbouring directions, about 16 degrees for 40 of them, and some more.
+    near = np.cos(np.radians(20.0))
+    seen, opposite = ((kept @ (sign * rays).T).max(axis=0) > near for sign in (1.0, -1.0))
+    return float(seen.mean()), bool((seen | opposite).all())
+
+
+def largest_piece(surface: SurfacePoints, unexplained: Bool[np.ndarray, " N"]) -> Piece | None:
+    """Return the largest connected piece of the points that a body does not explain; None without any.
+
+    Points are connected where they are at most 6 cm apart.
+    """
+    rows = np.flatnonzero(unexplained)
+    if not len(rows):
+        return None
+    pairs = cKDTree(surface.points[rows]).query_pairs(0.06, output_type="ndarray")
+    piece = component_labels(pairs.astype(np.int64), len(rows))
+    count = np.bincount(piece)
+    points = surface.points[rows[piece == np.argmax(count)]]
+    low, high = points.min(axis=0), points.max(axis=0)
+    return Piece(
+        (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2])),
+        (float(low[0] + high[0]) / 2, float(low[2] + high[2]) / 2),
+        float(count.max() / len(surface)),
+    )

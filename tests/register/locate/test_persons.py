@@ -1,0 +1,80 @@
+"""What a scan shows that is not one whole person is named: two people, a head too many, half a person."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smplxpp.body import load_body
+from smplxpp.body.named_poses import standing_poses
+from smplxpp.core import TriangleMesh, matrix_from_rotvec
+from smplxpp.core.surface_points import SurfacePoints
+from smplxpp.register.kinematics import BodyState
+from smplxpp.register.landmarks import visible_vertices
+from smplxpp.register.locate.persons import heads, largest_piece, people_apart
+
+BODY = load_body()
+
+
+@pytest.fixture(scope="module")
+def person() -> TriangleMesh:
+    """Somebody with lowered arms, without eyes and teeth."""
+    pose = next(vectors for name, vectors in standing_poses(BODY.joint_count) if name == "arms lowered, legs apart")
+    rotations = matrix_from_rotvec(pose)[None]
+    state = BodyState(rotations, np.zeros((1, 3)), np.zeros(BODY.num_betas), np.zeros((1, BODY.num_expressions)))
+    posed = BODY.forward(state.to_params(BODY)).vertices[0]
+    outer = np.isin(np.arange(BODY.vertex_count), visible_vertices(BODY))
+    return TriangleMesh(posed, BODY.faces[outer[BODY.faces].all(axis=1)])
+
+
+def _moved(mesh: TriangleMesh, scale: float, move: tuple[float, float, float]) -> TriangleMesh:
+    return TriangleMesh(scale * mesh.vertices + np.array(move), mesh.faces)
+
+
+def _together(*meshes: TriangleMesh) -> TriangleMesh:
+    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
+def _heads(mesh: TriangleMesh) -> np.ndarray:
+    return heads(SurfacePoints.sample(mesh, 6000, seed=0), float(mesh.face_areas.sum()))
+
+
+def test_one_person_is_one_piece_with_one_head(person):
+    assert len(people_apart(person)) == 1
+    (head,) = _heads(person)
+    # Its centre lies a head's radius below the crown.
+    assert abs(head[0]) < 0.02 and 0.06 < person.vertices[:, 1].max() - head[1] < 0.16
+
+
+def test_two_people_are_two_pieces_and_two_heads(person):
+    """One of them is a child before the other's chest."""
+    child = _moved(person, 0.8, (0.0, 0.1, 0.3))
+    both = _together(person, child)
+    assert len(people_apart(both)) == 2
+    assert len(_heads(both)) == 2
+
+
+def test_a_garment_around_a_person_is_nobody(person):
+    shell = TriangleMesh(person.vertices + 0.02 * person.vertex_normals, person.faces)
+    below_the_neck = shell.face_centers[:, 1] < person.vertices[:, 1].max() - 0.3
+    assert len(people_apart(_together(person, shell.submesh(below_the_neck)[0]))) == 1
+
+
+def test_half_a_person_has_no_head(person):
+    legs = person.face_centers[:, 1] < 0.5 * (person.vertices[:, 1].min() + person.vertices[:, 1].max())
+    assert len(_heads(person.submesh(legs)[0])) == 0
+
+
+def test_the_largest_piece_that_no_body_explains_has_the_size_of_what_is_held(person):
+    low, size = np.array([0.4, 0.0, 0.2]), np.array([0.3, 0.4, 0.1])
+    surface = SurfacePoints.sample(person, 4000, seed=0)
+    points = np.concatenate([surface.points, low + size * np.random.default_rng(0).random((600, 3))])
+    normals = np.concatenate([surface.normals, np.tile([0.0, 0.0, 1.0], (600, 1))])
+    unexplained = np.arange(len(points)) >= 4000
+    unexplained[:3] = True  # stray points elsewhere
+    piece = largest_piece(SurfacePoints.from_arrays(points, normals), unexplained)
+    assert piece is not None and np.abs(np.array(piece.size) - size).max() < 0.03
+    assert abs(piece.share - 600 / 4600) < 0.001
+    assert largest_piece(surface, np.zeros(4000, dtype=bool)) is None
