@@ -152,9 +152,10 @@ def detect_format(path: str | Path) -> str:
         InputError: no layout matches, or several do.
     """
     root = Path(path)
-    fitting = [name for name, reader in READERS.items() if reader.detect(root)]
-    # A calibration file alone makes a rig of any folder that no layout of a data set fits.
-    fitting = [name for name in fitting if name != rig.NAME] or fitting
+    fitting = [name for name, reader in READERS.items() if name != rig.NAME and reader.detect(root)]
+    # A calibration file alone makes a rig of any folder that no layout of a data set fits; looking for one opens files.
+    if not fitting and rig.detect(root):
+        return rig.NAME
     if len(fitting) == 1:
         return fitting[0]
     have = sorted(entry.name for entry in root.iterdir())
