@@ -13,6 +13,7 @@ import pytest
 from smplxpp.body import load_body
 from smplxpp.body.layout import BODY_25, BODY_25B
 from smplxpp.capture import open_capture
+from smplxpp.capture.check.files import missing_findings
 from smplxpp.capture.keypoint_files import KeypointOptions, read_keypoints
 from smplxpp.capture.keypoint_order import body_25_order
 from smplxpp.core import BodyParams, Camera, InputError
@@ -151,6 +152,13 @@ def test_one_person_is_taken_without_a_word(tmp_path):
     assert distance_px(capture, PERSON) < 6 and capture.keypoint_notes() == ()
     with pytest.raises(InputError, match="one person is in view"):
         open_capture(tmp_path / "take", subject=2).keypoints("cam_01")
+
+
+def test_what_was_guessed_of_a_rig_is_looked_at_and_no_fault(tmp_path):
+    capture = open_capture(write_rig(tmp_path / "take", [(PERSON, 0.6, ALL)]))
+    guessed = [one for one in missing_findings(capture) if one.kind == "rig-guessed"]
+    assert len(guessed) == 1 and "z taken for up" in guessed[0].message and guessed[0].status == "warn"
+    assert not any(one.kind == "file-other" for one in missing_findings(capture))
 
 
 @pytest.mark.parametrize(("order", "name"), [(BODY_25, "openpose"), (BODY_25B, "openpose-25b")])

@@ -13,6 +13,8 @@ from smplxpp.capture.check.findings import Finding
 
 # What `find_problems` says without decoding -> kind; the first that matches.
 _KINDS = (
+    (r"^calibration \S+ \(\w+\): |^no (keypoints|images) of the cameras ", "rig-guessed"),
+    (r"videos, which `smplxpp capture convert` decodes", "rig-videos"),
     (r"not calibrated$", "camera-uncalibrated"),
     (r"calibrated, but without any image$", "camera-without-images"),
     (r"an image in camera .* alone$", "frame-alone"),

@@ -17,6 +17,12 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "file-size": ("files", "fail", "give images, masks and calibration of one resolution"),
     "file-other": ("files", "fail", "correct the file, or delete it"),
     "left-aside": ("files", "warn", "docs/captures.md says what each layout's reader leaves aside, and why"),
+    "rig-guessed": (
+        "files",
+        "warn",
+        "see whether it is right; --calibration, --units and --up of `capture convert` say it",
+    ),
+    "rig-videos": ("files", "warn", "convert the rig: smplxpp capture convert"),
     "camera-uncalibrated": ("files", "fail", "add the camera to the calibration, or delete the folder"),
     "camera-without-images": ("files", "fail", "add its images, or take the camera out of the calibration"),
     "image-missing": ("files", "warn", "copy the missing images; the views are left out until then"),
