@@ -66,7 +66,7 @@ class Source:
         return all((folder / name).exists() for name in (*self.files, *truth))
 
 
-_POLYGON = "polygonjs/polygonjs-assets, models/resources/renderpeople.com, with an MTL that names the texture"
+_POLYGON = "polygonjs/polygonjs-assets, models/resources/renderpeople.com, OBJ without texture coordinates"
 _RENDERPEOPLE = "RenderPeople free sample: terms of renderpeople.com, no redistribution"
 _CRAGL = "CraGL/Hyperspectral-Inverse-Skinning, models (Vlasic et al. 2008, performance capture from silhouettes)"
 _FAUST = "DavidBoja/SMPL-Fitting, data/demo"
