@@ -92,7 +92,7 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
     # Something large that is no part of a body.
     piece = largest_piece(surface, best.misfit.unexplained)
     if piece is not None and piece.share > 0.1:
-        what = "furniture, another person or something that is held"
+        what = "furniture, another person, something held or a wide garment"
         out.append(f"{piece.share:.0%} of the surface, in one piece of {piece}, is no part of the body found: {what}")
     if float(high - low) < 1.2:
         out.append(
