@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import functools
 import json
+import subprocess
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from pipelines.captures import turntable
-from pipelines.captures.turn_frames import lens_of
+from pipelines.captures.turn_frames import lens_of, turn_frames, upright_image
 from pipelines.captures.turntable import TurntableCaptureConfig, held_out_frames, make_turntable_capture
 from smplxpp.body import load_body
+from smplxpp.build import register
+from smplxpp.build.config import RegisterInputs
 from smplxpp.build.inputs import BuildRequest, plan_build
+from smplxpp.build.observe import observe
 from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import write_keypoints
 from smplxpp.core import InputError, Keypoints2D
+from smplxpp.core.files.image_file import image_size
+from smplxpp.detect import DetectedPerson
 from smplxpp.register import RegisterConfig
 from tests.register.turns import turned_person
 
 BODY = load_body()
 FRAMES = 5
+QUICK = {"keypoint_steps": 8, "surface_steps": 1}
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +50,7 @@ def taken(tmp_path_factory):
 def made(taken, tmp_path_factory):
     root, turn = taken
     config = TurntableCaptureConfig(height=turn.stature, masks=root / "masks", keypoints=root / "keypoints.npz")
-    quick = functools.partial(
-        turntable.TurntableConfig, keypoint_steps=8, surface_steps=1, solver=RegisterConfig(rim_samples=500)
-    )
+    quick = functools.partial(turntable.TurntableConfig, **QUICK, solver=RegisterConfig(rim_samples=500))
     out = tmp_path_factory.mktemp("captures") / "anna"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(turntable, "TurntableConfig", quick)
@@ -73,6 +78,58 @@ def test_a_build_reconstructs_with_the_poses_of_the_capture(made):
             plan_build(BuildRequest(capture=made.out))
     finally:
         (made.out / "params.away").rename(made.out / "params" / "params.npz")
+
+
+def test_a_registration_fits_the_whole_turn_at_once(made, monkeypatch):
+    # Parameters of the capture start it; one shape and one held pose for all frames come out.
+    monkeypatch.setattr(register, "TurntableConfig", functools.partial(register.TurntableConfig, **QUICK))
+    observed = observe(RegisterInputs(capture=made.out), BODY)
+    found, output = register.register_observed(observed, BODY, at=0, config=RegisterConfig(rim_samples=500))
+    assert found.fit.frames == tuple(range(FRAMES)) and np.ptp(found.fit.params.betas, axis=0).max() == 0.0
+    assert [check.name for check in output.checks if check.status != "pass"] == []
+
+
+def test_masks_and_keypoints_that_are_not_given_are_made(taken, tmp_path, monkeypatch):
+    root, turn = taken
+    seen = iter(zip(turn.keypoints.points, turn.keypoints.confidence, strict=True))
+
+    class Detects:
+        names, identity = turn.keypoints.names, "a detector that knows"
+
+        def __call__(self, image, box=None):
+            return [DetectedPerson(*next(seen))]
+
+    monkeypatch.setattr(turntable, "load_detector", lambda name: Detects())
+    monkeypatch.setattr(
+        turntable, "MattingModel", lambda path: lambda image: 255 * (image[..., 0] > 0).astype(np.uint8)
+    )
+    quick = functools.partial(turntable.TurntableConfig, keypoint_steps=1, surface_steps=0)
+    monkeypatch.setattr(turntable, "TurntableConfig", quick)
+    config = TurntableCaptureConfig(most_frames=4, matting=tmp_path / "model.onnx")
+    made = make_turntable_capture(root / "photos", tmp_path / "out", config)
+    capture = open_capture(made.out)
+    # Four of the five photographs; the first and the last are among them.
+    assert (
+        made.frames == 4 and capture.required_file("cam", 3).read_bytes() == (root / "photos/IMG_107.png").read_bytes()
+    )
+    np.testing.assert_array_equal(capture.mask("cam", 0), turn.masks[0])
+    np.testing.assert_allclose(capture.keypoints("cam").points[0], turn.keypoints.points[0], atol=0.1)
+
+
+def test_frames_of_a_video(tmp_path):
+    program = pytest.importorskip("imageio_ffmpeg", reason="the extra video reads films").get_ffmpeg_exe()
+    film = tmp_path / "turn.mp4"
+    source = ["-f", "lavfi", "-i", "testsrc=size=64x96:rate=20:duration=2"]
+    subprocess.run([program, "-v", "error", *source, str(film)], check=True, timeout=900)
+    with turn_frames(film, 8) as (frames, given):
+        assert given is None and [frame.number for frame in frames] == list(range(1, 9))
+        assert image_size(frames[0].path) == (64, 96)
+        # A second and a half apart, the counter of the test picture differs.
+        first, later = (np.asarray(upright_image(frames[k].path)) for k in (0, 6))
+        assert (first != later).any()
+    film.write_bytes(b"no film")
+    with pytest.raises(InputError, match="expected a video"), turn_frames(film, 8):
+        pass
 
 
 def test_photographs_that_were_cropped_one_by_one_are_refused(taken, tmp_path):
