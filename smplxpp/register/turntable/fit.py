@@ -252,7 +252,8 @@ class _Turn:
 
     def _outlines(self) -> dict[tuple[str, int], Outline]:
         """Read the masks as signed distance fields, by camera and row, and note those that are missing."""
-        out, missing = {}, []
+        out: dict[tuple[str, int], Outline] = {}
+        missing: list[int] = []
         if self.observed.mask is None:
             return out
         for row, frame in enumerate(self.observed.frames):
