@@ -87,7 +87,8 @@ def find_objects(
     unary = np.stack([np.zeros(mesh.face_count), -evidence * mesh.face_areas * _CM2], axis=1)
     unary -= unary.min(axis=1, keepdims=True)
     cut = minimize_potts(PottsProblem.from_costs(unary, pairs, cost))[0].astype(bool)
-    return _accepted(mesh, cut, pairs, (length, cost), (distance, to_hand))
+    hands = [posed[hand & (own.side == side)] for side in (1, -1)]
+    return _accepted(mesh, cut, pairs, (length, cost), (distance, to_hand), hands)
 
 
 _LEAST_AREA = 60.0
@@ -96,6 +97,10 @@ _LEAST_REACH = 0.06
 """Metres by which a thing leaves the body; fists and wrong fingers stay within."""
 _TOUCHES = 0.03
 """Metres from the hand within which a thing begins."""
+_SHOWS, _SHOWN = 0.015, 0.4
+"""Metres within which the scan shows a point of a hand, and the share of a hand that it has to show beside a thing."""
+_LARGER_THAN_HANDS = 900.0
+"""Square centimetres from which a piece is a thing, although the scan does not show the hand where the body has it."""
 _SMOOTH_BORDER = 0.6
 """Mean cost of the cut, as a share of that through smooth and plain surface, from which it is no border of a thing."""
 
@@ -115,6 +120,7 @@ def _accepted(
     pairs: Int64[np.ndarray, "P 2"],
     edges: tuple[np.ndarray, np.ndarray],
     where: tuple[np.ndarray, np.ndarray],
+    hands: list[np.ndarray],
 ) -> FoundObjects:
     """Keep the pieces of a cut that are things.
 
@@ -124,8 +130,12 @@ def _accepted(
         pairs: the two faces of each edge.
         edges: length, in centimetres, and cost of each edge.
         where: distance of each face to the body and to its hands, metres.
+        hands: points of either hand of the body.
     """
     distance, to_hand = where
+    # A hand that what is left of the scan does not show lies elsewhere: then a small piece is the hand itself.
+    left = cKDTree(mesh.face_centers[~cut]) if not cut.all() else None
+    shown = [bool(left and len(h) and (left.query(h)[0] < _SHOWS).mean() > _SHOWN) for h in hands]
     length, cost = edges
     inside = cut[pairs]
     piece = component_labels(pairs[inside.all(axis=1)], len(cut))
@@ -134,6 +144,10 @@ def _accepted(
         own = cut & (piece == number)
         area = float(mesh.face_areas[own].sum()) * _CM2
         if area < _LEAST_AREA or distance[own].max() < _LEAST_REACH or to_hand[own].min() > _TOUCHES:
+            continue
+        center = mesh.face_centers[own][to_hand[own].argmin()]
+        nearest = int(np.argmin([np.linalg.norm(h - center, axis=1).min() if len(h) else np.inf for h in hands]))
+        if not shown[nearest] and area < _LARGER_THAN_HANDS:
             continue
         # The cost of its border, relative to a border of the same length through smooth and plain surface.
         border = own[pairs[:, 0]] != own[pairs[:, 1]]
