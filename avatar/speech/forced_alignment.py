@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.speech.audio_features import clear_pauses, find_pauses, speech_level
+from avatar.speech.audio_features import amplified, clear_pauses, find_pauses, speech_level
 from avatar.speech.lips import LipNetwork, alignment_score
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech, Word
 from avatar.speech.pronunciation import EXTRA, check_text, no_words_error, phones_from_word, words_from_text
@@ -25,7 +25,7 @@ MIN_ENGLISH = 0.6
 """Recognised words with a lower `Recognition.score` belong to another language, music or noise. Chosen on recordings of
 people in seven languages; `python -m benchmarks spoken_languages` measures it."""
 _AGREEMENT = 0.25  # weight of the agreement, nats a row, beside the words' probability
-_SHORT = 0.05  # seconds; over the length of the words it is what a short recording scores less, as chance varies more
+_SHORT = 0.12  # seconds; over the length of the words it is what a short recording scores less, as chance varies more
 
 
 class NotEnglishError(InputError):
@@ -120,7 +120,7 @@ def align(sound: Sound, text: str | None = None, *, recogniser: Any | None = Non
     speech_level(sound)
     decoder = load_recogniser() if recogniser is None else recogniser
     aligned = _align_words(decoder, sound, _checked_words(text))
-    if aligned is None or alignment_score(LipNetwork.shipped()(sound), aligned) < MIN_SCORE_OF_TEXT:
+    if aligned is None or alignment_score(LipNetwork.shipped()(amplified(sound)), aligned) < MIN_SCORE_OF_TEXT:
         raise _other_text()
     return _without_pauses(aligned, sound)
 
@@ -181,7 +181,7 @@ def judge(sound: Sound, words: list[str], confidence: float, *, recogniser: Any)
         NotEnglishError: words that cannot be aligned, or no better than at random.
     """
     aligned = _align_words(recogniser, sound, words)
-    agreement = -np.inf if aligned is None else alignment_score(LipNetwork.shipped()(sound), aligned)
+    agreement = -np.inf if aligned is None else alignment_score(LipNetwork.shipped()(amplified(sound)), aligned)
     if aligned is None or agreement < MIN_SCORE_OF_WORDS:
         raise NotEnglishError(-np.inf)
     return Recognition(_without_pauses(aligned, sound), agreement, confidence)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from avatar.speech.audio_features import BANDS, FRAME, HOP, RATE, log_mel, speech_level
+from avatar.speech.audio_features import BANDS, FRAME, HOP, RATE, amplified, log_mel
 from avatar.speech.coarticulation import ARTICULATORS
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
 from smplxpp.core.errors import InputError
@@ -161,9 +161,8 @@ def recognise_phonemes(sound: Sound) -> Speech:
     Raises:
         InputError: silence, or more than 20 minutes.
     """
-    speech_level(sound)
     seconds = sound.seconds
-    heard = LipNetwork.shipped()(sound)
+    heard = LipNetwork.shipped()(amplified(sound))
     # The cost of a change keeps single noisy rows from becoming phonemes of their own.
     path = _best_path(np.log(heard.phones + 1e-9), 3.0)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])

@@ -40,6 +40,8 @@ class ScanAlone:
     """Number of procedural people; 0: none."""
     who: tuple[str, ...] = ()
     """These of them by name (`pipelines.synth.people.cast`), in place of the first ones."""
+    outsiders: bool = False
+    """The people whose surface the body model cannot reach, in place of the first ones of the cast."""
     seed: int = 0
     """Seed of the procedural people."""
     captured: bool = True
@@ -72,7 +74,7 @@ class ScanAlone:
             for name in captured_names():
                 yield from (variant(captured(name), one) for one in names)
         named = (person(name, seed=self.seed) for name in self.who)
-        for scan in named if self.who else people(count=self.people, seed=self.seed):
+        for scan in named if self.who else people(count=self.people, seed=self.seed, outsiders=self.outsiders):
             yield from (variant(scan, one) for one in names)
 
 

@@ -13,7 +13,7 @@ from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath,
 from pipelines.synth.config import SynthConfig, motion_kind
 from pipelines.synth.make_capture import make_capture
 from pipelines.synth.person import CLOTHES
-from smplxpp.core import InputError, require_at_least, require_choice
+from smplxpp.core import InputError, require_at_least, require_between, require_choice
 from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.raster.soft_light import Environment
 
@@ -41,6 +41,8 @@ class Synth:
     """Clothes below the shirt: skirt (loose) or trousers (tight); by default a skirt (talking: trousers)."""
     skirt_pattern: OptionalText = None
     """Pattern of a skirt: plaid (default), stripes (vertical), hoops (horizontal), dots or plain."""
+    outside: float = 0.0
+    """Millimetres (root mean square) of offsets of her body that no shape of the body model has, as real people do."""
     seed: int = 0
     """Seed of the motion, the cameras and all noise."""
     fps: float = 10.0
@@ -112,6 +114,7 @@ class Synth:
         """Make the configuration; the kind of motion gives the defaults of omitted options."""
         # The motion determines sensible numbers of cameras, truth meshes and clothes.
         kind = motion_kind(self.motion)
+        require_between("--outside", self.outside, 0.0, 30.0)
         require_at_least("--size", self.size, 16)
         if self.width is not None:
             require_at_least("--width", self.width, 8)
@@ -132,6 +135,7 @@ class Synth:
             scan_faces=self.scan_faces,
             motion=self.motion,
             clothes=clothes,
+            outside=1e-3 * self.outside,
             skirt_pattern=self.skirt_pattern or SynthConfig.skirt_pattern,
             aspect=kind.aspect if self.width is None else self.width / self.size,
             texel=kind.texel,

@@ -90,6 +90,8 @@ class SynthConfig:
         scan_faces: number of faces of the reference frame's scan; 0 makes no scan.
         motion: name in `MOTIONS`.
         clothes: one of `CLOTHES`.
+        outside: root mean square of smooth offsets of her body that no shape of the body model has, metres; so that a
+            fit keeps a distance, as on real people.
         skirt_pattern: name in `patterns.SKIRT_PATTERNS`.
         aspect: width of body images by their height.
         texel: side of a cell of the texture atlas in metres (finer on the head). The atlas is several times as fast as
@@ -114,6 +116,7 @@ class SynthConfig:
     scan_faces: int = 80_000
     motion: str = "turning"
     clothes: str = "skirt"
+    outside: float = 0.0
     skirt_pattern: str = "plaid"
     aspect: float = 0.8
     texel: float = 0.0

@@ -14,6 +14,7 @@ from jaxtyping import Bool, UInt8
 from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.checks import scan_checks, take_checks
 from pipelines.synth.config import SynthConfig, motion_kind, split_frames
+from pipelines.synth.people.outside import Outside, with_offsets
 from pipelines.synth.person import PART_LABELS, PART_NAMES, Person, person_of, read_layers
 from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import Take, simulate
@@ -55,6 +56,8 @@ def make_capture(
     """
     # Dress the person and simulate her performance.
     layers = read_layers(topology_file, config.clothes)
+    if config.outside:
+        layers = with_offsets(layers, load_body(), Outside(noise=config.outside), seed=config.seed + 5)
     person = replace(person_of(layers, config.clothes), skirt_pattern=config.skirt_pattern)
     motion = motion_kind(config.motion).make(
         betas=person.betas,

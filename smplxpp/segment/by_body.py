@@ -49,8 +49,9 @@ from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, 
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
 from smplxpp.segment.by_body_layers import Layers, find_layers
 from smplxpp.segment.by_body_objects import FoundObjects, find_objects
-from smplxpp.segment.by_body_outfit import ARM_END, ARM_START, COLUMN_END, Outfit, OutfitConfig, Rings, find_outfit
+from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
+from smplxpp.segment.by_body_rings import ARM_END, ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.segment import SegmentedScan
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors, likeness
@@ -227,12 +228,16 @@ def weigh_evidence(
         steps=config.blend_steps,
     )
     weight = config.distance_alone if lab is None else config.distance
+    local = _local_misfit(chart, column, arm, misplaced)
+    # Distances err together, so that one of a face tells little for skin.
+    alone = np.clip(cloth_against_skin(chart.distance, local), -0.5, 3.0)
+    far = alone if lab is None else _cloth_by_distance(chart.distance, misplaced)
     costs = label_costs(
         prior,
         palette,
         skin_like,
         area=area,
-        far=weight * _cloth_by_distance(chart.distance, misplaced),
+        far=weight * far,
         blend=blend,
         bald=layers.bald,
         rounds=config.rounds,
@@ -246,6 +251,19 @@ def weigh_evidence(
 
 _CERTAIN = 12.0
 """Nats, the largest cost of a label at a face."""
+
+
+def _local_misfit(chart: BodyChart, column: Rings, arm: Rings, misfit: float) -> Float64[np.ndarray, " M"]:
+    """Return what the body misses each face by, metres: the spread of the distances about its limb there.
+
+    A limb that no shape of the model has, or that is turned, lies on the body on one side and off it on the other,
+    while face and hands may fit. `misfit` is that of face and hands, the least anywhere.
+    """
+    out = np.full(len(chart.region), misfit)
+    for mask, rings, place in ((in_column(chart), column, chart.height), (in_arm(chart), arm, chart.reach)):
+        ring = np.clip(np.floor((place[mask] - rings.start) / STEP).astype(np.int64), 0, len(rings) - 1)
+        out[mask] = np.clip(rings.spread[ring], misfit, 0.02)
+    return out
 
 
 def _cloth_by_distance(distance: np.ndarray, misfit: float) -> np.ndarray:

@@ -10,7 +10,8 @@ from smplxpp.core import LABELS, SKIN, UPPER, TriangleMesh
 from smplxpp.segment.by_body_chart import LEG, TRUNK, BodyChart, in_arm, in_column
 from smplxpp.segment.by_body_colors import SkinModel
 from smplxpp.segment.by_body_layers import Layers
-from smplxpp.segment.by_body_outfit import ARM_START, RUNS, STEP, Outfit
+from smplxpp.segment.by_body_outfit import RUNS, Outfit
+from smplxpp.segment.by_body_rings import ARM_START, STEP
 
 BODY_ELSEWHERE = 0.05
 """Distance, in metres, between body and bare skin from which the body is not the scan's."""

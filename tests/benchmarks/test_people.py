@@ -10,13 +10,15 @@ import pytest
 
 from benchmarks.support.people import body_outside, captured, captured_names
 from pipelines.synth.garments.wardrobe import all_garments
-from pipelines.synth.people import CAST, VARIANTS, access, people, person, variant
+from pipelines.synth.people import CAST, OUTSIDERS, VARIANTS, access, people, person, variant
 from pipelines.synth.people.bodies import BUILDS, STANCES, Posing, betas_of, fitting_mannequin
 from pipelines.synth.people.making import make_person
+from pipelines.synth.people.outside import Outside, heel_blocks, outside_body, reachable
 from pipelines.synth.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
 from pipelines.synth.scan_simulation import ScanConfig
 from smplxpp.body import load_body
-from smplxpp.core import LABEL_BY_NAME, InputError
+from smplxpp.core import LABEL_BY_NAME, BodyParams, InputError
+from smplxpp.skinning import skin
 
 NAME = "man shirt trousers short hair, arms down"
 COARSE = ScanConfig(cell=0.012, views=24, resolution=384, faces=12_000)
@@ -84,7 +86,7 @@ def test_variants_keep_scan_and_truth_together(body, scan, name):
     """The nearest point of the surface to every joint is as far as it was."""
     changed = variant(scan, name)
     shown = changed.as_read()
-    np.testing.assert_allclose(body.forward(changed.params).vertices[0], changed.body_vertices, atol=1e-12)
+    np.testing.assert_allclose(scan.body.forward(changed.params).vertices[0], changed.body_vertices, atol=1e-12)
     before, after = (
         np.sqrt(igl.point_mesh_squared_distance(one.joints, one.mesh.vertices, one.mesh.faces)[0])
         for one in (scan, shown)
@@ -122,11 +124,71 @@ def test_what_nobody_has_is_refused(scan):
 def test_the_cast_is_made_of_what_there_is(body):
     mannequin, _ = fitting_mannequin(body, betas_of(body, "mean", np.random.default_rng(0)))
     garments = all_garments(mannequin)
-    for name, member in CAST.items():
+    for name, member in (CAST | OUTSIDERS).items():
         assert member.build in BUILDS and member.stance in STANCES and member.tone in SKIN_TONES, name
         for wear in member.wears:
             dyes = HAIR_COLORS if garments[wear.garment].label == "hair" else DYES
             assert wear.dye.color in dyes and wear.dye.second in DYES and wear.dye.pattern in PATTERNS, name
+
+
+def test_noise_of_an_outsider_is_what_no_shape_has(body):
+    """Whatever the betas, the body stays away from hers; ears and fingers keep their form, both sides alike."""
+    other = outside_body(body, Outside(noise=0.01), seed=5)
+    offsets = other.v_template - body.v_template
+    found = np.linalg.lstsq(body.shapedirs.reshape(-1, body.num_betas), offsets.ravel(), rcond=None)[0]
+    assert np.abs(found).max() < 1e-9
+    params = Posing.of(body, "A", np.ones(20) * 0.3, facing=30.0, rng=np.random.default_rng(0)).params(1.0)
+    near = reachable(body, other, params)
+    apart = np.sqrt(
+        igl.point_mesh_squared_distance(other.forward(params).vertices[0], body.forward(near).vertices[0], body.faces)[
+            0
+        ]
+    )
+    legs = body.weights[:, [body.joint_names.index(f"{side}_knee") for side in ("left", "right")]].sum(axis=1) > 0.9
+    assert 0.003 < np.sqrt(np.mean(apart[legs] ** 2)) < 0.02
+    fingers = body.weights[:, [k for k, name in enumerate(body.joint_names) if "index" in name]].sum(axis=1) > 0.9
+    assert apart[fingers].max() < 0.008
+    assert outside_body(body, Outside(fists=True), seed=5) is body
+
+
+def test_longer_limbs_move_what_follows_them(body):
+    other = outside_body(body, Outside(limbs=1.1), seed=0)
+    joints = [one.joint_regressor @ one.v_template for one in (body, other)]
+
+    def length(k: int, start: str, end: str) -> float:
+        return float(np.linalg.norm(np.subtract(*(joints[k][body.joint_names.index(name)] for name in (start, end)))))
+
+    for side in ("left", "right"):
+        for start, end in ((f"{side}_knee", f"{side}_ankle"), (f"{side}_elbow", f"{side}_wrist")):
+            assert length(1, start, end) / length(0, start, end) == pytest.approx(1.1, abs=0.02)
+        assert length(1, f"{side}_hip", f"{side}_knee") == pytest.approx(
+            length(0, f"{side}_hip", f"{side}_knee"), abs=4e-3
+        )
+        assert length(1, f"{side}_wrist", f"{side}_index1") == pytest.approx(
+            length(0, f"{side}_wrist", f"{side}_index1"), abs=3e-3
+        )
+
+
+def test_heels_stand_on_the_floor_with_the_balls_of_the_feet(body):
+    outside = Outside(heels=0.07)
+    rest = BodyParams.rest(betas=np.zeros(body.num_betas), expressions=body.num_expressions)
+    blocks = heel_blocks(body, rest, outside)
+    posing = Posing.of(body, "T", np.zeros(body.num_betas), facing=0.0, rng=np.random.default_rng(0))
+    posing = replace(posing, jitter=0.0 * posing.jitter, added=outside.turns())
+    posed = body.forward(posing.params(1.0))
+    low = skin(blocks.vertices, blocks.weights, posed.posed_from_rest[0])[:, 1].min()
+    assert low == pytest.approx(posed.vertices[0][:, 1].min(), abs=1e-9)
+    flat = body.forward(rest).vertices[0]
+    heel = flat[:, 1] < flat[:, 1].min() + 0.03
+    heel &= flat[:, 2] < flat[heel, 2].min() + 0.03
+    assert posed.vertices[0][heel, 1].min() - posed.vertices[0][:, 1].min() == pytest.approx(0.07, abs=0.012)
+    # Their faces look outwards.
+    mesh = blocks.mesh
+    side = mesh.face_centers - np.where(
+        mesh.face_centers[:, :1] > 0, mesh.vertices[:48].mean(axis=0), mesh.vertices[48:].mean(axis=0)
+    )
+    around = (np.abs(mesh.face_normals[:, 1]) < 0.5) & (mesh.face_areas > 1e-9)
+    assert (np.einsum("ij,ij->i", mesh.face_normals, side)[around] > 0).all()
 
 
 def test_another_seed_gives_another_body_of_that_build(body):

@@ -19,6 +19,7 @@ from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.segment import label_by_body, read_labels, segment_scan
 from smplxpp.segment.by_body_outfit import NAT, RUNS, label_shares
+from smplxpp.segment.by_body_rings import cloth_against_skin
 
 PERSON = Path(__file__).resolve().parents[2] / "data/fixtures/person"
 _SKIN_RGB, _BLUE, _GREY = (222, 176, 150), (58, 98, 170), (90, 90, 94)
@@ -123,6 +124,61 @@ def test_nothing_tells_a_closed_jacket_from_a_shirt(body, scanned):
     result = label_by_body(mesh, body, params, colors=colors)
     assert result.confidence[result.face_labels == UPPER.id].max() < 0.95
     assert np.median(result.confidence[result.face_labels == LOWER.id]) > 0.95
+
+
+def thick_clothes(body: BodyModel, calves: float) -> tuple[TriangleMesh, dict[str, np.ndarray], BodyParams]:
+    """Shirt, shorts and shoes some centimetres above the body, and calves that no shape of it has; masks of faces."""
+    params = BodyParams.rest()
+    posed = body.forward(params)
+    mesh = body.mesh(posed.vertices[0])
+    joint = {name: posed.joints[0, k] for k, name in enumerate(body.joint_names)}
+    x, y, _ = mesh.vertices.T
+    inner = np.abs(x) < joint["left_elbow"][0] - 0.08
+    ankle, knee, hip = (joint[f"left_{name}"][1] for name in ("ankle", "knee", "hip"))
+    where = {
+        "shoe": y < ankle + 0.02,
+        "calf": (y >= ankle + 0.02) & (y < knee + 0.04),
+        "shorts": (y >= knee + 0.04) & (y < hip + 0.03),
+        "shirt": (y >= hip + 0.03) & (y < joint["neck"][1] - 0.04) & inner,
+    }
+    above = {"shoe": 0.012, "calf": calves, "shorts": 0.028, "shirt": 0.014}
+    away = sum((above[name] * mask for name, mask in where.items()), np.zeros(len(y)))
+    # The muscle rises from the ankle over half of the calf, and its widest place is 8 mm off the body.
+    away[where["calf"]] *= np.clip((y[where["calf"]] - ankle - 0.02) / (0.5 * (knee - ankle)), 0.0, 1.0)
+    outer = (body.part_labels == body.part_label_names.index("body"))[mesh.faces].all(axis=1)
+    masks = {name: mask[mesh.faces].all(axis=1) & outer for name, mask in where.items()}
+    return mesh.with_vertices(mesh.vertices + away[:, None] * mesh.vertex_normals), masks, params
+
+
+@pytest.mark.parametrize("calves", [0.0, 0.004, 0.008])
+def test_calves_that_no_shape_of_the_body_has_are_no_trousers(body, calves):
+    """Without colours: 4 mm off the body they were skin, at 8 mm trousers, whatever the shorts above."""
+    mesh, masks, params = thick_clothes(body, calves)
+    labels = label_by_body(mesh, body, params).face_labels
+    area = mesh.face_areas
+    for name, label in (("calf", SKIN), ("shorts", LOWER), ("shirt", UPPER)):
+        own = masks[name]
+        assert area[own] @ (labels[own] == label.id) > 0.85 * area[own].sum(), name
+
+
+def test_who_wears_nothing_wears_no_shirt(body):
+    """Without colours the bare body was labelled shirt, shoes and hair."""
+    params = BodyParams.rest()
+    mesh = body.mesh(body.forward(params).vertices[0])
+    labels = label_by_body(mesh, body, params).face_labels
+    below = mesh.face_centers[:, 1] < body.forward(params).joints[0, body.joint_names.index("neck"), 1]
+    area = mesh.face_areas[below]
+    assert area @ (labels[below] == SKIN.id) > 0.85 * area.sum()
+
+
+def test_a_distance_on_the_body_is_skin_and_a_centimetre_above_it_cloth():
+    """Densities against numbers by hand, and no jump where the body itself is uncertain."""
+    ratio = cloth_against_skin(np.array([0.0, 0.0035, 0.014, 0.03]), np.zeros(4))
+    by_hand = np.log(14 / 49 * np.exp(-2.0)) - np.log(0.5 / (8 * np.sqrt(2 * np.pi)) * np.exp(-0.5 * (14 / 8) ** 2))
+    assert ratio[0] < -3.0 and abs(ratio[1]) < 0.2 and ratio[3] == 3.0
+    assert ratio[2] == pytest.approx(by_hand, abs=1e-6)
+    wide = cloth_against_skin(np.array([0.014]), np.array([0.02]))
+    assert 0.0 < wide[0] < ratio[2]
 
 
 def test_legs_alone_wear_a_lower_garment(body, scanned):

@@ -167,6 +167,17 @@ def test_another_language_is_said_and_followed_by_its_sounds(spoken, recogniser,
     assert plain.notes == [] and "umbrella before the big storm" in plain.speech.transcript
 
 
+def test_a_quiet_recording_is_no_silence(spoken, recogniser, tmp_path):
+    """Public recordings at -66 dB were refused as silence."""
+    level = float(np.sqrt(np.mean(spoken.sound.samples**2)))
+    quiet = Sound(spoken.sound.samples * np.float32(5e-4 / level), spoken.sound.rate)
+    (tmp_path / "a.wav").write_bytes(wave_bytes(quiet))
+    found = align(read_wave(tmp_path / "a.wav"), TEXT)
+    truth = closures(spoken.speech)
+    assert len(closures(found)) == len(truth) and np.abs(closures(found) - truth).mean() < 0.06
+    assert hear(audio=tmp_path / "a.wav").notes == []
+
+
 def test_silence_and_a_blip_are_refused(recogniser):
     with pytest.raises(InputError, match="silence"):
         align(Sound(np.zeros(16_000, np.float32), 16_000))

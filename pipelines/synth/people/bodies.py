@@ -7,7 +7,7 @@ clothes are on.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -203,6 +203,7 @@ class Posing:
         stance: the stance.
         betas: her shape coefficients.
         facing: rotation about the vertical to her left, degrees.
+        added: rotations (3, 3) after those of the stance, by joint: heels, fists.
         jitter: rotation vectors added at every joint, radians.
     """
 
@@ -211,6 +212,7 @@ class Posing:
     betas: Float[np.ndarray, " B"]
     facing: float
     jitter: Float[np.ndarray, "J 3"]
+    added: Turns = field(default_factory=dict)
 
     @staticmethod
     def of(
@@ -233,6 +235,8 @@ class Posing:
         pose = np.zeros((1, len(self.body.joint_names), 3))
         for k, name in enumerate(self.body.joint_names):
             turn = Rotation.from_rotvec(self.jitter[k]) * Rotation.from_matrix(turns.get(name, np.eye(3)))
+            if name in self.added:
+                turn = Rotation.from_matrix(self.added[name]) * turn
             if name == "pelvis":
                 turn = Rotation.from_euler("y", self.facing, degrees=True) * turn
             pose[0, k] = turn.as_rotvec()

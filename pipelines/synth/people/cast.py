@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
+from pipelines.synth.people.outside import Outside
 from pipelines.synth.people.paint import Dye
 
 
@@ -33,6 +34,7 @@ class Member:
         tone: name in `SKIN_TONES`.
         facing: rotation about the vertical to her left, degrees.
         colored: whether the scan has colours.
+        outside: how the person differs from every shape of the body model.
     """
 
     build: str
@@ -41,6 +43,7 @@ class Member:
     tone: str
     facing: float
     colored: bool
+    outside: Outside = field(default_factory=Outside)
 
 
 def _member(build: str, stance: str, wears: str, tone: str, facing: float = 0.0, *, colored: bool = True) -> Member:
@@ -279,3 +282,54 @@ CAST: dict[str, Member] = {
     ),
     "mean body nearly naked bald, A": _member("mean", "A", "hot pants: white", "tan"),
 }
+
+
+def _outsider(member: Member, outside: Outside) -> Member:
+    return replace(member, outside=outside)
+
+
+OUTSIDERS: dict[str, Member] = {
+    "man T-shirt shorts, calves 8 mm": _outsider(
+        _member("man", "A", "shorts: navy | T-shirt: white | sneakers: red | short hair: brown", "light"),
+        Outside(calves=0.008),
+    ),
+    "broad man shorts uncoloured, calves 10 mm, noise 4 mm": _outsider(
+        _member("broad man", "wide A", "shorts: grey | T-shirt: teal | low shoes: black", "tan", colored=False),
+        Outside(calves=0.010, noise=0.004),
+    ),
+    "woman T-shirt shorts barefoot, noise 8 mm": _outsider(
+        _member("woman", "arms down", "shorts: beige | T-shirt: green | ponytail: black", "olive", 30),
+        Outside(noise=0.008),
+    ),
+    "heavy man trousers sweater, noise 12 mm": _outsider(
+        _member("heavy man", "A", "trousers: denim | sweater: wine | sneakers: white | short hair: grey", "pale"),
+        Outside(noise=0.012),
+    ),
+    "woman skirt blouse, heels, noise 5 mm": _outsider(
+        _member(
+            "tall woman",
+            "contrapposto",
+            "knee skirt: black | long-sleeved shirt: white | low shoes: red | bun: brown",
+            "light",
+            -60,
+        ),
+        Outside(heels=0.07, noise=0.005),
+    ),
+    "thin man shirt trousers, limbs 8 % longer, fists": _outsider(
+        _member(
+            "thin man",
+            "step",
+            "trousers: olive | long-sleeved shirt: blue | ankle boots: brown | short hair: red",
+            "tan",
+        ),
+        Outside(limbs=1.08, fists=True),
+    ),
+    "woman leggings top uncoloured, noise 8 mm": _outsider(
+        _member("woman", "A", "leggings: black | crop top: pink | sneakers: grey", "light", colored=False),
+        Outside(noise=0.008),
+    ),
+    "man nearly naked bald, noise 8 mm, fists": _outsider(
+        _member("man", "A", "hot pants: white", "brown", 90), Outside(noise=0.008, fists=True)
+    ),
+}
+"""People whose surface the body model cannot reach, so that a fit keeps the distances that it keeps to real people."""

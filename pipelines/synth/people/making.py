@@ -16,6 +16,7 @@ from pipelines.synth.garments.wardrobe import all_garments
 from pipelines.synth.patterns import smooth_noise
 from pipelines.synth.people.bodies import Posing, betas_of, fitting_mannequin
 from pipelines.synth.people.cast import Member, Wear
+from pipelines.synth.people.outside import heel_blocks, outside_body, seed_of
 from pipelines.synth.people.paint import cloth_paint, hair_paint, photographed, skin_paint
 from pipelines.synth.people.person_scan import PersonScan, face_majority
 from pipelines.synth.people.things import Thing, thing_mesh
@@ -69,7 +70,7 @@ def make_person(
     Args:
         name: of the member, which enters the seed.
         member: her description.
-        body: the body model.
+        body: the body model; hers has offsets from it where the member is outside its shapes.
         seed: of shape, pose, folds, patterns and noise.
         scan: settings of the simulated scan.
         thing: what she holds; its faces have the label "object".
@@ -77,9 +78,11 @@ def make_person(
     # Dress her, then pose her as far along her stance as the clothes let her hands come.
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng([seed, int.from_bytes(digest[:4], "little")])
+    body = outside_body(body, member.outside, seed=seed_of(name, seed))
     dressed = dress(member, body, rng)
     facing = member.facing if seed == 0 else float(rng.uniform(-180.0, 180.0))
     posing = Posing.of(body, member.stance, dressed.betas, facing=facing, rng=rng)
+    posing = replace(posing, added=member.outside.turns())
     params = posing.params(_reachable_share(dressed, posing))
     posed, sheets = pose_layers(dressed, params)
     # Put her on the floor, near the origin.
@@ -142,6 +145,10 @@ def dress(member: Member, body: BodyModel, rng: np.random.Generator) -> Dressed:
         cloth = _put_on(garment.make(), [one.cloth for one in worn], folds=wear.folds, seed=seed)
         worn.append(Layer(wear, LABEL_BY_NAME[garment.label].id, cloth, seed))
     sized = [replace(one, cloth=one.cloth.with_vertices(one.cloth.vertices * scale)) for one in worn]
+    if member.outside.heels:
+        shoes = next(one for one in sized if one.label == LABEL_BY_NAME["shoe"].id)
+        rest = BodyParams.rest(betas=betas, expressions=body.num_expressions)
+        sized.append(replace(shoes, cloth=heel_blocks(body, rest, member.outside)))
     return Dressed(body, betas, sized)
 
 

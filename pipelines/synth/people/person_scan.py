@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from smplxpp.body import BodyModel, load_body
+from smplxpp.body import BodyModel
 from smplxpp.clean import METRES_PER_UNIT, convert_points, simplify
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 
@@ -27,9 +27,10 @@ class PersonScan:
         colors: sRGB colour of each vertex; None for a scan without colours.
         face_labels: id of `smplxpp.core.labels` of the layer that each face shows.
         seen: whether a face lies on a layer that the scanner saw; false on bridges and filled holes.
-        params: one row that gives `body_vertices` with `load_body()`.
-        body_vertices: vertices of the open body under the clothes.
+        params: one row that gives `body_vertices` with `body`.
+        body_vertices: vertices of the body under the clothes, in the open body's order.
         joints: its joints.
+        body: the body of this person: the open body, or one whose surface that cannot reach (`outside.outside_body`).
         units: unit of `mesh`, as in `smplxpp.clean.convert_points`.
         up: up axis of `mesh`, likewise.
     """
@@ -42,6 +43,7 @@ class PersonScan:
     params: BodyParams
     body_vertices: Float[np.ndarray, "V 3"]
     joints: Float[np.ndarray, "J 3"]
+    body: BodyModel
     units: str = "m"
     up: str = "y"
 
@@ -58,18 +60,17 @@ class PersonScan:
     ) -> PersonScan:
         """Return a scan in metres, +Y up, whose body one row of parameters gives."""
         posed = body.forward(params)
-        return PersonScan(name, mesh, colors, face_labels, seen, params, posed.vertices[0], posed.joints[0])
+        return PersonScan(name, mesh, colors, face_labels, seen, params, posed.vertices[0], posed.joints[0], body)
 
     def as_read(self) -> PersonScan:
         """Return the same scan with its mesh in metres, +Y up."""
         vertices = convert_points(self.mesh.vertices, units=self.units, up=self.up)
         return replace(self, mesh=self.mesh.with_vertices(vertices), units="m", up="y")
 
-    def changed(self, body: BodyModel, params: BodyParams, mesh: TriangleMesh) -> PersonScan:
+    def changed(self, params: BodyParams, mesh: TriangleMesh) -> PersonScan:
         """Return the scan with another pose and other vertices; labels and colours stay."""
-        return PersonScan.of(
-            body, params, name=self.name, mesh=mesh, colors=self.colors, face_labels=self.face_labels, seen=self.seen
-        )
+        posed = self.body.forward(params)
+        return replace(self, params=params, mesh=mesh, body_vertices=posed.vertices[0], joints=posed.joints[0])
 
 
 def face_majority(vertex_labels: Int[np.ndarray, " N"], faces: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, " M"]:
@@ -92,22 +93,20 @@ def variant(scan: PersonScan, name: str) -> PersonScan:
 
 def turned(scan: PersonScan, degrees: float, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PersonScan:
     """Turn the person about the vertical axis to her left, then move her."""
-    body = load_body()
     turn = Rotation.from_euler("y", degrees, degrees=True)
-    posed = body.forward(scan.params)
+    posed = scan.body.forward(scan.params)
     orient = (turn * Rotation.from_rotvec(scan.params.global_orient[0].copy())).as_rotvec()[None]
     # The body turns about its root joint, and `transl` comes last.
     root = posed.rest_joints[0, 0]
     transl = (turn.apply(root + scan.params.transl[0]) + shift - root)[None]
     moved = scan.mesh.with_vertices(scan.mesh.vertices @ turn.as_matrix().T + shift)
-    return scan.changed(body, replace(scan.params, global_orient=orient, transl=transl), moved)
+    return scan.changed(replace(scan.params, global_orient=orient, transl=transl), moved)
 
 
 def mirrored(scan: PersonScan) -> PersonScan:
     """Mirror the person at x = 0. The body is symmetric to 0.4 mm, single vertices to 5 mm."""
-    body = load_body()
     mesh = TriangleMesh(scan.mesh.vertices * _FLIP, scan.mesh.faces[:, ::-1])
-    return scan.changed(body, mirrored_params(body, scan.params), mesh)
+    return scan.changed(mirrored_params(scan.body, scan.params), mesh)
 
 
 def mirrored_params(body: BodyModel, params: BodyParams) -> BodyParams:
