@@ -21,7 +21,7 @@ MIN_SCORE_OF_TEXT = 0.0
 """A given text that scores less belongs to another recording."""
 MIN_SCORE_OF_WORDS = -0.35
 """Recognised words that score less are no words: some may be wrong, but most of their phonemes are right."""
-MIN_ENGLISH = 0.6
+MIN_ENGLISH = 0.605
 """Recognised words with a lower `Recognition.score` belong to another language, music or noise. Chosen on recordings of
 people in seven languages; `python -m benchmarks spoken_languages` measures it."""
 _AGREEMENT = 0.25  # weight of the agreement, nats a row, beside the words' probability
