@@ -15,7 +15,7 @@ from smplxpp.build.completeness import completeness_checks, photograph_checks
 from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PreparedScan
 from smplxpp.clean import loop_lengths, thickened
-from smplxpp.core import CLOTH_LABELS, LABELS, SKIN, BodyParams, Check, InputError, StageOutput, TriangleMesh, spread
+from smplxpp.core import BACKGROUND, CLOTH_LABELS, LABELS, SKIN, BodyParams, Check, InputError, StageOutput, TriangleMesh, spread
 from smplxpp.core.solids import closed_mesh
 from smplxpp.core.topology import border_loops
 from smplxpp.metrics import CompareConfig, DirectedDistances, directed_distances, point_to_surface, summarize
@@ -64,7 +64,10 @@ def validate_template(
     """
     # Pose with the parameters of the scan: the template should then lie on the scan.
     posed = template.mesh.with_vertices(template.pose(params)[0])
-    found, checks, numbers = _against_scan(posed, template.vertex_labels, scan.mesh, face_labels, config)
+    # Patches over the holes of cuts are guesses where the scan shows nothing, so that they count for no label.
+    guessed = (template.scan_index < 0) & (template.vertex_part != template.part_names.index(BODY_PART))
+    labels = np.where(guessed, BACKGROUND, template.vertex_labels)
+    found, checks, numbers = _against_scan(posed, labels, scan.mesh, face_labels, config)
     whole, numbers["completeness"] = completeness_checks(template, params, scan.mesh, face_labels, found.to_template)
     checks += whole
     seen, numbers["photographs"] = photograph_checks(template, params, scan.mesh, scan.colors, inputs)
