@@ -28,8 +28,8 @@ from smplxpp.segment.smoothing import SmoothingConfig, edge_weights
 
 _CM2 = 1e4  # square centimetres in a square metre
 # Evidence of faces by their distance, in metres, from the nearest part of the body, interpolated. A fist, or fingers
-# that the fit bends otherwise, stand up to 2.5 cm off the fitted hand. What stands farther off an arm is a wide sleeve or
-# a thing beside it, which the fold between them tells apart.
+# that the fit bends otherwise, stand up to 2.5 cm off the fitted hand. What stands farther off an arm is a wide sleeve
+# or a thing beside it, which the fold between them tells apart.
 _AT_HAND = ((0.012, 0.025, 0.05), (-0.3, 0.0, 1.0))
 _AT_ARM = ((0.015, 0.035, 0.06, 0.12), (-1.0, -0.05, 0.02, 0.3))
 _ELSEWHERE = ((0.015, 0.05, 0.25, 0.35), (-1.0, -0.05, -0.03, 0.1))
