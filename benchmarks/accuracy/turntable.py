@@ -28,7 +28,7 @@ from smplxpp.core import BodyParams, Camera, normalize_rows
 from smplxpp.metrics.distance import MM
 from smplxpp.metrics.sampling import sample_surface
 from smplxpp.reconstruct import PhotoView, Reconstruction
-from smplxpp.reconstruct.turntable import coverage, reconstruct_turntable
+from smplxpp.reconstruct.turntable import reconstruct_turntable
 from smplxpp.register import Observations
 from smplxpp.register.turntable import TurntableConfig, TurntableFit, register_turntable
 
@@ -137,13 +137,9 @@ def surface_figures(
     ]
     points = sample_surface(true, SAMPLES, seed=1)
     visible = points.points[seen_by_two(true, points.points, normalize_rows(points.normals), views)]
-    used = [capture.frames.index(int(name)) for name in result.numbers["views"]]
-    (name,) = capture.cameras
-    shown = [PhotoView(str(k), found.camera, blank, capture.mask(name, capture.frames[k])) for k in used]
-    agreement = coverage(result.mesh, shown, posed_person(body, found.fit.params).select(used))[:, 1]
     return {
         **distances(mesh, true, visible),
-        "silhouettes": float(agreement.mean()),
+        "silhouettes": float(np.mean(list(result.numbers["silhouettes"].values()))),
         "left_out": len(result.numbers["left_out"]),
         "unseen": result.unseen,
     }

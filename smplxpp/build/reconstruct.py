@@ -15,7 +15,7 @@ import numpy as np
 from smplxpp.build.config import ReconstructInputs
 from smplxpp.build.limits import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
 from smplxpp.build.opened import opened
-from smplxpp.build.turning import turn_agreement, turning_person
+from smplxpp.build.turning import turning_person
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture
 from smplxpp.capture.recording import TURNTABLE
@@ -189,8 +189,7 @@ def reconstruct_frame(
     if capture.kind == TURNTABLE:
         turn, notes = turning_person(capture, cameras[0], frame, body or load_body())
         result = make(turn.views, person=turn.person, progress=progress)
-        agreement = turn_agreement(result, turn)
-        return result, {**result.numbers, "silhouettes": agreement, "problems": [*notes, *result.notes]}
+        return result, {**result.numbers, "problems": [*notes, *result.notes]}
     views, notes = photographs(capture, cameras, frame)
     result = make(views, progress=progress)
     # Intersection over union of the rendered surface and the mask, for the views that the reconstruction used.

@@ -8,12 +8,13 @@ import numpy as np
 
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
-from smplxpp.core import BodyParams, InputError
+from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
+from smplxpp.register.kinematics import BodyState
 from smplxpp.register.landmarks import visible_vertices
-from smplxpp.reconstruct import PhotoView, Reconstruction
+from smplxpp.reconstruct import PhotoView
 from smplxpp.reconstruct.carried import PosedPerson
-from smplxpp.reconstruct.turntable import coverage
 
+_SPREAD_DEGREES = 12.0  # of each leg, which takes knees that touch some 20 cm apart
 _BODY_JOINTS = 22  # joints that carry the space around a body; fingers and face follow wrists and head
 
 
@@ -69,9 +70,15 @@ def turning_person(
 
 
 def posed_person(body: BodyModel, params: BodyParams) -> PosedPerson:
-    """Return the body in some frames, with the first of them as the reference pose."""
-    posed = body.forward(params)
+    """Return the body in some frames, to carve a surface in the pose of the first of them.
+
+    The surface is carved with the legs of that pose spread further and carried back: thighs that touch would become
+    one.
+    """
+    apart = spread_legs(body, params.frame(0))
+    posed, reference = body.forward(params), body.forward(apart)
     transforms = np.asarray(posed.posed_from_rest, dtype=np.float64)
+    from_reference = np.linalg.inv(np.asarray(reference.posed_from_rest[0], dtype=np.float64))
     # Joints beyond the body's own follow their nearest ancestor among these.
     carrier = np.arange(body.joint_count)
     for joint in range(body.joint_count):
@@ -79,15 +86,17 @@ def posed_person(body: BodyModel, params: BodyParams) -> PosedPerson:
             carrier[joint] = body.parents[carrier[joint]]
     weights = np.zeros((min(_BODY_JOINTS, body.joint_count), body.vertex_count))
     np.add.at(weights, carrier, body.weights.T)
-    moved = transforms[:, : len(weights)] @ np.linalg.inv(transforms[0, : len(weights)])
-    mesh = body.mesh(np.asarray(posed.vertices[0], dtype=np.float64))
+    moved = (transforms @ from_reference)[:, : len(weights)]
+    mesh = body.mesh(np.asarray(reference.vertices[0], dtype=np.float64))
     shown = visible_vertices(body)
-    return PosedPerson(mesh.vertices[shown], mesh.vertex_normals[shown], weights.T[shown], moved)
+    return PosedPerson(mesh.vertices[shown], mesh.vertex_normals[shown], weights.T[shown], moved, moved[0])
 
 
-def turn_agreement(result: Reconstruction, turn: TurningPerson) -> dict[str, float]:
-    """Return the intersection over union of the posed surface and the mask of every frame that was used."""
-    used = [row for row, view in enumerate(turn.views) if view.name in result.numbers["views"]]
-    views = [turn.views[row] for row in used]
-    shares = coverage(result.mesh, views, turn.person.select(used))[:, 1]
-    return {view.name: float(share) for view, share in zip(views, shares, strict=True)}
+def spread_legs(body: BodyModel, params: BodyParams) -> BodyParams:
+    """Return one row of parameters with each leg turned outwards at the hip by `_SPREAD_DEGREES`."""
+    state = BodyState.of_params(body, params)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        joint = body.joint_names.index(f"{side}_hip")
+        outwards = matrix_from_rotvec(np.radians([0.0, 0.0, sign * _SPREAD_DEGREES]))
+        state.rotations[:, joint] = outwards @ state.rotations[:, joint]
+    return state.to_params(body)

@@ -24,20 +24,30 @@ class PosedPerson:
     """The body that carries the space around it from the reference pose to the poses of T frames.
 
     Attributes:
-        vertices: of the body's surface in the reference pose, metres.
+        vertices: of the body's surface in the reference pose, metres; limbs apart from each other.
         normals: of these vertices, outward unit vectors.
         weights: skinning weights.
         transforms: of the joints, from the reference pose to that of each frame.
+        result: of the joints, from the reference pose to that of the finished surface; None: they are the same.
     """
 
     vertices: Float64[np.ndarray, "V 3"]
     normals: Float64[np.ndarray, "V 3"]
     weights: Float[np.ndarray, "V J"]
     transforms: Float64[np.ndarray, "T J 4 4"]
+    result: Float64[np.ndarray, "J 4 4"] | None = None
 
     def select(self, rows: Sequence[int]) -> PosedPerson:
         """Return the person in some of the frames."""
         return replace(self, transforms=self.transforms[list(rows)])
+
+    def finished(self, mesh: TriangleMesh) -> TriangleMesh:
+        """Return a surface in the reference pose carried to the pose of the finished surface."""
+        if self.result is None:
+            return mesh
+        carrier = replace(self, transforms=self.result[None]).carrier()
+        features = carrier.features(mesh.vertices, carrier.weights_at(mesh.vertices))
+        return mesh.with_vertices(carrier.carried(features, 0))
 
     def room(
         self,

@@ -1,8 +1,8 @@
 """Bound how far clothes and hair stand off a body, by its rims in the silhouettes of a turn.
 
 A vertex whose normal is across the ray lies at the rim of the body. Its depth inside the silhouette is how far clothes
-stand off there, unless another limb or a wide garment is beside it, which makes the depth larger. So the least depth of
-a vertex over the frames is kept, and every vertex takes the median over the rims near it.
+stand off there, unless another limb is beside it: then the contour is that limb's, and the rim is not counted. The
+least depth of a vertex over the frames is kept, and every vertex takes the median over the rims near it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette
 REACH_M = 0.25
 """Distance from the body's surface to its farthest clothes and hair."""
 _RIM_COSINE = 0.15  # between normal and ray
-_NEAR_M, _MOST_NEAR, _LEAST_NEAR = 0.12, 48, 8
+_THIN_M = 0.02  # gaps below it are no limb's
+_NEAR_M, _MOST_NEAR, _LEAST_NEAR = 0.2, 48, 8
 # Added to the median: folds, and errors of body and poses. Where no rim is near, what most clothes keep to.
 _SLACK_M, _UNKNOWN_M = 0.008, 0.08
 
@@ -31,7 +32,7 @@ def clothing_limits(silhouettes: Sequence[Silhouette], person: PosedPerson) -> F
         silhouettes: a frame each.
         person: the body in these frames.
     """
-    # Every second vertex is enough for what is averaged over 12 cm.
+    # Every second vertex is enough for what is averaged over 20 cm.
     rows = np.arange(0, len(person.vertices), 2)
     carrier = person.carrier()
     weights = np.asarray(person.weights, np.float32)[rows]
@@ -45,8 +46,14 @@ def clothing_limits(silhouettes: Sequence[Silhouette], person: PosedPerson) -> F
         cosine = np.einsum("nx,nx->n", rays, normals) / np.linalg.norm(rays, axis=1)
         rim = np.flatnonzero(np.abs(cosine) < _RIM_COSINE)
         depth = silhouette.depth(points[rim].astype(np.float32))
-        depth = np.where(depth < UNSEEN, np.maximum(depth, 0.0), np.inf)
-        least[rim] = np.minimum(least[rim], depth)
+        shown = depth < UNSEEN
+        depth = np.maximum(depth, 0.0)
+        # Half as far outwards there is cloth and nothing of the body in the image; else another limb has the contour.
+        there = points[rim] + np.where(shown, 0.5 * depth, 0.0)[:, None] * normals[rim]
+        own, screen = (silhouette.camera.screen_from_world(place) for place in (points, there))
+        away = cKDTree(own[:, :2]).query(screen[:, :2])[0] * silhouette.pixel * screen[:, 2]
+        reached = (away > 0.3 * depth) | (depth < _THIN_M)
+        least[rim] = np.minimum(least[rim], np.where(shown & reached, depth, np.inf))
     # The median over the rims that lie near in the reference pose.
     seen = np.flatnonzero(np.isfinite(least))
     limits = np.full(len(person.vertices), _UNKNOWN_M)

@@ -51,7 +51,7 @@ def reconstruct_turntable(
     *,
     progress: ProgressCallback = ignore_progress,
 ) -> Reconstruction:
-    """Reconstruct a person who turns before one camera, in the reference pose.
+    """Reconstruct a person who turns before one camera, carved in the reference pose of the body.
 
     Args:
         views: a photograph and a mask a frame, through the camera that stands still.
@@ -93,7 +93,10 @@ def reconstruct_turntable(
         "cell_mm": 1e3 * cell,
     }
     pyramids = CarriedPyramids.of_turn(views, person.carrier())
-    return refined(hull, pyramids, inside, config, (notes, numbers), progress=progress)
+    found = refined(hull, pyramids, inside, config, (notes, numbers), progress=progress)
+    agreement = coverage(found.mesh, views, person)[:, 1]
+    numbers["silhouettes"] = {view.name: float(share) for view, share in zip(views, agreement, strict=True)}
+    return replace(found, mesh=person.finished(found.mesh), hull=person.finished(found.hull))
 
 
 def _usable(views: Sequence[PhotoView], person: PosedPerson) -> tuple[list[PhotoView], PosedPerson, dict[str, str]]:

@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from smplxpp.body import load_body
 from smplxpp.build.turning import posed_person
 from smplxpp.core import InputError
+from smplxpp.core.topology import face_components
 from smplxpp.reconstruct import PhotoView, ReconstructConfig
 from smplxpp.reconstruct.turntable import reconstruct_turntable
+from tests.register import turns
 from tests.register.turns import turned_person
 
 BODY = load_body()
@@ -68,3 +71,20 @@ def test_masks_of_nobody_are_refused(turn, views):
     empty = [replace(view, opacity=np.zeros_like(view.opacity)) for view in views]
     with pytest.raises(InputError, match="at least 4 with a photograph"):
         reconstruct_turntable(empty, posed_person(BODY, turn.params), COARSE)
+
+
+def test_legs_in_trousers_that_touch_stay_two(monkeypatch):
+    for side, sign in (("left", -1.0), ("right", 1.0)):
+        monkeypatch.setitem(turns.HELD, f"{side}_hip", (0, 0, sign * 2.5))
+    close = turned_person(BODY, 6, sway=1.0, height=160)
+    # Masks two pixels wider, as of trousers that stand off by 25 mm and close the gap between the legs.
+    dressed = [255 * ndimage.binary_dilation(mask > 0, iterations=2).astype(np.uint8) for mask in close.masks]
+    color = np.zeros((*dressed[0].shape, 3), np.uint8)
+    views = [PhotoView(str(k), close.camera, color, mask) for k, mask in enumerate(dressed)]
+    mesh = reconstruct_turntable(views, posed_person(BODY, close.params), COARSE).mesh
+    # Cut through the thighs, two fifths of the way from knee to hip: what is below are two pieces of one size.
+    joints = BODY.forward(close.params.frame(0)).joints[0]
+    knee, hip = (joints[BODY.joint_names.index(f"left_{name}"), 1] for name in ("knee", "hip"))
+    low = (mesh.vertices[mesh.faces, 1] < knee + 0.4 * (hip - knee)).all(axis=1)
+    sizes = np.sort(np.bincount(face_components(mesh.submesh(low)[0].faces)))[::-1]
+    assert len(sizes) >= 2 and sizes[1] > 0.8 * sizes[0]
