@@ -319,7 +319,7 @@ class _Turn:
         self, state: BodyState, shared: Shared, equations: NormalEquations, numbers: tuple[float, float]
     ) -> TurntableFit:
         """Collect poses, residuals, confidence and the camera."""
-        rows = np.arange(len(state))
+        rows = range(len(state))
         postures = [self.kinematics.posture(state, row) for row in rows]
         px = [self.term.residual_px(row, self.kinematics, postures[row]) for row in rows]
         residuals = {"keypoints_px": np.array(px)}
@@ -328,7 +328,7 @@ class _Turn:
             term = self._surface_term(state, outlines)
             contour = [term.residual_px(row, self.kinematics, postures[row]) for row in rows]
             residuals["silhouette_px"] = np.array(contour)
-        confidence = joint_confidence(self.kinematics, state, equations, rows)
+        confidence = joint_confidence(self.kinematics, state, equations, np.arange(len(state)))
         params = state.to_params(self.body, fps=self.observed.fps)
         fit = BodyFit(tuple(self.observed.frames), params, confidence, residuals, notes=tuple(self.notes))
         focal_spread, cost = numbers
