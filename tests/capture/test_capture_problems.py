@@ -223,7 +223,7 @@ def test_cameras_of_4ddress_that_were_not_released_are_left_out(tmp_path):
 def test_a_folder_of_two_layouts_is_ambiguous(rig):
     (rig / "intri.yml").write_text("")
     (rig / "extri.yml").write_text("")
-    with pytest.raises(InputError, match=r"simple and easymocap.*format="):
+    with pytest.raises(InputError, match=r"simple and easymocap.*format"):
         open_capture(rig)
     assert open_capture(rig, format="simple").format == "simple"
 
