@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, read_json, shown
 from smplxpp.core.files.paths import path_inside
+from smplxpp.core.validation import require_choice
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -48,11 +49,14 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def require_plain_fields(cls: type[DataclassInstance], values: Mapping[str, Any], *, subject: str) -> None:
     """Raise `InputError` unless values are of the kinds that a dataclass's annotations name, where these are plain."""
+    hints = get_type_hints(cls)
     for field in fields(cls):
         value, place = values.get(field.name), f"{subject}: {field.name}"
         optional = str(field.type).endswith(" | None")
         if field.name not in values or (optional and value is None):
             continue
+        if get_origin(hints[field.name]) is Literal:
+            require_choice(place, value, get_args(hints[field.name]))
         match str(field.type).removesuffix(" | None"):
             case "int":
                 as_integer(value, subject=place)

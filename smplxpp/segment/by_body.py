@@ -181,11 +181,13 @@ def weigh_evidence(
     # The misfit of the body is the robust spread (1.4826 MAD) of the distances of face and hands.
     chart = chart_of_scan(mesh, body, params)
     pairs, _ = face_adjacency(mesh.faces)
-    # What the person holds says nothing about her clothes, so that it has no area in the steps that follow.
-    objects = find_objects(mesh, body, params, lab=lab)
+    # What the person holds says nothing about her clothes, so that it has no area in the steps that follow. A body that
+    # is not even at the face, where nothing is held, would make a thing of her own arm.
+    elsewhere = chart.face_core.any() and _spread(chart.distance[chart.face_core]) > BODY_ELSEWHERE
+    objects = FoundObjects.none(mesh.face_count) if elsewhere else find_objects(mesh, body, params, lab=lab)
     area = np.where(objects.faces, 0.0, mesh.face_areas)
     bare = (chart.face_core | chart.hand_core) & ~objects.faces
-    misfit = float(1.4826 * np.median(np.abs(chart.distance[bare if bare.any() else slice(None)])))
+    misfit = _spread(chart.distance[bare if bare.any() else slice(None)])
     misplaced = float(np.clip(misfit, 0.003, 0.02))
     # Colours: the palette, the skin model, and layers that hang over other clothes.
     skin, palette = None, None
@@ -251,6 +253,11 @@ def weigh_evidence(
 
 _CERTAIN = 12.0
 """Nats, the largest cost of a label at a face."""
+
+
+def _spread(distance: np.ndarray) -> float:
+    """Return the robust standard deviation about 0, 1.4826 times the median of the absolute values."""
+    return float(1.4826 * np.median(np.abs(distance)))
 
 
 def _local_misfit(chart: BodyChart, column: Rings, arm: Rings, misfit: float) -> Float64[np.ndarray, " M"]:

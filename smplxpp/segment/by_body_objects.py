@@ -51,6 +51,11 @@ class FoundObjects:
     faces: Bool[np.ndarray, " M"]
     notes: tuple[str, ...]
 
+    @staticmethod
+    def none(count: int) -> FoundObjects:
+        """Return no things on a scan of `count` faces."""
+        return FoundObjects(np.zeros(count, dtype=bool), ())
+
 
 def find_objects(
     mesh: TriangleMesh,
@@ -69,7 +74,7 @@ def find_objects(
     """
     own, posed = chart_of_body(body, params), body.forward(params).vertices[0]
     pairs, ends = face_adjacency(mesh.faces)
-    nothing = FoundObjects(np.zeros(mesh.face_count, dtype=bool), ())
+    nothing = FoundObjects.none(mesh.face_count)
     hand = own.region == HAND
     if not hand.any():
         return nothing

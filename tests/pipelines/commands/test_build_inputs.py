@@ -16,7 +16,7 @@ from pipelines.stages.build_config import (
     save_reconstruct,
     stages_of,
 )
-from smplxpp.core.errors import InputError
+from smplxpp.core import BodyParams, InputError
 
 PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
 
@@ -111,7 +111,7 @@ def test_the_frame_of_the_capture_is_kept_apart_from_the_row_of_a_file(tmp_path)
     for frame in (0, 8):
         (capture / "scans" / f"scan_{frame:06d}.ply").touch()
         (capture / "scans" / f"scan_{frame:06d}_labels.npz").touch()
-        (capture / "params" / f"{frame:06d}.npz").touch()
+        BodyParams.rest().save(capture / "params" / f"{frame:06d}.npz")
     inputs = Build(run_folder=tmp_path / "run", capture=capture, frame=8).plan().inputs
     assert (inputs.frame, inputs.params_row, inputs.params.name) == (8, 0, "000008.npz")
     save_build(tmp_path, inputs, BuildConfig())

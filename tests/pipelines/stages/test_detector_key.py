@@ -21,7 +21,7 @@ def test_another_model_of_the_same_name_is_asked_again(tmp_path: Path, monkeypat
 
     def run(folder, build):
         asked.append(build.config.detector)
-        return StageOutput([], {})
+        return StageOutput([], {"confidence": 1.0})
 
     monkeypatch.setitem(PARTS, LOCATE_STAGE, replace(PARTS[LOCATE_STAGE], work=run))
     scan = tmp_path / "scan.ply"

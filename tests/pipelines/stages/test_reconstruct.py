@@ -84,19 +84,19 @@ def test_frames_that_were_finished_before_a_kill_are_not_made_again(tmp_path, mo
     inputs = ReconstructInputs(FIXTURE, (0, 2), refine=False, cell_mm=40.0)
     made, whole = [], stage_module._keep_frame
 
-    def killed(folder, capture, cameras, frame, *rest):
+    def killed(folder, frame, *rest):
         if made:
             raise KeyboardInterrupt
         made.append(frame)
-        whole(folder, capture, cameras, frame, *rest)
+        whole(folder, frame, *rest)
 
     monkeypatch.setattr(stage_module, "_keep_frame", killed)
     with pytest.raises(KeyboardInterrupt):
         reconstruct_capture(tmp_path, inputs)
 
-    def counted(folder, capture, cameras, frame, *rest):
+    def counted(folder, frame, *rest):
         made.append(frame)
-        whole(folder, capture, cameras, frame, *rest)
+        whole(folder, frame, *rest)
 
     monkeypatch.setattr(stage_module, "_keep_frame", counted)
     record = reconstruct_capture(tmp_path, inputs)
