@@ -56,7 +56,7 @@ def require_plain_fields(cls: type[DataclassInstance], values: Mapping[str, Any]
         if field.name not in values or (optional and value is None):
             continue
         if get_origin(hints[field.name]) is Literal:
-            require_choice(place, value, get_args(hints[field.name]))
+            require_choice(place, as_text(value, subject=place), get_args(hints[field.name]))
         match str(field.type).removesuffix(" | None"):
             case "int":
                 as_integer(value, subject=place)

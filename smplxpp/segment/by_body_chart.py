@@ -142,8 +142,35 @@ def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> Bo
     # Near the body the distance is that to the vertex's tangent plane, farther than 4 cm that to the vertex.
     far = row_lengths(offset)
     distance = np.where(far < 0.04, along, np.copysign(far, along))
+    # The body's vertices are centimetres apart along a shin, so that heights go on between them by their gradient.
     place = own[nearest]
-    return BodyChart(place.region, place.height, place.reach, place.azimuth, place.face_height, distance, place.side)
+    beside = offset - along[:, None] * normals[nearest]
+    height, reach = (
+        value[nearest] + _between_vertices(posed, value, nearest, beside) for value in (own.height, own.reach)
+    )
+    return BodyChart(place.region, height, reach, place.azimuth, place.face_height, distance, place.side)
+
+
+def _between_vertices(
+    posed: TriangleMesh, value: Float64[np.ndarray, " V"], nearest: np.ndarray, beside: Float64[np.ndarray, "M 3"]
+) -> Float64[np.ndarray, " M"]:
+    """Return by how much a function of the vertices changes from the nearest vertex over an offset along the surface.
+
+    The gradient g at a vertex minimises sum_j (value_j - value - g (x_j - x))^2 over its neighbours j; the change is
+    bounded by half of the largest difference to a neighbour, where the next vertex begins.
+    """
+    ends = np.concatenate([posed.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    start, end = np.concatenate([ends, ends[:, ::-1]]).T
+    step, rise = posed.vertices[end] - posed.vertices[start], value[end] - value[start]
+    matrix, right = np.zeros((len(value), 3, 3)), np.zeros((len(value), 3))
+    np.add.at(matrix, start, step[:, :, None] * step[:, None, :])
+    np.add.at(right, start, step * rise[:, None])
+    # The normal direction, in which the neighbours do not lie, is kept from the gradient by a small regularisation.
+    damping = 1e-3 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+    gradient = np.linalg.solve(matrix + damping, right[:, :, None])[:, :, 0]
+    bound = np.zeros(len(value))
+    np.maximum.at(bound, start, 0.5 * np.abs(rise))
+    return np.clip(np.einsum("ij,ij->i", gradient[nearest], beside), -bound[nearest], bound[nearest])
 
 
 def in_column(chart: BodyChart) -> np.ndarray:

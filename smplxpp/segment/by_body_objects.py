@@ -94,7 +94,8 @@ def find_objects(
     unary -= unary.min(axis=1, keepdims=True)
     cut = minimize_potts(PottsProblem.from_costs(unary, pairs, cost))[0].astype(bool)
     hands = [posed[hand & (own.side == side)] for side in (1, -1)]
-    return _accepted(mesh, cut, pairs, (length, cost), (distance, to_hand), hands)
+    middle = posed[own.region == TRUNK].mean(axis=0)
+    return _accepted(mesh, cut, pairs, (length, cost), (distance, to_hand, _sectors(mesh, middle)), hands)
 
 
 _LEAST_AREA = 60.0
@@ -111,6 +112,16 @@ _SMOOTH_BORDER = 0.6
 """Mean cost of the cut, as a share of that through smooth and plain surface, from which it is no border of a thing."""
 
 
+_SECTORS, _ALL_ROUND = 12, 9
+"""Sectors of 30 degrees about the person, and the number of them from which a piece goes round her, as skirts do."""
+
+
+def _sectors(mesh: TriangleMesh, middle: Float64[np.ndarray, " 3"]) -> Int64[np.ndarray, " M"]:
+    """Return the sector of each face about the vertical axis through `middle`."""
+    x, _, z = (mesh.face_centers - middle).T
+    return np.floor((np.arctan2(x, z) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS
+
+
 def _evidence(distance: np.ndarray, region: np.ndarray, chest: np.ndarray) -> Float64[np.ndarray, " M"]:
     """Return the evidence of each face that it belongs to a thing, a square centimetre for each of its own."""
     out = np.interp(distance, *_ELSEWHERE)
@@ -125,7 +136,7 @@ def _accepted(
     cut: Bool[np.ndarray, " M"],
     pairs: Int64[np.ndarray, "P 2"],
     edges: tuple[np.ndarray, np.ndarray],
-    where: tuple[np.ndarray, np.ndarray],
+    where: tuple[np.ndarray, np.ndarray, np.ndarray],
     hands: list[np.ndarray],
 ) -> FoundObjects:
     """Keep the pieces of a cut that are things.
@@ -135,10 +146,10 @@ def _accepted(
         cut: faces on the side of things.
         pairs: the two faces of each edge.
         edges: length, in centimetres, and cost of each edge.
-        where: distance of each face to the body and to its hands, metres.
+        where: distance of each face to the body and to its hands, metres, and its sector about the person.
         hands: points of either hand of the body.
     """
-    distance, to_hand = where
+    distance, to_hand, sector = where
     # A hand that what is left of the scan does not show lies elsewhere: then a small piece is the hand itself.
     left = cKDTree(mesh.face_centers[~cut]) if not cut.all() else None
     shown = [bool(left and len(h) and (left.query(h)[0] < _SHOWS).mean() > _SHOWN) for h in hands]
@@ -150,6 +161,10 @@ def _accepted(
         own = cut & (piece == number)
         area = float(mesh.face_areas[own].sum()) * _CM2
         if area < _LEAST_AREA or distance[own].max() < _LEAST_REACH or to_hand[own].min() > _TOUCHES:
+            continue
+        # Clothes that hang far off the legs go round the person; a thing is on one side of her.
+        around = np.bincount(sector[own], mesh.face_areas[own], minlength=_SECTORS) * _CM2 / area
+        if (around > 0.02).sum() >= _ALL_ROUND:
             continue
         center = mesh.face_centers[own][to_hand[own].argmin()]
         nearest = int(np.argmin([np.linalg.norm(h - center, axis=1).min() if len(h) else np.inf for h in hands]))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipelines.synth.people.things import THINGS, Thing, thing_mesh
 from pipelines.synth.scan_simulation import ScanConfig, simulate_scan
 from smplxpp.body import BodyModel, PosedBody, load_body
-from smplxpp.core import OBJECT, BodyParams, InputError, concatenate_meshes
+from smplxpp.core import OBJECT, BodyParams, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.segment import label_by_body
 from smplxpp.segment.by_body_objects import find_objects
 from smplxpp.transfer import rigid_weights
@@ -86,6 +88,34 @@ def test_what_stands_beside_the_person_is_no_thing_in_her_hand(open_body, stance
     beside = case.with_vertices(case.vertices - [0.5, 0.0, 0.0])
     mesh = concatenate_meshes([open_body.mesh(posed.vertices[0]), beside])
     assert not find_objects(mesh, open_body, params).faces.any()
+
+
+def test_a_skirt_that_stands_off_the_legs_all_round_is_no_thing(open_body, stance):
+    """A cone from the hips to the ankles, half a metre wide at the hem, which begins at the hands."""
+    params, posed = stance
+    skin = open_body.mesh(posed.vertices[0])
+    hands = posed.joints[0, [open_body.joint_names.index(f"{side}_wrist") for side in ("left", "right")]]
+    pelvis, top = posed.joints[0, 0], hands[:, 1].max() + 0.05
+    turn, down = np.meshgrid(
+        np.linspace(0.0, 2.0 * np.pi, 80, endpoint=False), np.linspace(0.0, 1.0, 40), indexing="ij"
+    )
+    wide = np.linalg.norm((hands - pelvis)[:, [0, 2]], axis=1).mean()
+    radius = wide + 0.1 * down
+    height = top + down * (skin.vertices[:, 1].min() + 0.1 - top)
+    points = np.stack([pelvis[0] + radius * np.sin(turn), height, pelvis[2] + radius * np.cos(turn)], axis=-1)
+    at = np.arange(80 * 40).reshape(80, 40)
+    a, b, c, d = at[:, :-1], np.roll(at, -1, axis=0)[:, :-1], np.roll(at, -1, axis=0)[:, 1:], at[:, 1:]
+    faces = np.concatenate([np.stack([a, d, b], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    skirt = TriangleMesh(points.reshape(-1, 3), faces)
+    assert not find_objects(concatenate_meshes([skin, skirt]), open_body, params).faces.any()
+
+
+def test_no_thing_is_sought_beside_a_body_that_is_not_at_the_face(open_body, stance, scan):
+    mesh, _ = scan
+    params, _ = stance
+    elsewhere = replace(params, transl=params.transl + [0.0, 0.0, 0.25])
+    result = label_by_body(mesh, open_body, elsewhere)
+    assert not (result.face_labels == OBJECT.id).any() and any("no label can be trusted" in n for n in result.notes)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
