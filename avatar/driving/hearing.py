@@ -113,10 +113,10 @@ def _follow(sound: Sound, text: str | None, follow: str) -> tuple[Speech, list[s
     except NotEnglishError as error:
         if follow == "words":
             raise
-        doubt = f"the recording does not sound like English ({error.received})"
-        return recognise_phonemes(sound), [f"{doubt}: followed by its sounds; --hear words follows words all the same"]
-    doubt = f"the words hardly match the sounds ({found.score:.2f}, English has {MIN_ENGLISH:g} and more)"
-    return found.speech, [] if found.english else [doubt]
+        note = f"the recording does not sound like English ({error.received})"
+        return recognise_phonemes(sound), [f"{note}: followed by its sounds; --hear words follows words all the same"]
+    note = f"the words hardly match the sounds ({found.score:.2f}, English has {MIN_ENGLISH:g} and more)"
+    return found.speech, [] if found.english else [note]
 
 
 def _lasting(speech: Speech, seconds: float) -> Speech:

@@ -195,9 +195,9 @@ class Conversation:
         self.frames.listen(False)
         if part.cut:
             self._note("Only the first half minute was heard.")
-        if not words or recogniser.doubt:
+        if not words or recogniser.other_language:
             self._tell({"kind": "heard", "text": ""})
-            self._note(recogniser.doubt or "I heard something, but no words.")
+            self._note(recogniser.other_language or "I heard something, but no words.")
             return
         self._begin(words, began, spoken=True, pause=decided - began)
 

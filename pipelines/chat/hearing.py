@@ -192,7 +192,7 @@ class Recogniser:
     Words of low confidence are aligned with their sound: those that do not match it are another language or noise.
 
     Attributes:
-        doubt: of the last utterance: why its words are none of English, a sentence; "" where they are.
+        other_language: of the last utterance: why its words are none of English, a sentence; "" where they are.
 
     Raises:
         MissingExtraError: pocketsphinx is not installed.
@@ -212,7 +212,7 @@ class Recogniser:
         self._decoder = pocketsphinx.Decoder(samprate=float(RATE), loglevel="FATAL")
         self._open = False
         self._samples: list[np.ndarray] = []
-        self.doubt = ""
+        self.other_language = ""
 
     def begin(self) -> None:
         """Begin an utterance and drop one that was not ended."""
@@ -229,9 +229,9 @@ class Recogniser:
         self._decoder.process_raw(samples.astype("<i2").tobytes())
 
     def end(self) -> str:
-        """Return the words of the utterance, "" if it has none; `doubt` tells whether they are English."""
+        """Return the words of the utterance, "" if it has none; `other_language` tells whether they are English."""
         self._decoder.end_utt()
-        self._open, self.doubt = False, ""
+        self._open, self.other_language = False, ""
         try:
             words, confidence = hypothesis(self._decoder)
         except NotEnglishError:
@@ -243,5 +243,7 @@ class Recogniser:
                 english = judge(sound, words, confidence, recogniser=self._decoder).english
             except InputError:  # no better than at random, or hardly a sound
                 english = False
-            self.doubt = "" if english else f'That did not sound like English; the nearest words are "{spoken}".'
+            self.other_language = (
+                "" if english else f'That did not sound like English; the nearest words are "{spoken}".'
+            )
         return spoken

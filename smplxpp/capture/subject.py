@@ -87,7 +87,7 @@ class SubjectKeypoints:
         """Read the subject's keypoints of a camera, None without any.
 
         Raises:
-            InputError: a damaged file, or a `subject` that nobody is.
+            InputError: a damaged file, or a `subject` that is no person found.
         """
         if camera not in self._chosen[0]:
             return self.files.read(camera)
@@ -131,10 +131,10 @@ def choose_subject(
         mask: reads the masks of the person that is wanted.
 
     Returns:
-        The person of each camera and frame, None where nobody is the subject; and sentences about who was taken.
+        The person of each camera and frame, None where the subject is not seen; and sentences about who was taken.
 
     Raises:
-        InputError: a `subject` that nobody is.
+        InputError: a `subject` that is no person found.
     """
     names = [name for name in cameras if name in people]
     frames = sorted({frame for name in names for frame in people[name]})

@@ -226,24 +226,24 @@ class ClothDriver:
         return self._rows_skinned.posed(posed, self._shaped_rest, origin=self._origin)
 
     def follow(
-        self, way: Sequence[BodyParams], seconds: float, drawn: BodyParams | None, *, posed: PosedBody | None = None
+        self, poses: Sequence[BodyParams], seconds: float, drawn: BodyParams | None, *, posed: PosedBody | None = None
     ) -> ClothShape:
         """Go on along poses that are even in time, and return the cloth for the body that is drawn at their end.
 
         Args:
-            way: at least one frame, as `smplxpp.cloth.following.ways` yields them.
+            poses: at least one frame, as `smplxpp.cloth.following.ways` yields them.
             seconds: of all of it.
-            drawn: one frame; None: the last of the way.
+            drawn: one frame; None: the last of the poses.
             posed: the drawn body, where it is there already.
         """
-        for pose in way:
-            shape = self.step(pose, seconds / len(way))
+        for pose in poses:
+            shape = self.step(pose, seconds / len(poses))
         return shape if drawn is None else self.over(drawn, posed=posed)
 
     def over(self, params: BodyParams, *, posed: PosedBody | None = None) -> ClothShape:
         """Return the cloth where it hangs now, for a body that is drawn in another pose than the last step's.
 
-        Between the pins and what hangs free the way from one pose to the other is blended by `ClothShape.share`.
+        Between the pins and what hangs free, the change from one pose to the other is blended by `ClothShape.share`.
 
         Args:
             posed: the body in that pose, where it is there already.

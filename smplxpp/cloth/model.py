@@ -151,7 +151,9 @@ def _hinges(
     a, b, c, d, face = a[moves], b[moves], c[moves], d[moves], face[moves]
     x = rest.vertices
     # Needles would give weights without bound.
-    ac, ad, bc, bd = (np.clip(_cotangents(x, *way), -3.0, 3.0) for way in ((a, b, c), (a, b, d), (b, a, c), (b, a, d)))
+    ac, ad, bc, bd = (
+        np.clip(_cotangents(x, *corners), -3.0, 3.0) for corners in ((a, b, c), (a, b, d), (b, a, c), (b, a, d))
+    )
     weights = np.stack([bc + bd, ac + ad, -ac - bc, -ad - bd], axis=1)
     corners = np.stack([a, b, c, d], axis=1)
     normal = np.cross(x[b] - x[a], x[c] - x[a]) + np.cross(x[d] - x[a], x[b] - x[a])

@@ -36,10 +36,10 @@ def play(
     driver = ClothDriver(template, garments, config)
     weights = template.weights.dense()
     count = template.body.vertex_count
-    for k, way in enumerate(ways(params, fps, smoothing=smoothing)):
+    for k, poses in enumerate(ways(params, fps, smoothing=smoothing)):
         frame = params.frame(k)
         posed = template.posed_body(frame)
-        shape = driver.follow(way, 1.0 / fps, frame, posed=posed)
+        shape = driver.follow(poses, 1.0 / fps, frame, posed=posed)
         # Cloth is displaced at rest and then skinned: v = sum_j w_j G_j (rest + share displacement). The body's rest
         # vertices bring shape, expression and pose correctives.
         rest = template.vertices.copy()

@@ -103,14 +103,14 @@ def resampled(params: BodyParams, times: Float[np.ndarray, " T"], wanted: Float[
     for name in (*_ROTATIONS, "expression", "transl"):
         value = getattr(params, name)
         turning = _turns(name, value, value)
-        way = _step(value, step, step + 1, turning)
+        change = _step(value, step, step + 1, turning)
         came = -_step(value, step, before, turning) / np.where(first > 0, first, 1.0)
         goes = _step(value, step + 1, after, turning) / np.where(last > 0, last, 1.0)
         # At an end the tangent is that of the last step.
-        start = np.where(first > 0, (first * way + came) / (1.0 + first), way)
-        end = np.where(last > 0, (last * way + goes) / (1.0 + last), way)
+        start = np.where(first > 0, (first * change + came) / (1.0 + first), change)
+        end = np.where(last > 0, (last * change + goes) / (1.0 + last), change)
         t2, t3 = t * t, t * t * t
-        curve = (t3 - 2.0 * t2 + t) * start + (3.0 * t2 - 2.0 * t3) * way + (t3 - t2) * end
+        curve = (t3 - 2.0 * t2 + t) * start + (3.0 * t2 - 2.0 * t3) * change + (t3 - t2) * end
         changes[name] = _moved(value[step], curve, turning)
     return replace(params.select(step), **changes)
 

@@ -163,7 +163,7 @@ def refined(
     pyramids: Pyramids,
     inside: Field,
     config: ReconstructConfig,
-    said: tuple[list[str], dict[str, Any]],
+    results: tuple[list[str], dict[str, Any]],
     *,
     progress: ProgressCallback = ignore_progress,
 ) -> Reconstruction:
@@ -174,13 +174,13 @@ def refined(
         pyramids: of the photographs.
         inside: depth of points inside the silhouettes, metres.
         config: options.
-        said: notes and numbers so far.
+        results: notes and numbers so far.
         progress: called with the running step and its share done.
 
     Raises:
         InputError: the result is no closed manifold.
     """
-    notes, numbers = said
+    notes, numbers = results
     hull = taubin(hull, mean_of_neighbours(hull), steps=3)
     levels = config.levels if config.refine else ()
     # The sweep, level by level, each followed by one Taubin step against the noise of the displacements.

@@ -96,7 +96,7 @@ class Script:
 class Words:
     """A recogniser that hears the same words in every utterance."""
 
-    doubt = ""
+    other_language = ""
 
     def __init__(self, words: str = "hello") -> None:
         self.words, self.samples, self.open = words, 0, False

@@ -184,10 +184,10 @@ def test_sound_without_words_and_signs_without_sound_are_said(talk):
 
 def test_words_that_do_not_match_their_sounds_are_said_and_not_answered(talk):
     words = Words("a good resume bag get")
-    words.doubt = 'That did not sound like English; the nearest words are "a good resume bag get".'
+    words.other_language = 'That did not sound like English; the nearest words are "a good resume bag get".'
     it, page, _ = talk(recogniser=words)
     it.heard(sound(("quiet", 0.5), ("tone", 0.5), ("quiet", 1.0)))
-    assert page.told[-1] == {"kind": "note", "text": words.doubt}
+    assert page.told[-1] == {"kind": "note", "text": words.other_language}
     assert not any(one["kind"] == "heard" and one["text"] for one in page.told)
 
 

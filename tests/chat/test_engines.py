@@ -48,6 +48,6 @@ def test_an_utterance_of_no_english_is_doubted_and_the_next_is_heard_again():
         recogniser.begin()
         recogniser.hear(samples)
         words = recogniser.end()
-        doubts.append(recogniser.doubt)
+        doubts.append(recogniser.other_language)
     assert doubts[0].startswith("That did not sound like English") and doubts[1] == ""
     assert "before the big storm" in words

@@ -84,9 +84,9 @@ def blind_cameras(views: Iterable[ViewCheck]) -> Iterator[Finding]:
     """Find cameras whose every mask is empty, and into which the body does not project either."""
     blind: dict[str, bool] = {}
     for view in views:
-        nobody = view.mask_share is not None and view.mask_share < MIN_SHARE and not view.fit and not view.findings
-        blind[view.camera] = blind.get(view.camera, True) and nobody
-    for name in (name for name, nobody in blind.items() if nobody):
+        empty = view.mask_share is not None and view.mask_share < MIN_SHARE and not view.fit and not view.findings
+        blind[view.camera] = blind.get(view.camera, True) and empty
+    for name in (name for name, empty in blind.items() if empty):
         yield Finding("camera-sees-nobody", f"camera {name}: its masks are empty, it never sees the person", name)
 
 

@@ -63,32 +63,32 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
         surface: points of it, which the best body was compared with.
         best: the body.
     """
-    out, doubt = [], 1.0
+    out, trust = [], 1.0
     # Several people: pieces of their size beside each other, or two heads in the upper half.
     apart = people_apart(mesh)
     if len(apart) > 1:
-        doubt = 0.1
+        trust = 0.1
         pieces = ", ".join(str(piece) for piece in apart)
         out.append(f"{len(apart)} pieces of a person's size beside each other ({pieces}): two people, or furniture")
     seen = heads(surface, float(mesh.face_areas.sum()))
     low, high = np.quantile(surface.points[:, 1], (0.0, 1.0))
     upper = seen[seen[:, 1] > 0.5 * (low + high)]
     if len(upper) > 1:
-        doubt = min(doubt, 0.3)
+        trust = min(trust, 0.3)
         heights = " and ".join(f"{head[1] - low:.2f}" for head in upper[:3])
         out.append(
             f"{len(upper)} heads, {heights} m above the lowest point: two people, or something round that is held"
         )
     # Half a person: no head anywhere, or neither legs nor feet.
     if not len(seen) and best.misfit.parts["head"] < _HEAD_SHOWN:
-        doubt = min(doubt, 0.3)
+        trust = min(trust, 0.3)
         out.append("no head: it may be cut off above, or hidden by a hood")
     legs = [f"{side} {part}" for side in ("left", "right") for part in ("lower leg", "foot")]
     if all(best.misfit.parts[part] < 0.2 for part in legs):
-        doubt = min(doubt, 0.3)
+        trust = min(trust, 0.3)
         out.append("neither lower legs nor feet: it may be cut off below")
     if not no_person(best) and best.misfit.covered >= _BOUNDS.doubtful_covered:
-        return tuple(out), doubt
+        return tuple(out), trust
     # Something large that is no part of a body.
     piece = largest_piece(surface, best.misfit.unexplained)
     if piece is not None and piece.share > 0.1:
@@ -98,7 +98,7 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
         out.append(
             f"only {high - low:.2f} m from the lowest to the highest point: a small child, or a part of somebody"
         )
-    return tuple(out), doubt
+    return tuple(out), trust
 
 
 def confidence_of(best: Found, others: Sequence[Found]) -> float:

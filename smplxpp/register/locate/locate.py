@@ -77,10 +77,10 @@ def locate_body(
         if labels is not None:
             best = search.finished(best, np.asarray(labels)[search.fine.face] == SKIN.id)
     others = tuple(found[1:])
-    findings, doubt = findings_of(mesh, search.fine, best)
+    findings, trust = findings_of(mesh, search.fine, best)
     located = LocatedBody(
         best.state.to_params(body),
-        0.0 if reason else doubt * confidence_of(best, others),
+        0.0 if reason else trust * confidence_of(best, others),
         (*findings, *notes_of(best, others)),
         tuple(_candidate(one) for one in (best, *others)),
         moved,

@@ -123,7 +123,7 @@ def doubtful_limbs(
     surface has no explanation; those that show least come first."""
     posture = search.kinematics.posture(found.state, 0)
     place = {name: k for k, name in enumerate(search.kinematics.body.joint_names)}
-    doubt: dict[str, float] = {}
+    shown: dict[str, float] = {}
     for side, kind in product(("left", "right"), _JOINTS):
         shares = {part: found.misfit.parts[f"{side} {part}"] for part in _PARTS[kind]}
         off = [
@@ -133,8 +133,8 @@ def doubtful_limbs(
         hidden = any(share < _PARTS[kind][part] for part, share in shares.items())
         strays = kind == "arm" and found.misfit.covered < 1.0 - _UNEXPLAINED
         if hidden or strays or max(off, default=0.0) > _HINT_OFF:
-            doubt[f"{side} {kind}"] = min(shares.values())
-    return sorted(doubt, key=doubt.__getitem__)
+            shown[f"{side} {kind}"] = min(shares.values())
+    return sorted(shown, key=shown.__getitem__)
 
 
 def _hints_of(
