@@ -114,7 +114,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "photographs or a video of a person who turns before one camera, to a capture with camera and poses",
     ),
     "capture masks": (
-        "pipelines.commands.capture",
+        "pipelines.commands.masks",
         "CaptureMasks",
         "masks of a capture's images by a matting model, empty plates or MediaPipe",
     ),

@@ -29,8 +29,7 @@ from benchmarks.accuracy.registration import bare_and_under
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
 from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes
-from pipelines.commands.capture import selected_frames
-from pipelines.commands.options import OptionalPath, OptionalText
+from pipelines.commands.options import OptionalPath, OptionalText, selected_frames
 from pipelines.stages.build_config import RegisterInputs
 from pipelines.synth.people import PersonScan, people, variant
 from smplxpp.body import BodyModel, load_body

@@ -17,7 +17,8 @@ from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import load_reconstruct, load_register
 from smplxpp.body import Whose
 from smplxpp.build.config import BuildConfig
-from smplxpp.build.inputs import BuildPlan, BuildRequest, plan_build
+from smplxpp.build.inputs import BuildPlan, plan_build
+from smplxpp.build.request import BuildRequest
 from smplxpp.clean.remesh import require_remesher
 from smplxpp.core.files.json_file import read_json
 from smplxpp.detect import load_detector

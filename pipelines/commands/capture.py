@@ -1,8 +1,8 @@
-"""`smplxpp capture check` and `smplxpp capture convert`."""
+"""`smplxpp capture check`, `smplxpp capture convert` and `smplxpp capture degrade`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,12 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
+from pipelines.commands.options import (
+    OptionalInt,
+    OptionalPath,
+    OptionalText,
+    frame_numbers,
+    listed_names,
+    selected_frames,
+)
 from pipelines.commands.terminal import print_notes, print_paths
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.captures.masks import MatteModel
     from smplxpp.capture import Capture
     from smplxpp.capture.convert import Conversion
 
@@ -23,7 +29,6 @@ if TYPE_CHECKING:
 FormatName = Literal[
     "auto", "simple", "actorshq", "talkbody4d", "avatarrex", "thuman4", "4ddress", "neus2", "easymocap", "colmap", "rig"
 ]
-_FRAMES = "numbers and ranges START:STOP or START:STOP:STEP (STOP not included), with commas between"
 
 
 @dataclass(frozen=True)
@@ -173,7 +178,7 @@ class CaptureConvertCommand:
             layout=self.layout,
             scale=self.scale,
             frames=selected_frames(self.frames, capture),
-            cameras=None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(",")),
+            cameras=listed_names(self.cameras),
             quality=self.quality,
         )
         # The same command resumes an interrupted conversion, so that files of the first call count as kept.
@@ -198,8 +203,8 @@ class CaptureConvertCommand:
         config = VideoConfig(
             offsets=_offsets(self.offset),
             sync=self.sync,
-            frames=_numbers(self.frames),
-            cameras=None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(",")),
+            frames=frame_numbers(self.frames),
+            cameras=listed_names(self.cameras),
             quality=self.quality,
         )
         with shared_progress(enabled=not self.json) as progress:
@@ -255,59 +260,9 @@ def _offsets(text: str | None) -> dict[str, float]:
     return out
 
 
-def _numbers(text: str | None) -> tuple[int, ...] | None:
-    """Return the frames that a text names, which no capture bounds yet: `0,5`, `0:100:10`; None for None or all."""
-    if text is None or text.strip() == "all":
-        return None
-    chosen: list[int] = []
-    for part in text.split(","):
-        try:
-            numbers = [int(n) for n in part.split(":")]
-            if len(numbers) > 3 or min(numbers) < 0 or numbers[2:] == [0]:
-                raise ValueError
-            found = list(range(*numbers)) if len(numbers) > 1 else numbers
-        except ValueError:
-            raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
-        chosen += found
-    return tuple(sorted(set(chosen)))
-
-
 def _reader(format: FormatName) -> str | None:
     """Return the name of a reader; None where the files tell it."""
     return None if format == "auto" else format
-
-
-def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | None:
-    """Return the capture's frames that a text names: `all`, `0,5`, `0:100:10`; None for None.
-
-    Raises:
-        InputError: not understood, a number that is no frame, or a range without any.
-    """
-    if text is None:
-        return None
-    if text.strip() == "all":
-        return capture.frames
-    chosen: set[int] = set()
-    # Each part is a number, START:STOP or START:STOP:STEP; the result is the union of all.
-    for part in text.split(","):
-        try:
-            numbers = tuple(int(n) if n.strip() else None for n in part.split(":"))
-            if len(numbers) > 3 or numbers == (None,) or numbers[2:] == (0,):
-                raise ValueError
-        except ValueError:
-            raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
-        # A range is cut to the capture's frames; a range without any is an error of the user.
-        if len(numbers) == 1:
-            found = {frame for frame in capture.frames if frame == numbers[0]}
-        else:
-            last = max(capture.frames, default=-1) + 1
-            start, stop, step = numbers if len(numbers) == 3 else (*numbers, None)
-            found = set(range(start or 0, last if stop is None else min(stop, last), step or 1)) & set(capture.frames)
-        if not found:
-            have = f"{capture.frames[0]} to {capture.frames[-1]}" if capture.frames else "none"
-            raise InputError("--frames", expected=f"frames that the capture has ({have})", received=part)
-        chosen |= found
-    return tuple(sorted(chosen))
 
 
 @dataclass(frozen=True)
@@ -346,79 +301,3 @@ class CaptureDegradeCommand:
             line = f"{made.out}: {made.frames} frames, keypoints of {made.cameras} cameras, {labels}"
             console.print(line, soft_wrap=True, highlight=False)
         return {**vars(made), "out": str(made.out)}
-
-
-@dataclass(frozen=True)
-class CaptureMasks:
-    """Options of `smplxpp capture masks`. Give one of --matting, --plates and --mediapipe."""
-
-    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Folder of the capture, in any layout of docs/captures.md."""
-    out: Path
-    """Folder to write CAM/CAM_maskFFFFFF.png into, for --masks of the other commands, or `masks` of the capture itself;
-    existing ones are kept."""
-    matting: OptionalPath = None
-    """ONNX model of your own (BiRefNet, ISNet, ...), the best choice."""
-    plates: OptionalPath = None
-    """Folder with photographs of the empty rig: CAM.png, or a folder for each camera with one or several."""
-    mediapipe: bool = False
-    """MediaPipe's segmentation (extra `detect`): rough, without any file of yours."""
-    cameras: OptionalText = None
-    """Names of cameras with commas between; by default all."""
-    frames: OptionalText = None
-    """Frames: numbers and ranges START:STOP:STEP with commas between; by default all."""
-    json: bool = False
-    """Print the summary as JSON."""
-
-    def run(self) -> dict:
-        """Write the masks and return how many there are."""
-        from pipelines.captures.masks import write_masks
-        from pipelines.commands.progress import shared_progress
-        from pipelines.runs.folders import keep_out_of_capture
-        from smplxpp.capture import open_capture
-        from smplxpp.core.files.paths import same_place
-
-        # `masks` of the capture itself is allowed, any other place inside the capture is not.
-        if not same_place(self.out, self.capture / "masks"):
-            keep_out_of_capture(self.out, self.capture)
-        capture = open_capture(self.capture, cache_bytes=0)
-        names = None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(","))
-        frames = selected_frames(self.frames, capture)
-        # Look for images before the model is loaded, which takes seconds.
-        views = capture.views(names, frames)
-        if not views:
-            raise InputError(f"capture {capture.name}", expected="images to make masks of", received="none")
-        cameras = tuple(dict.fromkeys(camera for camera, _ in views))
-        model_of, identity = self._matte_models(capture, cameras)
-        written = write_masks(capture, model_of, self.out, identity=identity, cameras=cameras, frames=frames)
-        with shared_progress(enabled=not self.json) as progress:
-            for done, _ in enumerate(written, start=1):
-                progress("masks", done / len(views))
-        return {"out": str(self.out), "masks": len(views), "cameras": list(cameras)}
-
-    def _matte_models(self, capture: Capture, cameras: tuple[str, ...]) -> tuple[Callable[[str], MatteModel], str]:
-        """Return the chosen matte model of each camera and its identity for the record."""
-        given = [name for name in ("matting", "plates", "mediapipe") if getattr(self, name)]
-        if len(given) != 1:
-            raise InputError(
-                "options", expected="one of --matting, --plates and --mediapipe", received=" and ".join(given) or "none"
-            )
-        # The identity goes into the folder's record, because masks of two origins must not mix in one folder. Plates
-        # differ by camera; the other two models are the same for all.
-        if self.plates is not None:
-            from pipelines.captures.masks import Plates
-
-            plates = Plates(self.plates, cameras)
-            return plates.of_camera, plates.identity
-        model: MatteModel
-        if self.matting is not None:
-            from pipelines.runs.code import sha256_file
-            from smplxpp.capture.masks import MattingModel
-
-            model, identity = MattingModel(self.matting), f"matting model {sha256_file(self.matting)}"
-        else:
-            from smplxpp.detect.mediapipe_detector import PersonSegmenter
-
-            model = segmenter = PersonSegmenter()
-            identity = segmenter.identity
-        return lambda camera: model, identity

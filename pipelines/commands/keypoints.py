@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, listed_names, selected_frames
 from smplxpp.core.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -97,7 +97,6 @@ class KeypointsDetect:
     def run(self) -> dict:
         """Detect keypoints and return the number of frames for each camera."""
         from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes, detection_sheet
-        from pipelines.commands.capture import selected_frames
         from pipelines.commands.progress import shared_progress
         from pipelines.figures import encode_jpeg, encode_png
         from pipelines.runs.folders import keep_out_of_capture
@@ -110,7 +109,7 @@ class KeypointsDetect:
         if not same_place(self.out, self.capture / "keypoints"):
             keep_out_of_capture(self.out, self.capture)
         capture = open_capture(self.capture, masks=self.masks, cache_bytes=0)
-        names = None if self.cameras is None else tuple(name.strip() for name in self.cameras.split(","))
+        names = listed_names(self.cameras)
         frames = selected_frames(self.frames, capture)
         # Check the output name before the detector is loaded.
         if self.sheet is not None and self.sheet.suffix.lower() not in (".png", ".jpg"):

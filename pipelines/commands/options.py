@@ -1,17 +1,20 @@
-"""What commands share: types of options that may be left out, bounds, the check that an optional package is there."""
+"""What commands share: optional types, bounds, lists of frames and names, the check that a package is installed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from smplxpp.core import InputError, MissingExtraError, require_positive
 from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.light import Irradiance, Relighting
+
+if TYPE_CHECKING:
+    from smplxpp.capture import Capture
 
 # Types of optional values; the help shows the plain type instead of a union with None.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(optional)")]
@@ -25,6 +28,7 @@ LARGEST_PORT = 65535
 MOST_AVATAR_BYTES = 1 << 30
 """Largest size in bytes of a bundle that is read into memory: 1 GiB."""
 
+_FRAMES = "numbers and ranges START:STOP or START:STOP:STEP (STOP not included), with commas between"
 _AVATAR_PACKAGES = ("torch", "safetensors", "threadpoolctl")
 
 
@@ -86,3 +90,64 @@ def read_light(path: Path, *, turn: float = 0.0) -> Irradiance:
         if error.subject != "panorama":
             raise
         raise InputError(f"light {path}", expected=error.expected, received=error.received) from None
+
+
+def listed_names(text: str | None) -> tuple[str, ...] | None:
+    """Return the names in a text with commas between; None for None."""
+    return None if text is None else tuple(name.strip() for name in text.split(","))
+
+
+def selected_frames(text: str | None, capture: Capture) -> tuple[int, ...] | None:
+    """Return the capture's frames that a text names: `all`, `0,5`, `0:100:10`; None for None.
+
+    Raises:
+        InputError: not understood, a number that is no frame, or a range without any.
+    """
+    if text is None:
+        return None
+    if text.strip() == "all":
+        return capture.frames
+    chosen: set[int] = set()
+    # Each part is a number, START:STOP or START:STOP:STEP; the result is the union of all.
+    for part in text.split(","):
+        try:
+            numbers = tuple(int(n) if n.strip() else None for n in part.split(":"))
+            if len(numbers) > 3 or numbers == (None,) or numbers[2:] == (0,):
+                raise ValueError
+        except ValueError:
+            raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
+        # A range is cut to the capture's frames; a range without any is an error of the user.
+        if len(numbers) == 1:
+            found = {frame for frame in capture.frames if frame == numbers[0]}
+        else:
+            last = max(capture.frames, default=-1) + 1
+            start, stop, step = numbers if len(numbers) == 3 else (*numbers, None)
+            found = set(range(start or 0, last if stop is None else min(stop, last), step or 1)) & set(capture.frames)
+        if not found:
+            have = f"{capture.frames[0]} to {capture.frames[-1]}" if capture.frames else "none"
+            raise InputError("--frames", expected=f"frames that the capture has ({have})", received=part)
+        chosen |= found
+    return tuple(sorted(chosen))
+
+
+def frame_numbers(text: str | None) -> tuple[int, ...] | None:
+    """Return the numbers in a text such as `0,5` or `0:100:10`; None for None or `all`.
+
+    Unlike `selected_frames` it needs no capture, for frames of videos that are not decoded yet.
+
+    Raises:
+        InputError: not understood.
+    """
+    if text is None or text.strip() == "all":
+        return None
+    chosen: list[int] = []
+    for part in text.split(","):
+        try:
+            numbers = [int(n) for n in part.split(":")]
+            if len(numbers) > 3 or min(numbers) < 0 or numbers[2:] == [0]:
+                raise ValueError
+            found = list(range(*numbers)) if len(numbers) > 1 else numbers
+        except ValueError:
+            raise InputError("--frames", expected=f"all, or {_FRAMES}", received=text) from None
+        chosen += found
+    return tuple(sorted(set(chosen)))

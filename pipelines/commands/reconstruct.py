@@ -99,7 +99,7 @@ class ReconstructCommand:
         Raises:
             InputError: a number out of range, a missing file or folder, frames that the capture does not have.
         """
-        from pipelines.commands.capture import selected_frames
+        from pipelines.commands.options import selected_frames
         from pipelines.stages.build_config import ReconstructInputs
         from smplxpp.capture import open_capture
 

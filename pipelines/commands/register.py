@@ -120,9 +120,9 @@ class Register:
         Raises:
             InputError: neither a capture nor a scan, a missing file, frames that the capture has not.
         """
-        from pipelines.commands.capture import selected_frames
+        from pipelines.commands.options import selected_frames
         from smplxpp.build.config import RegisterInputs
-        from smplxpp.build.inputs import named_params
+        from smplxpp.build.request import named_params
         from smplxpp.capture import open_capture
 
         # Check that options fit together before files are read.

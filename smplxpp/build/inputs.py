@@ -3,75 +3,24 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from smplxpp.body import BodyModel, family_of_params, load_body, load_params
 from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs, resolved
 from smplxpp.build.reconstruct import open_photographs, usable_cameras, usable_frames
+from smplxpp.build.request import BuildRequest
 from smplxpp.capture import Capture, ReferenceFrame, find_reference
 from smplxpp.capture.declared import DeclaredInputs
 from smplxpp.capture.protocols import TRACKED, choose_protocol, read_description
-from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.clean.scan_frame import AUTO
-from smplxpp.core import BodyParams, InputError, MeshLike, spread
+from smplxpp.core import BodyParams, InputError, spread
 from smplxpp.core.files.paths import same_place
 from smplxpp.segment import find_label_set
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class BuildRequest:
-    """What a user asks a build for.
-
-    Attributes:
-        scan: clothed scan of the reference frame, a file or a mesh.
-        capture: folder of a capture, or an open one. Either this or a scan is given.
-        params: body parameters of the scan.
-        labels: labels of the scan's vertices or faces, a file or an array of ids.
-        body: body file or model; None: the open body.
-        config: choices of the build.
-        surface: file in which a reconstructed scan is kept; None: in memory.
-        registration: what was registered to before, which is kept where it fits.
-        reconstruction: what was reconstructed from before, likewise.
-    """
-
-    scan: Path | MeshLike | None = None
-    capture: Path | Capture | None = None
-    params: Path | BodyParams | None = None
-    labels: Path | np.ndarray | None = None
-    body: Path | BodyModel | None = None
-    config: BuildConfig = field(default_factory=BuildConfig)
-    surface: Path | None = None
-    registration: RegisterInputs | None = None
-    reconstruction: ReconstructInputs | None = None
-
-    @property
-    def root(self) -> Path | None:
-        """Folder of the capture."""
-        return self.capture.root if isinstance(self.capture, Capture) else self.capture
-
-    @property
-    def protocol(self) -> str | None:
-        """Name of the protocol that is read: the configuration's, or that of an open capture."""
-        if self.config.protocol is None and isinstance(self.capture, Capture):
-            return self.capture.protocol
-        return self.config.protocol
-
-    @property
-    def body_file(self) -> Path | None:
-        """The body's file; None for the open body and for a model in memory."""
-        return None if isinstance(self.body, BodyModel) else self.body
-
-    @property
-    def named_params(self) -> Path | None:
-        """The parameters' file (`named_params`); parameters in memory have none."""
-        return named_params(self.root, self.params) if isinstance(self.params, Path) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +38,6 @@ class BuildPlan:
     config: BuildConfig
     registration: RegisterInputs | None
     reconstruction: ReconstructInputs | None
-
-
-def named_params(root: Path | None, params: Path | None) -> Path | None:
-    """Return the file or folder that a user means by parameters: a path, or a name in the capture's folder `params`."""
-    return stacked_params(root, params) if params is not None and root is not None else params
 
 
 def plan_build(request: BuildRequest) -> BuildPlan:
@@ -117,7 +61,7 @@ def plan_build(request: BuildRequest) -> BuildPlan:
 
 
 def _of_capture(request: BuildRequest) -> BuildInputs:
-    """The inputs of a capture: a scan that it lacks is reconstructed, parameters that it lacks are registered."""
+    """Decide the inputs of a capture: a missing scan is reconstructed, missing parameters are registered."""
     root, config = request.root, request.config
     assert root is not None
     _refuse_height(config, "a capture, whose cameras state the size")
@@ -165,7 +109,7 @@ def _of_capture(request: BuildRequest) -> BuildInputs:
 
 
 def _of_scan(request: BuildRequest) -> BuildInputs:
-    """The inputs of a scan with what is known of it.
+    """Decide the inputs of a build from a scan.
 
     Raises:
         InputError: options that need a capture.
@@ -177,9 +121,9 @@ def _of_scan(request: BuildRequest) -> BuildInputs:
             raise InputError(f"option {name}", expected="with --capture", received="with --scan")
     if request.params is not None:
         _refuse_height(config, "parameters, which state the size")
-    # Parameters of a licensed model are no parameters of the open body: the search for the body starts from them.
-    foreign = request.params is not None and config.register != "on" and _of_a_family(request)
-    if foreign and config.register == "off":
+    # Parameters of a licensed model do not fit the open body; the search for the body starts from them.
+    of_licensed_model = request.params is not None and config.register != "on" and _of_licensed_model(request)
+    if of_licensed_model and config.register == "off":
         raise InputError(
             "option register",
             expected="auto, since parameters of another body than the open one are a start and no fit",
@@ -191,12 +135,12 @@ def _of_scan(request: BuildRequest) -> BuildInputs:
     return BuildInputs(
         subject=request.scan.stem if isinstance(request.scan, Path) else "scan",
         scan=request.scan,
-        params=None if registers or foreign else request.params,
+        params=None if registers or of_licensed_model else request.params,
         registers=registers,
-        locates=request.params is None or foreign,
+        locates=request.params is None or of_licensed_model,
         frame=config.frame,
         params_row=config.frame,
-        start=request.params if foreign else None,
+        start=request.params if of_licensed_model else None,
         whose=config.whose,
         labels=request.labels,
         label_set="4ddress" if config.label_set == AUTO else config.label_set,
@@ -205,8 +149,8 @@ def _of_scan(request: BuildRequest) -> BuildInputs:
     )
 
 
-def _of_a_family(request: BuildRequest) -> bool:
-    """Whether the parameters are SMPL's, SMPL-H's or SMPL-X's and the body is the open body."""
+def _of_licensed_model(request: BuildRequest) -> bool:
+    """Whether parameters of SMPL, SMPL-H or SMPL-X are given for the open body."""
     whose, params = request.config.whose, request.params
     if whose == "body" or (whose == AUTO and not isinstance(params, Path)):
         return False
@@ -230,7 +174,7 @@ def _registers(request: BuildRequest) -> bool:
     """Whether the parameters come from a registration of the capture."""
     root = request.root
     assert root is not None
-    # The user's word decides; without it an earlier registration stands, and repeated builds are equal.
+    # The user's choice decides; without it an earlier registration is kept, so that repeated builds are equal.
     if request.config.register != AUTO:
         return request.config.register == "on"
     if _standing_registration(request) is not None:
@@ -247,8 +191,8 @@ def _registers(request: BuildRequest) -> bool:
     params = declared.own_parameters() if request.params is None else request.named_params
     if params is None or declared.given_parameters(params) == TRACKED:
         return True
-    # Those of a licensed model start a registration of the open body, too.
-    return _of_a_family(replace(request, params=params))
+    # Parameters of a licensed model start a registration of the open body, too.
+    return _of_licensed_model(replace(request, params=params))
 
 
 def _turns(request: BuildRequest) -> bool:

@@ -15,7 +15,8 @@ from smplxpp.body import BodyModel
 from smplxpp.build.assemble import assemble_parts
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.build.data import LocatedInScan, RestPart
-from smplxpp.build.inputs import BuildRequest, check_inputs, given_motion, plan_build
+from smplxpp.build.inputs import check_inputs, given_motion, plan_build
+from smplxpp.build.request import BuildRequest
 from smplxpp.build.locate import locate_in_scan
 from smplxpp.build.observe import observe
 from smplxpp.build.opened import opened, with_params

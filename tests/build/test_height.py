@@ -16,7 +16,8 @@ from pipelines.stages.build_config import BuildContext
 from smplxpp.build import locate
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import LocatedInScan
-from smplxpp.build.inputs import BuildRequest, plan_build
+from smplxpp.build.inputs import plan_build
+from smplxpp.build.request import BuildRequest
 from smplxpp.core import BodyParams, InputError, StageOutput, TriangleMesh
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

@@ -12,7 +12,8 @@ import smplxpp
 from smplxpp.body.smpl_params import from_smpl
 from smplxpp.build import locate
 from smplxpp.build.config import BuildConfig
-from smplxpp.build.inputs import BuildRequest, plan_build
+from smplxpp.build.inputs import plan_build
+from smplxpp.build.request import BuildRequest
 from smplxpp.build.prepare import given_params, pose_fit, start_params
 from smplxpp.core import BodyParams, GeometryWarning, InputError
 

@@ -16,8 +16,9 @@ from pipelines.captures.turntable import TurntableCaptureConfig, held_out_frames
 from smplxpp.body import load_body
 from smplxpp.build import register
 from smplxpp.build.config import RegisterInputs
-from smplxpp.build.inputs import BuildRequest, plan_build
+from smplxpp.build.inputs import plan_build
 from smplxpp.build.observe import observe
+from smplxpp.build.request import BuildRequest
 from smplxpp.capture import open_capture
 from smplxpp.capture.writers.arrays import write_keypoints
 from smplxpp.core import InputError, Keypoints2D
