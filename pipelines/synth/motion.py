@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import ClassVar, Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from smplxpp.body.layout import SMPLX_JOINTS
@@ -158,25 +158,35 @@ class Motion(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Performance:
-    """A performance of gestures, speech and a turn, as a function of time.
+class SeededMotion:
+    """A motion of a length, made of a seed.
 
     Attributes:
         betas: shape coefficients.
         expression_names: names of the E expressions.
         seconds: duration; later instants hold the last pose.
-        seed: seed of timing, sizes of gestures, mouth shapes and blinks.
+        seed: seed of everything that is drawn at random.
     """
 
-    feet_stay: ClassVar[bool] = False
     betas: Float[np.ndarray, " B"]
     expression_names: tuple[str, ...]
     seconds: float
     seed: int = 0
 
+    def instants(self, times: Float[np.ndarray, " T"]) -> Float64[np.ndarray, " T"]:
+        """Return times cut to the duration, seconds."""
+        return np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, self.seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Performance(SeededMotion):
+    """A performance of gestures, speech and a turn, as a function of time."""
+
+    feet_stay: ClassVar[bool] = False
+
     def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
         """Return the parameters at `times` in seconds; transl is zero, `fps` is stored as it is given."""
-        t = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, self.seconds)
+        t = self.instants(times)
         pose, expression = self._poses(t), np.clip(self._faces(t), 0.0, 1.0)
         pose = pose + self._sway(t)
         pose[:, SMPLX_JOINTS.index("jaw"), 0] += (

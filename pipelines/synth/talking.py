@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
 from avatar.speech.gesture_lexicon import ARM_JOINTS, ARM_POSES, MIRROR, ArmPose
-from pipelines.synth.motion import JAW_DEGREES, relaxed_pose, wander
+from pipelines.synth.motion import JAW_DEGREES, SeededMotion, relaxed_pose, wander
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core import BodyParams, require_positive
 
@@ -83,31 +83,21 @@ _TEMPO = _Tempo()
 
 
 @dataclass(frozen=True, eq=False)
-class Talking:
+class Talking(SeededMotion):
     """The motion of a person who stands and talks, as a function of time.
-
-    Attributes:
-        betas: shape coefficients.
-        expression_names: names of the E expressions.
-        seconds: duration; later instants hold the last pose.
-        seed: seed of all tracks.
 
     Raises:
         InputError: a duration that is not above 0.
     """
 
     feet_stay: ClassVar[bool] = True
-    betas: Float[np.ndarray, " B"]
-    expression_names: tuple[str, ...]
-    seconds: float
-    seed: int = 0
 
     def __post_init__(self) -> None:
         require_positive("seconds of talking", self.seconds)
 
     def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
         """Return the parameters at `times` in seconds; transl is zero, `fps` is stored as it is given."""
-        t = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, self.seconds)
+        t = self.instants(times)
         pose = self._arms(t) + self._slow_turns(t) + self._small_turns(t)
         expression = np.clip(self._words(t) + self._looks(t) + self._blinks(t), 0.0, 1.0)
         jaw = expression[:, self.expression_names.index("jawOpen")]

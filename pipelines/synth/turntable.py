@@ -1,7 +1,7 @@
 """A person who turns once on the spot before a camera that stands still, with arms away from the body.
 
-Nobody holds a pose while turning: the arms float by some degrees, the weight shifts from foot to foot, the head looks
-around. Poses of frames differ by that much, and by the turn.
+The pose is not held still while turning: the arms sway by some degrees, the weight shifts from foot to foot, the head
+looks around. Poses of frames differ by this sway and by the heading.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.motion import relaxed_pose, wander
+from pipelines.synth.motion import SeededMotion, relaxed_pose, wander
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
@@ -36,25 +36,14 @@ _TURN_DEGREES = 345.0  # from the first frame to the last, which therefore do no
 
 
 @dataclass(frozen=True, eq=False)
-class Turntable:
-    """One turn to the left in the given time, as a function of time.
-
-    Attributes:
-        betas: shape coefficients.
-        expression_names: names of the E expressions; the face stays neutral.
-        seconds: duration of the turn's frames.
-        seed: seed of all sway.
-    """
+class Turntable(SeededMotion):
+    """One turn to the left within the duration, as a function of time; the face stays neutral."""
 
     feet_stay: ClassVar[bool] = False
-    betas: Float[np.ndarray, " B"]
-    expression_names: tuple[str, ...]
-    seconds: float
-    seed: int = 0
 
     def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
         """Return the parameters at `times` in seconds; `fps` is stored as it is given."""
-        t = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, self.seconds)
+        t = self.instants(times)
         rng = np.random.default_rng([self.seed, 7])
         # The performance begins at rest, so that cloth starts settled; all sway grows within half a second.
         grown = (1.0 - np.exp(-((t / 0.5) ** 2)))[:, None]

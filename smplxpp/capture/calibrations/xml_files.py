@@ -21,18 +21,18 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def is_qualisys(content: Any) -> bool:
-    """Tell `calibration/cameras/camera/transform`."""
+    """Recognise Qualisys by `calibration/cameras/camera/transform`."""
     return isinstance(content, Element) and content.find("cameras/camera/transform") is not None
 
 
 def is_vicon(content: Any) -> bool:
-    """Tell `Cameras/Camera/KeyFrames/KeyFrame` with a FOCAL_LENGTH."""
+    """Recognise Vicon by `Cameras/Camera/KeyFrames/KeyFrame` with a FOCAL_LENGTH."""
     frame = content.find("Camera/KeyFrames/KeyFrame") if isinstance(content, Element) else None
     return frame is not None and "FOCAL_LENGTH" in frame.attrib
 
 
 def is_optitrack(content: Any) -> bool:
-    """Tell `Camera/Extrinsic` with an OrientMatrix0."""
+    """Recognise OptiTrack by `Camera/Extrinsic` with an OrientMatrix0."""
     pose = content.find(".//Camera/Extrinsic") if isinstance(content, Element) else None
     return pose is not None and "OrientMatrix0" in pose.attrib
 
@@ -44,12 +44,15 @@ def read_qualisys(path: Path, content: Element) -> RigFile:
     its own -z. Lengths of `intrinsic` are in subpixels of the sensor, whose shown part is `fov_video`. The lens follows
     OpenCV's model on lengths in subpixels: its coefficients are divided by 64 as by Qualisys' own projection.
     """
-    everything = content.findall("cameras/camera")
-    video = [camera for camera in everything if "video" in camera.get("model", "").lower()]
-    notes = (
-        (f"{len(everything) - len(video)} marker cameras left out",) if video and len(video) < len(everything) else ()
-    )
-    return RigFile(tuple(_qualisys_camera(path, camera) for camera in video or everything), 1e-3, "z", notes)
+    cameras, notes = _video_cameras(content.findall("cameras/camera"), attribute="model")
+    return RigFile(tuple(_qualisys_camera(path, camera) for camera in cameras), 1e-3, "z", notes)
+
+
+def _video_cameras(cameras: list[Element], *, attribute: str) -> tuple[list[Element], tuple[str, ...]]:
+    """Keep the cameras marked as video cameras in an attribute, all if none is; the note counts those left out."""
+    video = [camera for camera in cameras if "video" in camera.get(attribute, "").lower()]
+    notes = (f"{len(cameras) - len(video)} marker cameras left out",) if video and len(video) < len(cameras) else ()
+    return video or cameras, notes
 
 
 def _qualisys_camera(path: Path, camera: Element) -> FileCamera:
@@ -89,12 +92,8 @@ def read_vicon(path: Path, content: Element) -> RigFile:
     VICON_RADIAL2 holds a model's name, the centre of distortion and k1, k2, k3, VICON_RADIAL k1, k2: Vicon's polynomial
     takes a distorted radius in pixels to the undistorted one, which is inverted by least squares over the image.
     """
-    everything = content.findall("Camera")
-    video = [camera for camera in everything if "video" in camera.get("TYPE", "").lower()]
-    notes = (
-        (f"{len(everything) - len(video)} marker cameras left out",) if video and len(video) < len(everything) else ()
-    )
-    return RigFile(tuple(_vicon_camera(path, camera) for camera in video or everything), 1e-3, "z", notes)
+    cameras, notes = _video_cameras(content.findall("Camera"), attribute="TYPE")
+    return RigFile(tuple(_vicon_camera(path, camera) for camera in cameras), 1e-3, "z", notes)
 
 
 def _vicon_camera(path: Path, camera: Element) -> FileCamera:
