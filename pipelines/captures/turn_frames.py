@@ -27,7 +27,7 @@ _FFMPEG_SECONDS = 900
 
 @dataclass(frozen=True)
 class TurnFrame:
-    """A photograph of a turn.
+    """A photograph of a turning person.
 
     Attributes:
         path: of the image.

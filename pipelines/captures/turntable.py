@@ -91,7 +91,7 @@ class TurntableCapture:
     notes: tuple[str, ...]
 
     def numbers(self) -> dict[str, Any]:
-        """Return figures for a summary."""
+        """Return the figures of the command's summary."""
         residuals = {name: float(np.nanmedian(values)) for name, values in self.found.fit.residuals.items()}
         return {
             "frames": self.frames,
@@ -299,7 +299,7 @@ def _by_frame(folder: Path, frames: list[TurnFrame], what: str) -> dict[int, Pat
 def _register(
     root: Path, body: BodyModel, lens: Lens, config: TurntableCaptureConfig, progress: ProgressCallback
 ) -> tuple[TurntableFit, tuple[str, ...]]:
-    """Find poses, shape and camera."""
+    """Fit poses, shape and camera to keypoints and masks."""
     capture = open_capture(root)
     keypoints = capture.keypoints(CAMERA)
     frames = capture.frames

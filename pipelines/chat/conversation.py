@@ -40,12 +40,12 @@ class Partner(Protocol):
         ...
 
     def cancel(self) -> None:
-        """Stop waiting for an answer."""
+        """Stop waiting for the current answer."""
 
 
 @dataclass(frozen=True)
 class ChatParts:
-    """Engines of a conversation.
+    """Engines that a conversation is made of.
 
     Attributes:
         voice: synthesises speech.
@@ -66,7 +66,7 @@ class ChatParts:
 
 @dataclass
 class Turn:
-    """A message and its answer.
+    """A message of the person and its answer.
 
     Attributes:
         number: number of the turn, from 1.
@@ -92,7 +92,7 @@ class Turn:
 
 
 class Conversation:
-    """The conversation with one page.
+    """The conversation of a person in one page.
 
     Args:
         parts: engines.
@@ -269,7 +269,7 @@ def history(turns: Sequence[Turn]) -> list[tuple[str, str]]:
 
 
 def rounded(marks: dict[str, float]) -> dict[str, float]:
-    """Return seconds rounded to milliseconds."""
+    """Round the seconds of each part to milliseconds."""
     return {part: round(seconds, 3) for part, seconds in marks.items()}
 
 

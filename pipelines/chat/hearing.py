@@ -95,7 +95,7 @@ def find_activity() -> Activity:
 
 @dataclass(frozen=True, kw_only=True)
 class ListenConfig:
-    """Bounds of an utterance.
+    """Thresholds that begin and end an utterance.
 
     Attributes:
         threshold: probability from which a block counts as speech.
@@ -118,7 +118,7 @@ class ListenConfig:
 
 @dataclass(frozen=True, eq=False)
 class UtterancePart:
-    """A piece of an utterance.
+    """A piece of sound of an utterance.
 
     Attributes:
         samples: sound to be recognised.

@@ -86,8 +86,8 @@ class Driving:
 
 def _whole(path: Path, body: BodyModel, up: UpAxis | None, whose: Whose) -> BodyParams:
     """Read a motion for a body; frames without a pose get one between their neighbours."""
-    params, family, holes = load_motion(path, body, up=up, whose=whose)
-    params = _without_holes(params, holes, path)
+    params, family, invalid = load_motion(path, body, up=up, whose=whose)
+    params = _interpolated(params, invalid, path)
     if family is None:
         return params
     if whose == "auto":
@@ -101,24 +101,24 @@ def _whole(path: Path, body: BodyModel, up: UpAxis | None, whose: Whose) -> Body
     return retarget_smpl(params, family, Skeleton.of(body))
 
 
-def _without_holes(params: BodyParams, holes: list[int], path: Path) -> BodyParams:
-    """Interpolate poses in frames without one between their neighbours, or copy the nearest at the ends."""
-    if not holes:
+def _interpolated(params: BodyParams, invalid: list[int], path: Path) -> BodyParams:
+    """Interpolate the poses of invalid frames between their neighbours; at the ends copy the nearest."""
+    if not invalid:
         return params
     count = len(params)
     warnings.warn(
-        f"{path}: {len(holes)} of {count} frames hold NaN or infinity, the first {holes[0]}: poses between those "
+        f"{path}: {len(invalid)} of {count} frames hold NaN or infinity, the first {invalid[0]}: poses between those "
         "before and behind stand there",
         GeometryWarning,
         stacklevel=4,
     )
-    # Interpolate at the holes; times outside the known frames are clamped to the nearest one.
-    known = np.setdiff1d(np.arange(count), holes)
+    # Interpolate at the invalid frames; times outside the known frames are clamped to the nearest one.
+    known = np.setdiff1d(np.arange(count), invalid)
     times = known.astype(np.float64)
     between = resampled(params.select(known), times, np.clip(np.arange(float(count)), times[0], times[-1]))
-    # Take row k of the motion, or of the interpolated copy (rows count to 2 count - 1) at a hole.
+    # Take row k of the motion, or of the interpolated copy (rows count to 2 count - 1) at an invalid frame.
     rows = np.arange(count)
-    rows[holes] += count
+    rows[invalid] += count
     return BodyParams.concatenate([params, between]).select(rows)
 
 

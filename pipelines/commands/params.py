@@ -55,7 +55,7 @@ class ParamsConvert:
     """Print the summary as JSON."""
 
     def run(self) -> dict:
-        """Convert and return a summary."""
+        """Convert the parameters and return a summary."""
         if self.out.suffix.lower() != ".npz":
             raise InputError("--out", expected="a file name ending in .npz", received=str(self.out))
         if self.joints is not None and self.joints.suffix.lower() != ".npz":

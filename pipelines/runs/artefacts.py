@@ -67,7 +67,7 @@ def load_source_faces(run: Path) -> np.ndarray:
 
 
 def load_prepared_scan(run: Path) -> PreparedScan:
-    """Read what `save_scan` wrote."""
+    """Read the prepared scan that `save_scan` wrote."""
     mesh, colors, source_vertex = load_scan(run)
     source_face = load_source_faces(run)
     with values_of(run / SCAN):
@@ -112,7 +112,7 @@ def save_fit(folder: Path, fit: PosedFit) -> None:
 
 
 def load_fit(run: Path, body: BodyModel) -> PosedFit:
-    """Read what `save_fit` wrote."""
+    """Read the posed body that `save_fit` wrote."""
     V, J = body.vertex_count, body.joint_count
     shapes = {
         "vertices": (V, 3),
@@ -142,7 +142,7 @@ def save_located(folder: Path, located: LocatedInScan) -> None:
 
 
 def load_located(folder: Path) -> LocatedInScan:
-    """Read what `save_located` wrote.
+    """Read the located body that `save_located` wrote.
 
     Raises:
         InputError: files of another version.

@@ -69,7 +69,7 @@ def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
 
 
 def save_register(run: Path, inputs: RegisterInputs) -> None:
-    """Write `register.json` into a run."""
+    """Write the inputs of a registration to a run's `register.json`."""
     atomic_write_text(run / REGISTER_FILE, json.dumps(_plain(asdict(inputs)), indent=1) + "\n")
 
 
@@ -85,7 +85,7 @@ def load_register(run: Path) -> RegisterInputs | None:
 
 
 def save_reconstruct(run: Path, inputs: ReconstructInputs) -> None:
-    """Write `reconstruct.json` into a run."""
+    """Write the inputs of a reconstruction to a run's `reconstruct.json`."""
     atomic_write_text(run / RECONSTRUCT_FILE, json.dumps(_plain(asdict(inputs)), indent=1) + "\n")
 
 

@@ -81,7 +81,7 @@ def _between(
     *,
     turns: bool,
 ) -> np.ndarray:
-    """Return the values at a share of the way from some rows to others; of rotation vectors on the shortest arc."""
+    """Interpolate between pairs of rows by a share of each; rotation vectors along the shortest arc."""
     a, b = rows[first].astype(np.float64), rows[second].astype(np.float64)
     weight = share.reshape(-1, *(1,) * (rows.ndim - 1))
     if not turns:

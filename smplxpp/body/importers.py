@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, without_holes
+from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, with_valid_frames
 from smplxpp.body.retarget import Skeleton
 from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.body.smpl_params import FAMILY_NAMES, from_smpl, rests_like_smpl, smpl_skeleton
@@ -67,8 +67,8 @@ def load_params(
     frame (or more) a file: all files whose names differ in their numbers alone, in their order; others are ignored.
 
     Parameters of SMPL, SMPL-H and SMPL-X, where counts and keys tell them (docs/inputs.md), are exact for a model of
-    that family. For the open body their turns are kept, the pelvis stands where theirs does, and their shape is dropped
-    (`smplxpp.body.smpl_params.from_smpl`): a start for a registration, or a motion.
+    that family. For the open body their joint rotations are converted, the pelvis keeps its position, and the shape
+    is dropped (`smplxpp.body.smpl_params.from_smpl`): a start for a registration, or a motion.
 
     EasyMocap and TalkBody4D rotate and translate the posed body about the origin, `x = R(Rh) X + Th`, SMPL-X about its
     root joint J0. With the inner pose (R_g, t): `global_orient = R(Rh) R_g`, `transl = R(Rh) (J0 + t) + Th - J0`.
@@ -100,7 +100,7 @@ def load_params(
         >>> len(params)
         16
     """
-    parts, name = _read_parts(Path(path), layout, person, holes=None)
+    parts, name = _read_parts(Path(path), layout, person, filled=None)
     params = _joined(_cut(parts, max_betas), body, up or _OWN_UP.get(name), whose, str(path))
     return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
 
@@ -112,49 +112,52 @@ def load_motion(
 
     Args:
         path: a file or a folder, as `load_params` takes it.
-        body: that shall move, of any kind with SMPL's joint names.
+        body: body to move, of any kind with SMPL's joint names.
         up: axis that points up in the file; None: as `load_params` finds it.
         whose: whose parameters they are, as in `load_params`.
 
     Returns:
         The parameters, y up; the family that they are of, None where they are the body's or the body has the family's
-        joints; and the frames of a single file in which another stands.
+        joints; and the frames of a single file that were replaced by others.
 
     Raises:
         InputError: as `load_params`.
     """
-    holes: list[int] = []
-    parts, name = _read_parts(Path(path), "auto", None, holes=holes)
-    family = _told(parts, whose)
-    foreign = family
+    filled: list[int] = []
+    parts, name = _read_parts(Path(path), "auto", None, filled=filled)
+    family = _family_of(parts, whose)
+    # A body with SMPL's joints takes the family's rotations as they are.
     if family is not None and not is_open_body(body) and rests_like_smpl(Skeleton.of(body)):
-        foreign = None
-    return _upright(parts, body, up or _OWN_UP.get(name), foreign, str(path)), foreign, holes
+        family = None
+    return _upright(parts, body, up or _OWN_UP.get(name), family, str(path)), family, filled
 
 
 def family_of_params(path: str | Path, *, layout: LayoutName = "auto") -> Family | None:
-    """Return whose parameters a file's counts and keys tell, SMPL's, SMPL-H's or SMPL-X's; None where they do not tell.
+    """Recognise parameters of SMPL, SMPL-H or SMPL-X by a file's counts and keys; None where these do not decide.
 
     Raises:
         InputError: as `load_params`.
     """
     file = _frame_files(Path(path))[0]
     content, source = _content(file), f"file {file}"
-    content, _ = without_holes(content)
+    content, _ = with_valid_frames(content)
     name = recognise(content, source=source) if layout == "auto" else layout
-    # Of several people the first tells; a frame without any tells nothing.
+    # Of several people the first one decides; a frame without people has no family.
     if isinstance(content, list):
         content = content[:1]
     if isinstance(content, list) and not content:
         return None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GeometryWarning)  # told when it is read for use
+        warnings.simplefilter("ignore", GeometryWarning)  # given when the file is read for use
         frames = _read_content(content, name, None, source)
     return None if frames is None else frames.family
 
 
-def _read_parts(path: Path, layout: str, person: int | None, *, holes: list[int] | None) -> tuple[list[Frames], str]:
-    """Read all files of a path, and return their frames and the layout; `holes` takes those filled by others."""
+def _read_parts(path: Path, layout: str, person: int | None, *, filled: list[int] | None) -> tuple[list[Frames], str]:
+    """Read all files of a path; return their frames and the layout.
+
+    Frames that hold NaN or infinity are replaced by others and appended to `filled`; None refuses them.
+    """
     # Files of the frames, and the layout that the first of them has.
     files = _frame_files(path)
     name = detect_layout(path) if layout == "auto" else layout
@@ -165,9 +168,9 @@ def _read_parts(path: Path, layout: str, person: int | None, *, holes: list[int]
     absent: list[str] = []
     for file in files:
         content = _content(file)
-        if holes is not None and len(files) == 1:
-            content, empty = without_holes(content)
-            holes += empty
+        if filled is not None and len(files) == 1:
+            content, invalid = with_valid_frames(content)
+            filled += invalid
         elif len(files) == 1:
             content = without_gaps(content, source=f"file {file}")
         frames = _read_content(content, name, person, f"file {file}")
@@ -230,20 +233,22 @@ def _cut(parts: list[Frames], max_betas: int | None) -> list[Frames]:
 
 def _joined(parts: list[Frames], body: BodyModel | None, up: str | None, whose: Whose, source: str) -> BodyParams:
     """Return all frames in one world, y up, for the body: composed with outer motions, turned, brought to it."""
-    family = _told(parts, whose)
+    family = _family_of(parts, whose)
     body = load_body() if body is None and family is not None else body
-    foreign = family if family is not None and body is not None and is_open_body(body) else None
-    params = _upright(parts, body, up, foreign, source)
-    if foreign is None:
+    # Only the open body needs a conversion: other bodies are models of the family.
+    if body is None or not is_open_body(body):
+        family = None
+    params = _upright(parts, body, up, family, source)
+    if family is None:
         return params
     assert body is not None
     if whose == "auto":
-        _warn_of_another_body(params, foreign, source)
-    return from_smpl(params, foreign, body)
+        _warn_of_another_body(params, family, source)
+    return from_smpl(params, family, body)
 
 
-def _told(parts: list[Frames], whose: Whose) -> Family | None:
-    """Return the family that parameters are of: as the caller says, or as the file tells."""
+def _family_of(parts: list[Frames], whose: Whose) -> Family | None:
+    """Return the family of the parameters: the caller's choice, else the one recognised in the file."""
     require_choice("option whose", whose, get_args(Whose))
     if whose == "auto":
         return parts[0].family
@@ -251,9 +256,9 @@ def _told(parts: list[Frames], whose: Whose) -> Family | None:
 
 
 def _upright(
-    parts: list[Frames], body: BodyModel | None, up: str | None, foreign: Family | None, source: str
+    parts: list[Frames], body: BodyModel | None, up: str | None, family: Family | None, source: str
 ) -> BodyParams:
-    """Return all frames with y up, as parameters of the body, or of the family `foreign` that its file is of."""
+    """Return all frames with y up, still as parameters of `family`; None: of the body."""
     params = BodyParams.concatenate([part.params for part in parts])
     outer = [part.outer for part in parts if part.outer]
     # An axis stated by the caller, by the file, or by the layout's definition; only the last may not hold for a file.
@@ -265,8 +270,8 @@ def _upright(
     if not outer and stated == "y":
         return params
     # Motion about the origin needs the root joint of the body that the parameters are of.
-    if foreign is not None:
-        root = np.repeat(smpl_skeleton(foreign).places[:1], len(params), axis=0)
+    if family is not None:
+        root = np.repeat(smpl_skeleton(family).places[:1], len(params), axis=0)
     else:
         root = (body or load_body()).rest_joints(params)[:, 0]
     if outer:
@@ -277,7 +282,7 @@ def _upright(
 
 
 def _warn_of_another_body(params: BodyParams, family: Family, source: str) -> None:
-    """Say what is kept of parameters of a family, and how they are exact."""
+    """Warn that shape and expression of a family's parameters are lost, with the remedy."""
     # Files of frames get one text, so that it is shown once.
     source = re.sub(r"\d{4,}", "#", source)
     warnings.warn(

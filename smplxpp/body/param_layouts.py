@@ -60,10 +60,10 @@ class Frames:
     up: str | None = None
 
 
-def without_holes(content: Any) -> tuple[Any, list[int]]:
-    """Return a file of stacked frames whose frames with NaN or infinity are the last good ones before, and which.
+def with_valid_frames(content: Any) -> tuple[Any, list[int]]:
+    """Replace frames with NaN or infinity by the last valid frame before; return the content and their numbers.
 
-    Those at the start are the first good one. Files of other kinds, and without a good frame, stay as they are.
+    Those at the start become the first valid frame. Other kinds of files, or without any valid frame, are unchanged.
     """
     if not isinstance(content, Mapping):
         return content, []
@@ -72,14 +72,14 @@ def without_holes(content: Any) -> tuple[Any, list[int]]:
     counts = [len(arrays[name]) for name in _STACKED if name in arrays]
     count = counts[0] if counts else 0
     arrays = {name: value for name, value in arrays.items() if len(value) == count and value.dtype.kind == "f"}
-    good = np.ones(count, bool)
+    valid = np.ones(count, bool)
     for value in arrays.values():
-        good &= (np.abs(value.reshape(count, -1)) <= _FARTHEST).all(axis=1)
-    if count < 2 or good.all() or not good.any():
+        valid &= (np.abs(value.reshape(count, -1)) <= _FARTHEST).all(axis=1)
+    if count < 2 or valid.all() or not valid.any():
         return content, []
-    # Index of the last good frame up to each frame; before the first good one, the first.
-    held = np.maximum.accumulate(np.where(good, np.arange(count), np.argmax(good)))
-    return {**content, **{name: value[held] for name, value in arrays.items()}}, np.flatnonzero(~good).tolist()
+    # Index of the last valid frame up to each frame; before the first valid one, the first.
+    held = np.maximum.accumulate(np.where(valid, np.arange(count), np.argmax(valid)))
+    return {**content, **{name: value[held] for name, value in arrays.items()}}, np.flatnonzero(~valid).tolist()
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Joints of SMPL on the open body: a sparse regressor of its vertices for each, and the body that turns about them.
+"""Regress SMPL's joints from the open body's vertices, and make an open body that rotates about them.
 
-The open body's joints lie where its rig puts them, SMPL's where its training did: SMPL's hips are 12 to 14 cm apart,
-the open body's 23. Joint errors against SMPL's, and turns of SMPL's joints, mean SMPL's places. `OFFSETS_MM` says how
-far these are from the open body's own joints; docs/inputs.md has the table and how it was measured.
+The open body's joints come from its rig, SMPL's from training: SMPL's hips are 12 to 14 cm apart, the open body's 23.
+Joint errors against SMPL fits, and rotations of SMPL's joints, refer to SMPL's positions. `OFFSETS_MM` is the distance
+of these from the open body's own joints; docs/inputs.md has the table and how it was measured.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def smpl_joint_regressor(body: BodyModel) -> Float64[np.ndarray, "22 V"]:
     """Return the rows that give SMPL's joints of the open body's shaped vertices in the rest pose.
 
     A row has weights `w` of least `|w|^2` on the skin around the joint, a band across the limb or the trunk of 6 cm,
-    that sum to 1 and put the joint of the mean body at its place: `w = C^T (C C^T)^-1 (place, 1)` with the vertices'
-    coordinates and ones as the rows of C. So the joint moves with the band where a shape changes it.
+    that sum to 1 and reproduce the joint of the mean body: `w = C^T (C C^T)^-1 (place, 1)` with the vertices'
+    coordinates and ones as the rows of C. A change of shape moves the joint with the band.
 
     Args:
         body: the open body.
@@ -135,9 +135,9 @@ def smpl_joints(body: BodyModel, params: BodyParams) -> Float64[np.ndarray, "T 2
 
 
 def with_smpl_joints(body: BodyModel) -> BodyModel:
-    """Return the open body with SMPL's joints of the body in the place of its own: turns are about SMPL's points.
+    """Replace the 22 body joints of the open body by SMPL's, so that it rotates about SMPL's positions.
 
-    Its surface at rest, its skin weights, fingers and face stay. Parameters of the open body are not its parameters.
+    Rest surface, skin weights, fingers and face stay. Parameters of the open body are not its parameters.
 
     Raises:
         InputError: another body.

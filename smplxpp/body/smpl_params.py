@@ -1,8 +1,8 @@
 """Bring parameters of SMPL, SMPL-H and SMPL-X to the open body without the files of these models.
 
-Turns and places of the family's joints are public knowledge, shapes are not: without the model's file the turns are
-kept, in the open body's rest pose, the pelvis stands where SMPL's does, and the shape is the mean's. That is a start
-for a registration, or a motion to retarget, and no fit.
+Rotations and rest positions of the family's joints are published, shape directions are not. Without the model's file
+the joint rotations are converted to the open body's rest pose, the pelvis is placed where SMPL's is, and the shape is
+the mean shape. The result can start a registration or be retargeted, but it is not a fit.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ _BONES_MM: dict[str, tuple[float, float, float]] = {
     "elbow": (260, -13, -27),
     "wrist": (249, 9, -1),
 }
-# How a limb of the open body at rest is turned to lie as SMPL's at rest, degrees about x, y, z of the world, of the
-# left side (of the right one y and z have the other sign). Its legs are spread by 7 degrees more, its feet turned in.
+# Rotation of a limb from the open body's rest pose to SMPL's: rotation vectors in degrees, world axes, left side (y and
+# z change sign on the right). SMPL's legs are spread by 7 degrees more, its feet turned in.
 _REST_TURNS: dict[str, tuple[float, float, float]] = {
     "hip": (3, 0, -7),
     "knee": (2, 0, -6),
@@ -77,9 +77,9 @@ def smpl_skeleton(family: Family = "smpl") -> Skeleton:
 def from_smpl(params: BodyParams, family: Family, body: BodyModel) -> BodyParams:
     """Bring parameters of SMPL, SMPL-H or SMPL-X to the open body, without the model that they are of.
 
-    With `A_j` the turn from the open body's limb at rest to SMPL's, the turns are `R'_j = A_parent^T R_j A_j`, so that
-    limbs point where SMPL's do. The translation puts the open body's point for SMPL's pelvis where SMPL's pelvis is.
-    The shape and the expression are dropped, PCA coefficients of hands, too, whose basis the model's file has.
+    With `A_j` the rotation from the open body's limb at rest to SMPL's, `R'_j = A_parent^T R_j A_j`, so that limbs have
+    the directions of SMPL's. The translation puts the regressed SMPL pelvis of the open body where SMPL's pelvis is.
+    Shape and expression are dropped, and PCA coefficients of hands, because the model's file holds their basis.
 
     Args:
         params: T frames of the family.
@@ -101,14 +101,14 @@ def from_smpl(params: BodyParams, family: Family, body: BodyModel) -> BodyParams
 def retarget_smpl(params: BodyParams, family: Family, target: Skeleton) -> BodyParams:
     """Return a motion of SMPL, SMPL-H or SMPL-X for another skeleton with the open body's rest pose.
 
-    The turns are those of `from_smpl`. The way of SMPL's pelvis is scaled by the length of the legs between SMPL's
-    points of the target; planted feet stay planted, as `retarget` keeps them. The motion's shape is not known without
-    its model: steps are scaled from those of the mean body.
+    Rotations are those of `from_smpl`. The path of SMPL's pelvis is scaled by the ratio of leg lengths, that of the
+    target measured between SMPL's joints. Planted feet stay planted, as in `retarget`. The motion's shape is not known
+    without its model, so that steps are scaled from those of the mean body.
 
     Args:
         params: T frames of the family.
         family: whose they are.
-        target: skeleton that shall move, such as `Skeleton.of(body)` of the open body or of a template.
+        target: skeleton to move, such as `Skeleton.of(body)` of the open body or of a template.
     """
     source = smpl_skeleton(family)
     like = Skeleton(BODY_JOINTS, source.parents, smpl_places(target))
@@ -143,7 +143,7 @@ def rests_like_smpl(skeleton: Skeleton) -> bool:
 
 
 def _turned(params: BodyParams) -> BodyParams:
-    """Return the turns for the open body's rest pose, without shape and expression, not yet placed."""
+    """Return joint rotations for the open body's rest pose, without shape and expression, before translation."""
     parents, count = _parents(), len(params)
     turns = matrix_from_rotvec(np.concatenate([params.global_orient, params.body_pose], 1).reshape(count, -1, 3))
     at_rest = rest_turns()
@@ -171,13 +171,13 @@ def _placed(
     own: Float64[np.ndarray, " 3"],
     point: Float64[np.ndarray, " 3"],
 ) -> BodyParams:
-    """Return the parameters with the point for SMPL's pelvis at its places; it turns about the body's own pelvis."""
+    """Choose translations that put the regressed SMPL pelvis at `pelvis`; it rotates about the body's own pelvis."""
     turned = (matrix_from_rotvec(params.global_orient) @ (point - own)[:, None])[..., 0]
     return replace(params, transl=pelvis - own - turned)
 
 
 def rest_turns() -> Float64[np.ndarray, "22 3 3"]:
-    """Return the turn of each limb of the open body at rest to lie as SMPL's at rest, in world axes."""
+    """Return the rotation of each limb from the open body's rest pose to SMPL's, in world axes."""
     vectors = np.zeros((len(BODY_JOINTS), 3))
     for j, name in enumerate(BODY_JOINTS):
         side, _, part = name.rpartition("_")

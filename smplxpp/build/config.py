@@ -285,5 +285,5 @@ class ReconstructInputs:
 
     @property
     def root(self) -> Path:
-        """Folder of the capture."""
+        """Folder of the capture, also of an open one."""
         return self.capture.root if isinstance(self.capture, Capture) else self.capture

@@ -60,7 +60,7 @@ class LocatedInScan:
         params: one frame.
         labels: certain labels of the scan's vertices, -1 elsewhere.
         bare: the body's vertices that nothing covers.
-        scale: by which the scan, as it was read, has to be scaled so that the body has the stated stature; 1 without.
+        scale: factor from the scan as it was read to one whose body has the stated stature; 1 without a stature.
     """
 
     params: BodyParams

@@ -46,10 +46,10 @@ def locate_in_scan(
     height: float | None = None,
     start: BodyParams | None = None,
 ) -> tuple[LocatedInScan, StageOutput]:
-    """Find the body in a scan, and say what else it might have been and how certain it is.
+    """Find the body in a scan, with its confidence and the other candidates.
 
-    With a stature the scan is scaled by what the body found in it lacks of that, and searched again, until both agree.
-    Whether the body is certain enough is the caller's to ask (`smplxpp.build.verdict.require_found`).
+    With a stature the scan is scaled by the ratio of the stature to that of the body found, and searched again, until
+    both agree. The caller decides whether the confidence suffices (`smplxpp.build.verdict.require_found`).
 
     Args:
         scan: repaired.
@@ -71,12 +71,12 @@ def locate_in_scan(
     # wrong size towards the mean, so that one step need not suffice. 1 % is less than shoes and hair add.
     scale, tolerance, rounds = 1.0, 0.01, 3
     for _ in range(rounds):
-        lacks = height / stature(body, found.params)
-        if abs(lacks - 1.0) < tolerance:
+        ratio = height / stature(body, found.params)
+        if abs(ratio - 1.0) < tolerance:
             break
-        scale *= lacks
-        there = None if placed is None else {name: scale * point for name, point in placed.items()}
-        found, output = _located(scan.scaled(scale), body, there, detector, None)
+        scale *= ratio
+        scaled = None if placed is None else {name: scale * point for name, point in placed.items()}
+        found, output = _located(scan.scaled(scale), body, scaled, detector, None)
     numbers = {"height": height, "stature": stature(body, found.params), "scale": scale}
     return replace(found, scale=scale), StageOutput(output.checks, {**output.numbers, **numbers})
 
@@ -99,19 +99,19 @@ def _located(
     mesh, colors = smooth_if_rough(scan.clean.mesh).mesh, scan.colors
     labeller = partial(certain_labels, mesh, body, colors)
     search = partial(locate_body, body, mesh, colors=colors, labeller=labeller)
-    # Search the surface, because it is precise; a detector's keypoints, or those of a body of another shape, propose
-    # limbs and can correct the front.
+    # The surface decides, because it is precise. Keypoints of a detector, or of a body of another shape, only propose
+    # limb poses and can correct the facing direction.
     note, seen = "", Landmarks()
     if start is not None:
         seen = _points_of(body, start)
     elif detector is not None and landmarks is None:
-        seen, note = _seen(mesh, colors, detector)
+        seen, note = _detected(mesh, colors, detector)
     if seen and landmarks is None:
-        found = _found(search, hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
+        found = _best(search, hints={name: point for name, (point, certainty) in seen.items() if certainty >= _CERTAIN})
         found, note = _confirmed(found, search, seen)
         note = note if start is None else note.replace("detector's keypoints", "given parameters")
     else:
-        found = _found(search, landmarks=landmarks)
+        found = _best(search, landmarks=landmarks)
     # Keep the labels that a registration may lean on, a label for each vertex of a certain face.
     labels = np.full(mesh.vertex_count, BACKGROUND, dtype=np.int64)
     # One label a face, BACKGROUND where body and colours disagree, and everywhere on what is no person.
@@ -150,13 +150,13 @@ def _located(
 
 
 def _points_of(body: BodyModel, start: BodyParams) -> Landmarks:
-    """Return where a posed body has the points that detectors mark, by name, each with a confidence of 1."""
+    """Return the detectors' keypoints on a posed body, by name, each with a confidence of 1."""
     vertices = body.forward(start).vertices[0]
     return {name: (weights @ vertices[index], 1.0) for name, (index, weights) in body.landmarks.items()}
 
 
-def _seen(mesh: TriangleMesh, colors: UInt8[np.ndarray, "N 3"] | None, detector: str) -> tuple[Landmarks, str]:
-    """Return a detector's keypoints of a scan; none, and the reason, where it sees nobody, which may be the colours."""
+def _detected(mesh: TriangleMesh, colors: UInt8[np.ndarray, "N 3"] | None, detector: str) -> tuple[Landmarks, str]:
+    """Return a detector's keypoints of a scan; if it finds no person, possibly for lack of colours, the reason."""
     loaded = load_detector(detector)
     try:
         return keypoints_of_scan(mesh, colors, loaded), ""
@@ -164,8 +164,8 @@ def _seen(mesh: TriangleMesh, colors: UInt8[np.ndarray, "N 3"] | None, detector:
         return {}, f"the detector sees no person: {error.received}"
 
 
-def _found(search: Callable[..., LocatedBody], **known: Any) -> LocatedBody:
-    """Return the best body even of a surface that is no person; its confidence is 0, and `require_found` stops there."""
+def _best(search: Callable[..., LocatedBody], **known: Any) -> LocatedBody:
+    """Return the best body, with confidence 0 for a surface that is no person; `require_found` refuses it later."""
     try:
         return search(**known)
     except BodyNotFoundError as error:
@@ -175,9 +175,9 @@ def _found(search: Callable[..., LocatedBody], **known: Any) -> LocatedBody:
 def _confirmed(
     found: LocatedBody, search: Callable[..., LocatedBody], landmarks: Landmarks
 ) -> tuple[LocatedBody, str]:
-    """The found body if a detector's keypoints on pictures of the scan agree on the front; else search again with them.
+    """Keep the body found if a detector's keypoints agree on its facing direction; else search again with them.
 
-    Keypoints are centimetres off and geometry is not, so that they propose limbs and decide the front alone.
+    Keypoints are centimetres off, geometry is not: they propose limb poses and decide the facing direction alone.
     """
     front = facing(landmarks)
     if front is None:
@@ -187,7 +187,7 @@ def _confirmed(
     own = np.radians(found.candidates[0].facing_degrees)
     if np.sin(own) * front[0] + np.cos(own) * front[2] > 0:
         return found, "the detector's keypoints face the same way"
-    again = _found(search, landmarks={name: point for name, (point, _) in landmarks.items() if name.startswith("coco_")})
+    again = _best(search, landmarks={name: point for name, (point, _) in landmarks.items() if name.startswith("coco_")})
     return again, "the surface alone was taken for somebody who faces the other way than the detector's keypoints do"
 
 

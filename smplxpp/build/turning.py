@@ -79,7 +79,7 @@ def posed_person(body: BodyModel, params: BodyParams) -> PosedPerson:
     posed, reference = body.forward(params), body.forward(apart)
     transforms = np.asarray(posed.posed_from_rest, dtype=np.float64)
     from_reference = np.linalg.inv(np.asarray(reference.posed_from_rest[0], dtype=np.float64))
-    # Joints beyond the body's own follow their nearest ancestor among these.
+    # Joints that the body lacks follow their nearest ancestor that it has.
     carrier = np.arange(body.joint_count)
     for joint in range(body.joint_count):
         while carrier[joint] >= _BODY_JOINTS:

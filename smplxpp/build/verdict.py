@@ -1,4 +1,4 @@
-"""Stop a build whose body was not found, with a picture of what was found and what helps."""
+"""Refuse to build on a body of low confidence, with a picture of it and remedies."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def require_found(
         body: the model.
         params: the body that was found, one row.
         confidence: of it, from 0 to 1.
-        findings: what speaks against one whole person, in words.
-        picture_file: where the caller will keep the error's picture, which the message names; None: nowhere.
+        findings: sentences about evidence against one whole person.
+        picture_file: file in which the caller will write the error's picture, for the message; None: it does not.
 
     Raises:
         BodyNotFoundError: the confidence is below `LEAST_CONFIDENCE`.

@@ -34,7 +34,7 @@ class VideoConfig:
         quality: quality of the JPEG images.
 
     Raises:
-        InputError: offsets beside a search for them, an unknown way to find them, a quality out of range.
+        InputError: offsets beside a search for them, an unknown method of search, a quality out of range.
     """
 
     offsets: Mapping[str, float] = field(default_factory=dict)
@@ -177,7 +177,7 @@ def _write_keypoints(capture: Capture, out: Path, times: Timeline, frames: np.nd
 
 
 def _write_cameras(capture: Capture, names: Sequence[str], out: Path) -> None:
-    """Write cameras.json with the lenses."""
+    """Write intrinsics, poses and distortion of the cameras to cameras.json."""
     recording = capture.recording
     entries = [
         camera_entry(recording.cameras[name], name) | lens_entry(recording.distortions.get(name)) for name in names

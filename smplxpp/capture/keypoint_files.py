@@ -141,20 +141,20 @@ def frame_files(folder: Path) -> dict[int, Path]:
 
 
 def _order_of(path: Path) -> KeypointFormat:
-    """Return OpenPose's format where 25 points tell their order, else "auto".
+    """Recognise OpenPose's order of 25 points from detected people; "auto" for other counts of points.
 
     Raises:
-        InputError: lists of 25 points whose order people do not tell.
+        InputError: lists of 25 points whose order cannot be recognised.
     """
-    told = body_25_order(sampled_people(path))
-    if told == "unclear":
+    order = body_25_order(sampled_people(path))
+    if order == "unclear":
         raise InputError(
             f"keypoints {path}",
             expected="25 points of which the face tells whether they are BODY_25 or BODY_25B",
             received="no face, or one of the same size in both orders",
             remedy="name the order: smplxpp keypoints convert --format openpose (BODY_25) or openpose-25b",
         )
-    return "auto" if told == "none" else told
+    return "auto" if order == "none" else order
 
 
 def sampled_people(path: Path) -> Iterator[Any]:

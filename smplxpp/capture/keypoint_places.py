@@ -64,17 +64,17 @@ class KeypointFiles:
         return ()
 
     def options_of(self, camera: str) -> KeypointOptions:
-        """Return the options for a camera's files: its image size, and the order of points that all cameras tell."""
+        """Return the options for a camera's files: its image size, and the order of points common to all cameras."""
         size = self.sizes.get(camera, self.options.size)
         return replace(self.options, size=size, format=self._format)
 
     @cached_property
     def _format(self) -> KeypointFormat:
-        """The format, with the order of OpenPose's 25 points, which all cameras tell together."""
+        """The format; OpenPose's order of 25 points is recognised from all cameras together."""
         if self.options.format != "auto":
             return self.options.format
-        told = body_25_order(people for path in self.places.values() for people in sampled_people(path))
-        return told if told in ("openpose", "openpose-25b") else "auto"
+        order = body_25_order(people for path in self.places.values() for people in sampled_people(path))
+        return order if order in ("openpose", "openpose-25b") else "auto"
 
 
 def find_places(folder: Path, cameras: Iterable[str] | None = None) -> dict[str, Path]:

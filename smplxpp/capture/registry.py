@@ -179,7 +179,7 @@ def detect_format(path: str | Path) -> str:
 
 
 def _nearest(root: Path) -> list[str]:
-    """Return a line for each of the layouts of whose files most are there: name, what it looks for, what is missing.
+    """Describe the layouts that share most files with a folder, one a line: name, its files, those present.
 
     The words of a reader's `LOOKS_FOR` that name files or folders are looked for in the folder and in its folders.
     """
@@ -189,12 +189,12 @@ def _nearest(root: Path) -> list[str]:
     ranked = []
     for place, (name, reader) in enumerate(READERS.items()):
         files = _FILE_WORD.findall(reader.LOOKS_FOR)
-        there = [word for word in files if any(fnmatch(one.lower(), word.rstrip("/").lower()) for one in inside)]
-        ranked.append((-len(there) / max(1, len(files)), place, name, there))
+        present = [word for word in files if any(fnmatch(one.lower(), word.rstrip("/").lower()) for one in inside)]
+        ranked.append((-len(present) / max(1, len(files)), place, name, present))
     ranked.sort()
     missing = rig.what_is_missing(root)
     lines = [f"{rig.NAME}: {missing}"] if missing else []
-    for _, _, name, there in ranked[: _NEAREST - len(lines)]:
-        found = f" (there: {', '.join(there)})" if there else ""
+    for _, _, name, present in ranked[: _NEAREST - len(lines)]:
+        found = f" (there: {', '.join(present)})" if present else ""
         lines.append(f"{name}: {READERS[name].LOOKS_FOR}{found}")
     return lines

@@ -40,7 +40,7 @@ _NAMED = 4  # people that a note describes
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A person over the frames.
+    """A person followed through the frames.
 
     Attributes:
         places: the person in space by frame.
@@ -80,7 +80,7 @@ class SubjectKeypoints:
         return self.files.cameras()
 
     def frames(self) -> tuple[int, ...]:
-        """Return the frames with keypoints."""
+        """Return the numbers of the frames with keypoints."""
         return self.files.frames()
 
     def read(self, camera: str) -> Keypoints2D | None:
@@ -139,7 +139,7 @@ def choose_subject(
     names = [name for name in cameras if name in people]
     frames = sorted({frame for name in names for frame in people[name]})
     views = Views.of(people, {name: cameras[name] for name in names}, distortions, frames)
-    # A long take is compared at evenly spread frames; in the others people are found by where they are between these.
+    # A long take is compared at evenly spread frames; between these, positions are interpolated.
     compared = frames[:: max(1, len(frames) // _MOST_FRAMES)]
     found = {frame: people_in_space(views.sighted[frame]) for frame in compared}
     tracks = sorted(_scored(_followed(found), views, mask, len(found)), key=lambda track: -track.score)
@@ -183,7 +183,7 @@ def _followed(found: Mapping[int, Sequence[PersonInSpace]]) -> list[Track]:
 
 
 def _scored(tracks: Sequence[Track], views: Views, mask: MaskReader | None, compared: int) -> list[Track]:
-    """Return the people with their scores, of the number of frames that were compared."""
+    """Score the people; `compared` is the number of frames in which views were compared."""
     total = max(1, (len(views.names) - 1) * compared)
     out = []
     for track in tracks:
@@ -207,14 +207,14 @@ def _inside(track: Track, views: Views, mask: MaskReader) -> float:
             if shown is None:
                 continue
             column, line = np.floor(views.points[frame][row]).astype(int).T
-            there = (column >= 0) & (line >= 0) & (column < shown.shape[1]) & (line < shown.shape[0])
-            inside += int((shown[line[there], column[there]] > 127).sum())
+            in_image = (column >= 0) & (line >= 0) & (column < shown.shape[1]) & (line < shown.shape[0])
+            inside += int((shown[line[in_image], column[in_image]] > 127).sum())
             count += len(column)
     return inside / count if count else 0.5
 
 
 def _members(track: Track, tracks: Sequence[Track], views: Views) -> dict[str, dict[int, int]]:
-    """Return the place in its list of the subject of each camera and frame, also where two views alone do not tell."""
+    """Return the subject's index among the people of each camera and frame, also where fewer than two views agree."""
     agreeing = np.zeros(len(views.names))
     for frame, place in track.places.items():
         agreeing[views.sighted[frame].camera[list(place.members)]] += 1

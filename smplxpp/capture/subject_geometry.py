@@ -1,4 +1,4 @@
-"""Find people in space among the people of all views of a frame: who is seen by which cameras, by agreement of rays."""
+"""Match the people of all views of a frame to people in space, by the distances between rays to their keypoints."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class PersonInSpace:
 
     @property
     def centre(self) -> Float64[np.ndarray, " 3"]:
-        """Median of the points, metres."""
+        """Median of the points that are known, metres."""
         return np.median(self.points[np.isfinite(self.points).all(axis=1)], axis=0)
 
 
@@ -95,9 +95,9 @@ def distances(seen: Sighted, row: int, points: Float64[np.ndarray, "K 3"]) -> Fl
 
     Points behind the camera are infinitely far.
     """
-    there = points - seen.origin[row]
-    along = np.einsum("kx,kx->k", there, seen.rays[row])
-    away = np.linalg.norm(there - along[:, None] * seen.rays[row], axis=1)
+    offset = points - seen.origin[row]
+    along = np.einsum("kx,kx->k", offset, seen.rays[row])
+    away = np.linalg.norm(offset - along[:, None] * seen.rays[row], axis=1)
     away = np.where(along > 0, away, np.inf)
     return np.where((seen.weight[row] > 0) & np.isfinite(points).all(axis=1), away, np.nan)
 

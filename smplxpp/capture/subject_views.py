@@ -107,16 +107,16 @@ def _rays(
     table: Float64[np.ndarray, "D K 3"], camera: Camera, distortion: Distortion | None
 ) -> tuple[Float64[np.ndarray, "D K 3"], np.ndarray]:
     """Return unit vectors of the world to the points of one camera, and which points the lens shows."""
-    there = table[..., 2] > 0
-    plane = (table[there][:, :2] - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
+    detected = table[..., 2] > 0
+    plane = (table[detected][:, :2] - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
     if distortion is not None:
         plane = distortion.undistort(plane)
     known = np.isfinite(plane).all(axis=1)
     inside = np.concatenate([np.where(known[:, None], plane, 0.0), np.ones((len(plane), 1))], axis=1)
     inside = inside @ camera.cam_from_world[:3, :3]
-    rays, shown = np.zeros(table.shape), there.copy()
-    rays[there] = inside / np.linalg.norm(inside, axis=1, keepdims=True)
-    shown[there] = known
+    rays, shown = np.zeros(table.shape), detected.copy()
+    rays[detected] = inside / np.linalg.norm(inside, axis=1, keepdims=True)
+    shown[detected] = known
     return rays, shown
 
 

@@ -19,8 +19,8 @@ from smplxpp.core.errors import InputError
 _SOUND_RATE = 8000  # samples a second: speech and claps
 _RATE = 200  # values a second of both kinds of signals, which bounds the precision to 5 ms
 _SMALL = 64  # pixels of the longer side of pictures that are compared
-# The best lag must correlate this much better than any that is 0.15 s and more away from it, and lie so many standard
-# deviations of a chance correlation above 0.
+# The best lag must have `_CLEARLY` times the correlation of any lag at least `_APART` seconds away from it, and exceed
+# 0 by `_DEVIATIONS` standard deviations of a chance correlation.
 _CLEARLY, _APART, _DEVIATIONS = 1.15, 0.15, 3.0
 _LEAST_OVERLAP = 1.0  # seconds that two recordings must share
 _SLOW = 1.0  # seconds over which signals are compared to their own mean: light and gain change slowly
@@ -106,7 +106,7 @@ def found_offsets(videos: Mapping[str, Video], by: str) -> dict[str, float]:
 
 
 def best_lag(a: Float64[np.ndarray, " N"], b: Float64[np.ndarray, " M"]) -> tuple[float, float]:
-    """Return by how many values b starts after a, and how clear that is: 1 and more is beyond chance.
+    """Return the lag of b behind a in samples, and its clarity: from 1 on it is not due to chance.
 
     The correlation is normalised by the energies of the parts that overlap, which have at least one second. It is clear
     if it is 1.15 times as high as that of any other lag, and three times the standard deviation `1 / sqrt(n)` of a

@@ -206,7 +206,7 @@ def _without_strays(values: np.ndarray) -> np.ndarray:
 
 
 def _refuse_normalised(heights: np.ndarray) -> None:
-    """Refuse a scan that reaches from -1 to 1 exactly: data sets are scaled so, and nobody stands 1 m in the floor."""
+    """Refuse heights from exactly -1 to 1: the scan was normalised, because no person stands 1 m in the floor."""
     if abs(heights.min() + 1.0) < 1e-3 and abs(heights.max() - 1.0) < 1e-3:
         raise _no_size("2 from head to foot, from -1 to 1: scaled data, whose unit is lost", 2.0)
 
@@ -241,10 +241,10 @@ def _cost(surface: SurfacePoints, bodies: _Bodies, up: str) -> float:
         scale = np.ptp(body_points[:, 1]) / max(high - low, 1e-12)
         placed = points * scale
         placed[:, 1] += body_points[:, 1].min() - placed[:, 1].min()
-        there = SurfacePoints.from_arrays(placed, normals)
+        target = SurfacePoints.from_arrays(placed, normals)
         for k in range(headings):
             turn = matrix_from_rotvec(np.array([0.0, 2.0 * np.pi * k / headings, 0.0]))
-            best = min(best, truncated_distance(body_points @ turn.T, body_normals @ turn.T, there))
+            best = min(best, truncated_distance(body_points @ turn.T, body_normals @ turn.T, target))
     return best
 
 

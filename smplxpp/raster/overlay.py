@@ -1,4 +1,4 @@
-"""Draw one mesh as glass over another, and a body within the scan that it was found in."""
+"""Draw a mesh as glass over another, for a body within the scan in which it was found."""
 
 from __future__ import annotations
 

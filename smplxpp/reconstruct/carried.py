@@ -56,7 +56,7 @@ class PosedPerson:
         index: Int64[np.ndarray, "N K"],
         limits: Float64[np.ndarray, " V"],
     ) -> Float32[np.ndarray, " N"]:
-        """Return how far points lie inside the surface that stands off the body by a limit a vertex, metres.
+        """Return the signed depth of points inside the surface at a given distance from each vertex, metres.
 
         Args:
             points: in the reference pose.
@@ -77,7 +77,7 @@ class PosedPerson:
         return out
 
     def carrier(self) -> Carrier:
-        """Return what finds weights near points."""
+        """Return the skinning of points near the body."""
         return Carrier(cKDTree(self.vertices), np.asarray(self.weights, np.float32), self.transforms)
 
 
@@ -128,7 +128,7 @@ class Carrier:
         return (weights[:, :, None] * homogeneous[:, None, :]).reshape(len(points), 4 * weights.shape[1])
 
     def carried(self, features: Float32[np.ndarray, "N _"], frame: int) -> Float64[np.ndarray, "N 3"]:
-        """Return the points of some features carried to a frame."""
+        """Carry points, given by their features, to a frame."""
         matrix = self.transforms[frame, :, :3].transpose(0, 2, 1).reshape(-1, 3)
         return (features @ matrix.astype(np.float32)).astype(np.float64)
 

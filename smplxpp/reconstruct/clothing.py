@@ -26,13 +26,13 @@ _SLACK_M, _UNKNOWN_M = 0.008, 0.08
 
 
 def clothing_limits(silhouettes: Sequence[Silhouette], person: PosedPerson) -> Float64[np.ndarray, " V"]:
-    """Return the distance from each vertex of the body beyond which there are no clothes, metres.
+    """Return the largest distance of clothes from each vertex of the body, metres.
 
     Args:
         silhouettes: a frame each.
         person: the body in these frames.
     """
-    # Every second vertex is enough for what is averaged over 20 cm.
+    # Every second vertex is enough, because the limits are medians over 20 cm.
     rows = np.arange(0, len(person.vertices), 2)
     carrier = person.carrier()
     weights = np.asarray(person.weights, np.float32)[rows]
@@ -48,9 +48,9 @@ def clothing_limits(silhouettes: Sequence[Silhouette], person: PosedPerson) -> F
         depth = silhouette.depth(points[rim].astype(np.float32))
         shown = depth < UNSEEN
         depth = np.maximum(depth, 0.0)
-        # Half as far outwards there is cloth and nothing of the body in the image; else another limb has the contour.
-        there = points[rim] + np.where(shown, 0.5 * depth, 0.0)[:, None] * normals[rim]
-        own, screen = (silhouette.camera.screen_from_world(place) for place in (points, there))
+        # At half the depth outwards the image must show cloth and no body; else the contour belongs to another limb.
+        outward = points[rim] + np.where(shown, 0.5 * depth, 0.0)[:, None] * normals[rim]
+        own, screen = (silhouette.camera.screen_from_world(place) for place in (points, outward))
         away = cKDTree(own[:, :2]).query(screen[:, :2])[0] * silhouette.pixel * screen[:, 2]
         reached = (away > 0.3 * depth) | (depth < _THIN_M)
         least[rim] = np.minimum(least[rim], np.where(shown & reached, depth, np.inf))

@@ -133,7 +133,7 @@ def _keys(cells: np.ndarray) -> np.ndarray:
 
 
 def _cells_of(keys: np.ndarray) -> np.ndarray:
-    """Unpack the coordinates of cells."""
+    """Unpack the coordinates of cells from their integers."""
     low = (1 << 21) - 1
     return np.stack([keys >> 42, keys >> 21 & low, keys & low], axis=1) - _SHIFT
 

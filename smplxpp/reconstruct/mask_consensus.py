@@ -28,7 +28,7 @@ _MOST_WRONG = 1.0 / 3.0
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """The views whose masks agree.
+    """The views whose masks agree with the majority.
 
     Attributes:
         trusted: whether a view is kept.

@@ -39,7 +39,7 @@ class SweepLevel:
         inward: distance that is searched inside the surface, metres.
         outward: distance that is searched outside the surface, metres.
         step: distance of the offsets, metres.
-        gain: agreement by which an offset must exceed the present place to be taken.
+        gain: least increase of agreement over the present position for an offset to be taken.
         coarseness: spacing of a patch's samples, in pixels, with photographs of that resolution. Each further value is
             used where the one before has no convincing agreement: small patches follow a surface, large ones find
             texture.

@@ -6,8 +6,8 @@ People Models", who carry the rays of silhouettes instead). There the photograph
 inside its silhouette, and what colour it has. Hull and colours are those of `reconstruct`, with all views looking at
 points that are carried.
 
-Eight silhouettes leave wedges of air between them. So the surface lies no farther from the body than clothes do where
-they are seen from the side (`clothing`).
+Eight silhouettes leave wedges of air between them. The surface is therefore bounded by the distance of clothes from the
+body, measured where they are seen from the side (`clothing`).
 
 Poses are wrong by some degrees, and each wrong one cuts into the surface. So a share of the frames may reject a point,
 and the surface is smoothed. It is not swept along its normals to where photographs agree: at poses that are off by
@@ -129,7 +129,7 @@ def _hull(
         out = np.empty(len(points), np.float32)
         for first in range(0, len(points), chunk):
             part = points[first : first + chunk]
-            # Nothing of the person stands farther off the body than clothes do there, whatever the silhouettes hold.
+            # Clothes bound the person's surface also where the silhouettes do not.
             distance, index = carrier.neighbours(part, reach=REACH_M)
             out[first : first + chunk] = person.room(part, distance, index, limits)
             rows = np.flatnonzero(distance[:, 0] < REACH_M)

@@ -21,7 +21,7 @@ from smplxpp.core import BodyParams, require_at_least, require_between
 
 _LEVER = 0.155  # metres; what the heel rises by over the ball of the foot, over the sine of the pitch
 _FINE = {"head": 0.4, "jaw": 0.4, "neck": 0.6, "wrist": 0.3, "ankle": 0.4, "foot": 0.25}
-"""Share of the noise on parts that 10 mm would deform beyond recognition."""
+"""Share of the noise on small parts, which 10 mm would make unrecognisable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Outside:
 
     @property
     def pitch(self) -> float:
-        """Angle by which heels pitch the feet, radians."""
+        """Pitch of the feet on their heels, radians."""
         return float(np.arcsin(min(self.heels / _LEVER, 0.8)))
 
     def turns(self) -> dict[str, np.ndarray]:
@@ -224,7 +224,7 @@ def _longer(body: BodyModel, posed: PosedBody, share: float) -> Float64[np.ndarr
             a, b = at[f"{side}_{start}"], at[f"{side}_{end}"]
             axis = (b - a) / np.linalg.norm(b - a)
             along = np.clip((vertices - a) @ axis, 0.0, np.linalg.norm(b - a))
-            # Of the trunk's vertices only those of the limb itself lie beyond its start.
+            # Vertices of the trunk are left out: only the limb's own lie past its start.
             limb = own & (_share(body, f"{side}_{start}") + _beyond(body, side, end) > 0.02)
             out += np.where(limb, share * along, 0.0)[:, None] * axis
     return out

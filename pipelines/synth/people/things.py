@@ -15,7 +15,7 @@ from smplxpp.core import InputError, TriangleMesh
 
 @dataclass(frozen=True)
 class Thing:
-    """A thing in a hand.
+    """A thing that a person holds.
 
     Attributes:
         kind: name among `THINGS`.

@@ -58,7 +58,7 @@ class FileCamera:
 
 @dataclass(frozen=True, eq=False)
 class RigFile:
-    """Content of a calibration file.
+    """Cameras and world of a calibration file.
 
     Attributes:
         cameras: in the order of the file.

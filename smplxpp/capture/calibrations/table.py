@@ -31,7 +31,7 @@ from smplxpp.core.validation import require_choice
 
 @dataclass(frozen=True)
 class CalibrationFormat:
-    """A format of calibration files.
+    """A file format of calibrations: how it is recognised and read.
 
     Attributes:
         name: of the format.
@@ -172,14 +172,15 @@ def find_calibration(folder: Path) -> Path | None:
 
 
 def format_of(path: Path) -> CalibrationFormat | None:
-    """Return the format of a file by its content; None where no format tells it, also if it cannot be read."""
+    """Recognise the format of a file by its content; None if no format fits or the file cannot be read."""
     try:
-        return _told(path)[0]
+        return _recognised(path)[0]
     except (InputError, OSError, TypeError, ValueError, KeyError, AttributeError):
         return None
 
 
-def _told(path: Path) -> tuple[CalibrationFormat | None, Any]:
+def _recognised(path: Path) -> tuple[CalibrationFormat | None, Any]:
+    """Open a calibration file; return its format, None where no format recognises it, and its content."""
     kind = next((kind for kind, (suffixes, _) in _LOADERS.items() if path.suffix.lower() in suffixes), None)
     if kind is None:
         return None, None
@@ -194,7 +195,7 @@ def _opened(path: Path) -> tuple[Path, CalibrationFormat, RigFile]:
     if file is None:
         raise InputError(f"folder {path}", expected=f"a calibration file of {known}", received="none that is known")
     try:
-        format, content = _told(file)
+        format, content = _recognised(file)
         if format is None:
             raise InputError(f"calibration {file}", expected=f"a file of {known}", received="content of none of them")
         return file, format, format.read(file, content)

@@ -53,7 +53,7 @@ def read_anipose(path: Path, content: Any) -> RigFile:
 
 
 def read_freemocap(path: Path, content: Any) -> RigFile:
-    """Millimetres."""
+    """Read FreeMoCap's cameras, whose unit is the millimetre."""
     return RigFile(_cameras(path, content), metres=1e-3)
 
 

@@ -126,7 +126,7 @@ def focus_of(centres: Float64[np.ndarray, "C 3"], ahead: Float64[np.ndarray, "C 
     """
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]  # projections perpendicular to the axes
     normal, right = across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0]
-    # Cameras that look the same way leave the distance open: it stays near them.
+    # The distance is undetermined for cameras with parallel axes: it stays near them.
     mean = centres.mean(axis=0)
     damping = 1e-6 * len(centres) * np.eye(3)
     return mean + np.linalg.solve(normal + damping, right - normal @ mean)

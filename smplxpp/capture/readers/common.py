@@ -170,7 +170,7 @@ def first_folder(root: Path, names: Iterable[str]) -> Path | None:
 
 
 def required(mapping: Any, key: str, *, source: str) -> Any:
-    """Return `mapping[key]`, which must exist.
+    """Return `mapping[key]`; refuse a missing key.
 
     Raises:
         InputError: no such key, or not a mapping.

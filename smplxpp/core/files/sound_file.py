@@ -1,6 +1,6 @@
 """Read sound files of any usual kind: WAV directly, others (FLAC, AIFF, MP3, Ogg, M4A) decoded by ffmpeg.
 
-The kind is told by the first bytes and handed to ffmpeg by name, so that no playlist makes it open other files.
+The format is recognised by the first bytes and named to ffmpeg, so that a playlist cannot make it open other files.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Decide whether a found body is believed: bounds, confidence, missing parts, and what the surface shows in words."""
+"""Decide whether a found body is accepted: bounds, confidence, missing parts, and findings about the surface."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from smplxpp.register.locate.search import Found
 
 @dataclass(frozen=True)
 class LocateBounds:
-    """Bounds by which a located body is refused or loses confidence. They
-    trade people that are refused against chairs, boxes and half a person that are taken for one; how both fare is
-    measured by `python -m benchmarks scan_alone`.
+    """Bounds that refuse a located body or lower its confidence.
+
+    They trade people that are refused against chairs, boxes and partial scans that are accepted; `python -m benchmarks
+    scan_alone` measures both.
 
     Attributes:
         least_covered: smallest share of the surface that a body must explain.
@@ -40,11 +41,11 @@ class LocateBounds:
 
 _BOUNDS = LocateBounds()
 _HEAD_SHOWN = 0.5
-"""Share of the head, from which hair and hoods hide some, below which it may be missing."""
+"""Visible share of the head below which it may be missing; hair and hoods hide some of it."""
 
 
 def no_person(found: Found) -> str:
-    """Return in words why a surface has too little in common with the body found in it; empty if it has enough."""
+    """Return the reason why the body found does not explain a surface; empty if it does."""
     fit = found.misfit
     if fit.covered < _BOUNDS.least_covered or fit.shown < _BOUNDS.least_shown or _shape(found) > _BOUNDS.largest_shape:
         unlike = ", and a body unlike any person" if _shape(found) > _BOUNDS.doubtful_shape else ""
@@ -56,7 +57,7 @@ def no_person(found: Found) -> str:
 
 
 def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tuple[tuple[str, ...], float]:
-    """Return in words what a surface shows that is not one whole person, and the factor that leaves of the confidence.
+    """Describe what a surface shows besides one whole person; return it with a factor for the confidence.
 
     Args:
         mesh: the surface.

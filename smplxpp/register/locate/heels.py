@@ -1,9 +1,9 @@
 """Lift the heels of a body that stands in the floor of its scan: shoes with heels.
 
-Feet are searched flat, so that a leg in a shoe with a heel comes out too long: its foot lies in the sole and below, and
-no small step lifts it, because knee, ankle and toes would have to bend together. A foot that is lower than everything
-that the scan has around it is therefore tried on heels of two heights: the ankle is raised along the leg (law of
-cosines for hip and knee), the foot is pitched down and the toes up, and the dressed fit decides.
+Feet are fitted flat, so that a leg in a heeled shoe comes out too long and its foot ends below the sole. A local step
+cannot lift it, because knee, ankle and toes would have to bend together. A foot that is lower than the scan around it
+is therefore tried on heels of two heights: the ankle is raised along the leg (law of cosines for hip and knee), the
+foot is pitched down and the toes up, and the candidate of lowest cost is kept.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.locate.search import Found, Search
 
-# Height of a heel in metres, pitch of the foot and of the toes in degrees: of a usual and of a high one.
+# A usual and a high heel: height in metres, pitch of the foot and of the toes in degrees.
 _HEELS = ((0.05, 30.0, -20.0), (0.08, 45.0, -30.0))
 _BELOW = 0.015
-"""Metres below the lowest point of the scan around it from which a foot lies in the floor; soles lie above it."""
+"""Depth in metres below the scan around it from which a foot counts as in the floor; in a flat shoe it is above."""
 _AROUND = 0.25
 """Metres around an ankle within which the scan shows its shoe."""
 

@@ -38,8 +38,8 @@ def locate_body(
 ) -> LocatedBody:
     """Find pose, shape, facing and place of the one person in a surface.
 
-    The candidate that best explains hands, face and feet within joint limits wins. Its margin over the best candidate
-    that faces the other way is most of the confidence.
+    The candidate that best explains hands, face and feet within joint limits wins. The confidence is
+    mainly its margin over the best candidate of the opposite facing.
 
     Args:
         body: the body model.

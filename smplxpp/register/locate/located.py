@@ -1,4 +1,4 @@
-"""What a search for the body in a surface returns, and the error of one that found nobody."""
+"""Hold the result of a search for the body in a surface, and the error if there is no person in it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class LocatedBody:
     Attributes:
         params: one row.
         confidence: from 0 to 1; a result below 0.5 should be inspected.
-        notes: sentences about what speaks against it and what to do.
+        notes: sentences about evidence against it, with remedies.
         candidates: all that were fitted to the end, the winner first.
         moved: limbs that were found elsewhere when they were searched again.
         findings: what the surface shows that is not one whole person, in words.

@@ -1,7 +1,7 @@
-"""Name what a scan shows that is not one whole person: several people, something large beside one, a cut body.
+"""Detect scans of other things than one whole person: several people, something large beside one, a cut body.
 
-These are tests of the geometry, which need no detector. They put a weak confidence into words: a single one may be
-wrong (a helmet under an arm is a second head), so that they lower the confidence and refuse nothing by themselves.
+These are tests of the geometry, which need no detector. A single one may be wrong (a helmet under an arm counts as a
+second head), so that they lower the confidence, explain it in words, and refuse nothing by themselves.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from smplxpp.register.priors import Anatomy, Priors
 
 # Joints of the SMPL body without hands and face; they come first.
 _BODY_JOINTS = 22
-# Millimetres of cost by which a fit may end above its start: bare skin that is known weighs more than before.
+# Largest increase of cost during a fit, millimetres; known bare skin raises the weights.
 _DIVERGED = 3.0
 _Ranked = tuple[float, str, BodyState]
 """Distance to the surface, metres; name of the pose of the start; the body."""

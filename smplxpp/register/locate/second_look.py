@@ -1,10 +1,10 @@
-"""Look again for limbs that the surface does not show where the fitted body has them.
+"""Search again for limbs that the surface does not show where the fitted body has them.
 
-The first search compares whole bodies at few points before anything is known about clothes, so that an arm may end on
-the belly, a leg on the other one. Once the body is dressed, what the rest of it explains is known. A doubtful limb is
-then compared with the surface that is left: in the poses of a finer grid and, where a detector saw its joints, in the
-pose that leads there. The nearest few are refined by ICP of the limb alone and then as whole dressed bodies, and the
-one of least cost is kept, which may be the old one.
+The first search compares whole bodies at few points without a model of clothes, so that an arm may end on the belly, or
+a leg on the other leg. The dressed fit shows which surface the rest of the body explains. An unexplained limb is then
+compared with the remaining surface: in the poses of a finer grid and, where a detector found its joints, in the pose
+that reaches them. The nearest few are refined by ICP of the limb alone and then as whole dressed bodies, and the one
+of least cost is kept, which may be the first.
 """
 
 from __future__ import annotations
@@ -77,9 +77,9 @@ class _Limb:
 
     def score(self, search: Search, state: BodyState) -> float:
         """Return the mean distance of the limb and of the surface in its reach, as shares of body and scan, metres."""
-        there = position_normal_features(*self.proxy.posed(search.kinematics, search.kinematics.posture(state, 0)))
-        one, _ = search.fine.tree.query(there, distance_upper_bound=_CAP)
-        left, _ = cKDTree(there).query(self.surface.tree.data, distance_upper_bound=_CAP)
+        posed = position_normal_features(*self.proxy.posed(search.kinematics, search.kinematics.posture(state, 0)))
+        one, _ = search.fine.tree.query(posed, distance_upper_bound=_CAP)
+        left, _ = cKDTree(posed).query(self.surface.tree.data, distance_upper_bound=_CAP)
         both = np.minimum(np.minimum(left, self.rest), _CAP)
         return float(self.size * np.minimum(one, _CAP).mean() + self.share * both.sum())
 
@@ -140,7 +140,7 @@ def doubtful_limbs(
 def _hints_of(
     side: str, kind: str, hints: Mapping[str, Float[np.ndarray, " 3"]] | None
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Return the joints of a limb that a detector sees, beyond its root, under the body's names."""
+    """Return a detector's points for the joints of a limb except its root, under the body's names."""
     seen = {} if hints is None else hints
     names = {f"{side}_{joint}": f"coco_{side}_{joint}" for joint in _JOINTS[kind][1:]}
     return {joint: np.asarray(seen[name]) for joint, name in names.items() if name in seen}

@@ -8,8 +8,8 @@ The minimised sum is that of `smplxpp.register` (keypoints, masks, joint limits,
    free in the second half, because a wrong pose explains itself by a wrong lens.
 3. Masks: the silhouette as in any registration, with the focal length held.
 
-Which scale a person has is not seen by one camera: twice as large and twice as far looks the same. It comes from the
-prior of the shape, or from the stature that is told.
+One camera does not determine scale: a person twice as large and twice as far looks the same. It comes from the shape
+prior, or from a stature that the user states.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class TurntableConfig:
 
 @dataclass(frozen=True, eq=False)
 class TurntableFit:
-    """A body that turns, and the camera before which it does.
+    """The fit of a turning body, and the camera that saw it.
 
     Attributes:
         fit: poses and shape, with residuals in pixels.
@@ -76,7 +76,7 @@ class TurntableFit:
         up: vertical in that world, a unit vector.
         focal_spread: standard deviation of the logarithm of the focal length, from the normal equations.
         stature: height of the body in the T-pose, metres.
-        turned: degrees by which the body turned in total, positive to its left.
+        turned: total rotation of the body about the vertical, degrees, positive to its left.
         start_cost: mean truncated error of the starting poses, from 0 to about 1.
     """
 
@@ -237,7 +237,7 @@ class _Turn:
         return np.flatnonzero(free)
 
     def _start(self) -> tuple[BodyState, Shared, float]:
-        """Return the initial fit, or the standing body turned as the keypoints say."""
+        """Return the initial fit, or the standing body with the headings that fit the keypoints."""
         up = np.array([0.0, 1.0, 0.0])
         state, cost = start_of_turn(self.kinematics, self.camera, self.landmarks, self.keypoints, up)
         if self.observed.initial is not None:
@@ -287,7 +287,7 @@ class _Turn:
     def _step(
         self, state: BodyState, shared: Shared, priors: SharedPriors, surface: SilhouetteTerm | None
     ) -> tuple[BodyState, Shared, NormalEquations]:
-        """Take one damped Gauss-Newton step."""
+        """Take one damped Gauss-Newton step in all unknowns."""
         self.term.with_focal(shared.log_focal)
         equations = NormalEquations(self.columns, len(state))
         for row in range(len(state)):

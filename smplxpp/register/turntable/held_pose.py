@@ -241,10 +241,10 @@ class HeldPose:
         equations.shape[index, index] += 1.0
         equations.shape_gradient[index] += state.betas
         if self.priors.stature is not None:
-            told = 0.01  # metres: shoes and posture
+            deviation = 0.01  # metres: shoes and posture
             off = self.rest_height + self.height_dirs @ state.betas - self.priors.stature
-            equations.shape[np.ix_(index, index)] += np.outer(self.height_dirs, self.height_dirs) / told**2
-            equations.shape_gradient[index] += self.height_dirs * off / told**2
+            equations.shape[np.ix_(index, index)] += np.outer(self.height_dirs, self.height_dirs) / deviation**2
+            equations.shape_gradient[index] += self.height_dirs * off / deviation**2
         spread = max(self.priors.focal_spread, 1e-6)
         equations.shape[c.focal, c.focal] += 1.0 / spread**2
         equations.shape_gradient[c.focal] += (shared.log_focal - np.log(self.priors.focal)) / spread**2

@@ -1,9 +1,9 @@
-"""Find which way a person faces in every frame of one camera: candidate turns, then the best path through the frames.
+"""Find the heading of a person in every frame of one camera: candidate headings, then the best path (Viterbi).
 
-Each frame is compared with the body at rest, arms lowered, turned about the vertical in steps of 10 degrees and placed
-where its points of trunk, head and legs project best. The cost of a turn is the mean truncated reprojection error, plus
-the points of the face that ought to be seen and are not, or the other way round. The path minimises the sum of these
-costs and of the deviations from a steady turn (Viterbi), once to the left and once to the right.
+Each frame is compared with the body at rest, arms lowered, rotated about the vertical in steps of 10 degrees and placed
+where its points of trunk, head and legs project best. The cost of a heading is the mean truncated reprojection error,
+plus a penalty for face points that are visible and not detected, or detected and not visible. The path minimises the
+sum of these costs and of the deviations from a steady rotation, once to the left and once to the right.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _STEADY = (
     "heel",
 )
 _FACE = ("nose", "left_eye", "right_eye", "face_30")
-_SEEN = 0.3  # confidence from which a detector means that it sees a point
+_SEEN = 0.3  # confidence from which a point counts as detected
 
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """Candidate turns of every frame.
+    """Candidate headings of the body in every frame.
 
     Attributes:
         cost: mean truncated error of each candidate, from 0 to about 1.
@@ -195,8 +195,8 @@ def _placed(
         b = seen[None] * inside[..., 2:] - inside[..., :2]
         normal = np.einsum("ak,akic,akid->acd", w, A, A) + 1e-9 * np.eye(3)
         move = np.linalg.solve(normal, np.einsum("ak,akic,aki->ac", w, A, b)[..., None])[..., 0]
-        there = inside + move[:, None]
-        projected = there[..., :2] / np.maximum(there[..., 2:], 0.1)
+        moved = inside + move[:, None]
+        projected = moved[..., :2] / np.maximum(moved[..., 2:], 0.1)
         squared = ((projected - seen) ** 2).sum(axis=2) / cutoff**2
         robust = 1.0 / (1.0 + squared / scale**2) ** 2
     return move, (weight * np.minimum(squared, 1.0)).sum(axis=1) / weight.sum()
