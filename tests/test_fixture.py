@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from pipelines.synth.checks import depths, free_edge_strain
-from pipelines.synth.person import load_person
 from pipelines.synth.simulate import Take
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.people.fixture_person import load_person
 from smplxpp.raster import rasterize_mesh
 from smplxpp.skinning import skin
 

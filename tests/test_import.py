@@ -17,8 +17,8 @@ from pipelines.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("smplxpp", "avatar", "pipelines")
-TOP = {"build"}
-"""Rooms above the stages: they put them in order, and nothing of the package imports them."""
+TOP = {"build", "people"}
+"""Rooms above the stages, which nothing of the package imports: the order of the stages, and procedural people."""
 SHARED = {"core", "native", "raster", "skinning", "body", "template", "cloth", "data"}
 STAGES = {
     "capture",

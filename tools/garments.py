@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, lift_outside, loop_subdivide, smooth, submesh
-from pipelines.synth.patterns import ramp, smooth_noise
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import face_components
+from smplxpp.people.cloth_mesh import ClothMesh, clip, diffuse, lift_outside, loop_subdivide, smooth, submesh
+from smplxpp.people.patterns import ramp, smooth_noise
 from tools.anny_base import JOINT_NAMES, BaseMesh
 
 

@@ -6,10 +6,10 @@ import igl
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.cloth_mesh import ClothMesh, clip, diffuse, smooth, submesh
-from pipelines.synth.patterns import smooth_noise
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
+from smplxpp.people.cloth_mesh import ClothMesh, clip, diffuse, smooth, submesh
+from smplxpp.people.patterns import smooth_noise
 from tools.garments import DressForm, largest_component, with_clean_weights
 
 

@@ -7,7 +7,7 @@
 `photographs`: the training cameras' photographs with their masks' boxes; errors against the true body's landmarks as a
 camera and a triangulation see them, and the body that `smplxpp.register` fits to these keypoints, with masks and
 without, from nothing else. `scans`: landmarks of bare scans drawn all around (`smplxpp.build.scan_keypoints`), of
-every capture and procedural person, as they are, after `pipelines.synth.people.VARIANTS`, without colours. `masks`: of
+every capture and procedural person, as they are, after `smplxpp.people.VARIANTS`, without colours. `masks`: of
 MediaPipe, and of empty plates: the captures are on black, so their people are put before made rooms, with noise, a
 shadow on the floor and another exposure than the plate's. The truth is looked at in measuring alone.
 """
@@ -31,7 +31,6 @@ from benchmarks.support.results import store_results
 from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes
 from pipelines.commands.options import OptionalPath, OptionalText, selected_frames
 from pipelines.stages.build_config import RegisterInputs
-from pipelines.synth.people import PersonScan, people, variant
 from smplxpp.body import BodyModel, load_body
 from smplxpp.build.observe import observe
 from smplxpp.build.scan_keypoints import ScanViews, facing, keypoints_of_scan
@@ -41,6 +40,7 @@ from smplxpp.detect import load_detector
 from smplxpp.detect.mediapipe_detector import PersonSegmenter
 from smplxpp.detect.plates import PlateModel
 from smplxpp.metrics.pose_error import pose_error
+from smplxpp.people import PersonScan, people, variant
 from smplxpp.register import LandmarkModel, Observations, RegisterConfig, register, triangulate
 
 _MM = 1000.0

@@ -18,10 +18,10 @@ from jaxtyping import Float
 
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
-from pipelines.synth.people import CAST, PersonScan, person
 from pipelines.viewer.session import lies_within
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core import BodyParams, spread
+from smplxpp.people import CAST, PersonScan, person
 from smplxpp.register import LandmarkModel, Observations, ScanObservation, register
 from smplxpp.register.locate import locate_body
 

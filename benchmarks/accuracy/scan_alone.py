@@ -20,11 +20,11 @@ import tyro
 
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
-from pipelines.synth.people import VARIANTS, PersonScan, people, person, variant
 from smplxpp.body import BodyModel, load_body
 from smplxpp.build.locate import certain_labels
 from smplxpp.clean import convert_points, find_scan_frame
 from smplxpp.core import BodyParams, InputError
+from smplxpp.people import VARIANTS, PersonScan, people, person, variant
 from smplxpp.register.locate import locate_body
 from smplxpp.segment import label_by_body
 
@@ -39,7 +39,7 @@ class ScanAlone:
     people: int = 12
     """Number of procedural people; 0: none."""
     who: tuple[str, ...] = ()
-    """These of them by name (`pipelines.synth.people.cast`), in place of the first ones."""
+    """These of them by name (`smplxpp.people.cast`), in place of the first ones."""
     outsiders: bool = False
     """The people whose surface the body model cannot reach, in place of the first ones of the cast."""
     seed: int = 0
@@ -47,7 +47,7 @@ class ScanAlone:
     captured: bool = True
     """The fixture's scan and those of captures, too."""
     variants: tuple[str, ...] = ("as it is",)
-    """Changes of the scans: names of `pipelines.synth.people.VARIANTS`, or "all"."""
+    """Changes of the scans: names of `smplxpp.people.VARIANTS`, or "all"."""
     labels: bool = True
     """Label the scans with the body that was found, too."""
     store: bool = True

@@ -28,10 +28,10 @@ from rich.table import Table
 
 from benchmarks.accuracy.driving import Method, nearest_point, nearest_vertex
 from benchmarks.support.results import store_results
-from pipelines.synth.garments.wardrobe import SHAPES, Case, cases
 from smplxpp.body import BodyModel, load_body
 from smplxpp.body.named_poses import stress_poses
 from smplxpp.core import GeometryWarning, TriangleMesh
+from smplxpp.people.garments.wardrobe import SHAPES, Case, cases
 from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 

@@ -15,15 +15,15 @@ from jaxtyping import Bool
 
 from benchmarks.support.results import ROOT
 from pipelines.figures.sheets import caption, contact_sheet, encode_png, row
-from pipelines.synth.garments.mannequin import shares
-from pipelines.synth.people import PersonScan, people, variant
-from pipelines.synth.people.bodies import FINGERS
-from pipelines.synth.people.person_scan import face_majority
 from smplxpp.body import load_body, load_params
 from smplxpp.core import LABELS, InputError, TriangleMesh, display_colors
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.people import PersonScan, people, variant
+from smplxpp.people.bodies import FINGERS
+from smplxpp.people.garments.mannequin import shares
+from smplxpp.people.person_scan import face_majority
 from smplxpp.raster import render_shaded
 from smplxpp.raster.viewpoints import body_cameras
 from smplxpp.segment import read_labels
@@ -91,7 +91,7 @@ class PeopleSheet:
     seed: int = 0
     """0: as the cast describes them; another one: others of the same kinds."""
     variant: str = "as it is"
-    """Change of the scans: one of `pipelines.synth.people.VARIANTS`."""
+    """Change of the scans: one of `smplxpp.people.VARIANTS`."""
     height: int = 420
     """Height of a person's pictures, pixels."""
 

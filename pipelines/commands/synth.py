@@ -12,9 +12,9 @@ from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextC
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from pipelines.synth.config import SynthConfig, motion_kind
 from pipelines.synth.make_capture import make_capture
-from pipelines.synth.person import CLOTHES
 from smplxpp.core import InputError, require_at_least, require_between, require_choice
 from smplxpp.core.files.panorama_file import read_panorama
+from smplxpp.people.fixture_person import CLOTHES
 from smplxpp.raster.soft_light import Environment
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pipelines.synth.motion import Motion, Performance
-from pipelines.synth.patterns import SKIRT_PATTERNS
-from pipelines.synth.person import CLOTHES
 from pipelines.synth.simulate import SimulationConfig
 from pipelines.synth.talking import Talking
 from pipelines.synth.turntable import Turntable
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core.validation import require_at_least, require_choice, require_positive
+from smplxpp.people.fixture_person import CLOTHES
+from smplxpp.people.patterns import SKIRT_PATTERNS
 from smplxpp.raster.soft_light import LightConfig
 
 

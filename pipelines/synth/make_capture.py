@@ -14,9 +14,6 @@ from jaxtyping import Bool, UInt8
 from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.checks import scan_checks, take_checks
 from pipelines.synth.config import SynthConfig, motion_kind, split_frames
-from pipelines.synth.people.outside import Outside, with_offsets
-from pipelines.synth.person import PART_LABELS, PART_NAMES, Person, person_of, read_layers
-from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from pipelines.synth.simulate import Take, simulate
 from pipelines.synth.tracked_inputs import INPUTS, protocols, write_estimated_labels, write_tracked_keypoints
 from pipelines.synth.tracker import tracker_noise
@@ -28,6 +25,9 @@ from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg
 from smplxpp.capture.writers.metadata import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.core import ProgressCallback, TriangleMesh, ignore_progress, write_ply
 from smplxpp.core.files import atomic_folder, atomic_write_text, read_json
+from smplxpp.people.fixture_person import PART_LABELS, PART_NAMES, Person, person_of, read_layers
+from smplxpp.people.outside import Outside, with_offsets
+from smplxpp.people.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from smplxpp.raster.soft_light import Environment, LightConfig, vertex_light
 
 

@@ -10,10 +10,10 @@ from jaxtyping import Float, Int
 
 from pipelines.synth.garment_dynamics import ContactSurface, GarmentConfig, GarmentDynamics
 from pipelines.synth.motion import Motion
-from pipelines.synth.patterns import ramp
-from pipelines.synth.person import PART_NAMES, Person, rest_joints
 from smplxpp.core import BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.people.fixture_person import PART_NAMES, Person, rest_joints
+from smplxpp.people.patterns import ramp
 
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
 

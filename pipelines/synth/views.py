@@ -10,9 +10,9 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
 
-from pipelines.synth.person import PART_NAMES, Person
 from smplxpp.core import Camera, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb, srgb8_from_linear
+from smplxpp.people.fixture_person import PART_NAMES, Person
 from smplxpp.raster import MeshMaps, rasterize_mesh
 from smplxpp.raster.soft_light import bounced
 

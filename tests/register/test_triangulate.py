@@ -10,11 +10,11 @@ import pytest
 
 from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.motion import Performance
-from pipelines.synth.person import PERSON_BETAS
 from pipelines.synth.tracker import DetectorConfig, detector_keypoints
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core import Camera, InputError, Keypoints2D, matrix_from_rotvec
+from smplxpp.people.fixture_person import PERSON_BETAS
 from smplxpp.register.keypoint_faults import mirror_index, number_ranges
 from smplxpp.register.triangulate import Triangulation, TriangulationConfig, triangulate
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.synth.people.things import THINGS, Thing, thing_mesh
-from pipelines.synth.scan_simulation import ScanConfig, simulate_scan
 from smplxpp.body import BodyModel, PosedBody, load_body
 from smplxpp.core import OBJECT, BodyParams, InputError, TriangleMesh, concatenate_meshes
+from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
+from smplxpp.people.things import THINGS, Thing, thing_mesh
 from smplxpp.segment import label_by_body
 from smplxpp.segment.by_body_objects import find_objects
 from smplxpp.transfer import rigid_weights

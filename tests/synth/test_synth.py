@@ -15,7 +15,6 @@ from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.config import SynthConfig, split_frames
 from pipelines.synth.make_capture import make_capture
 from pipelines.synth.motion import Performance
-from pipelines.synth.person import load_person
 from pipelines.synth.simulate import SimulationConfig
 from pipelines.synth.views import LitFrame, normal_map, render_view
 from smplxpp.body import load_body
@@ -25,6 +24,7 @@ from smplxpp.capture.writers.arrays import save_compact
 from smplxpp.capture.writers.images import png16, write_normal_png
 from smplxpp.capture.writers.metadata import FACE, write_calibration_csv, write_cameras_json
 from smplxpp.core import InputError, TriangleMesh
+from smplxpp.people.fixture_person import load_person
 from smplxpp.raster import rasterize_mesh
 from smplxpp.raster.soft_light import Environment, LightConfig, bounced, vertex_light
 

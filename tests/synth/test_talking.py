@@ -15,7 +15,6 @@ from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.config import SynthConfig
 from pipelines.synth.make_capture import make_capture
 from pipelines.synth.motion import Performance
-from pipelines.synth.person import load_person, read_layers
 from pipelines.synth.simulate import SimulationConfig, _Stage, attachment
 from pipelines.synth.talking import GESTURES, Talking
 from pipelines.synth.views import Atlas, LitFrame, _cell_centers, paint_atlas, render_view
@@ -24,6 +23,7 @@ from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import open_capture
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.people.fixture_person import load_person, read_layers
 from smplxpp.raster.soft_light import LightConfig
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"

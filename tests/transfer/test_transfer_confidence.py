@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy.transfer_garments import Trial
-from pipelines.synth.garments.fitted import fitted_garments
-from pipelines.synth.garments.hair import hairstyles
-from pipelines.synth.garments.loose import loose_garments
-from pipelines.synth.garments.mannequin import Mannequin, shares
-from pipelines.synth.garments.wardrobe import scan, shape_betas
 from smplxpp.body import load_body
+from smplxpp.people.garments.fitted import fitted_garments
+from smplxpp.people.garments.hair import hairstyles
+from smplxpp.people.garments.loose import loose_garments
+from smplxpp.people.garments.mannequin import Mannequin, shares
+from smplxpp.people.garments.wardrobe import scan, shape_betas
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.correspond import closest_points
 

@@ -9,13 +9,13 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from pipelines.synth.people.cast import CAST, OUTSIDERS, Member
-from pipelines.synth.people.making import make_person
-from pipelines.synth.people.outside import outside_body, seed_of
-from pipelines.synth.people.person_scan import PersonScan
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, TriangleMesh
 from smplxpp.core.files import read_arrays, read_bytes, write_arrays
+from smplxpp.people.cast import CAST, OUTSIDERS, Member
+from smplxpp.people.making import make_person
+from smplxpp.people.outside import outside_body, seed_of
+from smplxpp.people.person_scan import PersonScan
 
 CACHE_VARIABLE = "SMPLXPP_PEOPLE"
 
@@ -71,15 +71,9 @@ def _body() -> BodyModel:
 @lru_cache
 def _code() -> bytes:
     """Return a digest of the sources that people follow from; the cast enters the key of each member."""
-    synth = Path(__file__).parents[1]
-    names = (
-        "cloth_mesh.py",
-        "patterns.py",
-        "scan_simulation.py",
-        "textures.py",
-        *(f"people/{name}.py" for name in ("bodies", "making", "outside", "paint")),
-    )
-    files = [*(synth / name for name in names), *sorted((synth / "garments").glob("*.py"))]
+    room = Path(__file__).parent
+    names = ("cloth_mesh", "patterns", "scan_simulation", "textures", "bodies", "making", "outside", "paint")
+    files = [*(room / f"{name}.py" for name in names), *sorted((room / "garments").glob("*.py"))]
     return hashlib.sha256(b"".join(read_bytes(path) for path in files)).digest()
 
 

@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from pipelines.synth.cloth_mesh import ClothMesh, lift_outside
-from pipelines.synth.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
-from pipelines.synth.garments.mannequin import Mannequin
+from smplxpp.people.cloth_mesh import ClothMesh, lift_outside
+from smplxpp.people.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
+from smplxpp.people.garments.mannequin import Mannequin
 
 _SKIRT = (
     "trunk at the same height and azimuth down to the hips; from there to 22 cm below the thighs grow to {legs}, the "

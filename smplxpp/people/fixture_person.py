@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipelines.synth import textures
-from pipelines.synth.cloth_mesh import ClothMesh, clip, lift_outside, loop_subdivide, outer_faces, smooth, submesh
-from pipelines.synth.patterns import skirt_colors
 from smplxpp.body import BodyModel, load_body
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.files.array_file import read_arrays
+from smplxpp.people import textures
+from smplxpp.people.cloth_mesh import ClothMesh, clip, lift_outside, loop_subdivide, outer_faces, smooth, submesh
+from smplxpp.people.patterns import skirt_colors
 from smplxpp.skinning import skin
 
 PART_NAMES = ("body", "upper", "lower", "shoes", "hair")

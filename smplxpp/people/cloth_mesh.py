@@ -55,7 +55,7 @@ def loop_subdivide(cloth: ClothMesh, times: int = 1) -> ClothMesh:
     # Weights are subdivided as further coordinates of the vertices.
     stacked = np.ascontiguousarray(np.hstack([cloth.vertices, cloth.weights]))
     values, faces = igl.loop(stacked, np.ascontiguousarray(cloth.faces, dtype=np.int64), times)
-    return ClothMesh(values[:, :3], faces, values[:, 3:])
+    return ClothMesh(values[:, :3], faces.astype(np.int64), values[:, 3:])
 
 
 def clip(cloth: ClothMesh, level: Float[np.ndarray, " N"]) -> ClothMesh:

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pipelines.synth.cloth_mesh import ClothMesh
-from pipelines.synth.garments.mannequin import Mannequin
 from smplxpp.body import BodyModel
 from smplxpp.core.params import BodyParams
+from smplxpp.people.cloth_mesh import ClothMesh
+from smplxpp.people.garments.mannequin import Mannequin
 
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 Turns = dict[str, np.ndarray]

@@ -10,20 +10,20 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from pipelines.synth.cloth_mesh import ClothMesh, lift_outside, outer_faces, smooth
-from pipelines.synth.garments.mannequin import ARM_JOINTS, HAND_JOINTS, shares
-from pipelines.synth.garments.wardrobe import all_garments
-from pipelines.synth.patterns import smooth_noise
-from pipelines.synth.people.bodies import Posing, betas_of, fitting_mannequin
-from pipelines.synth.people.cast import Member, Wear
-from pipelines.synth.people.outside import heel_blocks, outside_body, seed_of
-from pipelines.synth.people.paint import cloth_paint, hair_paint, photographed, skin_paint
-from pipelines.synth.people.person_scan import PersonScan, face_majority
-from pipelines.synth.people.things import Thing, thing_mesh
-from pipelines.synth.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from smplxpp.body import BodyModel, PosedBody
 from smplxpp.core import LABEL_BY_NAME, BodyParams, TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.people.bodies import Posing, betas_of, fitting_mannequin
+from smplxpp.people.cast import Member, Wear
+from smplxpp.people.cloth_mesh import ClothMesh, lift_outside, outer_faces, smooth
+from smplxpp.people.garments.mannequin import ARM_JOINTS, HAND_JOINTS, shares
+from smplxpp.people.garments.wardrobe import all_garments
+from smplxpp.people.outside import heel_blocks, outside_body, seed_of
+from smplxpp.people.paint import cloth_paint, hair_paint, photographed, skin_paint
+from smplxpp.people.patterns import smooth_noise
+from smplxpp.people.person_scan import PersonScan, face_majority
+from smplxpp.people.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
+from smplxpp.people.things import Thing, thing_mesh
 from smplxpp.skinning import skin
 
 _OVER_CLOTH = 0.003  # metres between layers
@@ -163,7 +163,7 @@ def _put_on(cloth: ClothMesh, worn: list[ClothMesh], *, folds: float, seed: int)
     return cloth.with_vertices(vertices)
 
 
-def pose_layers(dressed: Dressed, params: BodyParams) -> tuple[PosedBody, list[Float[np.ndarray, "N 3"]]]:
+def pose_layers(dressed: Dressed, params: BodyParams) -> tuple[PosedBody, list[Float[np.ndarray, "_ 3"]]]:
     """Return the posed body and the vertices of its layers, pushed out of the skin and of each other again."""
     posed = dressed.body.forward(params)
     bare = dressed.body.mesh(posed.vertices[0]).submesh(outer_faces(dressed.body))[0]

@@ -7,10 +7,10 @@ from functools import partial
 
 import numpy as np
 
-from pipelines.synth.cloth_mesh import ClothMesh, lift_outside, smooth
-from pipelines.synth.garments.cut import Garment, Level, facing_out, grid_faces, joined, layer, tube_along
-from pipelines.synth.garments.mannequin import Mannequin
-from pipelines.synth.patterns import ramp
+from smplxpp.people.cloth_mesh import ClothMesh, lift_outside, smooth
+from smplxpp.people.garments.cut import Garment, Level, facing_out, grid_faces, joined, layer, tube_along
+from smplxpp.people.garments.mannequin import Mannequin
+from smplxpp.people.patterns import ramp
 
 _HOOD_UP = "the head from the chin up, from the neck's base down the shoulders' skin straight below, smooth between"
 _HOOD_DOWN = "shirt: as grown; the hood's roll: spine3, at its sides half the collar bone"

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipelines.synth import textures
-from pipelines.synth.patterns import Color, band, mix, smooth_noise
-from pipelines.synth.person import face_landmarks, face_marks
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.people import textures
+from smplxpp.people.fixture_person import face_landmarks, face_marks
+from smplxpp.people.patterns import Color, band, mix, smooth_noise
 from smplxpp.raster.soft_light import LightConfig, bounced, vertex_light
 
 SKIN_TONES: dict[str, Color] = {

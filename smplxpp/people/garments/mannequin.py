@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from pipelines.synth.cloth_mesh import ClothMesh, outer_faces
 from smplxpp.body import BodyModel
 from smplxpp.core.params import BodyParams
+from smplxpp.people.cloth_mesh import ClothMesh, outer_faces
 
 # Parts of joint names, without the side.
 HAND_JOINTS = ("elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")

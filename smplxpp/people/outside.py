@@ -14,10 +14,10 @@ from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from pipelines.synth.cloth_mesh import ClothMesh
-from pipelines.synth.patterns import ramp, smooth_noise
 from smplxpp.body import BodyModel, PosedBody
 from smplxpp.core import BodyParams, require_at_least, require_between
+from smplxpp.people.cloth_mesh import ClothMesh
+from smplxpp.people.patterns import ramp, smooth_noise
 
 _LEVER = 0.155  # metres; what the heel rises by over the ball of the foot, over the sine of the pitch
 _FINE = {"head": 0.4, "jaw": 0.4, "neck": 0.6, "wrist": 0.3, "ankle": 0.4, "foot": 0.25}
@@ -86,7 +86,7 @@ def outside_body(body: BodyModel, outside: Outside, *, seed: int) -> BodyModel:
         seed: of the noise.
 
     Example:
-        >>> from pipelines.synth.people.outside import Outside, outside_body
+        >>> from smplxpp.people.outside import Outside, outside_body
         >>> body = smplxpp.load_body()
         >>> other = outside_body(body, Outside(noise=0.01), seed=3)
         >>> 0.006 < np.sqrt(np.mean(np.sum((other.v_template - body.v_template) ** 2, axis=1))) < 0.01
@@ -109,7 +109,7 @@ def with_offsets(
     """Return the layers of a capture's person with a body that the model cannot reach; clothes and hair move along.
 
     Args:
-        arrays: of `pipelines.synth.person.read_layers`; the body's vertices come first.
+        arrays: of `smplxpp.people.fixture_person.read_layers`; the body's vertices come first.
         body: the model that is fitted later.
         outside: how the person differs.
         seed: of the noise.

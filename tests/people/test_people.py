@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from benchmarks.support.people import body_outside, captured, captured_names
-from pipelines.synth.garments.wardrobe import all_garments
-from pipelines.synth.people import CAST, OUTSIDERS, VARIANTS, access, people, person, variant
-from pipelines.synth.people.bodies import BUILDS, STANCES, Posing, betas_of, fitting_mannequin
-from pipelines.synth.people.making import make_person
-from pipelines.synth.people.outside import Outside, heel_blocks, outside_body, reachable
-from pipelines.synth.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
-from pipelines.synth.scan_simulation import ScanConfig
 from smplxpp.body import load_body
 from smplxpp.core import LABEL_BY_NAME, BodyParams, InputError
+from smplxpp.people import CAST, OUTSIDERS, VARIANTS, access, people, person, variant
+from smplxpp.people.bodies import BUILDS, STANCES, Posing, betas_of, fitting_mannequin
+from smplxpp.people.garments.wardrobe import all_garments
+from smplxpp.people.making import make_person
+from smplxpp.people.outside import Outside, heel_blocks, outside_body, reachable
+from smplxpp.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
+from smplxpp.people.scan_simulation import ScanConfig
 from smplxpp.skinning import skin
 
 NAME = "man shirt trousers short hair, arms down"

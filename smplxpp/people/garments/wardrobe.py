@@ -9,15 +9,15 @@ import igl
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.garments.cut import Garment
-from pipelines.synth.garments.fitted import bottoms, fitted_garments, tops
-from pipelines.synth.garments.hair import hairstyles, tied_and_short_hair
-from pipelines.synth.garments.loose import loose_garments
-from pipelines.synth.garments.mannequin import HAND_JOINTS, Mannequin, shares
-from pipelines.synth.patterns import smooth_noise
 from smplxpp.body import BodyModel
 from smplxpp.clean.simplify import simplify
 from smplxpp.core import BodyParams, TriangleMesh
+from smplxpp.people.garments.cut import Garment
+from smplxpp.people.garments.fitted import bottoms, fitted_garments, tops
+from smplxpp.people.garments.hair import hairstyles, tied_and_short_hair
+from smplxpp.people.garments.loose import loose_garments
+from smplxpp.people.garments.mannequin import HAND_JOINTS, Mannequin, shares
+from smplxpp.people.patterns import smooth_noise
 from smplxpp.skinning import skin
 
 SHAPES = ("mean", "heavy and tall", "slight")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from pipelines.synth.people.outside import Outside
-from pipelines.synth.people.paint import Dye
+from smplxpp.people.outside import Outside
+from smplxpp.people.paint import Dye
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipelines.synth.cloth_mesh import diffuse, smooth
 from smplxpp.core import Camera, TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 from smplxpp.core.topology import component_labels, face_components
+from smplxpp.people.cloth_mesh import diffuse, smooth
 from smplxpp.raster import rasterize_mesh, view_directions
 
 

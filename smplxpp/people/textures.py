@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipelines.synth.patterns import band, mix, mix_rows, ramp, smooth_noise, weave
 from smplxpp.core.mesh import row_lengths
+from smplxpp.people.patterns import band, mix, mix_rows, ramp, smooth_noise, weave
 
 SKIN = (222, 176, 150)
 _BROWS, _PUPIL = (66, 44, 32), (18, 14, 14)
