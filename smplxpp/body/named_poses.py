@@ -114,6 +114,34 @@ STRESS_POSES: dict[str, dict[str, tuple[float, float, float]]] = {
 }
 
 
+# What clothes are for: poses of every day, each of which shows a garment that follows the wrong limb.
+WORN_POSES: dict[str, dict[str, tuple[float, float, float]]] = {
+    "walk": {
+        "left_hip": (-30, 0, 0),
+        "left_knee": (15, 0, 0),
+        "right_hip": (22, 0, 0),
+        "right_knee": (30, 0, 0),
+        "left_shoulder": (0, 20, -68),
+        "right_shoulder": (0, 20, 68),
+    },
+    "sit": {
+        "left_hip": (-88, 0, 6),
+        "right_hip": (-88, 0, -6),
+        "left_knee": (90, 0, 0),
+        "right_knee": (90, 0, 0),
+        "left_shoulder": (0, 0, -60),
+        "right_shoulder": (0, 0, 60),
+    },
+    "reach": {
+        "left_collar": (0, 0, 15),
+        "left_shoulder": (0, -20, 60),
+        "right_shoulder": (0, 70, 10),
+        "spine2": (10, 10, 0),
+    },
+    "twist": STRESS_POSES["twist"],
+}
+
+
 def stress_poses(reference: BodyParams) -> BodyParams:
     """Return the poses of `STRESS_POSES`, in order, with the shape and translation of the reference's first frame.
 
@@ -123,11 +151,21 @@ def stress_poses(reference: BodyParams) -> BodyParams:
     Returns:
         BodyParams of `len(STRESS_POSES)` frames with a neutral face and hands at rest (zero).
     """
+    return _posed(reference, STRESS_POSES)
+
+
+def worn_poses(reference: BodyParams) -> BodyParams:
+    """Return the poses of `WORN_POSES` as `stress_poses` does."""
+    return _posed(reference, WORN_POSES)
+
+
+def _posed(reference: BodyParams, poses: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> BodyParams:
+    """Return named poses with the shape and translation of the reference's first frame."""
     first = reference.frame(0)
-    count = len(STRESS_POSES)
+    count = len(poses)
     # Axis-angle vectors of all joints of SMPL-X in radians; joints that a pose does not name stay at rest.
     pose = np.zeros((count, 55, 3))
-    for row, joints in enumerate(STRESS_POSES.values()):
+    for row, joints in enumerate(poses.values()):
         for joint, degrees in joints.items():
             pose[row, SMPLX_JOINTS.index(joint)] = np.radians(degrees)
     return BodyParams.from_full_pose(

@@ -50,6 +50,8 @@ class TransferConfig:
             follow. None: no vertex is confident.
         far: fractions of the source's extent. Between these distances the anchor weights gradually replace the weights
             of the body nearby.
+        around: fractions of the source's extent. Between these distances from the skin a vertex whose ring goes around
+            one arm or leg alone (`enclosed_by_one`) gradually takes the mean weights of that limb's skin at its place.
         anchor_length: `l` of the energy that inpaints the anchor weights, as a fraction of the source's extent. With a
             short length a skirt keeps a share of what its waist follows, a longer one continues the trend.
         published: share of the published method's weights in those of cloth off the skin. The errors of both differ, so
@@ -79,6 +81,7 @@ class TransferConfig:
     turned: float = 0.04
     confident: float | None = 0.015
     far: tuple[float, float] = (0.045, 0.08)
+    around: tuple[float, float] = (0.015, 0.04)
     anchor_length: float = 0.06
     published: float = 0.35
     allowed_joints: tuple[str | int, ...] | None = None
@@ -101,8 +104,12 @@ class TransferConfig:
         for name in ("normal_widening", "turned", "averaging_steps"):
             require_at_least(f"config {name}", getattr(self, name), 0)
         require_between("config published", self.published, 0.0, 1.0)
-        if len(self.far) != 2 or not 0 <= self.far[0] < self.far[1]:
-            raise InputError("config far", expected="two fractions, none negative, growing", received=str(self.far))
+        for name in ("far", "around"):
+            value = getattr(self, name)
+            if len(value) != 2 or not 0 <= value[0] < value[1]:
+                raise InputError(
+                    f"config {name}", expected="two fractions, none negative, growing", received=str(value)
+                )
         if self.max_influences is not None:
             require_at_least("config max_influences", self.max_influences, 1)
         require_choice("config laplacian", self.laplacian, ("auto", "cotangent", "intrinsic"))

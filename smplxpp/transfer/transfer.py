@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -34,6 +34,7 @@ from smplxpp.transfer.correspond import (
     settle_unmatched,
     vertex_components,
 )
+from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
 from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 
@@ -113,18 +114,28 @@ def transfer_weights(
     matched = found.matched(max_distance=limit, max_angle=angle)
     near = min(limit, (config.confident or 0.0) * size)
     confident = found.matched(max_distance=near, max_angle=angle) & (config.confident is not None)
+    # Find the rings that go around one limb, and let these vertices follow it, however far off it is.
+    limbs = None
+    if config.confident is not None:
+        limbs = _limbs(source, weights, target, found, size, config)
     # Compute each vertex's own value, then smooth the values over the surface.
     values = _values(source, weights, _Matches(target, normals, found, component, confident), allowed, size, config)
+    far_off = np.zeros(len(values))
+    if limbs is not None:
+        far_off = limbs.share * smooth_step(found.distance, *(k * size for k in config.around))
+        values = values + far_off[:, None] * (limbs.weights - values)
     settled, values, policies = settle_unmatched(component, matched, values, config)
     # Joints without weight are left out of the linear systems.
     occurring = np.flatnonzero(values.any(axis=0))
     dense = np.zeros((target.vertex_count, joint_count))
-    dense[:, occurring] = _smooth(target, found, values[:, occurring], matched, settled, size, config)
+    closer = replace(found, distance=found.distance * (1.0 - 0.7 * far_off))
+    dense[:, occurring] = _smooth(target, closer, values[:, occurring], matched, settled, size, config)
     if config.published:
         # Mix in the published method's weights. Their share rises from 1 % to 2.5 % of the source's extent off the
         # skin.
         answer = _published(_Matches(target, normals, found, component, matched), source, weights, size, config)
         share = config.published * smooth_step(found.distance, *(k * size for k in (0.01, 0.025)))
+        share *= 1.0 - far_off
         share[settled | components_without(component, matched)] = 0.0
         if allowed is not None:
             # Leave out joints that the label excludes and nothing here follows, such as the hand beside a skirt.
@@ -206,6 +217,21 @@ def _values(
     out = np.zeros((len(values), joint_count))
     out[:, used] = values
     return out
+
+
+def _limbs(
+    source: TriangleMesh,
+    weights: np.ndarray,
+    target: TriangleMesh,
+    found: Correspondence,
+    size: float,
+    config: TransferConfig,
+) -> Enclosure | None:
+    """Return which vertices go around one limb; None where all cloth is so near that this does not matter."""
+    if found.distance.max() <= config.around[0] * size:
+        return None
+    axes = limb_axes(source, weights, size, config)
+    return enclosed_by_one(target, axes, weights.shape[1]) if axes else None
 
 
 def _published(

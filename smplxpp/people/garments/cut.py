@@ -29,6 +29,7 @@ class Garment:
         rule: description of the rule that gives the weights.
         loose: whether it hangs free of the skin, so that the nearest skin does not tell which joints it follows.
         beside_hands: whether arms may hang beside it, as it follows neither arm.
+        pose: the one pose of the wardrobe in which it can be worn, such as over hanging arms; None: in all.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Garment:
     rule: str = "the weights of the skin that each vertex was grown from"
     loose: bool = False
     beside_hands: bool = False
+    pose: str | None = None
 
     @cached_property
     def cloth(self) -> ClothMesh:

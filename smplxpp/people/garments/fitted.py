@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from smplxpp.people.cloth_mesh import ClothMesh, lift_outside, smooth
-from smplxpp.people.garments.cut import Garment, Level, facing_out, grid_faces, joined, layer, tube_along
+from smplxpp.people.garments.cut import Garment, Level, around, facing_out, grid_faces, joined, layer, tube_along
 from smplxpp.people.garments.mannequin import Mannequin
 from smplxpp.people.patterns import ramp
 
@@ -124,6 +124,16 @@ def bottoms(mannequin: Mannequin) -> list[Garment]:
     ]
 
 
+def worn_things(mannequin: Mannequin) -> list[Garment]:
+    """Return a headscarf, a backpack with straps and plates of armour."""
+    straps = "sack: spine3; straps: as grown"
+    return [
+        Garment("hijab", "upper", partial(_hijab, mannequin), "the head down to the chin; below it the skin under it"),
+        Garment("backpack with straps", "outer", partial(_backpack, mannequin), straps),
+        Garment("plates of armour", "outer", partial(_armour, mannequin), "each plate one joint"),
+    ]
+
+
 def _trunk_heights(mannequin: Mannequin) -> tuple[float, float]:
     """Return the heights of waist and crotch, metres."""
     return mannequin.joints["spine1"][1] + 0.03, mannequin.joints["left_hip"][1] - 0.11
@@ -235,3 +245,85 @@ def _scarf(mannequin: Mannequin) -> ClothMesh:
     pushed = lift_outside(end.mesh, mannequin.skin.mesh, clearance=0.008, solid=True)
     end = end.with_vertices(smooth(end.mesh, pushed, steps=2))
     return joined(ring, end)
+
+
+def _hijab(mannequin: Mannequin) -> ClothMesh:
+    """Return a cloth about head and neck that falls over shoulders and chest."""
+    j = mannequin.joints
+
+    def level(p: np.ndarray) -> np.ndarray:
+        x, y, z = p.T
+        face = np.hypot(x / 0.85, y - j["jaw"][1] - 0.025) - 0.075
+        face = np.where(z > j["head"][2] + 0.01, face, 1.0)
+        return np.minimum(face, np.minimum(y - j["spine3"][1] - 0.03, j["left_shoulder"][0] + 0.05 - np.abs(x)))
+
+    neck = j["neck"][1]
+    cloth = layer(mannequin, level, ease=lambda p: 0.01 + 0.025 * ramp(p[:, 1], neck - 0.02, neck + 0.05), fairing=24)
+    head = ramp(cloth.vertices[:, 1], neck - 0.01, j["jaw"][1] - 0.02)[:, None]
+    low = ramp(cloth.vertices[:, 1], j["left_shoulder"][1] - 0.09, j["left_shoulder"][1] - 0.02)[:, None]
+    below = low * mannequin.below(cloth.vertices) + (1 - low) * mannequin.trunk_weights(cloth.vertices)
+    return ClothMesh(
+        cloth.vertices, cloth.faces, head * mannequin.rigid("head", len(cloth.vertices)) + (1 - head) * below
+    )
+
+
+def _backpack(mannequin: Mannequin) -> ClothMesh:
+    """Return a sack on the back and two straps over the shoulders."""
+    j = mannequin.joints
+    top, low = j["left_shoulder"][1] + 0.02, j["spine1"][1] - 0.02
+    t = np.linspace(0.03, np.pi - 0.03, 40)
+    # A rounded sack: a superellipse at every height.
+    angle = around(60)
+    shape = 1.0 / (np.abs(np.cos(angle)) ** 4 + np.abs(np.sin(angle)) ** 4) ** 0.25
+    y = 0.5 * (top + low) + 0.5 * (top - low) * np.cos(t)
+    grow = np.sin(t) ** 0.4
+    x = 0.14 * grow[:, None] * shape * np.cos(angle)
+    z = -0.225 + 0.085 * grow[:, None] * shape * np.sin(angle)
+    points = np.stack(np.broadcast_arrays(x, y[:, None], z), axis=-1).reshape(-1, 3)
+    sack = facing_out(mannequin.unweighted(points, grid_faces(40, 60, closed=True)), 0 * points + points.mean(axis=0))
+    sack = ClothMesh(
+        lift_outside(sack.mesh, mannequin.skin.mesh, clearance=0.006, solid=True),
+        sack.faces,
+        mannequin.rigid("spine3", len(points)),
+    )
+
+    def strap(p: np.ndarray) -> np.ndarray:
+        return np.minimum(0.025 - np.abs(np.abs(p[:, 0]) - 0.105), p[:, 1] - j["spine3"][1] + 0.02)
+
+    return joined(sack, layer(mannequin, strap, ease=0.008))
+
+
+def _armour(mannequin: Mannequin) -> ClothMesh:
+    """Return a breastplate, two plates on the thighs, two on the shins and two on the upper arms."""
+    j = mannequin.joints
+
+    def band(axis: int, sign: float, low: float, high: float):
+        def level(p: np.ndarray) -> np.ndarray:
+            front = p[:, 2] - (j["left_hip"][2] - 0.01) if axis == 1 else p[:, 1] - j["left_shoulder"][1] - 0.005
+            side = sign * p[:, 0] - 0.03 if axis == 1 else 1.0
+            return np.minimum(
+                np.minimum(front, side),
+                np.minimum(sign * p[:, 0] - low, high - sign * p[:, 0])
+                if axis == 0
+                else np.minimum(p[:, 1] - low, high - p[:, 1]),
+            )
+
+        return level
+
+    def breast(p: np.ndarray) -> np.ndarray:
+        return np.minimum(
+            np.minimum(p[:, 2] - mannequin.axis[1] - 0.01, 0.15 - np.abs(p[:, 0])),
+            np.minimum(p[:, 1] - j["spine2"][1], j["spine3"][1] + 0.15 - p[:, 1]),
+        )
+
+    pieces = [(breast, "spine3")]
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        hip, knee, ankle = j["left_hip"][1], j["left_knee"][1], j["left_ankle"][1]
+        pieces.append((band(1, sign, knee + 0.09, hip - 0.1), f"{side}_hip"))
+        pieces.append((band(1, sign, ankle + 0.07, knee - 0.06), f"{side}_knee"))
+        pieces.append((band(0, sign, j["left_shoulder"][0] + 0.05, j["left_elbow"][0] - 0.05), f"{side}_shoulder"))
+    out = []
+    for level, joint in pieces:
+        cloth = layer(mannequin, level, ease=0.012, fairing=4)
+        out.append(ClothMesh(cloth.vertices, cloth.faces, mannequin.rigid(joint, len(cloth.vertices))))
+    return joined(*out)

@@ -46,6 +46,11 @@ def hairstyles(mannequin: Mannequin) -> list[Garment]:
     ]
 
 
+def beards(mannequin: Mannequin) -> list[Garment]:
+    """Return a full beard."""
+    return [Garment("beard", "hair", partial(_beard, mannequin), "half jaw, half head")]
+
+
 def tied_and_short_hair(mannequin: Mannequin) -> list[Garment]:
     """Return three caps of short hair, a bun and a ponytail."""
     rigid, j = "the head", mannequin.joints
@@ -165,3 +170,20 @@ def _braid(mannequin: Mannequin) -> ClothMesh:
     line = ClothMesh(middle, cloth.faces, cloth.weights)
     weights = _handed_over(mannequin, line, mannequin.trunk_weights(middle), keeps=0.0, over=0.14).weights
     return joined(skull_cap(mannequin), ClothMesh(cloth.vertices, cloth.faces, weights))
+
+
+def _beard(mannequin: Mannequin) -> ClothMesh:
+    """Return a beard from the jaw down before neck and chest."""
+    j = mannequin.joints
+    drop, azimuth = np.linspace(0, 1, 26), np.linspace(-1.3, 1.3, 30)
+    jaw = j["jaw"]
+    # From the jaw line, an arc about the jaw joint, down and together.
+    radius = 0.085 + 0.03 * np.sin(np.pi * drop)[:, None] + 0 * azimuth
+    x = radius * np.sin(azimuth) * (1 - 0.55 * drop[:, None])
+    z = jaw[2] + 0.02 + radius * np.cos(azimuth) * (1 - 0.15 * drop[:, None])
+    y = jaw[1] - 0.03 - 0.05 * np.cos(azimuth) - 0.2 * drop[:, None] * (0.4 + 0.6 * np.cos(0.9 * azimuth))
+    points = np.stack(np.broadcast_arrays(x, y, z), axis=-1).reshape(-1, 3)
+    cloth = facing_out(mannequin.unweighted(points, grid_faces(26, 30, closed=False)), points - [0, 0, 1])
+    vertices = lift_outside(cloth.mesh, mannequin.skin.mesh, clearance=0.006, solid=True)
+    weights = 0.5 * mannequin.rigid("jaw", len(points)) + 0.5 * mannequin.rigid("head", len(points))
+    return ClothMesh(vertices, cloth.faces, weights)

@@ -9,6 +9,7 @@ import numpy as np
 from smplxpp.people.cloth_mesh import ClothMesh, lift_outside
 from smplxpp.people.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
 from smplxpp.people.garments.mannequin import Mannequin
+from smplxpp.people.patterns import ramp
 
 _SKIRT = (
     "trunk at the same height and azimuth down to the hips; from there to 22 cm below the thighs grow to {legs}, the "
@@ -28,7 +29,7 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
 
     def skirt(name: str, hem: float, *, label: str = "lower", top: float = waist, legs: float, shins: float, **cut):
         # `cut` holds the options of `hang`: flare, pleats and distance.
-        make = partial(_hung, mannequin, top, hem, legs=legs, shins=shins, **cut)
+        make = partial(hung, mannequin, top, hem, legs=legs, shins=shins, **cut)
         return Garment(name, label, make, _SKIRT.format(legs=legs, shins=shins), loose=True, beside_hands=True)
 
     return [
@@ -45,13 +46,43 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
     ]
 
 
-def _hung(
-    mannequin: Mannequin, top: float, hem: float, *, legs: float, shins: float, gap: float = 0.0, **cut
+def layered_garments(mannequin: Mannequin) -> list[Garment]:
+    """Return a one-shoulder dress, a skirt over trousers, an apron and a tutu."""
+    trunk = "trunk at the same height and azimuth, below the hips as a skirt"
+    return [
+        Garment(
+            "one-shoulder dress", "upper", partial(_one_shoulder, mannequin), f"bodice as grown; {trunk}", loose=True
+        ),
+        Garment(
+            "skirt over trousers", "lower", partial(_layers, mannequin), "trousers as grown; skirt as one", loose=True
+        ),
+        Garment("apron", "outer", partial(_apron, mannequin), trunk, loose=True),
+        Garment(
+            "tutu", "lower", partial(_tutu, mannequin), "pelvis, 0.15 of the thighs", loose=True, beside_hands=True
+        ),
+    ]
+
+
+def hung(
+    mannequin: Mannequin,
+    top: float,
+    hem: float,
+    *,
+    legs: float,
+    shins: float,
+    gap: float = 0.0,
+    front: float = 0.0,
+    **cut,
 ) -> ClothMesh:
-    """Return a skirt from `top` down to `hem`, open by `gap` radians to each side of the front."""
+    """Return a skirt from `top` down to `hem`.
+
+    It is open by `gap` radians to each side of the front, or covers only `front` radians to each side of it.
+    """
     heights = np.linspace(top, hem, int((top - hem) / 0.014) + 2)  # rows 14 mm apart
     azimuths = around(100) if not gap else np.linspace(np.pi / 2 + gap, 2.5 * np.pi - gap, 100)
-    points, faces = hang(mannequin, heights, azimuths, closed=not gap, **cut)
+    if front:
+        azimuths = np.linspace(np.pi / 2 - front, np.pi / 2 + front, 60)
+    points, faces = hang(mannequin, heights, azimuths, closed=not gap and not front, **cut)
     # Weights follow from the points before they are pushed off the skin.
     cloth = facing_out(mannequin.unweighted(points, faces), mannequin.inner_points(points))
     cloth = cloth.with_vertices(lift_outside(cloth.mesh, mannequin.skin.mesh, clearance=0.004, solid=True))
@@ -73,7 +104,7 @@ def _coat(mannequin: Mannequin) -> ClothMesh:
 
     top = layer(mannequin, level, ease=0.018, fairing=10)
     # The panels overlap the upper part by 1.5 cm.
-    panels = _hung(mannequin, hip + 0.075, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.022)
+    panels = hung(mannequin, hip + 0.075, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.022)
     return joined(top, panels)
 
 
@@ -126,3 +157,75 @@ def _kimono(mannequin: Mannequin) -> ClothMesh:
         sleeve = facing_out(sleeve, middle)
         pieces.append(sleeve.with_vertices(lift_outside(sleeve.mesh, mannequin.skin.mesh, clearance=0.005, solid=True)))
     return joined(*pieces)
+
+
+def _one_shoulder(mannequin: Mannequin) -> ClothMesh:
+    """Return a dress that one shoulder holds."""
+    j = mannequin.joints
+
+    def level(p: np.ndarray) -> np.ndarray:
+        x, y, _ = p.T
+        # The neckline rises from below the right armpit to the neck's left side.
+        line = (j["spine3"][1] + 0.16) + 0.75 * (x + 0.02) - y
+        strap = np.minimum(j["left_shoulder"][0] - 0.035 - x, x - 0.06)
+        return np.minimum(
+            np.maximum(line, np.where(y > j["spine3"][1], strap, -1.0)),
+            np.minimum(y - j["left_hip"][1] - 0.06, np.minimum(0.185 - np.abs(x), j["neck"][1] + 0.03 - y)),
+        )
+
+    top = layer(mannequin, level, ease=0.009, fairing=6)
+    below = hung(
+        mannequin,
+        j["left_hip"][1] + 0.075,
+        j["left_knee"][1] - 0.1,
+        legs=0.8,
+        shins=0.35,
+        flare=0.25,
+        pleats=(7, 0.03),
+        stand_off=0.014,
+    )
+    return joined(top, below)
+
+
+def _layers(mannequin: Mannequin) -> ClothMesh:
+    """Return close trousers and a flared skirt over them."""
+    j = mannequin.joints
+    waist = j["spine1"][1] + 0.03
+    side = j["left_shoulder"][0] + 0.14
+
+    def level(p: np.ndarray) -> np.ndarray:
+        return np.minimum(np.minimum(waist - p[:, 1], p[:, 1] - j["left_ankle"][1]), side - np.abs(p[:, 0]))
+
+    trousers = layer(mannequin, level, ease=0.01)
+    skirt = hung(
+        mannequin,
+        waist + 0.01,
+        j["left_knee"][1] + 0.08,
+        legs=0.8,
+        shins=0.2,
+        flare=0.28,
+        pleats=(9, 0.03),
+        stand_off=0.018,
+    )
+    return joined(trousers, skirt)
+
+
+def _apron(mannequin: Mannequin) -> ClothMesh:
+    """Return an apron: a bib, and a sheet about the front down to the knees."""
+    j = mannequin.joints
+    waist = j["spine1"][1] + 0.03
+    sheet = hung(
+        mannequin, waist, j["left_knee"][1] - 0.02, legs=0.75, shins=0.25, front=1.35, flare=0.08, stand_off=0.014
+    )
+    bib = hung(mannequin, j["spine3"][1] + 0.1, waist + 0.004, legs=0.75, shins=0.25, front=0.8, stand_off=0.012)
+    return joined(sheet, bib)
+
+
+def _tutu(mannequin: Mannequin) -> ClothMesh:
+    """Return a stiff skirt that stands off the hips."""
+    hip = mannequin.joints["left_hip"][1]
+    cloth = hung(mannequin, hip + 0.1, hip - 0.03, legs=0.0, shins=0.0, flare=3.0, stand_off=0.01)
+    p = cloth.vertices
+    left = ramp(p[:, 0], -0.12, 0.12)[:, None]
+    thighs = left * mannequin.rigid("left_hip", len(p)) + (1 - left) * mannequin.rigid("right_hip", len(p))
+    return ClothMesh(p, cloth.faces, 0.85 * mannequin.rigid("pelvis", len(p)) + 0.15 * thighs)

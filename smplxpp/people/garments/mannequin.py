@@ -15,6 +15,8 @@ from smplxpp.people.cloth_mesh import ClothMesh, outer_faces
 # Parts of joint names, without the side.
 HAND_JOINTS = ("elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
 ARM_JOINTS = ("shoulder", *HAND_JOINTS)
+ARMS_DOWN = 78.0
+"""Degrees of arms that hang under what is worn over the shoulders."""
 _HEAD_JOINTS = ("head", "jaw", "eye")
 
 # Outlines are sampled at heights this far apart (metres) and in this many directions around the trunk: finer than the
@@ -56,7 +58,7 @@ class Mannequin:
         """Return the mannequin of a skin and its joints, of any size."""
         # Arms and head would widen the outlines.
         torso = shares(body, skin.weights, (*ARM_JOINTS, *_HEAD_JOINTS)) < 0.5
-        low, outlines = _outlines(skin.vertices[torso], joints["pelvis"][2])
+        low, outlines = outlines_of(skin.vertices[torso], joints["pelvis"][2])
         return Mannequin(body, params, skin, joints, outlines, low)
 
     @property
@@ -134,6 +136,19 @@ class Mannequin:
         return np.column_stack([points[:, 1], flat])
 
 
+def lowered(mannequin: Mannequin, degrees: float) -> BodyParams:
+    """Return a pose with arms lowered by `degrees`, elbows a little bent and feet a step apart."""
+    pose = np.zeros((1, 55, 3))
+    names = mannequin.body.joint_names
+    for side, sign in (("left", -1.0), ("right", 1.0)):
+        pose[0, names.index(f"{side}_collar"), 2] = 0.12 * sign * degrees
+        pose[0, names.index(f"{side}_shoulder"), 2] = 0.88 * sign * degrees
+        pose[0, names.index(f"{side}_elbow"), 1] = 8.0 * sign
+        pose[0, names.index(f"{side}_hip"), 2] = -4.0 * sign
+    p = mannequin.params
+    return BodyParams.from_full_pose(np.radians(pose), betas=p.betas, expression=p.expression, transl=p.transl)
+
+
 def named(body: BodyModel, words: tuple[str, ...]) -> np.ndarray:
     """Return which joints (J,) have one of the words in their names."""
     return np.array([any(word in name for word in words) for name in body.joint_names])
@@ -152,7 +167,7 @@ def _mean_of_nearest(places: np.ndarray, weights: np.ndarray, queries: np.ndarra
     return out / out.sum(axis=1, keepdims=True)
 
 
-def _outlines(points: np.ndarray, depth: float) -> tuple[float, np.ndarray]:
+def outlines_of(points: np.ndarray, depth: float) -> tuple[float, np.ndarray]:
     """Return the lowest height, and the convex outlines of slices from there up as radii by azimuth."""
     heights = np.arange(points[:, 1].min(), points[:, 1].max(), _STEP)
     azimuth = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS

@@ -13,10 +13,11 @@ from smplxpp.body import BodyModel
 from smplxpp.clean.simplify import simplify
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.people.garments.cut import Garment
-from smplxpp.people.garments.fitted import bottoms, fitted_garments, tops
-from smplxpp.people.garments.hair import hairstyles, tied_and_short_hair
-from smplxpp.people.garments.loose import loose_garments
-from smplxpp.people.garments.mannequin import HAND_JOINTS, Mannequin, shares
+from smplxpp.people.garments.draped import draped_garments
+from smplxpp.people.garments.fitted import bottoms, fitted_garments, tops, worn_things
+from smplxpp.people.garments.hair import beards, hairstyles, tied_and_short_hair
+from smplxpp.people.garments.loose import layered_garments, loose_garments
+from smplxpp.people.garments.mannequin import ARMS_DOWN, HAND_JOINTS, Mannequin, lowered, shares
 from smplxpp.people.patterns import smooth_noise
 from smplxpp.skinning import skin
 
@@ -61,7 +62,15 @@ def shape_betas(body: BodyModel, shape: str) -> np.ndarray:
 
 def garments_of(mannequin: Mannequin) -> list[Garment]:
     """Return the garments of the transfer benchmark in their fixed order, which seeds their scans' noise."""
-    return [*fitted_garments(mannequin), *loose_garments(mannequin), *hairstyles(mannequin)]
+    return [
+        *fitted_garments(mannequin),
+        *loose_garments(mannequin),
+        *hairstyles(mannequin),
+        *draped_garments(mannequin),
+        *layered_garments(mannequin),
+        *worn_things(mannequin),
+        *beards(mannequin),
+    ]
 
 
 def all_garments(mannequin: Mannequin) -> dict[str, Garment]:
@@ -74,7 +83,7 @@ def cases(body: BodyModel, shape: str, *, poses: tuple[str, ...] = POSES) -> Ite
     """Yield every garment on a person of one shape in every pose; "hands" for those that arms may hang beside."""
     mannequin = Mannequin.of(body, shape_betas(body, shape))
     for k, garment in enumerate(garments_of(mannequin)):
-        for pose in poses:
+        for pose in poses if garment.pose is None else (garment.pose,):
             if pose != "hands" or garment.beside_hands:
                 yield scan(mannequin, garment, shape, pose, seed=k)
 
@@ -85,7 +94,8 @@ def scan(mannequin: Mannequin, garment: Garment, shape: str, pose: str, *, seed:
     if pose == "T":
         source = mannequin.body.mesh(mannequin.body.forward(mannequin.params).vertices[0])
         return Case(garment, shape, pose, cloth.mesh, cloth.weights, cloth.vertices, source, mannequin.params)
-    params = lowered(mannequin, 50.0) if pose == "A" else _hands_beside(mannequin, garment)
+    degrees = {"A": 50.0, "down": ARMS_DOWN}.get(pose)
+    params = _hands_beside(mannequin, garment) if degrees is None else lowered(mannequin, degrees)
     posed = mannequin.body.forward(params)
     mesh = cloth.mesh.with_vertices(skin(cloth.vertices, cloth.weights, posed.posed_from_rest[0]))
     # A scan adds folds of 1.2 mm and grain of 0.4 mm along the normals, and keeps 60 % of the faces.
@@ -105,19 +115,6 @@ def scan(mannequin: Mannequin, garment: Garment, shape: str, pose: str, *, seed:
         mannequin.body.mesh(posed.vertices[0]),
         params,
     )
-
-
-def lowered(mannequin: Mannequin, degrees: float) -> BodyParams:
-    """Return a pose with arms lowered by `degrees`, elbows a little bent and feet a step apart."""
-    pose = np.zeros((1, 55, 3))
-    names = mannequin.body.joint_names
-    for side, sign in (("left", -1.0), ("right", 1.0)):
-        pose[0, names.index(f"{side}_collar"), 2] = 0.12 * sign * degrees
-        pose[0, names.index(f"{side}_shoulder"), 2] = 0.88 * sign * degrees
-        pose[0, names.index(f"{side}_elbow"), 1] = 8.0 * sign
-        pose[0, names.index(f"{side}_hip"), 2] = -4.0 * sign
-    p = mannequin.params
-    return BodyParams.from_full_pose(np.radians(pose), betas=p.betas, expression=p.expression, transl=p.transl)
 
 
 def _hands_beside(mannequin: Mannequin, garment: Garment) -> BodyParams:

@@ -1,0 +1,273 @@
+"""Find which limb each ring of a garment goes around, and the weights at that place along the limb."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from smplxpp.body.layout import JOINT_NAMES
+from smplxpp.core import TriangleMesh, row_lengths
+from smplxpp.transfer.config import TransferConfig
+
+_SPACING = 0.01
+"""Distance of the planes along a limb, as a share of the body's extent: less than a ring of a coarse garment."""
+_BEYOND = 0.1
+"""How far a limb's axis goes on past ankle and wrist, as a share of the body's extent: hems reach lower than these."""
+_CLOSED = 0.99
+"""Least share of a turn about the axis that a ring has to make: a plane that leaves through a hem makes no ring."""
+_KERNEL = 0.006
+"""Standard deviation of the mean of weights along a limb, as a share of the body's extent (1 cm)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LimbAxis:
+    """A polyline through the middle of a limb, and the mean weights of the skin around it.
+
+    Attributes:
+        joints: indices of the joints that the limb consists of.
+        points: metres, from the trunk outwards, evenly spaced.
+        tangents: unit length.
+        weights: mean weights of the limb's skin at each point.
+        whole: points of the axis as it counts for the rings of other limbs: a leg's goes on to the floor.
+    """
+
+    joints: tuple[int, ...]
+    points: Float64[np.ndarray, "K 3"]
+    tangents: Float64[np.ndarray, "K 3"]
+    weights: Float64[np.ndarray, "K J"]
+    whole: Float64[np.ndarray, "L 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Enclosure:
+    """Which limb each of N vertices goes around.
+
+    Attributes:
+        share: 0 to 1, how far the vertex belongs to rings around one limb and nothing else.
+        weights: of that limb's skin at the same place along it; zero where `share` is.
+        limb: index of the limb, -1 where `share` is 0.
+    """
+
+    share: Float64[np.ndarray, " N"]
+    weights: Float64[np.ndarray, "N J"]
+    limb: np.ndarray
+
+
+def limb_axes(
+    source: TriangleMesh, weights: Float[np.ndarray, "V J"], size: float, config: TransferConfig
+) -> list[LimbAxis]:
+    """Return the axes of both legs and arms, then that of trunk and head; none for joints with other names.
+
+    The end of a bone is where the skin follows it and the next one alike: the mean of the skin's vertices, weighted by
+    the product of both weights. So no skeleton is needed beside the weights.
+    """
+    names = config.joint_names or JOINT_NAMES.get(weights.shape[1], ())
+    chains = [
+        *(("pelvis", f"{side}_hip", f"{side}_knee", f"{side}_ankle") for side in ("left", "right")),
+        *((f"{side}_collar", f"{side}_shoulder", f"{side}_elbow", f"{side}_wrist") for side in ("left", "right")),
+        ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
+    ]
+    out = []
+    for chain in chains:
+        if not set(chain) <= set(names):
+            return []
+        joints = tuple(names.index(name) for name in chain)
+        shares = [weights[:, a] * weights[:, b] for a, b in itertools.pairwise(joints)]
+        if not all(share.any() for share in (*shares, weights[:, joints[0]], weights[:, joints[-1]])):
+            return []
+        knots = [_mean(source.vertices, share) for share in shares]
+        # A limb starts where it leaves the trunk and goes on straight past its last joint; the trunk ends in the head.
+        if chain[-1] == "head":
+            ends = [_mean(source.vertices, weights[:, joints[k]]) for k in (0, -1)]
+            line = [ends[0], *knots, ends[1]]
+        else:
+            joints, line = joints[1:], knots
+            line.append(line[-1] + _BEYOND * size * (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2]))
+        onwards = 0.5 if chain[-1].endswith("ankle") else 0.0
+        out.append(_axis(np.array(line), joints, source, weights, size, onwards=onwards))
+    return out
+
+
+def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) -> Enclosure:
+    """Return for each vertex how far its ring goes around one limb alone, and the weights at that place.
+
+    Planes across each limb's axis cut the surface into rings. A ring goes around an axis if the angle under which it
+    is seen from there adds up to a full turn. A ring about one leg is that of trousers, one about both is a skirt's,
+    one about an arm and the trunk a shirt's below the armpit. This is a matter of topology: how wide the garment is,
+    and what else is near it, does not count.
+
+    Args:
+        mesh: the part; open, with holes.
+        axes: of `limb_axes`; the last one is the trunk's.
+        joint_count: J.
+    """
+    n = mesh.vertex_count
+    alone, other = np.zeros((len(axes), n)), np.zeros((len(axes), n))
+    place = np.zeros((len(axes), n))
+    for k, axis in enumerate(axes[:-1]):
+        step = np.linalg.norm(axis.points[1] - axis.points[0])
+        others = [a for m, a in enumerate(axes) if m != k]
+        # The vertices' heights over each plane, and the faces that it cuts.
+        side = axis.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", axis.tangents, axis.points)[:, None]
+        count = sum((side > 0)[:, mesh.faces[:, c]].astype(np.int8) for c in range(3))
+        cut = (count > 0) & (count < 3)
+        for i in np.flatnonzero(cut.sum(axis=1) > 2):
+            for corners, single in _rings(mesh, np.flatnonzero(cut[i]), side[i], axis, int(i), others):
+                # A vertex of a cut face counts the more, the nearer it lies to the plane.
+                near = step / (np.abs(side[i, corners]) + 0.05 * step)
+                (alone if single else other)[k, corners] += near
+                if single:
+                    place[k, corners] += near * (i + side[i, corners] / step)
+    share, at, limb = np.zeros(n), np.zeros(n), np.full(n, -1)
+    for k in range(len(axes) - 1):
+        seen = alone[k] > 0
+        own = np.where(seen, alone[k] / np.maximum(alone[k] + other[k], 1e-300), 0.0)
+        better = own > share
+        share[better], limb[better] = own[better], k
+        at[better] = place[k, better] / alone[k, better]
+    _continue_to_hems(mesh, axes, share, at, limb, open_rows=(alone + other).sum(axis=0) == 0)
+    # The weights of each vertex's place along its limb.
+    weights = np.zeros((n, joint_count))
+    for k, axis in enumerate(axes[:-1]):
+        rows = np.flatnonzero(limb == k)
+        places = np.arange(len(axis.points))
+        weights[rows] = np.stack([np.interp(at[rows], places, column) for column in axis.weights.T], axis=1)
+    return Enclosure(share, weights, limb)
+
+
+def _continue_to_hems(
+    mesh: TriangleMesh,
+    axes: list[LimbAxis],
+    share: np.ndarray,
+    at: np.ndarray,
+    limb: np.ndarray,
+    *,
+    open_rows: Bool[np.ndarray, " N"],
+) -> None:
+    """Continue share, place and limb, in place, outwards to vertices that no closed ring reaches.
+
+    Near a slanted or jagged hem planes across the limb leave the cloth, so that they make no ring.
+    """
+    ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
+    # Hems are seldom more slanted than 16 vertices are high.
+    for _ in range(16):
+        pairs = ends[(share[ends[:, 0]] > 0) & open_rows[ends[:, 1]]]
+        if not len(pairs):
+            return
+        origin, next_one = pairs.T
+        index = np.clip(at[origin].astype(int), 0, None)
+        tangent, step = np.zeros((len(pairs), 3)), np.ones(len(pairs))
+        for k, axis in enumerate(axes[:-1]):
+            rows = limb[origin] == k
+            tangent[rows] = axis.tangents[np.minimum(index[rows], len(axis.tangents) - 1)]
+            step[rows] = np.linalg.norm(axis.points[1] - axis.points[0])
+        along = np.einsum("ij,ij->i", mesh.vertices[next_one] - mesh.vertices[origin], tangent)
+        # Only outwards: upwards cloth that makes no ring is an open jacket's shoulder.
+        outwards = along > -0.3 * row_lengths(mesh.vertices[next_one] - mesh.vertices[origin])
+        origin, next_one, along, step = (values[outwards] for values in (origin, next_one, along, step))
+        share[next_one], limb[next_one] = share[origin], limb[origin]
+        at[next_one] = at[origin] + along / step
+        open_rows = open_rows & (share == 0)
+
+
+def _rings(
+    mesh: TriangleMesh, cut: np.ndarray, side: np.ndarray, axis: LimbAxis, index: int, others: list[LimbAxis]
+) -> Iterator[tuple[np.ndarray, bool]]:
+    """Yield the vertices (n,) of faces of each ring that goes around an axis, and whether it goes around it alone.
+
+    Args:
+        mesh: the part.
+        cut: faces that the plane across the axis at point `index` cuts.
+        side: height of each vertex over that plane.
+        axis: the limb's.
+        index: of the axis' point.
+        others: axes of other limbs and of the trunk.
+    """
+    point, tangent = axis.points[index], axis.tangents[index]
+    faces, above = mesh.faces[cut], side[mesh.faces[cut]] > 0
+    # The two edges of each face that cross the plane: those at the corner that is alone on its side.
+    odd = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    rows = np.arange(len(cut))
+    a, b, c = faces[rows, odd], faces[rows, (odd + 1) % 3], faces[rows, (odd + 2) % 3]
+    flip = above[rows, odd]
+    p, q = _crossing(mesh.vertices, side, a, b), _crossing(mesh.vertices, side, a, c)
+    # Segments hang together where they share a crossed edge.
+    key = np.sort(np.stack([np.stack([a, b], 1), np.stack([a, c], 1)], 1), axis=2) @ [mesh.vertex_count, 1]
+    edges, node = np.unique(key, return_inverse=True)
+    node = node.reshape(-1, 2)
+    count, ring = connected_components(coo_matrix((np.ones(len(cut)), node.T), shape=(len(edges),) * 2), directed=False)
+    ring = ring[node[:, 0]]
+    # The angle of every ring as seen from the axis, wound the same way all around.
+    start, end = np.where(flip[:, None], p, q), np.where(flip[:, None], q, p)
+    turn = np.abs(np.bincount(ring, _angle(start - point, end - point, tangent), minlength=count))
+    around = turn > _CLOSED * 2 * np.pi
+    if not around.any():
+        return
+    # Another axis is within the ring if that goes around it, too, be it with a gap where the plane grazes a hem.
+    shared = np.zeros(count, dtype=bool)
+    for other in others:
+        for at in _piercings(other.whole, point, tangent):
+            turn = np.abs(np.bincount(ring, _angle(start - at, end - at, tangent), minlength=count))
+            shared |= turn > np.pi
+    for k in np.flatnonzero(around):
+        yield np.unique(faces[ring == k]), not shared[k]
+
+
+def _crossing(vertices: np.ndarray, side: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return where the edges from a to b cross the plane."""
+    t = side[a] / (side[a] - side[b])
+    return vertices[a] + t[:, None] * (vertices[b] - vertices[a])
+
+
+def _piercings(points: np.ndarray, point: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    """Return where a polyline crosses the plane."""
+    side = (points - point) @ tangent
+    k = np.flatnonzero((side[:-1] > 0) != (side[1:] > 0))
+    t = side[k] / (side[k] - side[k + 1])
+    return points[k] + t[:, None] * (points[k + 1] - points[k])
+
+
+def _angle(u: np.ndarray, v: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return the signed angle from u to v about the axis, both across it."""
+    return np.arctan2(np.cross(u, v) @ axis, np.einsum("ij,ij->i", u, v))
+
+
+def _mean(vertices: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return the mean of vertices weighted by `share`."""
+    return share @ vertices / share.sum()
+
+
+def _axis(
+    line: np.ndarray,
+    joints: tuple[int, ...],
+    source: TriangleMesh,
+    weights: np.ndarray,
+    size: float,
+    *,
+    onwards: float,
+) -> LimbAxis:
+    """Return a polyline evenly resampled, with tangents that turn gradually and the mean weights of the skin there."""
+    length = np.concatenate([[0.0], np.cumsum(row_lengths(np.diff(line, axis=0)))])
+    at = np.linspace(0, length[-1], max(2, int(np.ceil(length[-1] / (_SPACING * size))) + 1))
+    points = np.stack([np.interp(at, length, column) for column in line.T], axis=1)
+    tangents = np.gradient(points, axis=0)
+    # At a bent joint the planes turn over three points to each side.
+    kernel = np.ones(7) / 7
+    tangents = np.stack([np.convolve(np.pad(c, 3, mode="edge"), kernel, mode="valid") for c in tangents.T], axis=1)
+    tangents /= np.maximum(row_lengths(tangents), 1e-300)[:, None]
+    # Skin that follows the limb, without what hangs on its last joint, such as fingers and toes.
+    own = weights[:, list(joints)].sum(axis=1) > 0.5
+    skin, rows = source.vertices[own], weights[own]
+    nearest = ((skin[:, None] - points) ** 2).sum(axis=2).argmin(axis=1)
+    kernel = np.exp(-0.5 * ((np.arange(len(points))[:, None] - nearest) * (at[1] - at[0]) / (_KERNEL * size)) ** 2)
+    # Far from any skin the kernel vanishes; the least share there is that of the nearest.
+    kernel += 1e-12
+    mean = kernel @ rows
+    whole = np.concatenate([points, points[-1:] + onwards * size * tangents[-1:]])
+    return LimbAxis(joints, points, tangents, mean / mean.sum(axis=1, keepdims=True), whole)
