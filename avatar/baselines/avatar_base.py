@@ -14,8 +14,7 @@ from avatar.gaussians.binding import corner_weights
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.deformation_field import FrameCodes
 from avatar.models.networks.teacher import local_offsets
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Pose, Rig
+from avatar.rig.rig import Pose, PosedAvatar, Rig
 from avatar.training.engine.optimization_task import ParameterGroup
 
 POSITION_SCALE = 0.05

@@ -25,8 +25,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Pose, Rig
+from avatar.rig.rig import Pose, PosedAvatar, Rig
 from avatar.training.engine.learning_rates import LearningRates
 from avatar.training.engine.optimization_task import ParameterGroup
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
 from smplxpp.cloth.driver import LONGEST_STEP
-from smplxpp.cloth.following import SMOOTHING, followed
+from smplxpp.cloth.play import SMOOTHING, followed
 from smplxpp.cloth.poses import resampled
 from smplxpp.core import BodyParams, GeometryWarning, InputError, require_at_least, require_positive
 from smplxpp.template.template import Template

@@ -10,8 +10,7 @@ import numpy as np
 from avatar.speech import Speech
 from avatar.speech.curves import Curves
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.sound_file import read_sound
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound, read_sound
 
 _SILENT_RATE = 16_000
 """Sample rate in hertz of the silence under curves that come without sound; any rate that players take."""

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.data.sequence import AvatarSequence
-from avatar.rig.posed import AvatarModel, PosedAvatar
-from avatar.rig.rig import Pose, Rig
+from avatar.rig.rig import AvatarModel, Pose, PosedAvatar, Rig
 
 
 class AsNew(nn.Module):

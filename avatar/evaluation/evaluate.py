@@ -26,8 +26,7 @@ from avatar.metrics.surface_quality import SAMPLES, SurfaceQuality, mean_surface
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, head_box, head_shown, head_vertices
 from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
-from avatar.rig.posed import AvatarModel, PosedAvatar, at_rest
-from avatar.rig.rig import Pose, Rig
+from avatar.rig.rig import AvatarModel, Pose, PosedAvatar, Rig, at_rest
 from smplxpp.core import BodyParams, InputError, ProgressCallback, TriangleMesh, ignore_progress, require_at_least
 
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.export.bundle import BundleConfig, BundleExtras, write_bundle
-from avatar.formats.splats_along import splats_along
+from avatar.formats.splats import splats_along
 from avatar.models.student import Student
 from avatar.runtime import AvatarBundle, AvatarPlayer, load_bundle
 from avatar.runtime.bundle import SUFFIX

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from avatar.runtime import AvatarPlayer
 from avatar.runtime.splatting import WorldSplats
+from smplxpp.cloth.play import ways
 from smplxpp.core.errors import InputError
+from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.spherical_harmonics import C0, MAX_DEGREE, coefficient_count, degree_of, rotate_sh
 
 REST_COUNTS = (0, 9, 24, 45)
@@ -145,3 +149,41 @@ def _rotate_quats(R: Float[np.ndarray, "3 3"], quats: Float[np.ndarray, "N 4"]) 
     # The matrix of multiplication by q from the left: (q p) = L(q) p.
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.asarray(quats, np.float64) @ left.T
+
+
+PRE_ROLL = 0.7
+"""Seconds of a motion before its first frame that loose clothes follow, so that they hang when it begins."""
+
+
+def splats_along(
+    player: AvatarPlayer,
+    motion: BodyParams,
+    rows: range,
+    *,
+    cloth: str = "simulate",
+    notes: list[str] | None = None,
+) -> Iterator[Splats]:
+    """Yield the splats of rows of a motion; simulated clothes follow it from a moment before the first row.
+
+    Args:
+        player: of the avatar.
+        motion: body parameters.
+        rows: ascending.
+        cloth: what moves loose clothes: "simulate", "field" or "skin".
+        notes: receives the player's remarks on the simulation after the last row.
+    """
+    # Without a simulation every pose stands alone: clothes follow the field, or skinning.
+    rate = motion.fps or DEFAULT_FPS
+    if cloth != "simulate" or not player.has_clothes:
+        skinned = player.skinned_clothes if cloth == "skin" else None
+        for k in rows:
+            yield world_splats(player.pose(motion.frame(k), cloth=skinned))
+        return
+    # A simulation has a state, so that rows before the first are stepped too and not written.
+    begin = max(0, rows[0] - round(PRE_ROLL * rate))
+    for k, path in enumerate(ways(motion.select(slice(begin, rows[-1] + 1)), rate), start=begin):
+        posed = player.step(motion.frame(k), 1.0 / rate, path=path)
+        if k in rows:
+            yield world_splats(posed)
+    if notes is not None:
+        notes += player.notes

@@ -13,7 +13,7 @@ from torch import nn
 
 from avatar.data.views import View
 from avatar.rendering.avatar_view import render_view
-from avatar.rig.posed import AvatarModel, at_rest
+from avatar.rig.rig import AvatarModel, at_rest
 from smplxpp.core import BodyParams, Camera, InputError
 
 CONVENTION = (

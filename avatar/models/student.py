@@ -19,8 +19,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.networks.control_points import choose_control_points, template_control_points
 from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.networks.pose_dependence import PoseGate, PoseRegression, seen_joints
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Pose, Rig
+from avatar.rig.rig import Pose, PosedAvatar, Rig
 from smplxpp.cloth.garment import Garment
 from smplxpp.core import BodyParams, InputError, require_at_least
 

@@ -18,8 +18,7 @@ from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
 from avatar.models.tracked_surface import Track
 from avatar.rendering.mesh_maps import MapFrame, front_back_maps, vertex_normals
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Pose, Rig
+from avatar.rig.rig import Pose, PosedAvatar, Rig
 
 TRACK_ERRORS = ("sigma", "drift")
 """Optional attributes of a `Track` that are stored with a teacher."""

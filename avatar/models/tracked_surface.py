@@ -14,8 +14,7 @@ from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.control_points import template_control_points
 from avatar.models.networks.sparse_rows import SparseRows
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Pose, Rig
+from avatar.rig.rig import Pose, PosedAvatar, Rig
 from smplxpp.template.template import Template
 
 

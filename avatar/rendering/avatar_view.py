@@ -14,7 +14,7 @@ from smplxpp.core import Camera, InputError
 
 if TYPE_CHECKING:
     from avatar.data.views import View
-    from avatar.rig.posed import PosedAvatar
+    from avatar.rig.rig import PosedAvatar
 
 
 @dataclass(frozen=True, eq=False)

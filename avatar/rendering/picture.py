@@ -11,7 +11,7 @@ from avatar.runtime import AvatarPlayer
 from smplxpp.core import BodyParams, Camera
 
 if TYPE_CHECKING:
-    from avatar.rig.posed import AvatarModel
+    from avatar.rig.rig import AvatarModel
 
 
 def render(
@@ -50,7 +50,7 @@ def render(
     import torch  # players are drawn without it
 
     from avatar.rendering.avatar_view import render_view
-    from avatar.rig.posed import at_rest
+    from avatar.rig.rig import at_rest
 
     # Colours depend on the view, so that the model is posed for the camera's centre of projection.
     device = avatar.rig.device

@@ -1,18 +1,21 @@
-"""The rig: a template that torch skins, `Pose` (the inputs of one frame) and simulated cloth displacements."""
+"""The rig: a template that torch skins, `Pose` (the inputs of one frame), simulated cloth, and the posed avatar."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64
 from threadpoolctl import ThreadpoolController
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from avatar.gaussians.binding import BoundGaussians, WorldGaussians
 from smplxpp.cloth.driver import ClothShape
 from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template
@@ -224,3 +227,58 @@ def _column_sum(factors: Tensor, columns: Sequence[Tensor]) -> Tensor:
     """`sum_k factors_k columns_k` of (V, 3) factors and the first three (V, 3) columns."""
     x, y, z = factors.split(1, dim=-1)
     return torch.addcmul(torch.addcmul(columns[0] * x, columns[1], y), columns[2], z)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedAvatar:
+    """An avatar in one pose, as C cameras see it.
+
+    Attributes:
+        vertices: of the posed mesh, world, metres.
+        gaussians: N of them in the world.
+        colors: sRGB, towards each camera.
+        bound: the same Gaussians in their triangles' frames, with this pose's residuals.
+        displacements: of the mesh in the T-pose before skinning, metres; None: skinning alone.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    gaussians: WorldGaussians
+    colors: Float[Tensor, "C N 3"]
+    bound: BoundGaussians
+    displacements: Float[Tensor, "V 3"] | None = None
+
+
+class AvatarModel(Protocol):
+    """Any module that can be posed and drawn: teacher, student, baselines."""
+
+    rig: Rig
+    training: bool
+
+    def __call__(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Return the avatar in a pose.
+
+        Args:
+            camera_centers: centres of projection in the world, metres.
+        """
+
+    def train(self, mode: bool = True) -> Any:
+        """Set the training mode, as modules do."""
+
+    def eval(self) -> Any:
+        """Set the evaluation mode, as modules do."""
+
+    def named_parameters(self) -> Iterable[tuple[str, Tensor]]:
+        """Return the learned parameters by name, as modules do."""
+
+
+@contextmanager
+def at_rest(model: AvatarModel | nn.Module) -> Iterator[None]:
+    """Run the block without gradients and with the module in its evaluation mode, and restore its mode."""
+    # The mode is restored after an error too, so that a training can go on after a failed evaluation.
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        model.train(was_training)

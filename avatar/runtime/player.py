@@ -137,7 +137,7 @@ class AvatarPlayer:
         Args:
             params: one frame.
             seconds: since the last step; ignored in the first one.
-            path: poses, evenly spaced in time, that the clothes follow to it: those of `smplxpp.cloth.following.ways`
+            path: poses, evenly spaced in time, that the clothes follow to it: those of `smplxpp.cloth.play.ways`
                 for a motion that is known whole, or the output of a `smplxpp.cloth.poses.CausalSmoother`.
 
         Raises:

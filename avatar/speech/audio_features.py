@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter1d
 
 from avatar.speech.phonemes import SILENCE, Phoneme
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 MIN_PAUSE = 0.16
 """Shortest pause in seconds; closures of stop consonants are shorter."""

@@ -15,7 +15,7 @@ from avatar.speech.pronunciation import EXTRA
 from smplxpp.core import DEFAULT_FPS, InputError
 from smplxpp.core.files import as_list, as_number, as_numbers, as_object, as_text, read_arrays, read_json, read_text
 from smplxpp.core.files.onnx_file import OnnxModel
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 _MAX_ROWS = 200_000  # of a table: 55 minutes at 60 frames a second
 _INDEX_OF_NAME = {name.lower(): k for k, name in enumerate(ARKIT)}

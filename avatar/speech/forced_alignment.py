@@ -13,7 +13,7 @@ from avatar.speech.lips import LipNetwork, alignment_score
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech, Word
 from avatar.speech.pronunciation import EXTRA, check_text, no_words_error, phones_from_word, words_from_text
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 _RATE = 16_000
 # Gates on `alignment_score`, in nats a row of 10 ms; `python -m benchmarks given_texts` measures right and wrong texts.

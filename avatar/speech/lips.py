@@ -23,8 +23,8 @@ from avatar.speech.coarticulation import ARTICULATORS
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.files.tensor_bytes import unpack_tensors
-from smplxpp.core.files.wave_file import Sound
 
 WEIGHTS = Path(__file__).parent / "lips.safetensors"
 """Made by `python -m tools.lips.train`; the page carries the same file."""

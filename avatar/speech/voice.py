@@ -15,7 +15,7 @@ from avatar.speech.pronunciation import EXTRA, PAUSES, no_words_error, pronounce
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.onnx_file import OnnxModel
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 _DURATIONS = "/Ceil_output_0"  # node inside Piper's models: number of frames of each symbol
 _PAD, _BEGIN, _END = "_", "^", "$"

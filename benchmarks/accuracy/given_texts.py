@@ -24,7 +24,7 @@ from avatar.speech.lips import LipNetwork, alignment_score
 from benchmarks.accuracy.live_lips import MORE, said_by_voices
 from benchmarks.accuracy.talking import SENTENCES, milliseconds, starts_apart
 from benchmarks.support.results import store_results
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 OTHERS = (1, 4, 7, 8, 11, 13)
 """Offsets from a sentence to its wrong texts."""

@@ -30,7 +30,7 @@ from avatar.speech.voice import PiperVoice
 from benchmarks.accuracy.talking import CLOSED, SENTENCES, VISEMES
 from benchmarks.support.other_voices import ESPEAK, FLITE, Espeak, by_flite
 from benchmarks.support.results import store_results
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 MORE = (
     "The young child watched a yellow bird over the garden.",

@@ -33,7 +33,7 @@ from benchmarks.accuracy.talking import closures_apart, milliseconds, shares, st
 from benchmarks.support.results import store_results
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes, read_text
-from smplxpp.core.files.wave_file import Sound, read_wave
+from smplxpp.core.files.sound_file import Sound, read_wave
 
 _RAW = {"goforward.raw": "go forward ten meters", "tidigits/dhd.2934z.raw": "two nine three four zero"}
 """Texts as the tests' grammar and the digits' name (z: zero) have them; 16 kHz, 16 bits."""

@@ -20,8 +20,7 @@ import tyro
 from avatar.speech.forced_alignment import MIN_ENGLISH, load_recogniser, recognise
 from benchmarks.support.results import store_results
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.sound_file import read_sound
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound, read_sound
 
 _GATES = np.arange(0.0, 1.2, 0.01)
 

@@ -27,8 +27,7 @@ from avatar.training.presets import TrainingPreset, training_preset
 from avatar.training.student.bake import BakeTask
 from avatar.training.student.compensate import CompensateTask
 from avatar.training.student.pretrain import PretrainFieldTask
-from avatar.training.teacher.fit_teacher import TeacherTask
-from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.teacher.fit_teacher import PretrainTeacherTask, TeacherTask
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.track import TrackTask
 from benchmarks.support.results import store_results

@@ -31,8 +31,8 @@ from pipelines.chat.hearing import BLOCK, RATE
 from pipelines.chat.server import ChatServer
 from pipelines.commands.chat import Chat
 from pipelines.figures import fit_cameras
+from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.files.tensor_bytes import unpack_tensors
-from smplxpp.core.files.wave_file import Sound
 
 SENTENCES = (
     "What is your name?",

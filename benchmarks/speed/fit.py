@@ -24,7 +24,7 @@ from avatar.data.views import read_views
 from avatar.gaussians.binding import world_from_frames
 from avatar.gaussians.colors import view_colors
 from avatar.gaussians.sampling import SamplingConfig
-from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import PosedAvatar
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.fit.config import PRESETS, FitConfig

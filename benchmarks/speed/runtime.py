@@ -33,8 +33,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Rig
+from avatar.rig.rig import PosedAvatar, Rig
 from avatar.runtime import AvatarPlayer
 from avatar.runtime.player import PARTS
 from benchmarks.support.results import store_results

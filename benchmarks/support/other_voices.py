@@ -14,7 +14,7 @@ import numpy as np
 
 from avatar.speech import SILENCE, Phoneme, Speech
 from avatar.speech.phonemes import CONSONANTS, VOWELS, arpabet_from_ipa
-from smplxpp.core.files.wave_file import Sound, read_wave
+from smplxpp.core.files.sound_file import Sound, read_wave
 
 FLITE = ("slt", "awb", "rms")
 ESPEAK = {

@@ -15,7 +15,7 @@ from avatar.evaluation.protocol import SETS
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
 from avatar.evaluation.summary import REFINED_POSES, summary_figures
 from avatar.evaluation.tables import Column, FigureTable
-from avatar.rig.posed import AvatarModel
+from avatar.rig.rig import AvatarModel
 from pipelines.ablation.rows import Row
 from pipelines.figures import encode_png
 from pipelines.runs.code import TRAINING

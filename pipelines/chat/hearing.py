@@ -19,7 +19,7 @@ from jaxtyping import Float32, Int16
 from avatar.speech.forced_alignment import NotEnglishError, hypothesis, judge, listen_for_words
 from smplxpp.core import InputError, MissingExtraError, require_positive
 from smplxpp.core.files.onnx_file import OnnxModel
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 # Sample rate (Hz) and block length (samples, 32 ms) of Silero's model; pocketsphinx takes the same rate.
 RATE = 16_000

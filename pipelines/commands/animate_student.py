@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from pipelines.commands.driving import Driving
 from pipelines.commands.options import ClothMode
 from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
-from smplxpp.cloth.following import ways
+from smplxpp.cloth.play import ways
 from smplxpp.core import BodyParams, Camera, spread
 from smplxpp.core.light import Relighting
 

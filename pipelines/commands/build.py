@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText
-from pipelines.commands.progress import stage_progress
+from pipelines.commands.terminal import stage_progress
 from pipelines.runs.folders import keep_out_of_capture
 from pipelines.runs.layout import BUILD_STAGES, CORRECTIONS_FILE, LANDMARKS_FILE, REGISTER_STAGE, reconstructed_scan
 from pipelines.runs.stage import read_manifest

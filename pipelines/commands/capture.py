@@ -57,10 +57,8 @@ class CaptureCheckCommand:
 
     def run(self) -> dict:
         """Check; exit status 1 if something has to be corrected."""
-        from pipelines.captures.check import write_check_report
-        from pipelines.captures.check.report import check_as_dict
-        from pipelines.captures.check.terminal import print_check
-        from pipelines.commands.progress import shared_progress
+        from pipelines.captures.check import check_as_dict, print_check, write_check_report
+        from pipelines.commands.terminal import shared_progress
         from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
@@ -145,7 +143,7 @@ class CaptureConvertCommand:
 
     def run(self) -> dict:
         """Convert; exit status 1 if something had to be left out."""
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture
         from smplxpp.capture.convert import ConvertConfig, convert_capture
@@ -189,7 +187,7 @@ class CaptureConvertCommand:
 
     def _decode(self, capture: Capture, videos: Mapping[str, Path]) -> dict:
         """Decode the videos of a rig; its notes are no reason for another exit status."""
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from smplxpp.capture.convert_videos import VideoConfig, convert_videos
 
         for option, value, default in (("--layout", self.layout, "simple"), ("--scale", self.scale, 1.0)):
@@ -229,7 +227,7 @@ class CaptureConvertCommand:
 
     def _matte(self, model_file: Path) -> None:
         """Run the model over every image that has no matte yet."""
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from smplxpp.capture import open_capture
         from smplxpp.capture.masks import MattingModel, write_mattes
 

@@ -76,10 +76,10 @@ class Chat:
     def partner(self) -> Partner:
         """Return the answering side: a language model with --llm, else rules."""
         if self.llm is None:
-            from pipelines.chat.rules import RulePartner
+            from pipelines.chat.answers import RulePartner
 
             return RulePartner()
-        from pipelines.chat.endpoint import SYSTEM_PROMPT, Endpoint
+        from pipelines.chat.answers import SYSTEM_PROMPT, Endpoint
 
         key = os.environ.get(self.key_variable, "")
         return Endpoint(self.llm, self.model, key, self.persona or SYSTEM_PROMPT)

@@ -12,8 +12,7 @@ import tyro
 from rich.console import Console
 
 from pipelines.commands.options import ClothMode, Lighting, OptionalPath, OptionalText, require_avatar
-from pipelines.commands.progress import shared_progress
-from pipelines.commands.terminal import print_paths
+from pipelines.commands.terminal import print_paths, shared_progress
 from pipelines.runs.layout import STUDENT
 from smplxpp.core.errors import InputError
 from smplxpp.core.light import STUDIO, Irradiance, Relighting, panoramas
@@ -94,7 +93,7 @@ class Evaluate:
         from pipelines.report.sections.build import rewrite_report
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.evaluate import evaluate
-        from pipelines.stages.evaluate_config import REPORT_FILE
+        from pipelines.stages.evaluate_inputs import REPORT_FILE
         from pipelines.stages.scene import TrainInputs
 
         # Check options and read the light before models are loaded.

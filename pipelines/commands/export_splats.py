@@ -33,7 +33,7 @@ def splat_writers(
         InputError: no student, parameters of another body, rows that are not there.
     """
     import avatar
-    from avatar.formats.splats_along import splats_along
+    from avatar.formats.splats import splats_along
     from avatar.runtime import AvatarPlayer
 
     # Exact numbers (float32): the export must not contain the bundle's quantisation error.

@@ -15,8 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, require_avatar
-from pipelines.commands.progress import shared_progress, training_progress
-from pipelines.commands.terminal import print_paths
+from pipelines.commands.terminal import print_paths, shared_progress, training_progress
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.stage import StageRecord, how_to_continue
 from smplxpp.core.validation import require_at_least, require_positive

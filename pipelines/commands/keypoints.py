@@ -41,7 +41,7 @@ class KeypointsConvert:
         """Convert the files and return the number of frames and points for each camera."""
         from smplxpp.capture import open_capture
         from smplxpp.capture.keypoint_files import KeypointOptions
-        from smplxpp.capture.keypoint_places import KeypointFiles, find_places
+        from smplxpp.capture.keypoints import KeypointFiles, find_places
         from smplxpp.capture.writers.arrays import write_keypoints
 
         if not self.input.is_dir():
@@ -97,7 +97,7 @@ class KeypointsDetect:
     def run(self) -> dict:
         """Detect keypoints and return the number of frames for each camera."""
         from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes, detection_sheet
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from pipelines.figures import encode_jpeg, encode_png
         from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.capture import open_capture

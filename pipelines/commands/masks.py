@@ -42,7 +42,7 @@ class CaptureMasks:
     def run(self) -> dict:
         """Write the masks and return how many there are."""
         from pipelines.captures.masks import write_masks
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.capture import open_capture
         from smplxpp.core.files.paths import same_place

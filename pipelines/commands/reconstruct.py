@@ -62,7 +62,7 @@ class ReconstructCommand:
 
     def run(self) -> dict:
         """Reconstruct the frames, write the report, print the surface's confidence and the notes."""
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from pipelines.runs.folders import keep_out_of_capture, own_run_folder
         from pipelines.runs.layout import RECONSTRUCT_STAGE
         from pipelines.stages.reconstruct import reconstruct_capture

@@ -78,7 +78,7 @@ class Register:
 
     def run(self) -> dict:
         """Register, write the report, print residuals before and after."""
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from pipelines.runs.artefacts import values_of
         from pipelines.runs.folders import keep_out_of_capture, own_run_folder, take_file
         from pipelines.runs.layout import LANDMARKS_FILE, REGISTER_STAGE

@@ -18,7 +18,7 @@ from pipelines.commands.templates import BUNDLE_SUFFIX, person_of_run
 from pipelines.figures.film import write_film
 from smplxpp.core import BodyParams, InputError, require_at_least
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, wave_bytes
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files import atomic_write_bytes, read_bytes
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, wave_bytes
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle

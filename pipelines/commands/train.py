@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, require_avatar
-from pipelines.commands.progress import training_progress
-from pipelines.commands.terminal import print_paths
+from pipelines.commands.terminal import print_paths, training_progress
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import FIT_STAGE
 from pipelines.runs.stage import StageRecord, how_to_continue

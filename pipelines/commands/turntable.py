@@ -48,7 +48,7 @@ class CaptureTurntable:
     def run(self) -> dict:
         """Make the capture and return its figures."""
         from pipelines.captures.turntable import TurntableCaptureConfig, make_turntable_capture
-        from pipelines.commands.progress import shared_progress
+        from pipelines.commands.terminal import shared_progress
         from smplxpp.body import load_body
 
         config = TurntableCaptureConfig(

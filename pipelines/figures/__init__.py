@@ -4,13 +4,13 @@
 >>> Path("scan.png").write_bytes(encode_png(render_shaded(mesh, camera, vertex_colors=colors)))
 """
 
+from pipelines.figures.body_drawings import render_heat
 from pipelines.figures.colors import (
     blend_joint_colors,
     colormap,
     heat_colors,
     joint_palette,
 )
-from pipelines.figures.render import render_heat
 from pipelines.figures.sheets import caption, color_bar, contact_sheet, encode_jpeg, encode_png, row
 from smplxpp.raster import (
     VIEWS,

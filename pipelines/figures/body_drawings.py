@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
-from smplxpp.core import Camera, TriangleMesh
+from pipelines.figures.colors import heat_colors
+from pipelines.figures.sheets import color_bar
+from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.core.colors import srgb8_from_linear
-from smplxpp.raster.shading import ShadeStyle, shade_layer
+from smplxpp.raster.shading import ShadeStyle, render_shaded, shade_layer
 
 LEFT, RIGHT, MIDDLE = (52, 130, 246), (232, 64, 52), (250, 205, 50)
 """Colours of the person's own left and right, and of what is on neither side."""
@@ -93,3 +96,37 @@ def draw_bones(
     for x, y in places[shown]:
         draw.ellipse([x - 2.0 * unit, y - 2.0 * unit, x + 2.0 * unit, y + 2.0 * unit], fill=JOINT)
     return np.asarray(whole.resize((width, height), Image.Resampling.BOX))
+
+
+def render_heat(
+    mesh: TriangleMesh,
+    camera: Camera,
+    values: Float[np.ndarray, " K"],
+    *,
+    cmap: str = "error",
+    limits: tuple[float, float],
+    unit: str = "",
+    bar: bool = True,
+    style: ShadeStyle | None = None,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a mesh coloured by values, one a vertex or one a face, with a colour bar on the right.
+
+    Values outside `limits` take the end colours, values that are not finite are grey. Vertex values are interpolated
+    after colouring, so a picture is exact at vertices only.
+    """
+    # Light and shadow are held back: the colour is the message.
+    style = style or ShadeStyle(relief=0.55)
+    values = np.asarray(values, dtype=np.float64)
+    if values.shape not in ((mesh.vertex_count,), (mesh.face_count,)):
+        raise InputError(
+            "values of a heat map",
+            expected=f"shape ({mesh.vertex_count},) or ({mesh.face_count},)",
+            received=f"shape {values.shape}",
+        )
+    colors = heat_colors(values, cmap=cmap, limits=limits)
+    key = "vertex_colors" if len(values) == mesh.vertex_count else "face_colors"
+    picture = render_shaded(mesh, camera, style=replace(style), **{key: colors})
+    if not bar:
+        return picture
+    side = color_bar(cmap=cmap, limits=limits, unit=unit, height=len(picture), background=style.background)
+    return np.concatenate([picture, side], axis=1)

@@ -20,7 +20,7 @@ from PIL import Image
 from pipelines.figures import encode_png
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.atomic import atomic_folder, atomic_path, atomic_write_bytes
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, wave_bytes
 
 FRAME_FOLDER = ""  # the suffix of a folder of pictures
 SUFFIXES = (".mp4", ".gif", FRAME_FOLDER)

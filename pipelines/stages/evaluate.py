@@ -16,8 +16,7 @@ from avatar.evaluation.summary import evaluation_tables, summary_figures
 from avatar.gaussians.bound_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student, StudentConfig
-from avatar.rig.posed import AvatarModel
-from avatar.rig.rig import Rig
+from avatar.rig.rig import AvatarModel, Rig
 from avatar.training.engine.learning_rates import pixel_size
 from pipelines.figures import encode_png
 from pipelines.figures.comparison import surface_picture, write_tiles
@@ -27,8 +26,14 @@ from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
-from pipelines.stages.evaluate_config import BEST_FIRST, MEASURED, MODEL_FILES, REPORT_FILE
-from pipelines.stages.evaluate_inputs import input_protocol, surface_digest
+from pipelines.stages.evaluate_inputs import (
+    BEST_FIRST,
+    MEASURED,
+    MODEL_FILES,
+    REPORT_FILE,
+    input_protocol,
+    surface_digest,
+)
 from pipelines.stages.evaluate_poses import (
     exact_params,
     of_held_out_poses,

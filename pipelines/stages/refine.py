@@ -15,7 +15,7 @@ from avatar.data.views import read_view
 from avatar.metrics.view_quality import eight_bit
 from avatar.models.student import Student, StudentConfig
 from avatar.rendering.avatar_view import render_view
-from avatar.rig.posed import at_rest
+from avatar.rig.rig import at_rest
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.refine import Refinement
 from avatar.training.refinement.refine_capture import refine_capture

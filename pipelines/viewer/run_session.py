@@ -12,16 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.figures import blend_joint_colors, heat_colors
 from pipelines.viewer.run_models import (
+    ShownMotion,
     SplatSource,
     Surface,
     TrainingNow,
+    capture_of_run,
     covariances,
+    motion_of_run,
     newest_splats,
     open_player,
     tracked_surface,
     training_now,
 )
-from pipelines.viewer.run_motion import ShownMotion, capture_of_run, motion_of_run
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import Capture
 from smplxpp.core import POSE_BLOCKS, BodyParams, display_colors, matrix_from_rotvec, require_choice, rotvec_from_matrix

@@ -12,8 +12,8 @@ from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 from pipelines.figures.colors import heat_colors
 from pipelines.viewer.session import LabelSession, UncertainRegion, lies_within
 from smplxpp.core import LABELS, TriangleMesh, display_colors
+from smplxpp.export.gltf import linear_rgba16
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
-from smplxpp.export.gltf_mesh import linear_rgba16
 
 MOST_SPLIT_FACES = 250_000
 """Scans with more faces are drawn with vertex colours, because separate corners for every face would take too long."""

@@ -13,9 +13,9 @@ from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
-from smplxpp.capture.keypoint_order import body_25_order
 from smplxpp.capture.keypoint_people import (
     Person,
+    body_25_order,
     chosen_person,
     coco_person,
     easymocap_people,

@@ -14,8 +14,7 @@ from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.files import subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
-from smplxpp.capture.keypoint_places import KeypointFiles
-from smplxpp.capture.keypoints import with_keypoints
+from smplxpp.capture.keypoints import KeypointFiles, with_keypoints
 from smplxpp.capture.masks import with_masks
 from smplxpp.capture.problems import lens_problems
 from smplxpp.capture.readers import (

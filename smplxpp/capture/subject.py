@@ -19,9 +19,8 @@ from scipy.optimize import linear_sum_assignment
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.keypoint_files import joined, read_people
 from smplxpp.capture.keypoint_people import Person, chosen_person
-from smplxpp.capture.keypoint_places import KeypointFiles
-from smplxpp.capture.subject_geometry import PersonInSpace, people_in_space, typical_distance
-from smplxpp.capture.subject_views import Views
+from smplxpp.capture.keypoints import KeypointFiles
+from smplxpp.capture.subject_geometry import PersonInSpace, Views, people_in_space, typical_distance
 from smplxpp.core import Camera, InputError, Keypoints2D
 
 MaskReader = Callable[[str, int], "np.ndarray | None"]

@@ -231,7 +231,7 @@ class ClothDriver:
         """Go on along poses that are even in time, and return the cloth for the body that is drawn at their end.
 
         Args:
-            poses: at least one frame, as `smplxpp.cloth.following.ways` yields them.
+            poses: at least one frame, as `smplxpp.cloth.play.ways` yields them.
             seconds: of all of it.
             drawn: one frame; None: the last of the poses.
             posed: the drawn body, where it is there already.

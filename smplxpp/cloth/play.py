@@ -1,17 +1,64 @@
-"""A template's surface along a motion, its loose clothes simulated."""
+"""Play a template along a motion: what loose clothes follow of it, and its surface with them simulated."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from math import ceil
 
 import numpy as np
 from jaxtyping import Float
 
 from smplxpp.cloth.driver import ClothDriver, DriverConfig
-from smplxpp.cloth.following import SMOOTHING, ways
 from smplxpp.cloth.garment import Garment
-from smplxpp.core.params import BodyParams
+from smplxpp.cloth.poses import resampled, smoothed
+from smplxpp.core import BodyParams, require_positive
 from smplxpp.template.template import Template
+
+SLOWEST = 40.0
+"""Poses a second at least that clothes follow: places that go straight from pose to pose cut the corners of limbs."""
+SMOOTHING = 0.03
+"""Standard deviation of the Gaussian in time, seconds: trackers shake waistbands."""
+
+
+def followed(poses: BodyParams, fps: float, *, smoothing: float = SMOOTHING) -> tuple[BodyParams, int]:
+    """Return an even motion without leaps as clothes follow it, and how many of its poses a frame has.
+
+    Frame k is pose k times that number.
+
+    Args:
+        poses: T frames.
+        fps: of them.
+        smoothing: seconds; 0: none.
+    """
+    poses = smoothed(poses, radius=smoothing * fps)
+    times, last = max(1, ceil(SLOWEST / fps - 1e-6)), len(poses) - 1
+    if times > 1:
+        steps = np.arange(times * last + 1.0) / times
+        poses = resampled(poses, np.arange(last + 1.0), np.minimum(steps, last))
+    return poses, times
+
+
+def ways(
+    params: BodyParams, fps: float, *, smoothing: float = SMOOTHING, leap: float = DriverConfig.teleport
+) -> Iterator[list[BodyParams]]:
+    """Yield for every frame the poses that lead to it from the one before, even in time, it (smoothed) the last.
+
+    Args:
+        params: T frames, evenly spaced.
+        fps: of them.
+        smoothing: seconds; 0: none.
+        leap: metres a second of the root; what is faster is a cut, over which nothing is smoothed.
+
+    Raises:
+        InputError: no frames a second.
+    """
+    require_positive("frames a second", fps)
+    speeds = fps * np.linalg.norm(np.diff(params.transl, axis=0), axis=1)
+    for stretch in np.split(np.arange(len(params)), np.flatnonzero(speeds > leap) + 1):
+        poses, times = followed(params.select(stretch), fps, smoothing=smoothing)
+        yield [poses.frame(0)]
+        for k in range(times, len(poses), times):
+            yield [poses.frame(at) for at in range(k - times + 1, k + 1)]
 
 
 def play(
@@ -30,7 +77,7 @@ def play(
         params: T frames, evenly spaced.
         fps: of them.
         config: of the driver.
-        smoothing: of what the clothes follow (`smplxpp.cloth.following`), seconds.
+        smoothing: of what the clothes follow (`smplxpp.cloth.play`), seconds.
         notes: list to which the remarks of the driver are added.
     """
     driver = ClothDriver(template, garments, config)

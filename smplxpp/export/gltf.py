@@ -5,15 +5,107 @@ from __future__ import annotations
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pygltflib
+from jaxtyping import UInt8, UInt16
+from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
+from smplxpp.core.colors import decode_srgb
 from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.labels import LABELS
 from smplxpp.core.params import BodyParams
 from smplxpp.export.gltf_animation import add_animation
-from smplxpp.export.gltf_buffers import BufferBuilder
-from smplxpp.export.gltf_mesh import add_parts
-from smplxpp.export.gltf_skin import add_skin
+from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
+from smplxpp.export.gltf_skin import add_skin, influence_sets, quantized_influences
 from smplxpp.template.template import BODY_PART, Template
+
+# A vertex that an expression of one unit moves by less, in metres, is left out of that morph target.
+_STILL = 1e-6
+
+
+def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template, *, morph_targets: bool) -> list[int]:
+    """Add a mesh, a material and a node for every part that has faces; skin 0 moves them all.
+
+    Vertices of a part keep their order; the body's are the body model's own.
+
+    Returns:
+        Indices of the nodes, the body's first.
+    """
+    # Weights are rounded so that rows sum to exactly one. Colours are linear, as COLOR_0 of glTF is, not sRGB.
+    joints, weights = quantized_influences(template.weights)
+    normals = _unit_normals(template)
+    colors = linear_rgba16(template.vertex_colors)
+    nodes = []
+    for index, name in enumerate(template.part_names):
+        faces = template.faces[template.part_faces(name)]
+        if not len(faces):
+            continue
+        rows = np.flatnonzero(template.vertex_part == index)
+        attributes = {
+            "POSITION": buffers.add(template.vertices[rows].astype(np.float32), target=ARRAY_BUFFER, bounds=True),
+            "NORMAL": buffers.add(normals[rows], target=ARRAY_BUFFER),
+            "COLOR_0": buffers.add(colors[rows], target=ARRAY_BUFFER, normalized=True),
+        }
+        # glTF holds four influences a set, so that more of them need further sets.
+        for k, (set_joints, set_weights) in enumerate(influence_sets(joints[rows], weights[rows])):
+            attributes[f"JOINTS_{k}"] = buffers.add(set_joints, target=ARRAY_BUFFER)
+            attributes[f"WEIGHTS_{k}"] = buffers.add(set_weights, target=ARRAY_BUFFER)
+        primitive = pygltflib.Primitive(
+            attributes=pygltflib.Attributes(**attributes),
+            # Parts follow each other in the vertices, so the part's own indices are these.
+            indices=buffers.add(
+                (faces - rows[0]).reshape(-1).astype(index_dtype(len(rows))), target=ELEMENT_ARRAY_BUFFER
+            ),
+            material=len(gltf.materials),
+        )
+        gltf.materials.append(_material(template, name, rows))
+        mesh = pygltflib.Mesh(name=name, primitives=[primitive])
+        if morph_targets and name == BODY_PART and template.body.num_expressions:
+            _add_expressions(buffers, template, mesh)
+        nodes.append(len(gltf.nodes))
+        gltf.nodes.append(pygltflib.Node(name=name, mesh=len(gltf.meshes), skin=0))
+        gltf.meshes.append(mesh)
+    return nodes
+
+
+def linear_rgba16(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]:
+    """Convert sRGB bytes to 16-bit linear RGB with full alpha.
+
+    Vertex colours of glTF are linear; 16 bits keep dark tones apart that 8 would merge.
+    """
+    table = np.rint(65535 * decode_srgb(np.arange(256) / 255.0)).astype(np.uint16)
+    return np.pad(table[colors], ((0, 0), (0, 1)), constant_values=65535)
+
+
+def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib.Mesh) -> None:
+    # (E, Vb, 3): each target's rows lie together.
+    offsets = np.ascontiguousarray(np.moveaxis(template.body.exprdirs, 2, 0), dtype=np.float32)
+    moved = np.einsum("evc,evc->ev", offsets, offsets) > _STILL**2
+    mesh.primitives[0].targets = [
+        {"POSITION": buffers.add_sparse(target, np.flatnonzero(rows))}
+        for target, rows in zip(offsets, moved, strict=True)
+    ]
+    mesh.weights = [0.0] * len(offsets)
+    mesh.extras = {"targetNames": list(template.body.expression_names)}
+
+
+def _unit_normals(template: Template) -> np.ndarray:
+    """(V, 3) float32; up where a vertex has no face of any area, since glTF asks for length 1 everywhere."""
+    normals = template.mesh.vertex_normals.astype(np.float32)
+    normals[~normals.any(axis=1)] = (0.0, 1.0, 0.0)
+    return normals
+
+
+def _material(template: Template, name: str, rows: np.ndarray) -> pygltflib.Material:
+    label = LABELS[int(np.bincount(template.vertex_labels[rows]).argmax())]
+    return pygltflib.Material(
+        name=label.name,
+        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.9),
+        # Clothes are open sheets, seen from inside at hems and cuffs; the body is closed.
+        doubleSided=name != BODY_PART,
+        alphaCutoff=None,
+        extras={"label": label.id, "part": name},
+    )
 
 
 def write_glb(

@@ -18,7 +18,7 @@ from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.core.labels import semantic_colors
 from smplxpp.skinning.linear_blend import skin
 from smplxpp.template import template_arrays
-from smplxpp.template.template_checks import check_arrays, metadata_of
+from smplxpp.template.template_arrays import check_arrays, metadata_of
 
 # The name of the part that comes first.
 BODY_PART = "body"

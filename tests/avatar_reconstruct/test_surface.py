@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from avatar.reconstruct import NeuralSurface, SurfaceConfig, fit_surface
-from avatar.reconstruct.fit_surface import hull_grid
-from avatar.reconstruct.hash_grid import HashGrid
-from avatar.reconstruct.rays import opacities, rays_of, weights_of
+from avatar.reconstruct.fit_surface import hull_grid, opacities, rays_of, weights_of
+from avatar.reconstruct.neural_surface import HashGrid
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.reconstruct.hull import solid_status, zero_surface
 from tests.reconstruct.scene import BOX, RADIUS, inside_ball, photograph, ring

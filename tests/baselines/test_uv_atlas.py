@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar.baselines.uv_atlas import REACH, _unrolled, cylinder_atlas
+from avatar.baselines.uv_unet import REACH, _unrolled, cylinder_atlas
 from avatar.gaussians.binding import corner_weights
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from tests.dolls.swaying import template

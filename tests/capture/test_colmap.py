@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from smplxpp.capture import open_capture
-from smplxpp.capture.readers.colmap_model import MODELS
+from smplxpp.capture.readers.colmap import MODELS
 from smplxpp.core.errors import InputError
 
 F, FY, CX, CY = 50.0, 52.0, 41.5, 29.25

@@ -21,7 +21,7 @@ from smplxpp.body.layout import (
     WHOLE_BODY_133,
 )
 from smplxpp.capture.keypoint_files import KeypointOptions, read_keypoints
-from smplxpp.capture.keypoint_places import find_places
+from smplxpp.capture.keypoints import find_places
 from smplxpp.core import InputError, Keypoints2D
 
 # Where each named point lies in frame 0: told by a number of the name, not by a place in any list.

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from smplxpp.capture.calibrations.opencv_yaml import read_opencv_yaml
+from smplxpp.capture.calibrations.camera_files import read_opencv_yaml
 from smplxpp.capture.files import FileSeries, image_name
-from smplxpp.capture.readers.colmap_model import read_model
+from smplxpp.capture.readers.colmap import read_model
 from smplxpp.core.errors import InputError
 from tests.capture.scene import make_scene
 from tests.capture.writers import write_colmap_binary, write_colmap_text

@@ -15,7 +15,7 @@ from smplxpp.body.layout import BODY_25, BODY_25B
 from smplxpp.capture import open_capture
 from smplxpp.capture.check.files import missing_findings
 from smplxpp.capture.keypoint_files import KeypointOptions, read_keypoints
-from smplxpp.capture.keypoint_order import body_25_order
+from smplxpp.capture.keypoint_people import body_25_order
 from smplxpp.core import BodyParams, Camera, InputError
 from smplxpp.register.landmarks import LandmarkModel
 from tests.capture.calibration_writers import Rig

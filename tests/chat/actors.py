@@ -20,7 +20,7 @@ from pipelines.chat.conversation import ChatParts
 from pipelines.chat.hearing import LoudnessActivity
 from smplxpp.body.model import BodyModel
 from smplxpp.core import BodyParams, InputError
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 from tests.dolls.dancing import dance
 from tests.web.avatars import write_avatar
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import pytest
 
-from pipelines.chat.endpoint import Endpoint
+from pipelines.chat.answers import Endpoint
 from smplxpp.core.errors import InputError
 
 HISTORY = [("user", "hello"), ("assistant", "hi"), ("user", "and?")]

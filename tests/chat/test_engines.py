@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from avatar.speech.voice import PiperVoice
+from pipelines.chat.answers import RulePartner
 from pipelines.chat.conversation import Conversation
 from pipelines.chat.hearing import RATE, Recogniser, find_activity
-from pipelines.chat.rules import RulePartner
 from smplxpp.core.files.tensor_bytes import unpack_tensors
 from tests.chat.actors import cast, doll
 

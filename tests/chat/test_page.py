@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, wave_bytes
 from tests.chat.actors import A_CHARACTER, Script, Words, cast, doll
 from tests.chat.test_listening import sound
 from tests.web.chromium import Page, find_chromium

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from pipelines.chat.answers import RulePartner
 from pipelines.chat.conversation import LONGEST_SENTENCE, sentences
-from pipelines.chat.rules import RulePartner
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.cloth.following import SLOWEST, followed, ways
-from smplxpp.cloth.play import play
+from smplxpp.cloth.play import SLOWEST, followed, play, ways
 from smplxpp.core import BodyParams, InputError
 from tests.cloth.persons import person
 from tests.cloth.test_driver import QUICK, garment, swaying

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
-from smplxpp.cloth.carriers import find_carriers
+from smplxpp.cloth.garment import find_carriers
 from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core import GeometryWarning, InputError, TriangleMesh
 from smplxpp.template.template import BODY_PART

@@ -22,8 +22,7 @@ from avatar.losses import perceptual as metric_names
 from avatar.losses.perceptual import MissingPackageError, load_metric
 from avatar.metrics.speed import bytes_on_disk, fitted, measure_speed, parameter_counts
 from avatar.metrics.view_quality import ViewQuality
-from avatar.rig.posed import at_rest
-from avatar.rig.rig import Rig
+from avatar.rig.rig import Rig, at_rest
 from smplxpp.core import BodyParams, Camera, InputError
 from tests.dolls.standing import OUT, Grown, doll, opened, still
 

@@ -10,7 +10,7 @@ import trimesh
 
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.export import write_glb
-from smplxpp.export.gltf_mesh import linear_rgba16
+from smplxpp.export.gltf import linear_rgba16
 from smplxpp.export.gltf_skin import quantized_influences
 from tests.export.glb_reader import GlbReader
 from tests.export.templates import open_body_template, random_motion, random_template

@@ -12,8 +12,7 @@ import trimesh
 
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
-from smplxpp.export.printing import write_solid
-from smplxpp.export.printing_check import check_written
+from smplxpp.export.printing import check_written, write_solid
 
 
 @pytest.fixture

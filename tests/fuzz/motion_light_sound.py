@@ -12,8 +12,7 @@ from smplxpp.body import load_body
 from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.retarget import Skeleton
 from smplxpp.core.files.panorama_file import read_panorama
-from smplxpp.core.files.sound_file import read_sound
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, read_sound, wave_bytes
 from smplxpp.core.light import Irradiance
 from smplxpp.core.params import BodyParams
 from smplxpp.export.bvh import write_bvh

@@ -14,13 +14,13 @@ from avatar.formats.ply import read_splat_ply, write_splat_ply
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.rig.rig import Rig
-from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.metrics_log import read_metrics
 from pipelines.commands.inspect import summarise_run
 from pipelines.report import Report, write_report
 from pipelines.report.builder import readable
 from pipelines.report.sections.fit import fit_section
-from pipelines.report.sections.refine import refine_section
+from pipelines.report.sections.training import refine_section
 from pipelines.runs.artefacts import load_arrays, save_arrays
 from pipelines.runs.layout import BUILD_STAGES, FIT_STAGE, REFINE_STAGE
 from pipelines.runs.stage import StageOutput, StageRecord, read_manifest, run_stage

@@ -34,8 +34,7 @@ from pipelines.report.sections.evaluation import (
 from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
-from pipelines.stages.evaluate_config import MODEL_FILES
-from pipelines.stages.evaluate_inputs import input_protocol
+from pipelines.stages.evaluate_inputs import MODEL_FILES, input_protocol
 from smplxpp.capture import open_capture
 from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template

@@ -15,7 +15,7 @@ from avatar.evaluation.evaluate import evaluate_models
 from pipelines.runs.layout import GARMENTS, REFINED_HELD_OUT_PARAMS
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.evaluate import load_model
-from pipelines.stages.evaluate_config import MODEL_FILES
+from pipelines.stages.evaluate_inputs import MODEL_FILES
 from smplxpp.body import load_params
 from smplxpp.capture import open_capture
 from smplxpp.cloth.garment_file import load_garments, save_garments

@@ -17,7 +17,7 @@ from avatar.training.engine.resources import choose_device
 from pipelines.cli import main
 from pipelines.commands import inspect, options
 from pipelines.commands.inspect import summarise_run
-from pipelines.commands.progress import training_progress
+from pipelines.commands.terminal import training_progress
 from pipelines.figures.comparison import read_strip
 from pipelines.runs.stage import SCHEMA, read_manifest
 from smplxpp.core.params import BodyParams

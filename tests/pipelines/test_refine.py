@@ -12,7 +12,7 @@ import pytest
 
 from avatar.training.refinement.config import RefineConfig
 from pipelines.cli import main
-from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
+from pipelines.report.sections.training import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import REFINED_CAMERAS, REFINED_HELD_OUT_PARAMS, REFINED_PARAMS, REGISTERED_PARAMS, TEMPLATE
 from pipelines.runs.stage import read_manifest

@@ -15,7 +15,7 @@ import pytest
 from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.protocol import ProtocolConfig
 from avatar.training.presets import TRAINING_PRESETS
-from avatar.training.student import init_blend_shapes
+from avatar.training.student import compensate
 from avatar.training.tracking import track
 from pipelines.ablation.ablate import AblationRun, ablate
 from pipelines.ablation.rows import ablation_rows
@@ -57,7 +57,7 @@ def _told(capture: Path) -> tuple[str, ...]:
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
-    monkeypatch.setattr(init_blend_shapes, "_fit", partial(init_blend_shapes._fit, steps=2))
+    monkeypatch.setattr(compensate, "_fit", partial(compensate._fit, steps=2))
 
 
 @pytest.fixture(scope="module")

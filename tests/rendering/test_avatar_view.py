@@ -10,8 +10,7 @@ from avatar.data.views import View
 from avatar.models.student import Student, StudentConfig
 from avatar.rendering.api import rasterize
 from avatar.rendering.avatar_view import render_view
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Rig
+from avatar.rig.rig import PosedAvatar, Rig
 from tests.dolls.dancing import HEIGHT, WIDTH, cameras, dance, gaussians, template, varied
 
 GREY = torch.tensor([0.2, 0.4, 0.6])

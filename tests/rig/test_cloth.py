@@ -9,8 +9,7 @@ import torch
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
 from smplxpp.cloth import ClothDriver, ClothShape
-from smplxpp.cloth.following import ways
-from smplxpp.cloth.play import play
+from smplxpp.cloth.play import play, ways
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import person
 from tests.cloth.test_driver import QUICK, garment, swaying

@@ -7,7 +7,7 @@ import pytest
 
 from avatar.speech import ARTICULATORS, Phoneme, Speech, articulate
 from avatar.speech.audio_features import clear_pauses, find_pauses
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 RATE = 16_000
 BURSTS = ((0.30, 1.10), (1.20, 1.75), (2.55, 3.20))

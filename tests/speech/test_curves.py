@@ -15,7 +15,7 @@ from avatar.speech.face import JAW_ANGLE
 from pipelines.commands.talk import Talk
 from smplxpp.body import load_body
 from smplxpp.core import BodyParams, InputError
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 BODY = load_body()
 FACE = Face.of(BODY.expression_names, BODY.joint_names)

@@ -18,7 +18,7 @@ from avatar.speech.voice import PiperVoice, _symbols
 from benchmarks.accuracy.talking import starts_apart
 from benchmarks.support.other_voices import Espeak
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
+from smplxpp.core.files.sound_file import Sound, read_wave, wave_bytes
 from tests.speech.conftest import TEXT
 
 

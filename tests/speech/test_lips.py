@@ -19,8 +19,8 @@ from avatar.speech.lips import (
 from avatar.speech.phonemes import BILABIALS, VOWELS
 from pipelines.commands.talk import Talk
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.files.tensor_bytes import unpack_tensors
-from smplxpp.core.files.wave_file import Sound
 
 JAW, PRESS = ARTICULATORS.index("jaw"), ARTICULATORS.index("press")
 

@@ -20,8 +20,7 @@ from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.student.bake import BakeConfig, bake
 from avatar.training.student.pretrain import PretrainFieldTask, _MapLookup
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, fit_teacher
-from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.teacher.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
 from avatar.training.tracking.config import Level
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import gaussians, sequence, template, write_dance

@@ -17,7 +17,7 @@ from pipelines.commands.talking_page import write_talking_page
 from pipelines.web.page import PageContent, lips_of, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.body import load_body
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, wave_bytes
 from smplxpp.core.params import BodyParams
 from tests.dolls.dancing import dance
 from tests.web.avatars import NAME

@@ -13,7 +13,7 @@ import pytest
 from avatar.runtime.bundle import load_bundle, save_with_motion
 from pipelines.web.page import PageContent, page_files, single_page
 from pipelines.web.server import PageServer
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, wave_bytes
 from smplxpp.core.params import BodyParams
 from tests.dolls.dancing import dance
 from tests.web.avatars import NAME, write_avatar

@@ -20,7 +20,7 @@ from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstr
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_quality, view_quality
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.rendering.avatar_view import Rendering, render_view
-from avatar.rig.posed import AvatarModel, PosedAvatar
+from avatar.rig.rig import AvatarModel, PosedAvatar
 from avatar.training.engine.learning_rates import LearningRates, attribute_groups, pixel_size
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.engine.processes import Distributed

@@ -18,8 +18,7 @@ from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rendering.avatar_view import Rendering
 from avatar.rendering.mesh_maps import mesh_maps
-from avatar.rig.posed import PosedAvatar
-from avatar.rig.rig import Pose
+from avatar.rig.rig import Pose, PosedAvatar
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext

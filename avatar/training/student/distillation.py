@@ -18,7 +18,7 @@ from avatar.losses.reconstruction import Target
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rendering.avatar_view import render_view
 from avatar.rendering.mesh_maps import MeshMapsTensor, front_back_maps
-from avatar.rig.posed import PosedAvatar
+from avatar.rig.rig import PosedAvatar
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from pipelines.report.sections.evaluation import (
 )
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, standing_fit
 from pipelines.report.sections.reconstruct import reconstruct_section
-from pipelines.report.sections.refine import refine_section, refinement_key_numbers, standing_refinement
 from pipelines.report.sections.register import locate_section, register_section
 from pipelines.report.sections.template import (
     fidelity_section,
@@ -29,7 +28,15 @@ from pipelines.report.sections.template import (
     template_section,
     weights_section,
 )
-from pipelines.report.sections.training import cloth_section, standing_trainings, training_key_numbers, training_section
+from pipelines.report.sections.training import (
+    cloth_section,
+    refine_section,
+    refinement_key_numbers,
+    standing_refinement,
+    standing_trainings,
+    training_key_numbers,
+    training_section,
+)
 from pipelines.runs import layout
 from pipelines.runs.artefacts import load_params_of_run, load_scan, values_of
 from pipelines.runs.code import versions

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from smplxpp.capture.calibrations.opencv_yaml import read_opencv_yaml
+from smplxpp.capture.calibrations.camera_files import read_opencv_yaml
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.keypoints import found_keypoints

@@ -12,8 +12,7 @@ from typing import Any
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params, required
-from smplxpp.capture.readers.transforms_camera import frame_camera
-from smplxpp.capture.readers.transforms_images import NamedImage, find_image, mask_beside, places, same_camera
+from smplxpp.capture.readers.transforms import NamedImage, find_image, frame_camera, mask_beside, places, same_camera
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.splits import Splits
 from smplxpp.core import Camera, InputError

@@ -11,7 +11,7 @@ from smplxpp.capture.calibrations import find_calibration, read_calibration
 from smplxpp.capture.calibrations.names import matched_names
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
-from smplxpp.capture.keypoint_places import KeypointFiles, find_places
+from smplxpp.capture.keypoints import KeypointFiles, find_places
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params
 from smplxpp.capture.recording import Problem, Recording
 from smplxpp.capture.video_files import probe_video

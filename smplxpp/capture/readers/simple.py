@@ -12,8 +12,7 @@ import numpy as np
 from smplxpp.capture.cameras import read_lenses
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name, subfolders
-from smplxpp.capture.keypoint_places import KeypointFiles
-from smplxpp.capture.keypoints import found_keypoints
+from smplxpp.capture.keypoints import KeypointFiles, found_keypoints
 from smplxpp.capture.protocols import (
     ProtocolFiles,
     choose_protocol,

@@ -1,4 +1,4 @@
-"""Read sound files of any usual kind: WAV directly, others (FLAC, AIFF, MP3, Ogg, M4A) decoded by ffmpeg.
+"""Read sound files of any usual kind and write WAV; what is no WAV (FLAC, AIFF, MP3, Ogg, M4A) is decoded by ffmpeg.
 
 The format is recognised by the first bytes and named to ffmpeg, so that a playlist cannot make it open other files.
 """
@@ -6,12 +6,132 @@ The format is recognised by the first bytes and named to ffmpeg, so that a playl
 from __future__ import annotations
 
 import shutil
+import struct
 import subprocess
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from scipy.signal import resample_poly
 
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.files.wave_file import MAX_BYTES, REMEDY, Sound, sound_of_wave
+
+# Codes of the sample format in a WAV file; an extensible header holds the code in its second part.
+_PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
+_EXPECTED = "a WAV file (RIFF): integers of 8, 16, 24 or 32 bits, or floats"
+REMEDY = "`ffmpeg -i INPUT -ac 1 -ar 16000 speech.wav` makes one of any recording"
+"""What helps where a recording cannot be read."""
+MAX_BYTES = 1 << 30
+"""Size from which a sound file is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sound:
+    """Samples of one channel of sound at a constant rate.
+
+    Attributes:
+        samples: amplitudes from -1 to 1.
+        rate: samples per second.
+    """
+
+    samples: Float32[np.ndarray, " N"]
+    rate: int
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the sound in seconds."""
+        return len(self.samples) / self.rate
+
+    def at_rate(self, rate: int) -> Sound:
+        """Return the sound resampled to another rate, with a low-pass filter against aliasing."""
+        if rate == self.rate or not len(self.samples):
+            return Sound(self.samples, rate)
+        ratio = Fraction(rate, self.rate)
+        samples = resample_poly(self.samples.astype(np.float64), ratio.numerator, ratio.denominator)
+        return Sound(samples.astype(np.float32), rate)
+
+    def integers(self) -> np.ndarray:
+        """Return the samples as 16-bit integers, clipped to [-1, 1]."""
+        return np.round(np.clip(self.samples, -1.0, 1.0) * 32767.0).astype("<i2")
+
+
+def read_wave(path: str | Path) -> Sound:
+    """Read a WAV file and average its channels.
+
+    Raises:
+        InputError: missing, damaged or foreign; a coding other than integers and floats; NaN.
+    """
+    return sound_of_wave(read_bytes(path, subject="sound", most=MAX_BYTES), path)
+
+
+def sound_of_wave(data: bytes, path: str | Path) -> Sound:
+    """Return the sound in the bytes of a WAV file as `read_wave` does; `path` names it in errors."""
+    (lowest_rate, highest_rate), max_channels = (4000, 384_000), 64
+    subject = f"sound {path}"
+    if data[:4] != b"RIFF" or data[8:12] != b"WAVE":
+        raise InputError(subject, expected=_EXPECTED, received="another kind of file", remedy=REMEDY)
+    chunks = _chunks(data)
+    if len(chunks.get(b"fmt ", b"")) < 16 or b"data" not in chunks:
+        raise InputError(subject, expected=_EXPECTED, received="no description or no samples", remedy=REMEDY)
+    # Format header: sample format, channels, rate, bytes per second, bytes per block, bits per sample.
+    kind, channels, rate, _, block, bits = struct.unpack("<HHIIHH", chunks[b"fmt "][:16])
+    # WAVE_FORMAT_EXTENSIBLE keeps the true code in the first two bytes of its GUID, at byte 24.
+    if kind == _EXTENSIBLE and len(chunks[b"fmt "]) >= 26:
+        (kind,) = struct.unpack("<H", chunks[b"fmt "][24:26])
+    known = (kind == _PCM and bits in (8, 16, 24, 32)) or (kind == _FLOAT and bits in (32, 64))
+    if not known:
+        raise InputError(subject, expected=_EXPECTED, received=f"coding {kind} of {bits} bits", remedy=REMEDY)
+    if not (1 <= channels <= max_channels and lowest_rate <= rate <= highest_rate and block == channels * bits // 8):
+        raise InputError(
+            subject,
+            expected=f"1 to {max_channels} channels at {lowest_rate} to {highest_rate} Hz",
+            received=f"{channels} at {rate} Hz in blocks of {block} bytes",
+        )
+    # Drop an incomplete last block, which recorders leave when they are interrupted; (N, channels) afterwards.
+    raw = np.frombuffer(chunks[b"data"], np.uint8)
+    values = _numbers(raw[: len(raw) // block * block], kind, bits).reshape(-1, channels)
+    if not np.isfinite(values).all():
+        raise InputError(subject, expected="finite samples", received="NaN or infinity")
+    # Floats may exceed 1; the bound of 8 (18 dB) keeps damaged samples from overflowing later sums.
+    return Sound(np.clip(values.mean(axis=1), -8.0, 8.0).astype(np.float32), rate)
+
+
+def wave_bytes(sound: Sound) -> bytes:
+    """Return the bytes of a mono WAV file of 16-bit integers."""
+    data = sound.integers().tobytes()
+    form = struct.pack("<HHIIHH", _PCM, 1, sound.rate, 2 * sound.rate, 2, 16)
+    body = b"WAVEfmt " + struct.pack("<I", len(form)) + form + b"data" + struct.pack("<I", len(data)) + data
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
+
+def _chunks(data: bytes) -> dict[bytes, bytes]:
+    """Return the first chunk of each name; an interrupted recording may state sizes past its end."""
+    out: dict[bytes, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        size = int.from_bytes(data[at + 4 : at + 8], "little")
+        out.setdefault(data[at : at + 4], data[at + 8 : at + 8 + size])
+        at += 8 + size + size % 2
+    return out
+
+
+def _numbers(raw: UInt8[np.ndarray, " B"], kind: int, bits: int) -> np.ndarray:
+    """Convert raw samples to float64 from -1 to 1."""
+    if kind == _FLOAT:
+        return raw.view(f"<f{bits // 8}").astype(np.float64)
+    # Eight-bit samples are unsigned around 128, all wider ones are signed.
+    if bits == 8:
+        return (raw.astype(np.float64) - 128.0) / 128.0
+    # 24 bits become the upper three bytes of a 32-bit integer, which keeps the sign.
+    if bits == 24:
+        wide = np.zeros((len(raw) // 3, 4), np.uint8)
+        wide[:, 1:] = raw.reshape(-1, 3)
+        return wide.reshape(-1).view("<i4").astype(np.float64) / 2.0**31
+    return raw.view(f"<i{bits // 8}").astype(np.float64) / 2.0 ** (bits - 1)
+
 
 _LONGEST = 7200  # seconds that are decoded; 16 bits of two channels at 48 kHz stay below `MAX_BYTES`
 _TIMEOUT = 900  # seconds that ffmpeg may take

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core.errors import InputError, MissingExtraError
-from smplxpp.core.files.sound_file import read_sound
-from smplxpp.core.files.wave_file import Sound, wave_bytes
+from smplxpp.core.files.sound_file import Sound, read_sound, wave_bytes
 
 RATE = 22050
 TONE = (0.5 * np.sin(2 * np.pi * 440 * np.arange(RATE // 2) / RATE)).astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.wave_file import Sound, read_wave, wave_bytes
+from smplxpp.core.files.sound_file import Sound, read_wave, wave_bytes
 
 TONE = (0.5 * np.sin(2 * np.pi * 440 * np.arange(8000) / 16000)).astype(np.float32)
 

@@ -12,7 +12,7 @@ import pytest
 from pipelines.commands.talk import Talk
 from pipelines.figures.film import write_film
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.wave_file import Sound
+from smplxpp.core.files.sound_file import Sound
 
 
 @pytest.mark.parametrize(

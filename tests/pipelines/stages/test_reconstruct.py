@@ -187,7 +187,7 @@ def test_a_neural_surface_on_the_cpu_is_a_stage_like_others(tmp_path):
     method = neural_method(config, surface, "cpu")
     record = reconstruct_capture(tmp_path, ReconstructInputs(FIXTURE, (0,), cell_mm=40.0), method=method)
     assert record.manifest["config"]["method"]["name"] == "sdf"
-    assert "avatar.reconstruct.hash_grid" in record.manifest["code"]
+    assert "avatar.reconstruct.neural_surface" in record.manifest["code"]
     raw = read_raw_mesh(tmp_path / reconstructed_scan(0))
     assert solid_status(TriangleMesh(raw.vertices, raw.faces))[0] == "NoError"
     again = reconstruct_capture(tmp_path, ReconstructInputs(FIXTURE, (0,), cell_mm=40.0), method=method)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.mean_of_steps import EVERY, MeanOfSteps
 from avatar.training.engine.optimization_task import OptimiserConfig
 from smplxpp.core.errors import InputError

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.training.engine.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig, OptimizationTask, ParameterGroup
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy, copied, same_state

@@ -15,7 +15,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.teacher import local_offsets
 from avatar.models.student import Student, StudentConfig
 from avatar.models.tracked_surface import ControlCage, Track
-from avatar.training.student.init_blend_shapes import _components, init_blend_shapes
+from avatar.training.student.compensate import _components, init_blend_shapes
 from tests.dolls.dancing import dance, gaussians, sequence, varied, write_dance
 from tests.dolls.tiny import TINY_FIELD
 from tests.dolls.toy import copied, same_state
@@ -92,7 +92,7 @@ def test_what_is_left_over_is_the_way_from_the_students_mesh_to_the_surface(fram
     """In the triangles' frames of the T-pose, where both surfaces are looked at."""
     made, track, rig, seen = student(frames), followed(frames), frames.rig, []
     monkeypatch.setattr(
-        "avatar.training.student.init_blend_shapes._components",
+        "avatar.training.student.compensate._components",
         lambda shapes, left: seen.append(left) or _components(shapes, left),
     )
     init_blend_shapes(made, frames, track)
@@ -207,7 +207,7 @@ def test_poses_between_those_of_the_frames_have_displacements_between(frames):
 
 
 def test_many_more_frames_than_are_looked_at(frames, monkeypatch):
-    monkeypatch.setattr("avatar.training.student.init_blend_shapes.FRAMES", 2)
+    monkeypatch.setattr("avatar.training.student.compensate.FRAMES", 2)
     seen = []
     track = followed(frames)
     monkeypatch.setattr(Track, "displacements", lambda self, frame: seen.append(frame) or self.cage(self.controls[0]))

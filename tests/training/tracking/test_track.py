@@ -17,8 +17,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.session import Session
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, fit_teacher
-from avatar.training.teacher.pretrain import PretrainTeacherTask
+from avatar.training.teacher.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
 from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track import TrackTask, follow_surface
 from smplxpp.core.errors import InputError
