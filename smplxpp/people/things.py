@@ -94,6 +94,7 @@ def _ball(radius: tuple[float, float, float], center: tuple[float, float, float]
 
 THINGS: dict[str, tuple[bool, Callable[[], list[np.ndarray]]]] = {
     "binder": (False, lambda: [_box((0.30, 0.045, 0.24), (0.03, -0.045, 0.03))]),
+    "folder": (False, lambda: [_box((0.34, 0.03, 0.26), (-0.12, -0.055, 0.02))]),
     "book": (False, lambda: [_box((0.16, 0.025, 0.22), (0.03, -0.035, 0.06))]),
     "ball": (False, lambda: [_ball((0.11, 0.11, 0.11), (0.02, -0.12, 0.0))]),
     "bottle": (False, lambda: [_tube(0.035, (0.01, -0.045, -0.09), (0.01, -0.045, 0.15))]),

@@ -1,14 +1,17 @@
 """Find things that a person holds: surface at a hand that no pose of the body and no clothes explain.
 
-Every face has evidence, in square centimetres of surface, that it belongs to a thing: for faces whose nearest part of
-the body is a hand it grows with the distance, because cloth does not stand off a hand; on the trunk, legs and head,
-where clothes and hair stand off, it is slightly negative. The set O of faces of things minimises
+Every face has evidence, in square centimetres of surface, that it belongs to a thing. Evidence grows with the
+distance of faces whose nearest part of the body is a hand, because cloth does not stand off a hand; boards
+(`flat_share`) have it beside an arm and on the chest, because sleeves and shirts are nowhere flat over 10 cm; on the
+rest of trunk, legs and head, where clothes and hair stand off, it is slightly negative. The set O of faces of things
+minimises
 
     E(O) = - sum_(i in O) e_i a_i + sum_(cut edges) c_ij length_ij
 
 whose second term is low in concave folds and across edges of colour (`edge_weights`), as where a thing lies against
-clothes. A skirt beside a hand has such evidence, too; it goes on smoothly into cloth, so that cutting it out is dear. A
-minimum cut gives O; its pieces are kept where they are large enough, touch the hand, and leave its reach.
+clothes or an arm. A skirt beside a hand has such evidence, too; it goes on smoothly into cloth, so that cutting it
+out is dear. A minimum cut gives O; its pieces are kept where they are large enough, touch the hand, leave its reach,
+and have a border that is short for their area, which a flap of cloth does not have.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from scipy.spatial import cKDTree
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.topology import component_labels, face_adjacency
-from smplxpp.segment.by_body_chart import ARM, HAND, HEAD, NECK, TRUNK, chart_of_body
+from smplxpp.segment.by_body_chart import ARM, HAND, HEAD, LEG, NECK, TRUNK, chart_of_body, chart_of_scan
+from smplxpp.segment.flat_patches import flat_share
 from smplxpp.segment.graph_cut import PottsProblem, minimize_potts
 from smplxpp.segment.smoothing import SmoothingConfig, edge_weights
 
@@ -35,6 +39,12 @@ _AT_ARM = ((0.015, 0.035, 0.06, 0.12), (-1.0, -0.05, 0.02, 0.3))
 _ELSEWHERE = ((0.015, 0.05, 0.25, 0.35), (-1.0, -0.05, -0.03, 0.1))
 _ON_CHEST = ((0.015, 0.05, 0.09, 0.14), (-1.0, -0.1, 0.0, 0.4))
 _ON_HEAD = ((0.0, 1.0), (-0.5, -0.5))
+# Evidence of a board, which an arm may press against the chest; a shirt that lies on the chest may be flat.
+_BOARD, _BOARD_ON_CHEST = 0.3, ((0.02, 0.04), (0.0, 1.0))
+_BOARD_REACH = 0.6
+"""Metres from a hand within which boards are looked for, the diagonal of a large folder."""
+_HANGS, _LOOKS_OUT = 0.09, 0.5
+"""Metres within which a shirt or skirt hangs off trunk and legs, and the cosine between its normal and theirs."""
 _WAIST = 1.05  # height of the standard person above which no cloth stands far off the trunk, metres
 _LENGTH_COST = 2.0  # square centimetres of evidence for one centimetre of a cut through smooth, plain surface
 
@@ -72,30 +82,68 @@ def find_objects(
         params: one frame, in the pose of the scan.
         lab: colours of the faces in OKLab; None: the cut follows folds alone.
     """
-    own, posed = chart_of_body(body, params), body.forward(params).vertices[0]
-    pairs, ends = face_adjacency(mesh.faces)
-    nothing = FoundObjects.none(mesh.face_count)
+    own, posed = chart_of_body(body, params), body.mesh(body.forward(params).vertices[0])
     hand = own.region == HAND
     if not hand.any():
-        return nothing
+        return FoundObjects.none(mesh.face_count)
     # The distance from each face to the body, and the part of it that is nearest, wherever the face looks.
-    distance, nearest = cKDTree(posed).query(mesh.face_centers)
-    to_hand = cKDTree(posed[hand]).query(mesh.face_centers)[0]
+    distance, nearest = cKDTree(posed.vertices).query(mesh.face_centers)
+    to_hand = cKDTree(posed.vertices[hand]).query(mesh.face_centers)[0]
     region = own.region[nearest]
     chest = (region == TRUNK) & (own.height[nearest] > _WAIST)
     evidence = _evidence(distance, region, chest)
+    # Below a hand clothes hang off the trunk: they look the way that it looks there.
+    clothed = np.isin(own.region, (TRUNK, LEG))
+    off, at = cKDTree(posed.vertices[clothed]).query(mesh.face_centers)
+    looks = np.einsum("ij,ij->i", mesh.face_normals, posed.vertex_normals[clothed][at])
+    hangs = (region == HAND) & (off < _HANGS) & (looks > _LOOKS_OUT)
+    evidence[hangs] = np.minimum(evidence[hangs], 0.0)
     if not (mesh.face_areas[evidence > 0].sum() * _CM2 > _LEAST_AREA):
-        return nothing
+        return FoundObjects.none(mesh.face_count)
+    # Boards at an arm or on the chest, from both sides.
+    flat = flat_share(mesh, to_hand < _BOARD_REACH)
+    beside = np.where(chest, np.interp(distance, *_BOARD_ON_CHEST), np.isin(region, (ARM, HAND)))
+    evidence = np.maximum(evidence, (1.0 + _BOARD) * flat * beside - 1.0)
     # Minimise E by one cut; both terms are in square centimetres, so that finer meshes give the same cut.
+    pairs, ends = face_adjacency(mesh.faces)
     relative = edge_weights(mesh, pairs, ends, SmoothingConfig(smoothness=1.0, floor=0.0, eta_convex=0.0), lab=lab)
     length = 100.0 * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
     cost = _LENGTH_COST * relative * (length.mean() if len(length) else 1.0)
     unary = np.stack([np.zeros(mesh.face_count), -evidence * mesh.face_areas * _CM2], axis=1)
     unary -= unary.min(axis=1, keepdims=True)
     cut = minimize_potts(PottsProblem.from_costs(unary, pairs, cost))[0].astype(bool)
-    hands = [posed[hand & (own.side == side)] for side in (1, -1)]
-    middle = posed[own.region == TRUNK].mean(axis=0)
-    return _accepted(mesh, cut, pairs, (length, cost), (distance, to_hand, _sectors(mesh, middle)), hands)
+    # What is left of either hand, where a face takes the part of the body that looks the same way.
+    charted, middle = chart_of_scan(mesh, body, params), posed.vertices[own.region == TRUNK].mean(axis=0)
+    left = (charted.region == HAND) & ~cut
+    hands = [
+        (posed.vertices[hand & (own.side == side)], float(mesh.face_areas[left & (charted.side == side)].sum()) * _CM2)
+        for side in (1, -1)
+    ]
+    where = _Where(distance, to_hand, _sectors(mesh, middle), flat, pairs, length, cost)
+    return _accepted(mesh, cut, where, hands)
+
+
+@dataclass(frozen=True, eq=False)
+class _Where:
+    """Measures of faces and edges by which pieces of a cut are judged.
+
+    Attributes:
+        distance: of each face to the body, metres.
+        to_hand: of each face to the nearer hand, metres.
+        sector: of each face about the person (`_sectors`).
+        flat: share of each face on a board.
+        pairs: the two faces of each edge.
+        length: of each edge, centimetres.
+        cost: of cutting each edge, square centimetres of evidence.
+    """
+
+    distance: Float64[np.ndarray, " M"]
+    to_hand: Float64[np.ndarray, " M"]
+    sector: Int64[np.ndarray, " M"]
+    flat: Float64[np.ndarray, " M"]
+    pairs: Int64[np.ndarray, "P 2"]
+    length: Float64[np.ndarray, " P"]
+    cost: Float64[np.ndarray, " P"]
 
 
 _LEAST_AREA = 60.0
@@ -104,12 +152,18 @@ _LEAST_REACH = 0.06
 """Metres by which a thing leaves the body; fists and wrong fingers stay within."""
 _TOUCHES = 0.03
 """Metres from the hand within which a thing begins."""
-_SHOWS, _SHOWN = 0.015, 0.4
-"""Metres within which the scan shows a point of a hand, and the share of a hand that it has to show beside a thing."""
+_LEFT_OF_HAND = 120.0
+"""Square centimetres that the scan shows of a hand beside the thing in it, a third of it; less is the thing itself."""
 _LARGER_THAN_HANDS = 900.0
 """Square centimetres from which a piece is a thing, although the scan does not show the hand where the body has it."""
 _SMOOTH_BORDER = 0.6
 """Mean cost of the cut, as a share of that through smooth and plain surface, from which it is no border of a thing."""
+_LONG_BORDER = 7.5
+"""Squared length of a border by the area within it from which a piece is a flap of cloth; a disc has 4 pi. Of 72 things
+on procedural people the longest has 7.0, of flaps of capes and wide sleeves the shortest 7.9."""
+_CLAMPED, _CLAMPED_TOUCHES, _CLAMPED_BORDER = 0.5, 0.015, 0.35
+"""A board between arm and chest has a long border: it is flat by this share, comes as near to the hand (metres), and
+its border lies in folds (mean cost)."""
 
 
 _SECTORS, _ALL_ROUND = 12, 9
@@ -132,48 +186,40 @@ def _evidence(distance: np.ndarray, region: np.ndarray, chest: np.ndarray) -> Fl
 
 
 def _accepted(
-    mesh: TriangleMesh,
-    cut: Bool[np.ndarray, " M"],
-    pairs: Int64[np.ndarray, "P 2"],
-    edges: tuple[np.ndarray, np.ndarray],
-    where: tuple[np.ndarray, np.ndarray, np.ndarray],
-    hands: list[np.ndarray],
+    mesh: TriangleMesh, cut: Bool[np.ndarray, " M"], where: _Where, hands: list[tuple[np.ndarray, float]]
 ) -> FoundObjects:
     """Keep the pieces of a cut that are things.
 
     Args:
         mesh: the scan.
         cut: faces on the side of things.
-        pairs: the two faces of each edge.
-        edges: length, in centimetres, and cost of each edge.
-        where: distance of each face to the body and to its hands, metres, and its sector about the person.
-        hands: points of either hand of the body.
+        where: measures of faces and edges.
+        hands: points of either hand of the body, and what the rest of the scan shows of it, square centimetres.
     """
-    distance, to_hand, sector = where
-    # A hand that what is left of the scan does not show lies elsewhere: then a small piece is the hand itself.
-    left = cKDTree(mesh.face_centers[~cut]) if not cut.all() else None
-    shown = [bool(left and len(h) and (left.query(h)[0] < _SHOWS).mean() > _SHOWN) for h in hands]
-    length, cost = edges
-    inside = cut[pairs]
+    inside, pairs = cut[where.pairs], where.pairs
     piece = component_labels(pairs[inside.all(axis=1)], len(cut))
     faces, notes = np.zeros(len(cut), dtype=bool), []
     for number in np.unique(piece[cut]):
         own = cut & (piece == number)
-        area = float(mesh.face_areas[own].sum()) * _CM2
-        if area < _LEAST_AREA or distance[own].max() < _LEAST_REACH or to_hand[own].min() > _TOUCHES:
+        areas, to_hand = mesh.face_areas[own] * _CM2, where.to_hand[own]
+        area = float(areas.sum())
+        if area < _LEAST_AREA or where.distance[own].max() < _LEAST_REACH or to_hand.min() > _TOUCHES:
             continue
         # Clothes that hang far off the legs go round the person; a thing is on one side of her.
-        around = np.bincount(sector[own], mesh.face_areas[own], minlength=_SECTORS) * _CM2 / area
+        around = np.bincount(where.sector[own], areas, minlength=_SECTORS) / area
         if (around > 0.02).sum() >= _ALL_ROUND:
             continue
-        center = mesh.face_centers[own][to_hand[own].argmin()]
-        nearest = int(np.argmin([np.linalg.norm(h - center, axis=1).min() if len(h) else np.inf for h in hands]))
-        if not shown[nearest] and area < _LARGER_THAN_HANDS:
+        # A hand that what is left of the scan does not show lies elsewhere: then a small piece is the hand itself.
+        center = mesh.face_centers[own][to_hand.argmin()]
+        nearest = int(np.argmin([np.linalg.norm(h - center, axis=1).min() if len(h) else np.inf for h, _ in hands]))
+        if hands[nearest][1] < _LEFT_OF_HAND and area < _LARGER_THAN_HANDS:
             continue
         # The cost of its border, relative to a border of the same length through smooth and plain surface.
         border = own[pairs[:, 0]] != own[pairs[:, 1]]
-        plain = _LENGTH_COST * length[border].sum()
-        if plain > 0 and cost[border].sum() > _SMOOTH_BORDER * plain:
+        length = float(where.length[border].sum())
+        dear = float(where.cost[border].sum()) / max(_LENGTH_COST * length, 1e-9)
+        clamped = areas @ where.flat[own] > _CLAMPED * area and to_hand.min() < _CLAMPED_TOUCHES
+        if dear > _SMOOTH_BORDER or (length**2 > _LONG_BORDER * area and not (clamped and dear < _CLAMPED_BORDER)):
             continue
         faces |= own
         notes.append(f"a thing of {area:.0f} cm2 at a hand is labelled object")

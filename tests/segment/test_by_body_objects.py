@@ -13,6 +13,7 @@ from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
 from smplxpp.people.things import THINGS, Thing, thing_mesh
 from smplxpp.segment import label_by_body
 from smplxpp.segment.by_body_objects import find_objects
+from smplxpp.segment.flat_patches import flat_share
 from smplxpp.transfer import rigid_weights
 
 _COARSE = ScanConfig(cell=0.012, views=14, resolution=256, faces=6000)
@@ -64,6 +65,44 @@ def test_the_thing_keeps_its_label_through_the_cut_and_is_no_cloth(open_body, st
     own = result.face_labels == OBJECT.id
     assert mesh.face_areas[own & truth].sum() > 0.85 * mesh.face_areas[truth].sum()
     assert any("labelled object" in note for note in result.notes)
+
+
+def test_a_folder_that_the_forearm_presses_is_found_on_both_sides_and_the_sleeve_is_no_part_of_it(open_body, stance):
+    """A folder along the forearm lies nearer to the arm than cloth does: half of it stayed shirt and was torn."""
+    _, posed = stance
+    skin, folder = (
+        open_body.mesh(posed.vertices[0]),
+        thing_mesh(Thing("folder", "right"), open_body, posed),
+    )
+    taken = simulate_scan(concatenate_meshes([skin, folder]), [], _COARSE)
+    mesh, area = taken.mesh, taken.mesh.face_areas
+    truth = (taken.face >= skin.face_count)[mesh.faces].sum(axis=1) >= 2
+    found = find_objects(mesh, open_body, stance[0]).faces
+    assert area[found & truth].sum() > 0.9 * area[truth].sum()
+    assert area[found & ~truth].sum() < 0.05 * area[truth].sum()
+
+
+def test_only_what_is_flat_over_ten_centimetres_is_a_board():
+    """A sheet is flat from both sides, a tube of the radius of a thigh nowhere."""
+    turn, along = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False), np.linspace(0.0, 0.4, 40))
+    tube = grid_mesh(np.stack([0.08 * np.cos(turn), along, 0.08 * np.sin(turn)], axis=-1), closed=True)
+    across, up = np.meshgrid(np.linspace(0.5, 0.8, 24), np.linspace(0.0, 0.4, 32))
+    front = grid_mesh(np.stack([across, up, np.zeros_like(up)], axis=-1))
+    back = TriangleMesh(front.vertices - [0.0, 0.0, 0.02], front.faces[:, ::-1])
+    mesh = concatenate_meshes([tube, front, back])
+    share = flat_share(mesh, np.ones(mesh.face_count, dtype=bool))
+    sheet = np.arange(mesh.face_count) >= tube.face_count
+    assert share[~sheet].max() == 0.0 and share[sheet].mean() > 0.9
+
+
+def grid_mesh(points: np.ndarray, *, closed: bool = False) -> TriangleMesh:
+    """A surface through (rows, columns, 3) points; `closed` joins the last column to the first."""
+    rows, columns = points.shape[:2]
+    at = np.arange(rows * columns).reshape(rows, columns)
+    after = np.roll(at, -1, axis=1)
+    a, b, c, d = (x if closed else x[:, :-1] for x in (at[:-1], after[:-1], after[1:], at[1:]))
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return TriangleMesh(points.reshape(-1, 3), faces)
 
 
 def test_empty_hands_hold_nothing(open_body, stance):
