@@ -31,7 +31,7 @@ _EXPORTS: dict[str, str] = {
     "Template": "smplxpp.template",
     "TransferConfig": "smplxpp.transfer",
     "TriangleMesh": "smplxpp.core",
-    "as_mesh": "smplxpp.core.mesh",
+    "as_mesh": "smplxpp.core",
     "build_template": "smplxpp.build",
     "load_body": "smplxpp.body",
     "load_params": "smplxpp.body",

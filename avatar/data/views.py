@@ -14,6 +14,7 @@ from torch import Tensor
 
 from smplxpp.capture import Capture
 from smplxpp.core import Camera, GeometryWarning, InputError
+from smplxpp.core.errors import one_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +32,8 @@ class View:
     foreground: UInt8[Tensor, "H W 3"]
     alpha: UInt8[Tensor, "H W"]
     normals: Float16[Tensor, "H W 3"] | None = None
+
+    __repr__ = one_line
 
     @property
     def name(self) -> str:

@@ -14,7 +14,7 @@ from torch import Tensor
 from avatar.gaussians.frames import TriangleFrames, triangle_frames
 from avatar.gaussians.native_kernels import WorldFunction, is_native
 from avatar.gaussians.tensor_operations import gather_rows, multiply_quats
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, one_line
 from smplxpp.core.spherical_harmonics import degree_of
 
 THICKNESS = 0.01
@@ -53,6 +53,8 @@ class BoundGaussians:
     sh: Float[Tensor, "N K 3"]
     face_count: int
     topology: str
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         # Shapes, types and devices, then indices; indices on a GPU are not checked, which would wait for it.
@@ -150,6 +152,8 @@ class WorldGaussians:
     scales: Float[Tensor, "*B N 3"]
     opacities: Float[Tensor, " N"]
     normals: Float[Tensor, "*B N 3"]
+
+    __repr__ = one_line
 
 
 def topology_digest(faces: Int[np.ndarray, "F 3"] | Int[Tensor, "F 3"]) -> str:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avatar.gaussians.native_kernels import FramesFunction, is_native
 from avatar.gaussians.tensor_operations import quat_from_matrix
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, one_line
 
 MIN_EDGE = 1e-6
 """Smallest mean edge length, metres. Shorter ones are clamped, so that no Gaussian gets a scale of zero."""
@@ -33,6 +33,8 @@ class TriangleFrames:
     rotations: Float[Tensor, "*B F 3 3"]
     quats: Float[Tensor, "*B F 4"]
     lengths: Float[Tensor, "*B F"]
+
+    __repr__ = one_line
 
     @property
     def face_count(self) -> int:

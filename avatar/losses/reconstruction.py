@@ -11,6 +11,7 @@ from torch import Tensor
 
 from avatar.losses.image_similarity import psnr_from_mse, ssim
 from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
+from smplxpp.core.errors import one_line
 from smplxpp.core.validation import require_at_least
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ class Target:
     image: Float[Tensor, "H W 3"]
     alpha: Float[Tensor, "H W"]
     normals: Float[Tensor, "H W 3"] | None = None
+
+    __repr__ = one_line
 
 
 def reconstruction_loss(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from avatar.reconstruct.neural_surface import HashGrid, NeuralSurface
 from smplxpp.core import InputError, ProgressCallback, TriangleMesh, ignore_progress, require_at_least, require_positive
+from smplxpp.core.errors import one_line
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.raster import rasterize_mesh
 from smplxpp.reconstruct import Box, PhotoView
@@ -156,6 +157,8 @@ class SurfaceFit:
     mesh: TriangleMesh
     model: NeuralSurface
     losses: Float32[np.ndarray, " I"]
+
+    __repr__ = one_line
 
 
 def fit_surface(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from avatar.rendering.api import rasterize
 from smplxpp.core import Camera, InputError
+from smplxpp.core.errors import one_line
 
 if TYPE_CHECKING:
     from avatar.data.views import View
@@ -32,6 +33,8 @@ class Rendering:
     alpha: Float[Tensor, "H W"]
     normals: Float[Tensor, "H W 3"] | None = None
     extra: Float[Tensor, "H W D"] | None = None
+
+    __repr__ = one_line
 
 
 def render_view(

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from smplxpp.core.errors import one_line
+
 # Rules of 3D Gaussian Splatting, the same in all backends and kernels.
 ALPHA_MAX = 0.999
 """Opacity of one Gaussian at a pixel is clamped to this."""
@@ -53,6 +55,8 @@ class RasterMeta:
     radii: Float[Tensor, "C N 2"]
     depths: Float[Tensor, "C N"]
     depth: Float[Tensor, "C H W 1"] | None = None
+
+    __repr__ = one_line
 
     @property
     def visible(self) -> Bool[Tensor, "C N"]:

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 from avatar.gaussians.binding import BoundGaussians, WorldGaussians
 from smplxpp.cloth.driver import ClothShape
 from smplxpp.core import BodyParams, InputError
+from smplxpp.core.errors import one_line
 from smplxpp.template.template import Template
 
 THETA = 63
@@ -35,6 +36,8 @@ class SimulatedCloth:
 
     displacements: Float32[Tensor, "V 3"]
     share: Float32[Tensor, "V 1"]
+
+    __repr__ = one_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,8 @@ class Pose:
     cloth: SimulatedCloth | None = None
     time: float | None = None
     known: float | None = None
+
+    __repr__ = one_line
 
     def without_cloth(self) -> Pose:
         """Return the same pose without simulated clothes, so that the model alone moves them."""

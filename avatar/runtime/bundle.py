@@ -14,6 +14,7 @@ import numpy as np
 from avatar.runtime.layout import MAX_GAUSSIANS, NEEDED, PIECES, REMEDY, check_shapes, decode
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import BodyParams, InputError
+from smplxpp.core.errors import one_line
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, parse_json
 from smplxpp.core.files.package_file import read_package, write_package
 from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
@@ -76,6 +77,8 @@ class AvatarBundle:
     garments: Mapping[str, np.ndarray] = field(default_factory=dict)
     garments_about: Mapping[str, Any] = field(default_factory=dict)
     motion: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    __repr__ = one_line
 
     def __contains__(self, piece: str) -> bool:
         return any(name.startswith(f"{piece}.") for name in self.tensors)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from smplxpp.core import Camera, InputError
+from smplxpp.core.errors import one_line
 from smplxpp.core.light import Relighting
 from smplxpp.native import OverLimitError, address, check_size, native_library
 
@@ -61,6 +62,8 @@ class WorldSplats:
     sh: Float32[np.ndarray, "N K 3"]
     face: Int64[np.ndarray, " N"]
     rotations: Float32[np.ndarray, "F 3 3"]
+
+    __repr__ = one_line
 
     def colors(self, eye: Float32[np.ndarray, " 3"], *, threads: int = 1) -> Float32[np.ndarray, "N 3"]:
         """Return the colours towards a point in the world, metres: `max(0, dc + sum_k sh_k Y_k(R^T d))`."""

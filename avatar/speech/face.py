@@ -13,6 +13,7 @@ from avatar.speech.coarticulation import ARTICULATORS
 from avatar.speech.curves import ARKIT, BLINK
 from smplxpp.body.model import BodyModel
 from smplxpp.core import BodyParams, InputError
+from smplxpp.core.errors import one_line
 
 JAW_ANGLE = 0.15
 """Rotation of the jaw for an open vowel, radians, and its limit where the training did not open it further."""
@@ -81,6 +82,8 @@ class Face:
     jaw: Float64[np.ndarray, " 3"]
     jaw_reach: float
     numbered: bool = False
+
+    __repr__ = one_line
 
     @staticmethod
     def of(

@@ -13,6 +13,7 @@ from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.pose_range import PoseRange
 from smplxpp.body.retarget import FEET, Skeleton
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.errors import one_line
 
 BODY_JOINTS = 22
 """Number of joints that `global_orient` and `body_pose` rotate."""
@@ -37,6 +38,8 @@ class StandingBody:
     standing: BodyParams
     observed_poses: Float64[np.ndarray, "K 63"] | None
     trunk_slices: Float64[np.ndarray, "S 4"]
+
+    __repr__ = one_line
 
     @staticmethod
     def of(

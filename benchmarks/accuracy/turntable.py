@@ -25,7 +25,7 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.build.turning import posed_person
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core import BodyParams, Camera, normalize_rows
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 from smplxpp.metrics.sampling import sample_surface
 from smplxpp.reconstruct import PhotoView, Reconstruction
 from smplxpp.reconstruct.turntable import reconstruct_turntable

@@ -17,7 +17,7 @@ from smplxpp.clean import SolidConfig, solid_of_parts
 from smplxpp.core import InputError, TriangleMesh, require_positive
 from smplxpp.export.printing import check_solid_path, write_solid
 from smplxpp.metrics import self_intersections
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 from smplxpp.template.template import BODY_PART, Template
 
 _GAP_MM = 10.0  # gap between body and cloth that is filled by default, mm of the person

@@ -22,16 +22,15 @@ from rich.progress import track
 from rich.table import Table
 
 from pipelines.commands.options import OptionalPath
-from smplxpp.core import GeometryWarning, InputError, require_at_least
+from smplxpp.core import GeometryWarning, InputError, as_mesh, require_at_least
 from smplxpp.core.files.array_file import read_array, read_arrays
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.mesh_files.mesh_io import MeshFile, read_mesh
-from smplxpp.metrics import CompareConfig, MeshComparison, compare, presets
+from smplxpp.metrics import CompareConfig, MeshComparison, compare, doubtful_pair, presets
 
 # A folder's frames are its geometry files; arrays (which also hold labels) only where there is nothing else.
 FRAME_SUFFIXES = ((".ply", ".obj", ".glb", ".gltf", ".stl", ".off"), (".pkl",), (".npz",))
 LABEL_KEYS = ("face_labels", "vertex_labels", "labels", "label")
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 PLAUSIBLE_METRES = 20.0  # bounding-box diagonal above which the units are probably wrong
 Preset = Literal["smplxpp", "pifuhd-cm", "icon-cm", "now-mm", "occnet-l1", "occnet-l2", "pytorch3d"]
 
@@ -52,8 +51,8 @@ class Metrics:
     """Definition of P2S and Chamfer, which the output states. All other distances are in mm."""
     visible_only: bool = False
     """Measure from the outer surface of each mesh alone: skin hidden under clothes is left out."""
-    threshold_mm: float = 5.0
-    """Distance within which a point counts for precision, recall and F-score."""
+    threshold_mm: tuple[float, ...] = (5.0,)
+    """Distances within which a point counts for precision, recall and F-score, one or several."""
     units: Literal["m", "cm", "mm"] = "m"
     """Units of both meshes' coordinates."""
     labels_a: OptionalPath = None
@@ -112,7 +111,7 @@ class Metrics:
         for path, given in ((path_a, self.labels_a), (path_b, self.labels_b)):
             # Convert to metres, the unit of all metrics.
             file = read_mesh(path)
-            mesh = file.mesh.with_vertices(file.mesh.vertices * METRES[self.units])
+            mesh = as_mesh(file.mesh, unit=self.units)
             if mesh.bbox_diagonal > PLAUSIBLE_METRES:
                 warnings.warn(
                     f"{path} is {mesh.bbox_diagonal:.0f} m across: are its units {self.units}? See --units",
@@ -121,6 +120,9 @@ class Metrics:
                 )
             meshes.append(mesh)
             labels.append(_labels(file, given, path))
+        doubt = doubtful_pair(*meshes)
+        if doubt:
+            warnings.warn(f"{path_a.name}, {path_b.name}: {doubt}", GeometryWarning, stacklevel=2)
         return compare(
             *meshes,
             samples=self.samples,
@@ -128,7 +130,7 @@ class Metrics:
             preset=self.preset,
             pred_labels=labels[0],
             gt_labels=labels[1],
-            config=CompareConfig(threshold_mm=self.threshold_mm, visible_only=self.visible_only),
+            config=CompareConfig(threshold_mm=self.threshold_mm, visible_only=self.visible_only, certified=True),
         )
 
     def _report(self, frames: list[dict[str, Any]], skipped: list[dict[str, str]]) -> dict[str, Any]:
@@ -149,7 +151,7 @@ class Metrics:
             "source": convention.source,
             "samples": self.samples,
             "seed": self.seed,
-            "threshold_mm": self.threshold_mm,
+            "threshold_mm": list(self.threshold_mm),
             "visible_only": self.visible_only,
             "frames": frames,
             "over_frames": over_frames,
@@ -200,8 +202,14 @@ def flat_row(frame: dict[str, Any]) -> dict[str, Any]:
     """Return one frame's numbers by flat name: `p2s`, `pred_to_gt.p95`, `upper.chamfer`, ..."""
     row = {"frame": frame["frame"]}
     for prefix, result in [("", frame), *((f"{name}.", r) for name, r in frame["labels"].items())]:
-        for key in ("p2s", "chamfer", "hausdorff", "precision", "recall", "fscore"):
+        for key in ("p2s", "chamfer", "hausdorff", "hausdorff_upper", "precision", "recall", "fscore"):
             row[prefix + key] = result[key]
+        for scores in result["scores"]:
+            row[f"{prefix}fscore@{scores['threshold_mm']:g}mm"] = scores["fscore"]
+        # Normals are read for both directions together.
+        for key in ("normal_angle_deg", "normal_consistency"):
+            values = [(result[way] or {}).get(key) for way in ("pred_to_gt", "gt_to_pred")]
+            row[prefix + key] = None if None in values else float(np.mean(values))
         for direction in ("pred_to_gt", "gt_to_pred"):
             for key, value in (result[direction] or {}).items():
                 row[f"{prefix}{direction}.{key}"] = value
@@ -284,15 +292,17 @@ def _print(report: dict[str, Any], console: Console) -> None:
         "A->B\np95": "pred_to_gt.p95",
         "B->A\nmean": "gt_to_pred.mean",
         "B->A\np95": "gt_to_pred.p95",
-        "both\nmax": "hausdorff",
-        "A->B\ndeg": "pred_to_gt.normal_angle_deg",
-        "B->A\ndeg": "gt_to_pred.normal_angle_deg",
-        f"F\n{report['threshold_mm']:g} mm": "fscore",
+        "Haus\n>=": "hausdorff",
+        "dorff\n<=": "hausdorff_upper",
+        "norm.\ndeg": "normal_angle_deg",
+        "norm.\n|cos|": "normal_consistency",
+        **{f"F\n{threshold:g} mm": f"fscore@{threshold:g}mm" for threshold in report["threshold_mm"]},
     }
     table = Table(
         title=f"{report['preset']}: {report['definition']}",
         title_justify="left",
-        caption="A->B: from A to the surface of B, mm; deg: angle of the normals; F: F-score at the threshold",
+        caption="A->B: from A to the surface of B, mm; Hausdorff >=: samples and vertices, <=: certified bound, mm; "
+        "norm.: angle of the normals and mean |cos|, both ways; F: F-score at the threshold",
         caption_justify="left",
         padding=(0, 1 if console.width > 100 else 0),
     )

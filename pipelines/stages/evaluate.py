@@ -47,7 +47,7 @@ from smplxpp.body import load_body
 from smplxpp.capture import Capture
 from smplxpp.core import CLOTH_LABELS, Check, InputError, ProgressCallback, ignore_progress, require_known
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
 from smplxpp.template.template import Template
 

@@ -57,7 +57,7 @@ from smplxpp.build.verdict import LEAST_CONFIDENCE, require_found
 from smplxpp.core import BodyParams, StageOutput, display_colors, write_ply
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export import write_glb, write_obj
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 from smplxpp.register.locate import BodyNotFoundError
 from smplxpp.segment import Corrections
 from smplxpp.template.template import Template

@@ -31,6 +31,7 @@ from smplxpp.core import (
     TriangleMesh,
     concatenate_meshes,
 )
+from smplxpp.core.errors import one_line
 from smplxpp.core.labels import LAYER_ORDER
 from smplxpp.template.template import BODY_PART, Template
 
@@ -52,6 +53,8 @@ class CanonicalPart:
     label: int
     vertex_colors: UInt8[np.ndarray, "N 3"]
     scan_index: Int[np.ndarray, " S"]
+
+    __repr__ = one_line
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
 from smplxpp.core import OBJECT, SKIN, BodyParams, Check, InputError, StageOutput
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
 from smplxpp.template.template import Template
 

@@ -15,6 +15,7 @@ from smplxpp.capture import Capture
 from smplxpp.clean import BridgeConfig
 from smplxpp.clean.scan_frame import AUTO, check_height
 from smplxpp.core import BodyParams, InputError, LABELS, MeshLike, require_at_least, require_between, require_choice
+from smplxpp.core.errors import one_line
 
 STEPS = (
     *("reconstruct", "locate", "register"),
@@ -173,6 +174,8 @@ class BuildInputs:
     whose: Whose = "auto"
     body: Path | None = None
     protocol: str | None = None
+
+    __repr__ = one_line
 
     @property
     def scan_file(self) -> Path:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int64, Integer, UInt8
 
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, InputError, SkinWeights, TriangleMesh
+from smplxpp.core.errors import one_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +104,8 @@ class Part:
     label: int
     source_vertex: Integer[np.ndarray, " n"]
     colors: UInt8[np.ndarray, "n 3"]
+
+    __repr__ = one_line
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
 from smplxpp.core import LABELS, OBJECT, Check, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import UnposeConfig, Unposed, unpose
 from smplxpp.transfer import TransferConfig, rigid_weights, transfer_weights
 

@@ -17,7 +17,7 @@ from smplxpp.build.scan import ScanFile
 from smplxpp.clean import smooth_if_rough
 from smplxpp.core import BodyParams, Check, InputError, StageOutput, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 
 GREY = 180
 """Value of all channels of a scan without colours."""

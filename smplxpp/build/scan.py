@@ -21,6 +21,7 @@ from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes
 from smplxpp.segment import map_labels, read_labels
 from smplxpp.segment.label_files import check_element_count
+from smplxpp.core.errors import one_line
 
 
 # Formats whose files are in metres: by the format, or because their reader converts the unit that they state.
@@ -46,6 +47,8 @@ class ScanFile:
     units: str = "m"
     up: str = "y"
     note: str = ""
+
+    __repr__ = one_line
 
     @cached_property
     def colors(self) -> UInt8[np.ndarray, "n 3"] | None:

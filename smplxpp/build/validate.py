@@ -20,8 +20,8 @@ from smplxpp.core.solids import closed_mesh
 from smplxpp.core.topology import border_loops
 from smplxpp.metrics import CompareConfig, DirectedDistances, directed_distances, point_to_surface, summarize
 from smplxpp.metrics.conventions import convention_named
-from smplxpp.metrics.distance import MM
-from smplxpp.metrics.interpenetration import interpenetration
+from smplxpp.metrics.comparison import MM
+from smplxpp.metrics.intersection import interpenetration
 from smplxpp.metrics.quality import mesh_quality
 from smplxpp.metrics.stretch import stretch_report
 from smplxpp.template.template import BODY_PART, Template

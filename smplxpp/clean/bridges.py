@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from smplxpp.clean.components import drop_specks
-from smplxpp.core import TriangleMesh, require_at_least, row_lengths
+from smplxpp.core import MeshLike, TriangleMesh, as_mesh, require_at_least, row_lengths
 from smplxpp.core.topology import manifold_corners
 
 
@@ -53,10 +53,10 @@ class BridgeConfig:
 
 
 def find_bridges(
-    posed: TriangleMesh,
-    rest: TriangleMesh,
-    body: TriangleMesh,
-    body_rest: TriangleMesh,
+    posed: MeshLike,
+    rest: MeshLike,
+    body: MeshLike,
+    body_rest: MeshLike,
     *,
     config: BridgeConfig | None = None,
 ) -> Bool[np.ndarray, " M"]:
@@ -69,6 +69,10 @@ def find_bridges(
         body_rest: the body in the T-pose.
         config: thresholds.
     """
+    posed = as_mesh(posed, subject="posed")
+    rest = as_mesh(rest, subject="rest")
+    body = as_mesh(body, subject="body")
+    body_rest = as_mesh(body_rest, subject="body rest")
     config = config or BridgeConfig()
     # For each edge: its lengths posed and in the T-pose, and the distance at rest of the body points nearest to its
     # ends.
@@ -88,10 +92,10 @@ def find_bridges(
 
 
 def find_tears(
-    posed: TriangleMesh,
-    rest: TriangleMesh,
-    body: TriangleMesh,
-    body_rest: TriangleMesh,
+    posed: MeshLike,
+    rest: MeshLike,
+    body: MeshLike,
+    body_rest: MeshLike,
     *,
     config: BridgeConfig | None = None,
 ) -> Bool[np.ndarray, " M"]:
@@ -102,6 +106,10 @@ def find_tears(
     them, come first; where there are none, every torn edge counts, because the scan's cloth is lost there in any case.
     Arguments as for `find_bridges`.
     """
+    posed = as_mesh(posed, subject="posed")
+    rest = as_mesh(rest, subject="rest")
+    body = as_mesh(body, subject="body")
+    body_rest = as_mesh(body_rest, subject="body rest")
     config = config or BridgeConfig()
     ends = posed.edges
     nearest, place, normal = _nearest_on_body(posed.vertices, body, body_rest)
@@ -130,7 +138,7 @@ def _facing(nearest: np.ndarray, normal: np.ndarray, ends: Int[np.ndarray, "E 2"
 
 
 def cut_bridges(
-    part: TriangleMesh, bridge: Bool[np.ndarray, " M"], *, config: BridgeConfig | None = None
+    part: MeshLike, bridge: Bool[np.ndarray, " M"], *, config: BridgeConfig | None = None
 ) -> tuple[TriangleMesh, Int[np.ndarray, " N"]]:
     """Remove the faces of bridges, and the specks that this leaves; the new borders are openings like a hem.
 
@@ -141,6 +149,7 @@ def cut_bridges(
     Returns:
         The rest, manifold, and for each of its vertices the vertex of `part` that it is.
     """
+    part = as_mesh(part, subject="part")
     config = config or BridgeConfig()
     left, source = part.submesh(~bridge)
     # Widen the cut ring by ring where it touches itself. After four rings the sides part as two vertices.

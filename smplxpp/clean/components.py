@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float64, Int, Int64
 
+from smplxpp.core.foreign import MeshLike, as_mesh
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import border_loops, face_components
 
 
-def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> Bool[np.ndarray, " M"]:
+def drop_specks(mesh: MeshLike, *, area_fraction: float = 1e-3) -> Bool[np.ndarray, " M"]:
     """Return the faces of components with at least `area_fraction` of the mesh's area; the largest is always kept."""
+    mesh = as_mesh(mesh, subject="mesh")
     component = face_components(mesh.faces)
     area = np.bincount(component, mesh.face_areas)
     kept = area >= area_fraction * area.sum()
@@ -18,13 +20,14 @@ def drop_specks(mesh: TriangleMesh, *, area_fraction: float = 1e-3) -> Bool[np.n
     return kept[component]
 
 
-def loop_lengths(mesh: TriangleMesh, loops: list[Int[np.ndarray, " _"]]) -> Float64[np.ndarray, " L"]:
+def loop_lengths(mesh: MeshLike, loops: list[Int[np.ndarray, " _"]]) -> Float64[np.ndarray, " L"]:
     """Return the perimeter of each closed loop of vertex indices, metres."""
+    mesh = as_mesh(mesh, subject="mesh")
     positions = [mesh.vertices[loop] for loop in loops]
     return np.array([np.linalg.norm(p - np.roll(p, -1, axis=0), axis=1).sum() for p in positions])
 
 
-def fill_pinholes(mesh: TriangleMesh, *, max_length: float = 0.04) -> tuple[TriangleMesh, Int64[np.ndarray, " n"]]:
+def fill_pinholes(mesh: MeshLike, *, max_length: float = 0.04) -> tuple[TriangleMesh, Int64[np.ndarray, " n"]]:
     """Close border loops shorter than `max_length` metres; longer ones are openings (hem, cuffs, neck) and stay.
 
     A loop of three edges is closed by one triangle, a longer one by a fan around its mean. The border of a component
@@ -38,6 +41,7 @@ def fill_pinholes(mesh: TriangleMesh, *, max_length: float = 0.04) -> tuple[Tria
         The manifold mesh, with new vertices and faces at the end, and for every vertex the vertex of `mesh` that it is,
         or for a fan's centre the loop vertex nearest to it.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     loops = border_loops(mesh.faces)
     if not loops:
         return mesh, np.arange(mesh.vertex_count)

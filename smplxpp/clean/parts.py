@@ -12,7 +12,18 @@ from jaxtyping import Int, Int64, UInt8
 from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.remesh import METHODS, remesh, require_remesher
 from smplxpp.clean.simplify import simplify
-from smplxpp.core import LABEL_BY_NAME, LABELS, SKIN, InputError, MeshLike, TriangleMesh, as_mesh, require_choice
+from smplxpp.core import (
+    LABEL_BY_NAME,
+    LABELS,
+    SKIN,
+    InputError,
+    MeshLike,
+    TriangleMesh,
+    as_array,
+    as_mesh,
+    require_choice,
+)
+from smplxpp.core.errors import one_line
 from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
 
 
@@ -88,6 +99,8 @@ class CleanedPart:
     vertex_colors: UInt8[np.ndarray, "n 3"] | None
     report: PartReport
 
+    __repr__ = one_line
+
 
 def clean_parts(
     mesh: MeshLike,
@@ -114,7 +127,7 @@ def clean_parts(
     mesh = as_mesh(mesh, subject="mesh")
     config = config or PartsConfig()
     require_remesher(config.method)
-    face_labels = np.asarray(face_labels)
+    face_labels = as_array(face_labels)
     if face_labels.shape != (mesh.face_count,):
         raise InputError("face labels", expected=f"shape ({mesh.face_count},)", received=f"shape {face_labels.shape}")
     if vertex_colors is not None and len(vertex_colors) != mesh.vertex_count:

@@ -11,12 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
+from numpy.typing import ArrayLike
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from smplxpp.clean.components import drop_specks
 from smplxpp.core import TriangleMesh, normalize_rows, require_at_least, row_lengths
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError
+from smplxpp.core.errors import GeometryWarning, InputError, one_line
+from smplxpp.core.foreign import PointsLike, as_array, point_arrays
+from smplxpp.core.lazy import OPEN3D_NEEDS, import_extra
 
 FEWEST_POINTS = 500
 """Least number of points; fewer cannot show a person."""
@@ -60,10 +63,12 @@ class PointSurface:
     source_point: Int64[np.ndarray, " n"]
     note: str
 
+    __repr__ = one_line
+
 
 def surface_from_points(
-    points: Float[np.ndarray, "N 3"],
-    normals: Float[np.ndarray, "N 3"] | None = None,
+    points: PointsLike,
+    normals: ArrayLike | None = None,
     *,
     config: PoissonConfig | None = None,
 ) -> PointSurface:
@@ -74,7 +79,7 @@ def surface_from_points(
 
     Args:
         points: points of the surface, sampled about evenly; may hold NaN.
-        normals: normals of any length, outward or inward; zero or NaN where unknown.
+        normals: normals of any length, outward or inward; zero or NaN where unknown; None takes a cloud's own.
         config: options.
 
     Raises:
@@ -83,12 +88,13 @@ def surface_from_points(
     """
     # Select usable points, orient their normals, choose the octree's depth.
     config = config or PoissonConfig()
-    open3d = _open3d()
-    points = np.asarray(points, np.float64)
+    open3d = import_extra("open3d", extra="scan", purpose="a surface from a point cloud", apt=OPEN3D_NEEDS)
+    points, own = point_arrays(points)
+    normals = own if normals is None else normals
     kept = _usable(points)
     tree = cKDTree(points[kept])
     spacing = float(np.median(tree.query(points[kept], k=2)[0][:, 1]))
-    outward, about_normals = _normals(points[kept], None if normals is None else np.asarray(normals)[kept])
+    outward, about_normals = _normals(points[kept], None if normals is None else as_array(normals)[kept])
     depth = config.depth or _depth(points[kept], spacing)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points[kept]))
     cloud.normals = open3d.utility.Vector3dVector(np.ascontiguousarray(outward))
@@ -109,25 +115,6 @@ def surface_from_points(
     )
     warnings.warn(note, GeometryWarning, stacklevel=2)
     return PointSurface(mesh, kept[tree.query(mesh.vertices)[1]], note)
-
-
-def _open3d():
-    """Import open3d when it is first needed.
-
-    Raises:
-        MissingExtraError: it is not installed, or does not start.
-    """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        missing = isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "open3d"
-        raise MissingExtraError(
-            "open3d",
-            extra="scan",
-            purpose="a surface from a point cloud",
-            apt="" if missing else "libusb-1.0-0 libgl1 libegl1 libx11-6",
-        ) from error
-    return open3d
 
 
 def _usable(points: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " n"]:
@@ -191,7 +178,7 @@ def point_spacing(points: Float[np.ndarray, "N 3"]) -> float:
     return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
 
 
-def estimate_normals(points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+def estimate_normals(points: PointsLike) -> Float64[np.ndarray, "N 3"]:
     """Estimate outward unit normals of a point cloud of a body's surface.
 
     A normal is that of the plane through the nearest neighbours. Its sign comes from visibility: a point that a view
@@ -202,6 +189,7 @@ def estimate_normals(points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N
         points: points without duplicates, of a surface that is sampled about evenly.
     """
     # Normals in batches, which bound the memory.
+    points, _ = point_arrays(points)
     tree = cKDTree(points)
     near, neighbours = tree.query(points, k=min(NEIGHBOURS, len(points)))
     normals = np.concatenate(

@@ -14,14 +14,15 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from smplxpp.clean.simplify import Simplified, opposed_faces, separate_doubled_vertices
-from smplxpp.core import GeometryWarning, InputError, MissingExtraError, TriangleMesh, require_at_least
+from smplxpp.core import GeometryWarning, InputError, MeshLike, TriangleMesh, as_mesh, require_at_least
+from smplxpp.core.lazy import import_extra
 from smplxpp.core.topology import manifold_corners
 
 METHODS = ("quadric", "isotropic")
 """Methods that bring a part to its face budget: `simplify`, or `remesh`."""
 
 
-def remesh(mesh: TriangleMesh, face_budget: int) -> Simplified:
+def remesh(mesh: MeshLike, face_budget: int) -> Simplified:
     """Remesh a surface with `face_budget` faces of about equal size, at most as many as it has.
 
     The edge length follows from the area A, L^2 = 4 A / (sqrt(3) faces). Openings stay; their edges are split and
@@ -41,6 +42,7 @@ def remesh(mesh: TriangleMesh, face_budget: int) -> Simplified:
         InputError: a budget below 4, or a surface that vanished.
         MissingExtraError: pymeshlab is not installed, or does not start.
     """
+    mesh = as_mesh(mesh)
     require_at_least("face budget", face_budget, 4)
     wanted = min(face_budget, mesh.face_count)
     length = (4.0 * float(mesh.face_areas.sum()) / (3.0**0.5 * wanted)) ** 0.5
@@ -189,19 +191,5 @@ def _nearest(mesh: TriangleMesh, *, of: TriangleMesh) -> np.ndarray:
 
 
 def _pymeshlab():
-    """Import pymeshlab when it is first needed.
-
-    Raises:
-        MissingExtraError: it is not installed, or does not start.
-    """
-    try:
-        import pymeshlab
-    except (ImportError, OSError) as error:
-        missing = isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "pymeshlab"
-        raise MissingExtraError(
-            "pymeshlab",
-            extra="remesh",
-            purpose="isotropic remeshing",
-            apt="" if missing else "libgl1 libopengl0",
-        ) from error
-    return pymeshlab
+    """Import pymeshlab when it is first needed."""
+    return import_extra("pymeshlab", extra="remesh", purpose="isotropic remeshing", apt="libgl1 libopengl0")

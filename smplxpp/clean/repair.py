@@ -6,12 +6,15 @@ import warnings
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Int64, Integer, Num, UInt8
+from jaxtyping import Int64, UInt8
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from smplxpp.core import GeometryWarning, InputError, TriangleMesh
+from smplxpp.core import GeometryWarning, InputError, PointsLike, TriangleMesh
+from smplxpp.core.errors import one_line
+from smplxpp.core.foreign import mesh_arrays
 from smplxpp.core.topology import component_labels, half_edges, manifold_corners, paired_half_edges
 
 
@@ -67,6 +70,8 @@ class Sanitized:
     report: CleanReport
     merged_into: Int64[np.ndarray, " N"]
 
+    __repr__ = one_line
+
     def mean_colors(self, colors: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "n 3"]:
         """Return the colours of the mesh's vertices, each the mean over the raw vertices that were welded to it.
 
@@ -81,9 +86,7 @@ class Sanitized:
         return out
 
 
-def sanitize(
-    vertices: Num[np.ndarray, "N 3"], faces: Integer[np.ndarray, "M 3"], *, weld_tolerance: float | None = None
-) -> Sanitized:
+def sanitize(vertices: PointsLike, faces: ArrayLike | None = None, *, weld_tolerance: float | None = None) -> Sanitized:
     """Repair raw arrays: NaN, duplicates, faces without area, winding, and non-manifold edges and vertices.
 
     The repairs are done in this order:
@@ -99,14 +102,22 @@ def sanitize(
     Sanitising the result again changes nothing but the same cuts. A warning lists the changes.
 
     Args:
-        vertices: (N, 3) positions.
-        faces: (M, 3) integer vertex indices.
+        vertices: (N, 3) positions, or a mesh of any library.
+        faces: (M, 3) integer vertex indices; None if a mesh is given.
         weld_tolerance: distance below which vertices merge; None is 1e-6 of the bounding box's diagonal.
 
     Raises:
         InputError: wrong shapes, indices out of range, nothing left, or many vertices in one place.
     """
-    vertices = np.asarray(vertices, dtype=np.float64)
+    points, corners = mesh_arrays(vertices if faces is None else (vertices, faces))
+    result = _repaired(np.asarray(points, dtype=np.float64), corners, weld_tolerance)
+    if not result.report.is_clean:
+        warnings.warn(f"mesh repaired: {result.report}", GeometryWarning, stacklevel=2)
+    return result
+
+
+def _repaired(vertices: np.ndarray, faces: np.ndarray, weld_tolerance: float | None) -> Sanitized:
+    """Return the repaired arrays; the steps are numbered as in `sanitize`."""
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise InputError("mesh vertices", expected="shape (N, 3)", received=f"shape {vertices.shape}")
     # 1. Vertices that are not finite, and outliers. `TriangleMesh` checks shapes and indices.
@@ -156,8 +167,6 @@ def sanitize(
         split_vertices=len(source_vertex) - used,
         unreferenced_vertices=int(near.sum()) - merged - used,
     )
-    if not report.is_clean:
-        warnings.warn(f"mesh repaired: {report}", GeometryWarning, stacklevel=2)
     return Sanitized(TriangleMesh(vertices[source_vertex], new_faces), source_vertex, kept, report, target)
 
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, Num
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import standing_poses
 from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec, require_choice
+from smplxpp.core.foreign import METRES_PER_UNIT, PointsLike, mesh_arrays, point_arrays
 from smplxpp.core.surface_points import SurfacePoints, truncated_distance
 
-METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 # Rotations from a frame with the named upward axis to one with +Y, both right-handed.
 _Y_FROM_UP = {
     "y": np.eye(3),
@@ -29,9 +30,7 @@ _Bodies = list[tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]]
 AUTO = "auto"
 
 
-def convert_points(
-    points: Num[np.ndarray, "N 3"], *, units: str | float = "m", up: str = "y"
-) -> Float64[np.ndarray, "N 3"]:
+def convert_points(points: PointsLike, *, units: str | float = "m", up: str = "y") -> Float64[np.ndarray, "N 3"]:
     """Convert points in the stated units and axes to metres, +Y up.
 
     Args:
@@ -46,7 +45,7 @@ def convert_points(
         require_choice("option units", units, tuple(METRES_PER_UNIT))
     require_choice("option up", up, tuple(_Y_FROM_UP))
     scale = METRES_PER_UNIT[units] if isinstance(units, str) else units
-    return np.asarray(points, dtype=np.float64) @ _Y_FROM_UP[up].T * scale
+    return point_arrays(points)[0] @ _Y_FROM_UP[up].T * scale
 
 
 def sizes_by_unit(size: float) -> str:
@@ -57,7 +56,7 @@ def sizes_by_unit(size: float) -> str:
     )
 
 
-def check_human_scale(vertices: Float[np.ndarray, "N 3"], *, subject: str = "scan") -> None:
+def check_human_scale(vertices: PointsLike, *, subject: str = "scan") -> None:
     """Refuse a person that is not in metres or does not stand along Y.
 
     The largest extent shows the unit. An extent more than 1.3 times the vertical one shows swapped axes, because a
@@ -72,7 +71,7 @@ def check_human_scale(vertices: Float[np.ndarray, "N 3"], *, subject: str = "sca
     """
     # A clothed adult or adolescent, standing or crouching, is 0.7 to 2.6 m high.
     low, high = 0.7, 2.6
-    extent = np.ptp(np.asarray(vertices, dtype=np.float64), axis=0)
+    extent = np.ptp(point_arrays(vertices)[0], axis=0)
     size = float(extent.max())
     if not low <= size <= high:
         fitting = [u for u, scale in METRES_PER_UNIT.items() if 1.2 <= size * scale <= 2.3]
@@ -115,8 +114,8 @@ class ScanFrame:
 
 
 def find_scan_frame(
-    vertices: Num[np.ndarray, "N 3"],
-    faces: Int[np.ndarray, "M 3"],
+    vertices: PointsLike,
+    faces: ArrayLike | None = None,
     *,
     units: str = AUTO,
     up: str = AUTO,
@@ -128,8 +127,8 @@ def find_scan_frame(
     axis of the smallest distance is up, and the height along it gives the units. A scan may lean by some 20 degrees.
 
     Args:
-        vertices: vertices of the scan.
-        faces: faces of the scan.
+        vertices: vertices of the scan, or a mesh of any library.
+        faces: faces of the scan; None if a mesh is given.
         units: known units; "auto" finds them.
         up: known upward axis; "auto" finds it.
         height: metres from the lowest to the highest point; the units then follow from it.
@@ -138,16 +137,17 @@ def find_scan_frame(
         InputError: no surface, units that are stated beside a height, or a size that is no standing person's in any
             unit, or that of data scaled to [-1, 1].
     """
+    points, corners = mesh_arrays(vertices if faces is None else (vertices, faces))
     if height is not None:
         check_height(height, units)
-    surface = _surface(np.asarray(vertices, dtype=np.float64), np.asarray(faces))
+    surface = _surface(np.asarray(points, dtype=np.float64), corners)
     costs = {up: 0.0}
     if up == AUTO:
         bodies = _bodies()
         costs = {axis: _cost(surface, bodies, axis) for axis in _Y_FROM_UP}
     order = sorted(costs, key=lambda axis: costs[axis])
     best = order[0]
-    whole = convert_points(np.asarray(vertices)[np.unique(faces)], up=best)[:, 1]
+    whole = convert_points(points[np.unique(corners)], up=best)[:, 1]
     whole = whole[np.isfinite(whole)]
     size = float(np.ptp(_without_strays(whole)))
     if height is not None:

@@ -9,7 +9,8 @@ import igl
 import numpy as np
 from jaxtyping import Int64
 
-from smplxpp.core import TriangleMesh, require_at_least
+from smplxpp.core import MeshLike, TriangleMesh, as_mesh, require_at_least
+from smplxpp.core.errors import one_line
 from smplxpp.core.topology import component_labels, edge_groups, manifold_corners
 
 # Fraction of an edge. Vertices joined by an edge below this fraction of the mean edge coincide (0.09 mm on a garment of
@@ -35,8 +36,10 @@ class Simplified:
     restored_faces: int
     flipped_faces: int
 
+    __repr__ = one_line
 
-def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
+
+def simplify(mesh: MeshLike, face_budget: int) -> Simplified:
     """Collapse edges by quadric error (Garland and Heckbert 1997) down to about `face_budget` faces.
 
     - Border vertices stay, so that a mesh whose border alone needs more faces ends above the budget.
@@ -57,6 +60,7 @@ def simplify(mesh: TriangleMesh, face_budget: int) -> Simplified:
     Raises:
         InputError: a budget below 4.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     require_at_least("face budget", face_budget, 4)
     if mesh.face_count <= face_budget:
         used = np.bincount(mesh.faces.ravel(), minlength=mesh.vertex_count) > 0

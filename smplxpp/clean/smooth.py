@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
-from smplxpp.core import GeometryWarning, TriangleMesh, row_lengths
+from smplxpp.core import GeometryWarning, MeshLike, TriangleMesh, as_mesh, row_lengths
+from smplxpp.core.errors import one_line
 
 ROUGH = 0.3
 """Roughness (`roughness`) from which a scan is smoothed: more noise flips faces. Available scans have 0.04 to 0.09."""
@@ -30,14 +31,17 @@ class Smoothed:
     steps: int
     moved: float
 
+    __repr__ = one_line
 
-def roughness(mesh: TriangleMesh) -> float:
+
+def roughness(mesh: MeshLike) -> float:
     """Return the noise of vertices along their normals, as a fraction of the median edge length.
 
     A vertex's height h is its normal distance to the mean of its neighbours. With the mean W over neighbours the noise
     is h - W h, in which curvature, which neighbours share, cancels. Its standard deviation is estimated from the median
     of |h - W h|, which hair and folds, the smaller part of a person, do not disturb.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     mean = _mean_of_neighbours(mesh)
     height = np.einsum("ij,ij->i", mean @ mesh.vertices - mesh.vertices, mesh.vertex_normals)
     i, j = mesh.edges.T
@@ -46,7 +50,7 @@ def roughness(mesh: TriangleMesh) -> float:
     return float(np.median(np.abs(height - mean @ height))) / 0.6745 / edge
 
 
-def smooth_if_rough(mesh: TriangleMesh, *, rough: float = ROUGH) -> Smoothed:
+def smooth_if_rough(mesh: MeshLike, *, rough: float = ROUGH) -> Smoothed:
     """Smooth a scan whose roughness is above `rough`; return any other unchanged.
 
     Taubin's filter (SIGGRAPH 1995) with equal weights, which does not shrink the surface, is applied until the surface
@@ -56,6 +60,7 @@ def smooth_if_rough(mesh: TriangleMesh, *, rough: float = ROUGH) -> Smoothed:
         mesh: manifold, every vertex referenced (`sanitize`).
         rough: roughness above which it is smoothed.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     found = roughness(mesh)
     if found <= rough:
         return Smoothed(mesh, found, 0, 0.0)

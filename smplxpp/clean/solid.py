@@ -13,7 +13,16 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from smplxpp.clean.thicken import slab_behind, thickened
-from smplxpp.core import GeometryWarning, InputError, TriangleMesh, require_at_least, require_positive
+from smplxpp.core import (
+    GeometryWarning,
+    InputError,
+    MeshLike,
+    TriangleMesh,
+    as_mesh,
+    require_at_least,
+    require_positive,
+)
+from smplxpp.core.errors import one_line
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.solids import closed_mesh, mesh_of_solid, solid_of_mesh
 from smplxpp.core.surface_points import draw_on_surface
@@ -93,10 +102,10 @@ class Solid:
     mesh: TriangleMesh
     report: SolidReport
 
+    __repr__ = one_line
 
-def solid_of_parts(
-    body: TriangleMesh, parts: Mapping[str, TriangleMesh], *, config: SolidConfig | None = None
-) -> Solid:
+
+def solid_of_parts(body: MeshLike, parts: Mapping[str, MeshLike], *, config: SolidConfig | None = None) -> Solid:
     """Return one closed surface of body and parts, as a 3D printer needs it.
 
     The body's openings are closed. Each part is thickened inward (thin cloth by `thickened`, cloth thicker than a 360th
@@ -112,6 +121,7 @@ def solid_of_parts(
     Raises:
         InputError: a body of several pieces, or parts that stay separate from it.
     """
+    body = as_mesh(body, subject="body")
     config = config or SolidConfig()
     pieces = [_body_solid(body)]
     if len(_separate_pieces(pieces[0], least=_CRUMB * pieces[0].volume())) > 1:
@@ -119,7 +129,8 @@ def solid_of_parts(
     # Add part after part; the gap is doubled until the union is one piece.
     gaps = {}
     multiples = (1.0, 2.0, 4.0, 8.0)
-    for name, part in parts.items():
+    for name, given in parts.items():
+        part = as_mesh(given, subject=f"part {name}")
         for wider in multiples:
             made = _cloth(part, body, config, wider * config.gap)
             union = manifold3d.Manifold.batch_boolean([*pieces, made], manifold3d.OpType.Add)
@@ -254,13 +265,14 @@ def _measured(solid: manifold3d.Manifold, config: SolidConfig, dropped: int, gap
 
 
 def wall_thickness(
-    mesh: TriangleMesh, *, solid: manifold3d.Manifold | None = None, seed: int = 0
+    mesh: MeshLike, *, solid: manifold3d.Manifold | None = None, seed: int = 0
 ) -> Float[np.ndarray, " n"]:
     """Return the wall thickness at 4,000 random points of a closed surface, metres.
 
     It is the distance along the inward normal until the ray leaves the solid. Walls inside the solid, where it
     intersects itself, do not count, because a slicer does not see them.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     solid = solid_of_mesh(mesh) if solid is None else solid
     rays = 4000
     face, weights = draw_on_surface(mesh, rays, seed=seed, method="unsorted")

@@ -6,13 +6,14 @@ import igl
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 
+from smplxpp.core.foreign import MeshLike, as_mesh
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.signed_distance import barycentric_coordinates
 from smplxpp.core.topology import border_loops, face_components
 
 
 def thickened(
-    sheet: TriangleMesh,
+    sheet: MeshLike,
     *,
     inward: float | Float[np.ndarray, " V"],
     outward: float | Float[np.ndarray, " V"] = 0.0,
@@ -26,6 +27,7 @@ def thickened(
         inward: inward offset, metres, for all vertices or each.
         outward: outward offset, metres, for all vertices or each.
     """
+    sheet = as_mesh(sheet, subject="sheet")
     # Find the components with a border.
     component = face_components(sheet.faces)
     is_open = np.zeros(int(component.max()) + 1, dtype=bool)

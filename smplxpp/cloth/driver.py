@@ -15,6 +15,7 @@ from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.cloth.thread import GarmentThread
 from smplxpp.core import BodyParams, InputError, require_at_least, require_choice, require_positive
+from smplxpp.core.errors import one_line
 from smplxpp.template.template import Template
 
 # Longest step that is simulated; a longer one is a cut.
@@ -63,6 +64,8 @@ class ClothShape:
     vertices: Int64[np.ndarray, " L"]
     displacements: Float32[np.ndarray, "L 3"]
     share: Float32[np.ndarray, " L"]
+
+    __repr__ = one_line
 
 
 class ClothDriver:

@@ -6,6 +6,7 @@ Names that most rooms need are exported here; the modules of the room hold the r
 from smplxpp.core.camera import Camera
 from smplxpp.core.checks import Check, Gate, StageOutput
 from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError, ProgressCallback, ignore_progress
+from smplxpp.core.foreign import METRES_PER_UNIT, MeshLike, PointsLike, as_array, as_mesh, as_points
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import (
     BACKGROUND,
@@ -21,11 +22,11 @@ from smplxpp.core.labels import (
     UPPER,
     display_colors,
 )
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh, concatenate_meshes, normalize_rows, row_lengths
+from smplxpp.core.mesh import TriangleMesh, concatenate_meshes, normalize_rows, row_lengths
 from smplxpp.core.mesh_files.mesh_io import read_mesh, write_ply
 from smplxpp.core.params import ARRAY_NAMES, DEFAULT_FPS, POSE_BLOCKS, BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.core.skin_weights import SkinWeights
+from smplxpp.core.skin_weights import SkinWeights, WeightsLike, dense_weights
 from smplxpp.core.spread import spread
 from smplxpp.core.validation import (
     require_at_least,
@@ -51,11 +52,13 @@ __all__ = [
     "LABELS",
     "LABEL_BY_NAME",
     "LOWER",
+    "METRES_PER_UNIT",
     "MeshLike",
     "MissingExtraError",
     "OBJECT",
     "OUTER",
     "POSE_BLOCKS",
+    "PointsLike",
     "ProgressCallback",
     "SHOE",
     "SKIN",
@@ -63,8 +66,12 @@ __all__ = [
     "StageOutput",
     "TriangleMesh",
     "UPPER",
+    "WeightsLike",
+    "as_array",
     "as_mesh",
+    "as_points",
     "concatenate_meshes",
+    "dense_weights",
     "display_colors",
     "ignore_progress",
     "matrix_from_rotvec",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64, Num
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, one_line
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ class Camera:
     height: int
     orthographic: bool = False
     name: str = ""
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         for field, shape in (("K", (3, 3)), ("cam_from_world", (4, 4))):

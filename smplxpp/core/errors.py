@@ -1,9 +1,10 @@
-"""What the library reports to its caller: errors about input, warnings, and the progress of long work."""
+"""What the library reports to its caller: errors about input, warnings, progress, and results in one line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeAlias
 
 ProgressCallback: TypeAlias = Callable[[str, float], None]
 """Receives the name of the running step and its share that is done, 0 to 1."""
@@ -61,3 +62,32 @@ class MissingExtraError(ImportError):
         if apt:
             message = f"{purpose} needs {package}, which lacks libraries of the system: apt-get install {apt}"
         super().__init__(message)
+
+
+def one_line(result: Any) -> str:
+    """Describe a dataclass in one line: arrays by type and shape, collections by their length, numbers as they are.
+
+    It stands as `__repr__` in classes that hold arrays, which would print them.
+    """
+    shown = (f"{field.name}={_shown(getattr(result, field.name, None))}" for field in fields(result) if field.repr)
+    return f"{type(result).__name__}({', '.join(shown)})"
+
+
+def _shown(value: Any) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        size = " x ".join(map(str, value.shape))
+        return f"<{str(value.dtype).removeprefix('torch.')} {size or 'scalar'}>"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, dict | list | set) or (isinstance(value, tuple) and len(value) > _SHORT):
+        return f"<{type(value).__name__} of {len(value)}>"
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_shown, value))}{',' if len(value) == 1 else ''})"
+    text = repr(value)
+    if len(text) <= _LONG and "\n" not in text:
+        return text
+    return f"{type(value).__name__}(...)" if is_dataclass(value) else f"{text.split(chr(10))[0][:_LONG]}..."
+
+
+_SHORT, _LONG = 4, 80
+"""Items of a tuple, and characters of any other value, that one line shows."""

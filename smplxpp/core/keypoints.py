@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, one_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,8 @@ class Keypoints2D:
     frames: Int64[np.ndarray, " F"]
     points: Float64[np.ndarray, "F K 2"]
     confidence: Float64[np.ndarray, "F K"]
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         frames = np.asarray(self.frames, dtype=np.int64).reshape(-1)

@@ -1,10 +1,36 @@
-"""Names that a package exports and imports only when they are first used."""
+"""Import what is heavy or optional only when it is first used."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from types import ModuleType
 from typing import Any
+
+from smplxpp.core.errors import MissingExtraError
+
+OPEN3D_NEEDS = "libusb-1.0-0 libgl1 libegl1 libx11-6"
+"""Debian's packages without which open3d does not start."""
+
+
+def import_extra(package: str, *, extra: str, purpose: str, apt: str) -> ModuleType:
+    """Import an optional package.
+
+    Args:
+        package: its name.
+        extra: the extra of smplxpp that installs it.
+        purpose: what needs it.
+        apt: system packages without which it does not start.
+
+    Raises:
+        MissingExtraError: it is not installed, or does not start.
+    """
+    try:
+        return import_module(package)
+    except (ImportError, OSError) as error:
+        # Another missing module, or a library that does not load, means that the package itself is there.
+        missing = isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == package
+        raise MissingExtraError(package, extra=extra, purpose=purpose, apt="" if missing else apt) from error
 
 
 def lazy_exports(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64, Integer
-from numpy.typing import ArrayLike
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.lazy import OPEN3D_NEEDS, import_extra
 from smplxpp.core.topology import edge_groups
 
 if TYPE_CHECKING:
@@ -93,7 +93,38 @@ class TriangleMesh:
             raise ImportError(
                 "TriangleMesh.to_trimesh needs trimesh, which is not installed: pip install trimesh"
             ) from None
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+        return trimesh.Trimesh(*self.arrays(), process=False)
+
+    def show(self, **options: Any) -> Any:
+        """Open the mesh in trimesh's viewer, a window or a cell of a notebook; options are those of `Trimesh.show`.
+
+        Raises:
+            ImportError: trimesh is not installed; a window needs `trimesh[easy]` and `pyglet<2`.
+        """
+        return self.to_trimesh().show(**options)
+
+    def to_open3d(self) -> Any:
+        """Return the mesh as an `open3d.geometry.TriangleMesh` with the same vertices and faces in the same order.
+
+        Raises:
+            MissingExtraError: open3d is not installed (extra `scan`), or lacks libraries of the system.
+        """
+        open3d = import_extra("open3d", extra="scan", purpose="a mesh for open3d", apt=OPEN3D_NEEDS)
+        vertices, faces = self.arrays()
+        corners = open3d.utility.Vector3iVector(faces.astype(np.int32))
+        return open3d.geometry.TriangleMesh(open3d.utility.Vector3dVector(vertices), corners)
+
+    def arrays(self) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, "M 3"]]:
+        """Return writable copies of vertices and faces, as open3d's vectors and `torch.from_numpy` want them.
+
+        The mesh's own arrays are read-only, because what is derived from them is kept.
+
+        Example:
+            >>> vertices, faces = TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).arrays()
+            >>> vertices.flags.writeable and faces.flags.writeable
+            True
+        """
+        return self.vertices.copy(), self.faces.copy()
 
     @property
     def vertex_count(self) -> int:
@@ -204,51 +235,6 @@ class TriangleMesh:
         lookup = np.full(self.vertex_count, -1, dtype=np.int64)
         lookup[used] = np.arange(len(used))
         return TriangleMesh(self.vertices[used], lookup[faces]), used
-
-
-class HasVerticesAndFaces(Protocol):
-    """A mesh of another library, such as `trimesh.Trimesh`: it has arrays of vertices and of faces."""
-
-    @property
-    def vertices(self) -> Any: ...
-
-    @property
-    def faces(self) -> Any: ...
-
-
-MeshLike: TypeAlias = TriangleMesh | HasVerticesAndFaces | tuple[ArrayLike, ArrayLike]
-"""What public functions take as a mesh; `as_mesh` converts it."""
-
-
-def as_mesh(mesh: MeshLike, *, subject: str = "mesh") -> TriangleMesh:
-    """Convert a mesh of another library, or a pair (vertices, faces), to a `TriangleMesh`.
-
-    Args:
-        mesh: a `TriangleMesh`, which is returned as it is; an object with `vertices` and `faces`, such as
-            `trimesh.Trimesh`; or a pair of arrays (N, 3) and (M, 3).
-        subject: what the mesh is called in errors.
-
-    Raises:
-        InputError: something else, or arrays that a `TriangleMesh` refuses.
-
-    Example:
-        >>> as_mesh(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
-        TriangleMesh(3 vertices, 1 faces)
-    """
-    if isinstance(mesh, TriangleMesh):
-        return mesh
-    if isinstance(mesh, tuple | list) and len(mesh) == 2:
-        vertices, faces = mesh
-    elif hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
-        vertices, faces = mesh.vertices, mesh.faces
-    else:
-        raise InputError(
-            subject,
-            expected="a TriangleMesh, an object with vertices and faces (trimesh.Trimesh), or a pair (vertices, faces)",
-            received=type(mesh).__name__,
-            remedy="read a file with smplxpp.read_mesh",
-        )
-    return TriangleMesh(np.asarray(vertices), np.asarray(faces))
 
 
 def _occurring(indices: np.ndarray, count: int) -> np.ndarray:

@@ -9,6 +9,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
+from smplxpp.core.errors import one_line
+
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1 in pixels, the outer edges of what it holds."""
 
@@ -27,6 +29,8 @@ class DetectedPerson:
 
     points: Float64[np.ndarray, "K 2"]
     confidence: Float64[np.ndarray, " K"]
+
+    __repr__ = one_line
 
     @property
     def total_confidence(self) -> float:

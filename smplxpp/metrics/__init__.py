@@ -1,23 +1,28 @@
 """Every stage measured: distances between surfaces, mesh quality, weights, stretch, penetration. No torch."""
 
-from smplxpp.metrics.completeness import Patch, Uncovered, body_regions, far_patches, uncovered_body
-from smplxpp.metrics.conventions import Convention, presets
-from smplxpp.metrics.distance import (
+from smplxpp.metrics.comparison import (
     CompareConfig,
     DirectedDistances,
     DirectionStats,
     MeshComparison,
-    compare,
-    directed_distances,
-    point_to_surface,
+    ThresholdScores,
     summarize,
 )
-from smplxpp.metrics.interpenetration import Interpenetration, interpenetration
-from smplxpp.metrics.intersection import PenetrationReport, penetration, signed_distance
+from smplxpp.metrics.completeness import Patch, Uncovered, body_regions, far_patches, uncovered_body
+from smplxpp.metrics.conventions import Convention, presets
+from smplxpp.metrics.distance import compare, directed_distances, point_to_surface
+from smplxpp.metrics.hausdorff import DirectedHausdorff, HausdorffBounds, hausdorff
+from smplxpp.metrics.intersection import (
+    Interpenetration,
+    PenetrationReport,
+    interpenetration,
+    penetration,
+    signed_distance,
+)
 from smplxpp.metrics.mirror import mirror_ratio
 from smplxpp.metrics.mirror_views import mirrored_by_views
 from smplxpp.metrics.pose_error import PoseError, mean_pose_error, pose_error
-from smplxpp.metrics.quality import MeshQuality, mesh_quality
+from smplxpp.metrics.quality import MeshQuality, doubtful_pair, mesh_quality
 from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
 from smplxpp.metrics.self_intersection import self_intersections
 from smplxpp.metrics.stretch import StretchReport, edge_stretch, flipped_faces, stretch_report
@@ -27,7 +32,9 @@ __all__ = [
     "CompareConfig",
     "Convention",
     "DirectedDistances",
+    "DirectedHausdorff",
     "DirectionStats",
+    "HausdorffBounds",
     "Interpenetration",
     "MeshComparison",
     "MeshQuality",
@@ -36,15 +43,18 @@ __all__ = [
     "PoseError",
     "StretchReport",
     "SurfaceSamples",
+    "ThresholdScores",
     "Uncovered",
     "VariationStats",
     "WeightReport",
     "body_regions",
     "compare",
     "directed_distances",
+    "doubtful_pair",
     "edge_stretch",
     "far_patches",
     "flipped_faces",
+    "hausdorff",
     "interpenetration",
     "mean_pose_error",
     "mesh_quality",

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from smplxpp.core.mesh import TriangleMesh, concatenate_meshes, normalize_rows
+from smplxpp.core import MeshLike, as_mesh, concatenate_meshes, normalize_rows
+from smplxpp.core.errors import one_line
 from smplxpp.core.topology import face_components
 from smplxpp.metrics.distance import point_to_surface
 from smplxpp.metrics.sampling import sample_surface
@@ -43,6 +44,8 @@ class Uncovered:
     face: Int64[np.ndarray, " P"]
     share: Float64[np.ndarray, " P"]
 
+    __repr__ = one_line
+
     def mean(self, chosen: Bool[np.ndarray, " M"] | None = None) -> float:
         """The mean share over the area of all faces or of the chosen ones; 0 where no view sees any."""
         known = ~np.isnan(self.share)
@@ -60,8 +63,8 @@ class Patch:
 
 
 def uncovered_body(
-    body: TriangleMesh,
-    scan: TriangleMesh,
+    body: MeshLike,
+    scan: MeshLike,
     *,
     samples: int = 20_000,
     seed: int = 0,
@@ -80,6 +83,8 @@ def uncovered_body(
         behind: metres that the scan may lie behind the body along a view, for fits that are off.
         views, resolution: of parallel views spread over the sphere.
     """
+    body = as_mesh(body, subject="body")
+    scan = as_mesh(scan, subject="scan")
     points = sample_surface(body, samples, seed=seed)
     normals = normalize_rows(points.normals)
     seen, open_ = np.zeros(samples), np.zeros(samples)
@@ -107,11 +112,13 @@ def body_regions(joint_names: Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def far_patches(scan: TriangleMesh, chosen: Bool[np.ndarray, " M"], body: TriangleMesh, *, far: float) -> list[Patch]:
+def far_patches(scan: MeshLike, chosen: Bool[np.ndarray, " M"], body: MeshLike, *, far: float) -> list[Patch]:
     """Connected patches of the chosen faces that stand more than `far` metres off a body, largest first.
 
     Faces that look down or that nothing outside sees are left out: they close a scan from below and within.
     """
+    scan = as_mesh(scan, subject="scan")
+    body = as_mesh(body, subject="body")
     index = np.flatnonzero(chosen & (scan.face_normals[:, 1] > _LOOKS_DOWN))
     centers = scan.face_centers[index]
     off = point_to_surface(centers, body)[0] > far

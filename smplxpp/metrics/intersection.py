@@ -1,16 +1,20 @@
-"""Penetration of one layer into another: signed distance to a body that is neither closed nor one piece."""
+"""Penetration of one layer into another: signed distance to a body that may be open, and volumes that solids share."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
-from smplxpp.core import InputError, MeshLike, TriangleMesh, as_mesh, require_at_least
+from smplxpp.core import InputError, MeshLike, PointsLike, as_array, as_mesh, as_points, require_at_least
+from smplxpp.core.errors import one_line
 from smplxpp.core.signed_distance import SignedDistanceField
-from smplxpp.metrics.distance import MM
+from smplxpp.core.solids import solid_of_mesh
+from smplxpp.metrics.comparison import MM
 
+CM3 = 1e6
+"""Cubic centimetres in a cubic metre."""
 # Nearer to the surface than this share of the mesh's size the sign of the distance is rounding.
 SIGN_RESOLUTION = 1e-6
 
@@ -36,6 +40,8 @@ class PenetrationReport:
     signed_distance: Float64[np.ndarray, " N"]
     penetrating: Bool[np.ndarray, " N"]
 
+    __repr__ = one_line
+
     def as_dict(self) -> dict:
         """Return the scalar figures as a dictionary for JSON."""
         names = ("count", "fraction", "depth_mean_mm", "depth_max_mm", "clearance_mm")
@@ -43,7 +49,7 @@ class PenetrationReport:
 
 
 def signed_distance(
-    points: Float[np.ndarray, "P 3"], mesh: MeshLike
+    points: PointsLike, mesh: MeshLike
 ) -> tuple[Float64[np.ndarray, " P"], Float64[np.ndarray, "P 3"], Int64[np.ndarray, " P"]]:
     """Signed distance (P,) of (P, 3) points to `mesh`, negative inside; closest points (P, 3) and faces (P,).
 
@@ -55,20 +61,18 @@ def signed_distance(
         InputError: NaN or infinite points, another shape, a mesh without area or wound inside out.
     """
     mesh = as_mesh(mesh, subject="mesh")
-    found = SignedDistanceField(mesh, solid=True).query(points)
+    found = SignedDistanceField(mesh, solid=True).query(as_points(points)[0])
     return found.distance, found.closest, found.face
 
 
-def penetration(
-    outer: TriangleMesh | Float[np.ndarray, "N 3"], inner: MeshLike, *, clearance: float = 0.0
-) -> PenetrationReport:
+def penetration(outer: PointsLike, inner: MeshLike, *, clearance: float = 0.0) -> PenetrationReport:
     """How far vertices of `outer` (a mesh, or points (N, 3)) lie inside `inner` or nearer than `clearance` metres.
 
     Raises:
         InputError: no points, as `signed_distance`, or a clearance that is negative or not finite.
     """
     inner = as_mesh(inner, subject="inner mesh")
-    points = outer.vertices if isinstance(outer, TriangleMesh) else np.asarray(outer, dtype=np.float64)
+    points = as_array(outer) if isinstance(outer, np.ndarray) else as_points(outer, subject="outer layer")[0]
     if not len(points):
         raise InputError("outer layer", expected="points", received="none")
     require_at_least("clearance in metres", clearance, 0.0)
@@ -84,4 +88,46 @@ def penetration(
         clearance_mm=clearance * MM,
         signed_distance=signed,
         penetrating=penetrating,
+    )
+
+
+@dataclass(frozen=True)
+class Interpenetration:
+    """Volume and surface that two solids share.
+
+    Attributes:
+        volume_cm3: of what lies in both.
+        share: of the smaller one's volume; 0 where it has none.
+        volume_a_cm3, volume_b_cm3: of the two.
+    """
+
+    volume_cm3: float
+    share: float
+    volume_a_cm3: float
+    volume_b_cm3: float
+
+    def as_dict(self) -> dict:
+        """Return the numbers as a dictionary for JSON."""
+        return asdict(self)
+
+
+def interpenetration(a: MeshLike, b: MeshLike) -> Interpenetration:
+    """The volume of the intersection of two closed meshes in metres.
+
+    An open surface has no volume: give it a thickness first (`smplxpp.clean.thickened`), or close it. Where a surface
+    cuts itself, what it encloses twice counts once or twice.
+
+    Raises:
+        InputError: a mesh that is open, not manifold, or encloses nothing.
+    """
+    a = as_mesh(a, subject="first surface")
+    b = as_mesh(b, subject="second surface")
+    first, second = solid_of_mesh(a, subject="first surface"), solid_of_mesh(b, subject="second surface")
+    shared = max((first ^ second).volume(), 0.0)
+    smaller = min(first.volume(), second.volume())
+    return Interpenetration(
+        volume_cm3=shared * CM3,
+        share=shared / smaller if smaller > 0 else 0.0,
+        volume_a_cm3=first.volume() * CM3,
+        volume_b_cm3=second.volume() * CM3,
     )

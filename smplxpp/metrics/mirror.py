@@ -6,6 +6,7 @@ import igl
 import numpy as np
 from jaxtyping import Float64
 
+from smplxpp.core.foreign import MeshLike, PointsLike, as_mesh, as_points
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.rotations import rotation_between
 
@@ -15,8 +16,8 @@ _CAP = 0.03
 
 
 def mirror_ratio(
-    points: Float64[np.ndarray, "P 3"],
-    body: TriangleMesh,
+    points: PointsLike,
+    body: MeshLike,
     *,
     center: Float64[np.ndarray, " 3"],
     across: Float64[np.ndarray, " 3"],
@@ -31,8 +32,10 @@ def mirror_ratio(
         body: in the scan's pose.
         center, across: a point of the plane to mirror at, and its normal: the body's middle, from hip to hip.
     """
+    body = as_mesh(body, subject="body")
+    found, _ = as_points(points)
     tree = search_tree(body)
-    one, other = (_aligned_distance(each, body, tree) for each in (points, reflected(points, center, across)))
+    one, other = (_aligned_distance(each, body, tree) for each in (found, reflected(found, center, across)))
     return one / max(other, 1e-9)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.ndimage import binary_erosion, uniform_filter
 
-from smplxpp.core import Camera, TriangleMesh, spread
+from smplxpp.core import Camera, MeshLike, TriangleMesh, as_mesh, spread
 from smplxpp.core.rotations import rotation_between
 from smplxpp.metrics.mirror import aligned, reflected, search_tree
 from smplxpp.raster import rasterize_mesh
@@ -34,11 +34,11 @@ _SAME = 1e-3
 
 
 def mirrored_by_views(
-    scan: TriangleMesh,
+    scan: MeshLike,
     colors: Float[np.ndarray, "N 3"],
     views: Sequence[tuple[Camera, Float[np.ndarray, "_ _ 3"]]],
     *,
-    body: TriangleMesh,
+    body: MeshLike,
     center: Float64[np.ndarray, " 3"],
     across: Float64[np.ndarray, " 3"],
 ) -> float | None:
@@ -59,6 +59,8 @@ def mirrored_by_views(
     Returns:
         None where the photographs look like neither, or no view shows enough.
     """
+    scan = as_mesh(scan, subject="scan")
+    body = as_mesh(body, subject="body")
     # A reflection turns faces inside out, so that their order of corners is reversed.
     image = TriangleMesh(reflected(scan.vertices, center, across), np.ascontiguousarray(scan.faces[:, ::-1]))
     given, other = (

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 
 from smplxpp.body import BodyModel, PosedBody
 from smplxpp.core import BodyParams, InputError
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 
 CONVENTION = (
     "mean distance of body vertices with the estimated parameters from the same with the exact ones, nothing aligned: "

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict, dataclass
 
 import igl
 import numpy as np
 from jaxtyping import Bool, Float64, Integer
 
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
+from smplxpp.core.errors import GeometryWarning
+from smplxpp.core.foreign import MeshLike, as_mesh
+from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels
 from smplxpp.metrics.sampling import require_surface
 from smplxpp.metrics.self_intersection import self_intersections
@@ -187,3 +190,61 @@ def _duplicate_face_count(mesh: TriangleMesh) -> int:
     corners = np.sort(mesh.faces, axis=1)
     corners = corners[np.lexsort(corners.T)]
     return int((corners[1:] == corners[:-1]).all(axis=1).sum())
+
+
+def doubtful_pair(a: MeshLike, b: MeshLike) -> str:
+    """Return in words why two meshes may not belong together: their sizes differ as units do, or their boxes are apart.
+
+    An empty string where neither is so. A pose changes the size of a person's box by less than a factor of 1.5, so
+    that factors from 6.7 on suggest another unit.
+
+    Example:
+        >>> square = ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+        >>> doubtful_pair(square, (1000 * np.array(square[0]), square[1]))
+        'the second mesh is 1e+03 times as large as the first: their units differ by 1000'
+    """
+    one, other = as_mesh(a, subject="first mesh"), as_mesh(b, subject="second mesh")
+    boxes = [
+        np.stack([m.vertices[m.referenced].min(axis=0), m.vertices[m.referenced].max(axis=0)]) for m in (one, other)
+    ]
+    ratio = other.bbox_diagonal / max(one.bbox_diagonal, np.finfo(float).tiny)
+    for factor in (10, 100, 1000):
+        if factor / 1.5 <= max(ratio, 1.0 / max(ratio, np.finfo(float).tiny)) <= 1.5 * factor:
+            large, small, times = ("second", "first", ratio) if ratio > 1 else ("first", "second", 1.0 / ratio)
+            return f"the {large} mesh is {times:.3g} times as large as the {small}: their units differ by {factor}"
+    # Overlap along each axis, as a share of the shorter of both extents; a flat box overlaps where it lies within.
+    shared = np.minimum(boxes[0][1], boxes[1][1]) - np.maximum(boxes[0][0], boxes[1][0])
+    shortest = np.minimum(*(box[1] - box[0] for box in boxes))
+    margin = 0.01 * max(one.bbox_diagonal, other.bbox_diagonal)
+    share = np.clip((shared + margin) / (shortest + margin), 0.0, 1.0).prod()
+    if share < _OVERLAP:
+        apart = float(np.linalg.norm(boxes[0].mean(axis=0) - boxes[1].mean(axis=0)))
+        return (
+            f"their boxes share {share:.0%} of the smaller, their middles are {apart:.3g} apart: check place and axes"
+        )
+    return ""
+
+
+_OVERLAP = 0.25
+"""Share of the smaller box below which two meshes hardly overlap; a person turned by 90 degrees shares about 0.3."""
+
+
+def warn_of_mixed_winding(mesh: TriangleMesh, angles: tuple[np.ndarray, ...], subject: str) -> None:
+    """Warn that angles of normals mean nothing because a mesh's faces are wound both ways.
+
+    Asked only where more than 1 % of the angles (degrees) are obtuse, because the answer costs a sort of the edges.
+    Vertices in one place count as one, so that triangle soups are seen through.
+    """
+    obtuse = np.concatenate(angles) > 90.0
+    if obtuse.mean() <= 0.01:
+        return
+    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    welded = TriangleMesh(mesh.vertices, place.reshape(-1)[mesh.faces])
+    mixed = int(inconsistent_edges(welded).sum())
+    if mixed:
+        warnings.warn(
+            f"{subject}: winding is mixed at {mixed} edges, so that the angle of the normals means nothing; "
+            "read normal_consistency, or repair it with smplxpp.clean.sanitize",
+            GeometryWarning,
+            stacklevel=3,
+        )

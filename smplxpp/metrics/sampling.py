@@ -7,7 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64, Integer, Shaped
 
-from smplxpp.core import InputError, MeshLike, TriangleMesh, as_mesh, normalize_rows, require_at_least
+from smplxpp.core import (
+    METRES_PER_UNIT,
+    InputError,
+    MeshLike,
+    PointsLike,
+    TriangleMesh,
+    as_mesh,
+    as_points,
+    normalize_rows,
+    require_at_least,
+    require_choice,
+)
+from smplxpp.core.errors import one_line
 from smplxpp.core.surface_points import draw_on_surface
 
 
@@ -17,13 +29,15 @@ class SurfaceSamples:
 
     Attributes:
         points: (P, 3) float64 metres.
-        face: (P,) int64 the face that each point lies on.
-        normals: (P, 3) float64 unit normals, see `interpolated_normals`.
+        face: (P,) int64 the face that each point lies on; -1 of a point cloud.
+        normals: (P, 3) float64 unit normals, see `interpolated_normals`; NaN where a point cloud has none.
     """
 
     points: Float64[np.ndarray, "P 3"]
     face: Int64[np.ndarray, " P"]
     normals: Float64[np.ndarray, "P 3"]
+
+    __repr__ = one_line
 
     def __len__(self) -> int:
         return len(self.points)
@@ -55,6 +69,20 @@ def vertex_samples(mesh: TriangleMesh) -> SurfaceSamples:
     require_surface(mesh, "mesh to sample")
     vertex, first = np.unique(mesh.faces.ravel(), return_index=True)
     return SurfaceSamples(mesh.vertices[vertex], first // 3, mesh.vertex_normals[vertex])
+
+
+def cloud_samples(points: PointsLike, *, subject: str = "points", unit: str = "m") -> SurfaceSamples:
+    """Take every point of a cloud (P, 3) as a sample, in metres, with the cloud's normals where it has some.
+
+    Raises:
+        InputError: no points, NaN, another shape, or an unknown unit.
+    """
+    require_choice("unit", unit, tuple(METRES_PER_UNIT))
+    found, normals = as_points(points, subject=subject)
+    if not len(found):
+        raise InputError(subject, expected="points", received="none")
+    normals = np.full_like(found, np.nan) if normals is None else normals
+    return SurfaceSamples(METRES_PER_UNIT[unit] * found, np.full(len(found), -1), normals)
 
 
 def interpolated_normals(

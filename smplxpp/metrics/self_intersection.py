@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int64
 
-from smplxpp.core.mesh import MeshLike, as_mesh
+from smplxpp.core.foreign import MeshLike, as_mesh
 
 # A crossing nearer to an edge or a plane than this share of the triangle's size is touching, not cutting.
 TOLERANCE = 1e-9

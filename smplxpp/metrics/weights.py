@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64, Integer, Num
+from jaxtyping import Float64, Integer
 
-from smplxpp.core import InputError, SkinWeights
+from smplxpp.core import InputError, WeightsLike, dense_weights
 
 
 @dataclass(frozen=True)
@@ -55,15 +55,15 @@ class WeightReport:
         return {**asdict(self), "valid": self.valid}
 
 
-def total_variation(a: Float[np.ndarray, "N J"], b: Float[np.ndarray, "N J"]) -> Float64[np.ndarray, " N"]:
+def total_variation(a: WeightsLike, b: WeightsLike) -> Float64[np.ndarray, " N"]:
     """Half the L1 distance of two rows of weights: the share of a vertex that follows other joints."""
-    return 0.5 * np.abs(a - b).sum(axis=1)
+    return 0.5 * np.abs(dense_weights(a) - dense_weights(b)).sum(axis=1)
 
 
 def weight_report(
-    weights: Num[np.ndarray, "N J"] | SkinWeights,
+    weights: WeightsLike,
     *,
-    reference: Num[np.ndarray, "N J"] | SkinWeights | None = None,
+    reference: WeightsLike | None = None,
     edges: Integer[np.ndarray, "E 2"] | None = None,
 ) -> WeightReport:
     """Check skinning weights (N, J) and measure them against a reference (N, J) and along edges (E, 2).
@@ -109,8 +109,8 @@ def weight_report(
     )
 
 
-def _dense(weights: np.ndarray | SkinWeights, name: str) -> np.ndarray:
-    dense = weights.dense() if isinstance(weights, SkinWeights) else np.asarray(weights, dtype=np.float64)
+def _dense(weights: WeightsLike, name: str) -> np.ndarray:
+    dense = dense_weights(weights)
     if dense.ndim != 2 or not dense.size or not np.isfinite(dense).all():
         raise InputError(name, expected="finite values of shape (N, J)", received=f"shape {dense.shape} or NaN")
     return dense

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from smplxpp.body import BodyModel
 from smplxpp.clean import METRES_PER_UNIT, convert_points, simplify
 from smplxpp.core import BodyParams, InputError, TriangleMesh
+from smplxpp.core.errors import one_line
 
 _FLIP = np.array([-1.0, 1.0, 1.0])  # mirrors points at x = 0
 
@@ -46,6 +47,8 @@ class PersonScan:
     body: BodyModel
     units: str = "m"
     up: str = "y"
+
+    __repr__ = one_line
 
     @staticmethod
     def of(

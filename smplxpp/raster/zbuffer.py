@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer, Num
 
 from smplxpp.core import Camera, InputError, TriangleMesh
+from smplxpp.core.errors import one_line
 from smplxpp.native import address, check_size, native_library, thread_count
 
 
@@ -26,6 +27,8 @@ class MeshMaps:
     face_id: Int32[np.ndarray, "H W"]
     barycentric: Float32[np.ndarray, "H W 3"]
     depth: Float32[np.ndarray, "H W"]
+
+    __repr__ = one_line
 
     @property
     def mask(self) -> Bool[np.ndarray, "H W"]:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
 from smplxpp.core import TriangleMesh, require_at_least, require_positive
-from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress
+from smplxpp.core.errors import GeometryWarning, InputError, ProgressCallback, ignore_progress, one_line
 from smplxpp.reconstruct.colors import blend_colors
 from smplxpp.reconstruct.hull import Field, main_body, pixel_footprint, soft_hull, solid_status
 from smplxpp.reconstruct.mask_consensus import Consensus, find_consensus
@@ -94,6 +94,8 @@ class Reconstruction:
     hull: TriangleMesh
     numbers: dict[str, Any]
     notes: tuple[str, ...]
+
+    __repr__ = one_line
 
     @property
     def unseen(self) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from smplxpp.core import Camera, InputError, TriangleMesh, normalize_rows
+from smplxpp.core.errors import one_line
 from smplxpp.raster import rasterize_mesh
 
 INSIDE = 127.5
@@ -33,6 +34,8 @@ class PhotoView:
     color: UInt8[np.ndarray, "H W 3"]
     opacity: UInt8[np.ndarray, "H W"]
 
+    __repr__ = one_line
+
 
 @dataclass(frozen=True, eq=False)
 class Box:
@@ -45,6 +48,8 @@ class Box:
 
     low: Float64[np.ndarray, " 3"]
     high: Float64[np.ndarray, " 3"]
+
+    __repr__ = one_line
 
 
 def mask_fault(view: PhotoView) -> str:

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Float64, Integer
 from smplxpp.body import BodyModel
 from smplxpp.body.layout import POSE_NAMES
 from smplxpp.core import POSE_BLOCKS, BodyParams, matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.errors import one_line
 from smplxpp.skinning.linear_blend import forward_kinematics
 
 
@@ -39,6 +40,8 @@ class BodyState:
     transl: Float64[np.ndarray, "T 3"]
     betas: Float64[np.ndarray, " B"]
     expression: Float64[np.ndarray, "T E"]
+
+    __repr__ = one_line
 
     def __len__(self) -> int:
         return len(self.rotations)

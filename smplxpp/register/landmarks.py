@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float64, Int64
 
 from smplxpp.body import BodyModel
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, one_line
 from smplxpp.core.files import as_numbers, as_object, atomic_write_text, read_json
 from smplxpp.register.kinematics import BodyPoints, Kinematics, PointsMotion, Posture
 
@@ -42,6 +42,8 @@ class LandmarkModel:
     vertex_index: Int64[np.ndarray, "K M"]
     vertex_weight: Float64[np.ndarray, "K M"]
     joint_index: Int64[np.ndarray, " K"]
+
+    __repr__ = one_line
 
     @staticmethod
     def of(body: BodyModel, names: Sequence[str]) -> LandmarkModel:

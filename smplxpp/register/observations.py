@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float64, Integer, UInt8
 
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, Camera, Keypoints2D, TriangleMesh, require_at_least, require_positive
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, one_line
 
 ViewMap = Callable[[str, int], "UInt8[np.ndarray, 'H W'] | None"]
 """Reads a map of a camera and a frame, None where there is none."""
@@ -28,6 +28,8 @@ class ScanObservation:
 
     mesh: TriangleMesh
     labels: Integer[np.ndarray, " V"] | None = None
+
+    __repr__ = one_line
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ class Observations:
     shape_frames: tuple[int, ...] | None = None
     fps: float | None = None
     bare: Bool[np.ndarray, " V"] | None = None
+
+    __repr__ = one_line
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,8 @@ class BodyFit:
     residuals: Mapping[str, Float64[np.ndarray, " F"]]
     initial_residuals: Mapping[str, Float64[np.ndarray, " F"]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    __repr__ = one_line
 
 
 def check_observations(body: BodyModel, observed: Observations) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.core import Camera, InputError, Keypoints2D, require_at_least, require_positive
+from smplxpp.core.errors import one_line
 from smplxpp.register.keypoint_faults import (
     Table,
     find_camera_fault,
@@ -109,6 +110,8 @@ class Triangulation:
     keypoints: Mapping[str, Keypoints2D]
     left_out: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+
+    __repr__ = one_line
 
     @property
     def sigma(self) -> Float64[np.ndarray, "F K"]:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64, Integer
 
 from smplxpp.core import LABEL_BY_NAME, LABELS, TriangleMesh, matrix_from_rotvec, require_choice, rotvec_from_matrix
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, one_line
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_numbers, as_object, as_text, read_json
 from smplxpp.segment.corrected_faces import ScanSurface, nearest_faces, stroked_faces
@@ -40,6 +40,8 @@ class FaceCorrection:
     triangles: Float64[np.ndarray, "n 3 3"] | None = None
     scan: str | None = None
 
+    __repr__ = one_line
+
     @staticmethod
     def of(mesh: TriangleMesh, label: int, faces: Integer[np.ndarray, " n"]) -> FaceCorrection:
         """Build a correction of this mesh's faces with their corners and the mesh's digest."""
@@ -64,6 +66,8 @@ class StrokeCorrection:
     radius: float
     normals: Float64[np.ndarray, "n 3"] | None = None
 
+    __repr__ = one_line
+
 
 @dataclass(frozen=True, eq=False)
 class BoxCorrection:
@@ -80,6 +84,8 @@ class BoxCorrection:
     center: Float64[np.ndarray, " 3"]
     size: Float64[np.ndarray, " 3"]
     rotation: Float64[np.ndarray, "3 3"]
+
+    __repr__ = one_line
 
 
 Correction = FaceCorrection | StrokeCorrection | BoxCorrection

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float64, Int64, Num
 from scipy.sparse import csr_matrix, identity
 
 from smplxpp.core import BACKGROUND, LABELS, OUTER, SKIN, UPPER, InputError, MeshLike, TriangleMesh, as_mesh
+from smplxpp.core.errors import one_line
 from smplxpp.core.topology import face_adjacency
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors
@@ -63,6 +64,8 @@ class SegmentedScan:
     energy_after: float
     corrected: Bool[np.ndarray, " M"] | None = None
     notes: tuple[str, ...] = ()
+
+    __repr__ = one_line
 
 
 def segment_scan(

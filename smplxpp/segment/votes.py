@@ -10,12 +10,13 @@ from jaxtyping import Bool, Float64, Integer
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 
-from smplxpp.core import BACKGROUND, LABELS, Camera, InputError, TriangleMesh
+from smplxpp.core import BACKGROUND, LABELS, Camera, InputError, MeshLike, TriangleMesh, as_mesh
+from smplxpp.core.errors import one_line
 from smplxpp.raster import MeshMaps, rasterize_mesh
 
 
 def vote_on_faces(
-    mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]
+    mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]
 ) -> Float64[np.ndarray, "M L"]:
     """Sum `cos(view, normal) clip(d / 4, 0.1, 1)` over the views' pixels that show a face, for each label.
 
@@ -30,6 +31,7 @@ def vote_on_faces(
     Raises:
         InputError: sizes that do not agree, unknown ids, or no vote at all.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     votes = np.zeros((mesh.face_count, len(LABELS)))
     for camera, labels in views:
         votes += votes_of_view(mesh, camera, labels)
@@ -134,8 +136,10 @@ class AgreedVotes:
     votes: Float64[np.ndarray, "M L"]
     left_out: Mapping[str, float]
 
+    __repr__ = one_line
 
-def vote_in_agreement(mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]) -> AgreedVotes:
+
+def vote_in_agreement(mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]) -> AgreedVotes:
     """Sum votes as `vote_on_faces` does, without the label maps that the other views contradict.
 
     A view agrees on a face if its label wins the sum of all other views. A view is a candidate for exclusion if it
@@ -146,6 +150,7 @@ def vote_in_agreement(mesh: TriangleMesh, views: Sequence[tuple[Camera, Integer[
     Raises:
         InputError: as `vote_on_faces` does.
     """
+    mesh = as_mesh(mesh, subject="mesh")
     # Sparse matrices, because a view sees a part of the faces, and a studio has a hundred views.
     each = [csr_matrix(votes_of_view(mesh, camera, labels)) for camera, labels in views]
     require_votes(any(votes.nnz for votes in each))

@@ -6,9 +6,12 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64, Num
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
 
-from smplxpp.core import GeometryWarning, InputError, SkinWeights
+from smplxpp.core import GeometryWarning, InputError, PointsLike, WeightsLike, as_array, dense_weights
+from smplxpp.core.errors import one_line
+from smplxpp.core.foreign import point_arrays
 from smplxpp.skinning.linear_blend import blend_transforms, skin
 
 
@@ -59,13 +62,15 @@ class Unposed:
     determinant: Float64[np.ndarray, " N"]
     report: UnposeReport
 
+    __repr__ = one_line
+
 
 def pose(
-    rest_vertices: Num[np.ndarray, "N 3"],
-    weights: SkinWeights | Float[np.ndarray, "N J"],
-    posed_from_rest: Float[np.ndarray, "J 4 4"],
+    rest_vertices: PointsLike,
+    weights: WeightsLike,
+    posed_from_rest: ArrayLike,
     *,
-    rest_offsets: Float[np.ndarray, "N 3"] | None = None,
+    rest_offsets: PointsLike | None = None,
 ) -> Float64[np.ndarray, "N 3"]:
     """Pose rest points by linear blend skinning, `x = (sum_j w_j G_j) (x_T + b)`.
 
@@ -92,11 +97,11 @@ def pose(
 
 
 def unpose(
-    posed_vertices: Num[np.ndarray, "N 3"],
-    weights: SkinWeights | Float[np.ndarray, "N J"],
-    posed_from_rest: Float[np.ndarray, "J 4 4"],
+    posed_vertices: PointsLike,
+    weights: WeightsLike,
+    posed_from_rest: ArrayLike,
     *,
-    rest_offsets: Float[np.ndarray, "N 3"] | None = None,
+    rest_offsets: PointsLike | None = None,
     config: UnposeConfig | None = None,
 ) -> Unposed:
     """Invert linear blend skinning, `x_T = (sum_j w_j G_j)^-1 x - b`.
@@ -169,11 +174,11 @@ def unpose(
 
 def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):
     """Return vertices, dense weights, transforms and offsets in float64 after checking shapes, sums and finiteness."""
-    vertices = np.asarray(vertices, dtype=np.float64)
+    vertices, _ = point_arrays(vertices)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.isfinite(vertices).all():
         raise InputError(subject, expected="finite (N, 3), N > 0", received=_describe(vertices))
     # Vertices and weights: finite, of matching lengths.
-    dense = weights.dense() if isinstance(weights, SkinWeights) else np.asarray(weights, dtype=np.float64)
+    dense = dense_weights(weights)
     if dense.ndim != 2 or len(dense) != len(vertices) or not np.isfinite(dense).all():
         raise InputError("skinning weights", expected=f"finite ({len(vertices)}, J)", received=_describe(dense))
     # Rows of weights sum to 1, transforms are affine, offsets have the vertices' shape.
@@ -186,7 +191,7 @@ def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):
             remedy="normalise them, for instance with SkinWeights.from_dense",
         )
     # Transforms: one affine matrix for each joint. Transposed matrices have other last rows.
-    transforms = np.asarray(posed_from_rest, dtype=np.float64)
+    transforms = np.asarray(as_array(posed_from_rest), dtype=np.float64)
     if transforms.shape != (dense.shape[1], 4, 4) or not np.isfinite(transforms).all():
         raise InputError(
             "posed_from_rest", expected=f"finite ({dense.shape[1]}, 4, 4): one frame", received=_describe(transforms)
@@ -195,7 +200,7 @@ def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):
         raise InputError(
             "posed_from_rest", expected="last rows 0 0 0 1", received="others", remedy="check for transposed matrices"
         )
-    offsets = np.zeros((1, 3)) if rest_offsets is None else np.asarray(rest_offsets, dtype=np.float64)
+    offsets = np.zeros((1, 3)) if rest_offsets is None else point_arrays(rest_offsets)[0]
     if rest_offsets is not None and (offsets.shape != vertices.shape or not np.isfinite(offsets).all()):
         raise InputError("rest offsets", expected=f"finite {vertices.shape}", received=_describe(offsets))
     return vertices, dense, transforms, offsets

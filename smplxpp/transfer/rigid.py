@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from smplxpp.core import SkinWeights, TriangleMesh
+from smplxpp.core import MeshLike, SkinWeights, WeightsLike, as_mesh, dense_weights
 from smplxpp.transfer.correspond import vertex_components
 
 _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
@@ -15,9 +14,9 @@ _HOLDS = 0.03
 
 
 def rigid_weights(
-    source: TriangleMesh,
-    source_weights: Float[np.ndarray, "V J"],
-    target: TriangleMesh,
+    source: MeshLike,
+    source_weights: WeightsLike,
+    target: MeshLike,
     *,
     joint_names: tuple[str, ...],
 ) -> SkinWeights:
@@ -40,6 +39,8 @@ def rigid_weights(
         >>> len(np.unique(weights.dense().argmax(axis=1)))
         1
     """
+    source = as_mesh(source, subject="source")
+    target = as_mesh(target, subject="target")
     # Fingers count as the wrist that they belong to.
     names = list(joint_names)
     owner = np.arange(len(names))
@@ -47,8 +48,9 @@ def rigid_weights(
         side = name.partition("_")[0]
         if any(finger in name for finger in _FINGERS) and f"{side}_wrist" in names:
             owner[k] = names.index(f"{side}_wrist")
-    folded = np.zeros((len(source_weights), len(names)))
-    np.add.at(folded.T, owner, np.asarray(source_weights, dtype=np.float64).T)
+    own = dense_weights(source_weights)
+    folded = np.zeros((len(own), len(names)))
+    np.add.at(folded.T, owner, own.T)
     limb = folded.argmax(axis=1)
     distance, nearest = cKDTree(source.vertices).query(target.vertices)
     hands = [k for k, name in enumerate(names) if name.endswith("_wrist") and (limb == k).any()]

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
-from smplxpp.core import MeshLike, SkinWeights, TriangleMesh, as_mesh
+from smplxpp.core import MeshLike, SkinWeights, TriangleMesh, WeightsLike, as_mesh, dense_weights
 from smplxpp.transfer.anchors import (
     anchor_share,
     anchor_weights,
@@ -44,7 +43,7 @@ _LEAST_SUM = 1e-3
 
 def transfer_weights(
     source: MeshLike,
-    source_weights: Float[np.ndarray, "V J"],
+    source_weights: WeightsLike,
     target: MeshLike,
     *,
     config: TransferConfig | None = None,
@@ -92,7 +91,7 @@ def transfer_weights(
     source = as_mesh(source, subject="source mesh")
     target = as_mesh(target, subject="target mesh")
     config = config or TransferConfig()
-    weights = check_source(source, source_weights)
+    weights = check_source(source, dense_weights(source_weights))
     check_target(target)
     joint_count = weights.shape[1]
     source = consistent_winding(source, subject="source mesh")

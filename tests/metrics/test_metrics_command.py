@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from typing import get_args
 
 import numpy as np
@@ -129,3 +130,25 @@ def test_what_cannot_be_compared_is_refused(tmp_path, plane, case):
         out = tmp_path / "o.txt"
     with pytest.raises(InputError):
         Metrics(a=a, b=b, samples=10, out=out, json=True).run()
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "words"),
+    [
+        (1000.0, 0.0, "units differ by 1000"),
+        (0.1, 0.0, "units differ by 10"),
+        (1.0, 1.9, "boxes share"),
+        (1.0, 0.1, ""),
+    ],
+)
+def test_pairs_that_hardly_belong_together_are_named(tmp_path, plane, factor, offset, words):
+    a, b = tmp_path / "a.ply", tmp_path / "b.ply"
+    moved = plane(0.0)
+    write_ply(a, moved.with_vertices(factor * moved.vertices * 0.005 + [offset * 0.005, 0, 0]))
+    write_ply(b, moved.with_vertices(0.005 * moved.vertices))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        frame = Metrics(a=a, b=b, samples=100, json=True, threshold_mm=(1.0, 5.0)).run()["frames"][0]
+    assert (words in str(caught[0].message)) if words else not caught
+    assert frame["hausdorff"] <= frame["hausdorff_upper"] <= frame["hausdorff"] + 0.02
+    assert [scores["threshold_mm"] for scores in frame["scores"]] == [1.0, 5.0]

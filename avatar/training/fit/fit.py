@@ -25,7 +25,7 @@ from avatar.training.engine.photometric_task import ALONE, PhotometricTask, Task
 from avatar.training.fit.config import FitConfig
 from avatar.training.fit.initial_gaussians import initial_gaussians
 from avatar.training.scene import TrainScene
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, one_line
 from smplxpp.template.template import Template
 
 
@@ -46,6 +46,8 @@ class FitScene:
     train: Sequence[View]
     held_out: Sequence[View] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         if not self.train:

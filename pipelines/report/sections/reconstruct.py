@@ -21,7 +21,7 @@ from smplxpp.build.reconstruct import open_photographs
 from smplxpp.core import InputError, TriangleMesh, spread
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
-from smplxpp.metrics.distance import MM
+from smplxpp.metrics.comparison import MM
 from smplxpp.raster import rasterize_mesh
 
 HEIGHT = 560

@@ -24,6 +24,7 @@ from smplxpp.capture.check.parameters import parameter_findings, read_parameters
 from smplxpp.capture.check.silhouettes import FitSummary
 from smplxpp.capture.check.views import OPAQUE, ViewCheck, check_view
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, matrix_from_rotvec, spread
+from smplxpp.core.errors import one_line
 
 # Frame offsets that are tried where images and parameters may not be synchronised.
 _SHIFTS = (-3, -2, -1, 1, 2, 3)
@@ -66,6 +67,8 @@ class CaptureCheck:
     views: tuple[ViewCheck, ...]
     vertices: Callable[[int], Float[np.ndarray, "V 3"] | None]
     faces: Int[np.ndarray, "F 3"]
+
+    __repr__ = one_line
 
     @property
     def failed(self) -> bool:

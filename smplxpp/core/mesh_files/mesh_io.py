@@ -17,7 +17,8 @@ from jaxtyping import UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import as_numbers, atomic_write_bytes, read_arrays, regular_file
-from smplxpp.core.mesh import MeshLike, TriangleMesh, as_mesh
+from smplxpp.core.foreign import MeshLike, as_mesh
+from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.fbx_file import read_fbx
 from smplxpp.core.mesh_files.gltf_file import read_gltf
 from smplxpp.core.mesh_files.obj_file import read_obj
