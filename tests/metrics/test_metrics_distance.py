@@ -211,6 +211,7 @@ def test_what_cannot_be_measured_is_refused(plane, call):
         call(plane(0.0))
 
 
+@pytest.mark.filterwarnings("ignore:.*winding is mixed")
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.tuples(*[st.sampled_from([0.0, 1.0, 1e-8, -3.0, 1e4])] * 3), min_size=3, max_size=8),
