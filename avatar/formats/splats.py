@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Float64
 from avatar.runtime import AvatarPlayer
 from avatar.runtime.splatting import WorldSplats
 from smplxpp.cloth.play import ways
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, one_line
 from smplxpp.core.params import DEFAULT_FPS, BodyParams
 from smplxpp.core.spherical_harmonics import C0, MAX_DEGREE, coefficient_count, degree_of, rotate_sh
 
@@ -43,6 +43,8 @@ class Splats:
     opacity_logits: Float[np.ndarray, " N"]
     log_scales: Float[np.ndarray, "N 3"]
     quats: Float[np.ndarray, "N 4"]
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         # Convert first, so that values too large for float32 show as infinities below.

@@ -15,6 +15,7 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.control_points import template_control_points
 from avatar.models.networks.sparse_rows import SparseRows
 from avatar.rig.rig import Pose, PosedAvatar, Rig
+from smplxpp.core.errors import one_line
 from smplxpp.template.template import Template
 
 
@@ -144,6 +145,8 @@ class Track:
     cage: ControlCage
     sigma: Float[Tensor, "T K"] | None = None
     drift: Float[Tensor, " K"] | None = None
+
+    __repr__ = one_line
 
     def displacements(self, frame: int) -> Float[Tensor, "V 3"]:
         """Return the displacements of all vertices in a frame, metres along the axes of the T-pose."""

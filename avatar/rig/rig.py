@@ -252,6 +252,8 @@ class PosedAvatar:
     bound: BoundGaussians
     displacements: Float[Tensor, "V 3"] | None = None
 
+    __repr__ = one_line
+
 
 class AvatarModel(Protocol):
     """Any module that can be posed and drawn: teacher, student, baselines."""

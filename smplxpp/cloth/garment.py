@@ -25,7 +25,7 @@ from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.model import ClothModel, build_model
 from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core import BodyParams, TriangleMesh, require_at_least, require_choice, require_positive
-from smplxpp.core.errors import GeometryWarning, InputError
+from smplxpp.core.errors import GeometryWarning, InputError, one_line
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.topology import border_loops, component_labels
 from smplxpp.template.template import BODY_PART, Template
@@ -129,6 +129,8 @@ class Garment:
     vertex_depth: Float[np.ndarray, " N"]
     embedding: Embedding
     collider: ColliderMesh
+
+    __repr__ = one_line
 
     @property
     def pinned(self) -> Bool[np.ndarray, " n"]:
