@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from avatar.speech.phonemes import ipa_from_arpabet
+from avatar.speech.spoken_text import speak_text
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.paths import read_text
 
@@ -25,11 +26,6 @@ EXTRA = "talk"
 # Marks at which a sentence breaks, except within numbers, after a single letter and after a title.
 _POINT = "".join(rf"(?<!\b{title})" for title in ("[A-Za-z]", "Dr", "Mr", "Ms", "St", "Mrs", "Prof")) + r"\."
 _BREAK = re.compile(rf"((?:{_POINT}|[,;:!?])[{re.escape(PAUSES)}]*)(?=[\s\"'”’)\]]|$)")
-_ONES = (
-    "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen "
-    "eighteen nineteen"
-).split()
-_TENS = "twenty thirty forty fifty sixty seventy eighty ninety".split()
 
 # Function words, which carry no stress in a sentence.
 _UNSTRESSED_WORDS = frozenset(
@@ -95,6 +91,7 @@ def pronounce(text: str, *, language: str = "en-us") -> Pronunciation:
         MissingExtraError: neither the program nor the dictionary is installed.
     """
     text, foreign = _drop_foreign_words(check_text(text), language)
+    text = speak_text(text) if language.startswith("en") else text
     program = shutil.which("espeak-ng")
     if program is not None:
         return Pronunciation(_by_espeak(program, text, language), foreign=foreign)
@@ -241,26 +238,13 @@ def _by_dictionary(text: str) -> Pronunciation:
 
 
 def _tokens(text: str) -> list[str]:
-    """Return words in lower case without accents, numbers spelled out, and pauses."""
+    """Return words in lower case without accents, numbers and signs as they are spoken, and pauses."""
     out: list[str] = []
     # NFKD splits accented letters into letter and accent, which is dropped: "cafe" is in the dictionary, "café" is
     # not.
-    plain = "".join(one for one in unicodedata.normalize("NFKD", text) if not unicodedata.combining(one))
-    for token in re.findall(rf"[a-z]+(?:'[a-z]+)?|\d+|[{re.escape(PAUSES)}]", plain.lower().replace("’", "'")):
-        out += _spell_number(token) if token.isdigit() else [token]
+    plain = "".join(one for one in unicodedata.normalize("NFKD", speak_text(text)) if not unicodedata.combining(one))
+    for token in re.findall(rf"[A-Za-z]+(?:'[A-Za-z]+)?|[{re.escape(PAUSES)}]", plain):
+        # Short words in capitals that no dictionary has are said by their letters.
+        spelled = token.isupper() and 2 <= len(token) <= 5 and token.lower() not in cmu_dictionary()
+        out += list(token.lower()) if spelled else [token.lower()]
     return out
-
-
-def _spell_number(digits: str) -> list[str]:
-    """Spell a number below a million in words; spell larger ones, and those with leading zeros, digit by digit."""
-    # Larger numbers are not parsed at all.
-    value = int(digits) if len(digits) < 7 else 10**6
-    if value >= 10**6 or (len(digits) > 1 and digits[0] == "0"):
-        return [_ONES[int(one)] for one in digits]
-    if value < 20:
-        return [_ONES[value]]
-    if value < 100:
-        return [_TENS[value // 10 - 2], *([_ONES[value % 10]] if value % 10 else [])]
-    unit, name = (100, "hundred") if value < 1000 else (1000, "thousand")
-    rest = _spell_number(str(value % unit)) if value % unit else []
-    return [*_spell_number(str(value // unit)), name, *rest]

@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
+from pipelines.chat.spoken_answer import ThoughtFilter
 from smplxpp.core import InputError, require_positive
 from smplxpp.core.files.json_file import as_list, as_object, parse_json
 
@@ -81,6 +82,9 @@ SYSTEM_PROMPT = (
     "You speak aloud through an avatar. Answer in one to three short sentences of plain spoken English, "
     "without lists, markup or emoji."
 )
+# Tokens that an answer may take. Thoughts count too and are longer than answers; what is said is bounded in characters
+# (`pipelines.chat.conversation`).
+_MOST_TOKENS = 2048
 _PATH = "/chat/completions"
 _MOST_LINE, _MOST_BYTES = 1 << 18, 4 << 20  # bounds of a line and of an answer in bytes, against endless streams
 _REMEDY = "check that it runs and that --llm is its base address, for example http://127.0.0.1:8080/v1"
@@ -124,24 +128,51 @@ class Endpoint:
         path = parts.path.rstrip("/")
         self._path = path if path.endswith(_PATH) else path + _PATH
         self._waiting: set[socket.socket] = set()
+        # The name under which the address takes the bound of tokens; "" where it takes none.
+        self._bound = "max_tokens"
+        self._thoughts = ThoughtFilter()
 
     def answer(self, history: Sequence[tuple[str, str]]) -> Iterator[str]:
-        """Yield the model's words.
+        """Yield the model's words, without what it thinks.
 
         Args:
             history: (role, text) in order, with role "user" or "assistant".
 
         Raises:
-            InputError: no connection, a timeout, an error status, or a malformed answer.
+            InputError: no connection, a timeout, an error status, a malformed answer, one that breaks off, or thoughts
+                alone.
         """
-        subject = f"language model at {self._host}"
+        answered = False
+        for words in self._thoughts.answer(self._pieces(history)):
+            answered = answered or bool(words.strip())
+            yield words
+        if not answered:
+            raise InputError(
+                f"language model at {self._host}",
+                expected="words",
+                received=f"thoughts alone, up to {_MOST_TOKENS} tokens",
+                remedy="choose a model that does not think, or switch its thoughts off",
+            )
+
+    def _pieces(self, history: Sequence[tuple[str, str]]) -> Iterator[str]:
+        """Yield the answer as it arrives; ask again where the address knows another name of the bound of tokens."""
         messages = [{"role": "system", "content": self.prompt}]
         messages += [{"role": who, "content": what} for who, what in history]
-        body = json.dumps({"model": self.model, "messages": messages, "stream": True, "max_tokens": 300}).encode()
+        while True:
+            bound = {self._bound: _MOST_TOKENS} if self._bound else {}
+            body = json.dumps({"model": self.model, "messages": messages, "stream": True, **bound}).encode()
+            try:
+                yield from self._asked(body)
+                return
+            except _OtherBoundError as other:
+                self._bound = other.name
+
+    def _asked(self, body: bytes) -> Iterator[str]:
+        subject = f"language model at {self._host}"
         headers = {"Content-Type": "application/json", "Accept": "text/event-stream, application/json"}
         headers |= {"Authorization": f"Bearer {self.key}"} if self.key else {}
         # The socket is kept where another thread can close it, so that a stopped answer ends at once.
-        connection, waiting = self._connection(), None
+        connection, waiting, reply = self._connection(), None, None
         try:
             connection.connect()
             waiting = connection.sock
@@ -150,8 +181,13 @@ class Endpoint:
             connection.request("POST", self._path, body, headers)
             reply = connection.getresponse()
             if reply.status != http.client.OK:
-                words = " ".join(reply.read(400).decode(errors="replace").split())
-                raise InputError(subject, expected="status 200", received=f"{reply.status} {words}", remedy=_REMEDY)
+                words = " ".join(reply.read(1000).decode(errors="replace").split())
+                self._look_for_other_bound(reply.status, words)
+                # The server's own words name the cause of a refused request; others may have another address.
+                remedy = "" if reply.status == http.client.BAD_REQUEST else _REMEDY
+                raise InputError(
+                    subject, expected="status 200", received=f"{reply.status} {words[:400]}", remedy=remedy
+                )
             # Servers that do not stream send the whole answer as one JSON object.
             streamed = "event-stream" in (reply.getheader("Content-Type") or "")
             yield from _streamed(reply, subject) if streamed else _whole(reply, subject)
@@ -165,6 +201,16 @@ class Endpoint:
         finally:
             self._waiting.discard(waiting)
             connection.close()
+            # A reply holds the socket as well, and an exception's traceback would keep it alive.
+            if reply is not None:
+                reply.close()
+
+    def _look_for_other_bound(self, status: int, words: str) -> None:
+        """Raise `_OtherBoundError` where a refused request says that the bound of tokens has another name, or none."""
+        if status not in (400, 422) or not self._bound or self._bound not in words:
+            return
+        new = "max_completion_tokens"
+        raise _OtherBoundError(new if self._bound != new and new in words else "")
 
     def cancel(self) -> None:
         """Close the connections that wait for an answer; their readers get an error."""
@@ -179,10 +225,18 @@ class Endpoint:
         return http.client.HTTPConnection(self._host, self._port, timeout=self.connecting)
 
 
+class _OtherBoundError(Exception):
+    """The address takes the bound of tokens by another name."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.name = name
+
+
 def _streamed(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
     """Yield the words of server-sent events, lines `data: {...}` up to `data: [DONE]`."""
     # Lines and their sum are bounded, because the other side may be anything that answers at this address.
-    read, answered = 0, False
+    read, answered, ended, half = 0, False, False, b""
     while line := reply.readline(_MOST_LINE):
         read += len(line)
         if read > _MOST_BYTES or (not line.endswith(b"\n") and len(line) == _MOST_LINE):
@@ -192,34 +246,56 @@ def _streamed(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
             continue
         data = line[5:].strip()
         if data == b"[DONE]":
+            ended = True
             break
-        words = _words(data, "delta", subject)
-        answered = answered or bool(words)
+        data, half = _with_whole_characters(data, half)
+        words, finished = _words(data, "delta", subject)
+        answered, ended = answered or bool(words), ended or finished
         if words:
             yield words
     if not answered:
         raise InputError(subject, expected="words", received="none", remedy=_REMEDY)
+    if not ended:
+        raise InputError(subject, expected="a whole answer", received="one that breaks off")
+
+
+def _with_whole_characters(data: bytes, half: bytes) -> tuple[bytes, bytes]:
+    """Put the escape of a character's first half before its second one in the next event; return the first half left.
+
+    Models yield tokens, which may be parts of an emoji; JSON writes it as two escapes, and servers send one in each
+    event.
+    """
+    second = re.search(rb"(?<!\\ud[89ab][0-9a-f]{2})\\ud[c-f][0-9a-f]{2}", data, re.IGNORECASE)
+    if half and second:
+        data, half = data[: second.start()] + half + data[second.start() :], b""
+    first = re.search(rb"\\ud[89ab][0-9a-f]{2}(?!\\ud[c-f])", data, re.IGNORECASE)
+    if first:
+        data, half = data[: first.start()] + data[first.end() :], first[0]
+    return data, half
 
 
 def _whole(reply: http.client.HTTPResponse, subject: str) -> Iterator[str]:
     data = reply.read(_MOST_BYTES + 1)
     if len(data) > _MOST_BYTES:
         raise InputError(subject, expected=f"at most {_MOST_BYTES >> 20} MiB", received="more")
-    words = _words(data, "message", subject)
+    words, _ = _words(data, "message", subject)
     if not words.strip():
         raise InputError(subject, expected="words", received="none", remedy=_REMEDY)
     yield words
 
 
-def _words(data: bytes, part: str, subject: str) -> str:
-    """Return the words of one event or of the whole answer; some events have none."""
+def _words(data: bytes, part: str, subject: str) -> tuple[str, bool]:
+    """Return the words of one event or of the whole answer, of which some have none, and whether it is the last."""
     value = as_object(parse_json(data, subject=subject, remedy=_REMEDY), subject=subject)
-    if "error" in value:
+    if value.get("error"):
         raise InputError(subject, expected="an answer", received=str(value["error"])[:300], remedy=_REMEDY)
-    choices = as_list(value.get("choices"), subject=f"{subject}: choices")
+    choices = as_list(value.get("choices") or [], subject=f"{subject}: choices")
     if not choices:
-        return ""  # usage, at the end of some streams
-    content = as_object(as_object(choices[0], subject=subject).get(part), subject=f"{subject}: {part}").get("content")
+        return "", False  # usage, at the end of some streams
+    choice = as_object(choices[0], subject=subject)
+    finished = bool(choice.get("finish_reason"))
+    # Servers write null for what an event does not have.
+    content = as_object(choice.get(part) or {}, subject=f"{subject}: {part}").get("content")
     if not isinstance(content, str | None):
         raise InputError(f"{subject}: content", expected="a text", received=type(content).__name__)
-    return content or ""
+    return content or "", finished

@@ -16,6 +16,7 @@ from avatar.speech import SpeechAnimator
 from avatar.speech.voice import PiperVoice
 from pipelines.chat.frame_queue import FrameQueue, Line
 from pipelines.chat.hearing import Activity, Listener, Recogniser, UtterancePart
+from pipelines.chat.spoken_answer import MarkdownReader
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 
@@ -26,7 +27,10 @@ _MOST_ANSWERED = 4000
 _REMEMBERED = 12
 LONGEST_SENTENCE = 240
 """Characters after which a sentence is cut at a pause or between words, because a voice is synthesised by sentences."""
-_END = re.compile("[.!?\u2026]+[\"'\u201d\u2019)\\]]*(?=\\s)|\n+")
+# Not behind a title, an abbreviation that a word follows, or several initials.
+_ABBREVIATED = ("Dr", "Mr", "Mrs", "Ms", "Prof", "St", "Gen", "Lt", "Sgt", "Capt", "e.g", "i.e", "vs", "approx")
+_INNER = "".join(rf"(?<!\b{re.escape(one)})" for one in _ABBREVIATED) + r"(?<!\b[A-Z]\.[A-Z])"
+_END = re.compile(_INNER + "[.!?\u2026]+[\"'\u201d\u2019)\\]]*(?=\\s)|\n+")
 _PAUSE = re.compile("[,;:\u2013\u2014]\\s")
 
 
@@ -215,12 +219,13 @@ class Conversation:
 
     def _answer(self, turn: Turn) -> None:
         try:
+            reader = MarkdownReader()
             for number, sentence in enumerate(sentences(self._words(turn))):
                 if turn.cancelled:
                     break
                 turn.mark("sentence")
                 turn.answered.append(sentence)
-                self._say(turn, number, sentence)
+                self._say(turn, number, sentence, reader.spoken(sentence))
         except InputError as error:
             if not turn.cancelled:
                 self._note(str(error))
@@ -229,19 +234,29 @@ class Conversation:
 
     def _words(self, turn: Turn) -> Iterator[str]:
         count = 0
-        for piece in self._parts.partner.answer(history(self._turns)):
-            if turn.cancelled:
-                return
-            turn.mark("first words")
-            yield piece[: _MOST_ANSWERED - count]
-            count += len(piece)
-            if count >= _MOST_ANSWERED:
-                self._note("The answer was too long and is cut here.")
-                return
-
-    def _say(self, turn: Turn, number: int, sentence: str) -> None:
         try:
-            spoken = self._parts.voice.say(sentence)
+            for piece in self._parts.partner.answer(history(self._turns)):
+                if turn.cancelled:
+                    return
+                turn.mark("first words")
+                yield piece[: _MOST_ANSWERED - count]
+                count += len(piece)
+                if count >= _MOST_ANSWERED:
+                    self._note("The answer was too long and is cut here.")
+                    return
+        except InputError as error:
+            # What came before an answer broke off is said.
+            if not count:
+                raise
+            if not turn.cancelled:
+                self._note(str(error))
+
+    def _say(self, turn: Turn, number: int, sentence: str, words: str) -> None:
+        if not words:
+            self._tell({"kind": "silent", "turn": turn.number, "line": number, "text": sentence})
+            return
+        try:
+            spoken = self._parts.voice.say(words)
         except InputError as error:  # another alphabet or punctuation alone is shown and not spoken
             self._tell({"kind": "silent", "turn": turn.number, "line": number, "text": sentence})
             if any(one.isalnum() for one in sentence):

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import ClassVar
 
@@ -19,6 +20,27 @@ HISTORY = [("user", "hello"), ("assistant", "hi"), ("user", "and?")]
 
 def event(content: str | None) -> bytes:
     return b"data: " + json.dumps({"choices": [{"delta": {"content": content}}]}).encode() + b"\n\n"
+
+
+def stream(*pieces: str | None) -> bytes:
+    return b"".join(map(event, pieces)) + b"data: [DONE]\n\n"
+
+
+THOUGHT = ("Okay, I must", " not tell. </b> 1 < 2.", "\n")
+STREAMS = {
+    "tags": ["<think>", *THOUGHT, "</think>", "\n\nGood. 1 < 2."],
+    "cut": ["<thi", "nk>\n", *THOUGHT, "</th", "ink>Good. 1 < 2."],
+    "unopened": [*THOUGHT, "</think>\nGood. ", "1 < 2."],
+    "brackets": ["[THINK]", *THOUGHT, "[/THINK]Good. 1 < 2."],
+    "triangles": ["\u25c1think\u25b7", *THOUGHT, "\u25c1/think\u25b7Good. 1 < 2."],
+    "channels": [
+        "<|channel|>analysis<|message|>",
+        *THOUGHT,
+        "<|end|><|start|>assistant<|channel|>final<|message|>Good. 1 < 2.",
+    ],
+    "twice": ["<thinking>a</thinking>Good. ", "<Thinking>b</Thinking>1 < 2."],
+    "none": ["Good. ", "1 <", " 2."],
+}
 
 
 class _Model(BaseHTTPRequestHandler):
@@ -43,9 +65,26 @@ class _Model(BaseHTTPRequestHandler):
             "number": b'{"choices": [{"message": {"content": 7}}]}',
             "long": b"data: " + b"x" * (1 << 19),
             "hang": event("So"),
+            "breaks": event("One. ") + event("Two"),
+            "thoughts": stream("<think>", *THOUGHT),
+            "emoji": b'data: {"choices": [{"delta": {"content": "Hi \\ud83d"}}]}\n\n'
+            b'data: {"choices": [{"delta": {"content": "\\ude00!"}, "finish_reason": "stop"}]}\n\n',
+            "nulls": b'data: {"choices": [{"delta": null}], "error": null}\n\ndata: {"choices": null}\n\n'
+            + stream("Hi"),
+            "new_names": stream("Hi"),
+            "no_names": stream("Hi"),
         }
+        answers |= {name: stream(*pieces) for name, pieces in STREAMS.items()}
+        known = {"new_names": ("max_completion_tokens",), "no_names": ()}.get(kind, ("max_tokens",))
+        unknown = [name for name in body if name.endswith("_tokens") and name not in known]
+        if unknown:
+            self.send_response(400)
+            self.end_headers()
+            advice = f" Use '{known[0]}' instead." if known else ""
+            self.wfile.write(f'{{"error": {{"message": "Unsupported parameter: \'{unknown[0]}\'.{advice}"}}}}'.encode())
+            return
         self.send_response(503 if kind == "status" else 200)
-        streamed = kind in ("sse", "empty", "error", "long", "hang")
+        streamed = kind not in ("status", "whole", "garbage", "list", "number")
         self.send_header("Content-Type", "text/event-stream" if streamed else "application/json")
         self.end_headers()
         self.wfile.write(answers.get(kind, b"busy <b>now</b>"))
@@ -68,8 +107,10 @@ def address() -> Iterator[str]:
 @pytest.mark.parametrize("kind", ["sse", "whole"])
 def test_it_is_asked_with_the_conversation_and_answers(address, kind):
     partner = Endpoint(f"{address}/{kind}/v1", model="small", key="secret")
-    pieces = list(partner.answer(HISTORY))
-    assert "".join(pieces) == "Good. Bye." and len(pieces) == (2 if kind == "sse" else 1)
+    # The first answer is held back, because only its end tells that it began without thoughts.
+    for count in (1, 2 if kind == "sse" else 1):
+        pieces = list(partner.answer(HISTORY))
+        assert "".join(pieces) == "Good. Bye." and len(pieces) == count
     asked = _Model.asked
     assert asked["path"] == f"/{kind}/v1/chat/completions" and asked["model"] == "small"
     assert asked["messages"][0]["role"] == "system"
@@ -96,6 +137,33 @@ def test_what_is_no_answer_is_said(address, kind, word):
         list(Endpoint(f"{address}/{kind}").answer(HISTORY))
 
 
+@pytest.mark.parametrize("kind", list(STREAMS))
+def test_thoughts_are_no_words(address, kind):
+    partner = Endpoint(f"{address}/{kind}/v1")
+    for _ in range(2):  # the second answer is no longer held back
+        assert "".join(partner.answer(HISTORY)).strip() == "Good. 1 < 2."
+    with pytest.raises(InputError, match="thoughts alone"):
+        list(Endpoint(f"{address}/thoughts/v1").answer(HISTORY))
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"), [("emoji", "Hi \U0001f600!"), ("nulls", "Hi"), ("new_names", "Hi"), ("no_names", "Hi")]
+)
+def test_answers_of_other_servers_are_understood(address, kind, words):
+    partner = Endpoint(f"{address}/{kind}/v1")
+    assert ["".join(partner.answer(HISTORY)) for _ in range(2)] == [words, words]
+    bounds = {"new_names": {"max_completion_tokens"}, "no_names": set()}.get(kind, {"max_tokens"})
+    assert {name for name in _Model.asked if name.endswith("_tokens")} == bounds
+
+
+def test_an_answer_that_breaks_off_keeps_what_came(address):
+    words = []
+    with pytest.raises(InputError, match="breaks off"):
+        words.extend(Endpoint(f"{address}/breaks").answer(HISTORY))
+    with closing(Endpoint(f"{address}/breaks").answer(HISTORY)) as came:
+        assert next(came) == "One. Two"
+
+
 def test_one_that_hangs_is_left(address):
     words = []
     with pytest.raises(InputError, match="silence"):
@@ -106,6 +174,7 @@ def test_one_that_hangs_is_left(address):
 
 def test_a_cancelled_answer_ends_at_once(address):
     partner, ended = Endpoint(f"{address}/hang", silent=900.0), threading.Event()
+    partner._thoughts.opened_before = False  # as after an answer without thoughts: nothing is held back
     first = threading.Event()
 
     def ask() -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from pipelines.chat.answers import RulePartner
 from pipelines.chat.conversation import LONGEST_SENTENCE, sentences
+from pipelines.chat.spoken_answer import MarkdownReader
 
 
 @pytest.mark.parametrize(
@@ -16,11 +17,29 @@ from pipelines.chat.conversation import LONGEST_SENTENCE, sentences
         (['He said "No." Then', " he went"], ['He said "No."', "Then he went"]),
         (["One\ntwo\n\nthree"], ["One", "two", "three"]),
         (["", "  ", "\n"], []),
+        (["Dr. Smith of the U.S. left, e.g. by car. Good."], ["Dr. Smith of the U.S. left, e.g. by car.", "Good."]),
         (["Wait... what?!  Yes"], ["Wait...", "what?!", "Yes"]),
     ],
 )
 def test_sentences_come_whole_and_in_order(pieces, expected):
     assert list(sentences(pieces)) == expected
+
+
+@pytest.mark.parametrize(
+    ("lines", "spoken"),
+    [
+        (
+            ["## A *plan*:", "- **Read** [it](https://a.b/c)", "1. `make` __now__", "* * *"],
+            ["A plan:", "Read it", "1. make now", ""],
+        ),
+        (["Run this:", "```bash", "rm -rf *", "```", "Done."], ["Run this:", "", "", "", "Done."]),
+        (["| a | b |", "|---|:-:|", "| 1 | 2 |"], ["a, b", "", "1, 2"]),
+        (["2 * 3 * 4 is snake_case_name, a<br>b", "![a cat](c.png)"], ["2 * 3 * 4 is snake_case_name, a b", "a cat"]),
+    ],
+)
+def test_markup_is_read_as_a_person_would(lines, spoken):
+    reader = MarkdownReader()
+    assert [reader.spoken(line) for line in lines] == spoken
 
 
 def test_a_sentence_comes_as_soon_as_it_is_whole():

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from avatar.speech.pronunciation import MAX_CHARACTERS, check_text, phones_from_word, pronounce, words_from_text
+from avatar.speech.spoken_text import speak_text
 from smplxpp.core.errors import InputError
 
 
@@ -25,13 +29,58 @@ def test_nothing_to_say_and_too_much_is_refused(text, word):
         ("I’m 21, you 0!", "i'm twenty one you zero"),
         ("1999 is 007", "one thousand nine hundred ninety nine is zero zero seven"),
         ("100 300000", "one hundred three hundred thousand"),
-        ("12345678", "one two three four five six seven eight"),
+        ("12345678", "twelve million three hundred forty five thousand six hundred seventy eight"),
+        ("1" * 16, "one " * 16),
         ("Ünder — «mañana»", "under manana"),
-        ("½ ²", "one two two"),
+        ("½ 3²", "a half three squared"),
     ],
 )
 def test_words(text, words):
     assert words_from_text(text) == words.split()
+
+
+@pytest.mark.parametrize(
+    ("text", "spoken"),
+    [
+        ("Pi is 3.14, not .5.", "Pi is three point one four, not point five."),
+        ("It costs $100,000 or €2.50.", "It costs one hundred thousand dollars or two euros and fifty cents."),
+        (
+            "£1.01, $1.5 million, $10-20, 5€",
+            "one pound and one penny, one point five million dollars, ten to twenty dollars, five euros",
+        ),
+        ("-5 degrees, 20°C, 50% off", "minus five degrees, twenty degrees Celsius, fifty percent off"),
+        ("salt & pepper", "salt and pepper"),
+        ("2 + 2 = 4 < 5", "two plus two equals four less than five"),
+        ("the 21st, 2nd and 112th", "the twenty first, second and one hundred twelfth"),
+        (
+            "Dr. Smith met Mr. Jones on Main St. in St. Paul.",
+            "doctor Smith met mister Jones on Main street. in saint Paul.",
+        ),
+        ("At 3:05 p.m. Then at 15:00 or 10am.", "At three oh five p m. Then at fifteen o'clock or ten a m."),
+        ("Nov. 21, 2026", "November twenty first twenty twenty six"),
+        (
+            "2026-11-27 or 12/25/2024",
+            "November twenty seventh twenty twenty six or December twenty fifth twenty twenty four",
+        ),
+        ("In 1999 and the 1990s 2000 left.", "In nineteen ninety nine and the nineteen nineties two thousand left."),
+        ("5 kg at 60 km/h for 1 min", "five kilograms at sixty kilometers per hour for one minute"),
+        ("1/2 cup, 1½ cups, 24/7", "one half cup, one and a half cups, twenty four seven"),
+        ("pages 10-20, No. 5, #7", "pages ten to twenty, number five, number seven"),
+        ("v1.2.3 of me@foo.com", "v one point two point three of me at foo dot com"),
+        ("See https://www.example.com/a-b.", "See example dot com slash a dash b."),
+        ("5'10\" and/or 7-eleven", "five foot ten and or seven-eleven"),
+        ("1,234,567 people", "one million two hundred thirty four thousand five hundred sixty seven people"),
+        ("You may 5 times on May 5", "You may five times on May fifth"),
+    ],
+)
+def test_numbers_signs_and_abbreviations_are_spoken(text, spoken):
+    assert speak_text(text) == spoken
+
+
+@given(st.text(max_size=60))
+def test_no_digit_and_no_sign_of_money_is_left_for_the_voice(text):
+    said = speak_text(text)
+    assert not re.search("[0-9]", said) and said == " ".join(said.split())
 
 
 def test_words_of_the_dictionary_and_others():
