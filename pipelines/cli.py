@@ -201,6 +201,17 @@ def _answer(args: list[str], console: Console) -> int:
         if "--json" in rest:
             sys.stdout.write(json.dumps({"error": _error_fields(error)}, indent=1) + "\n")
         return USER_ERROR
+    except MemoryError as error:
+        # numpy's own words name the size and the shape that did not fit.
+        words = str(error) or "an array"
+        console.print(
+            Text("error: ", style="red")
+            + Text(
+                f"command {name}: expected memory for {words}, received none. Give it a smaller input or a smaller "
+                "--scale, --size, --max-views or --threads where the command has them; all finished stages are kept"
+            )
+        )
+        return USER_ERROR
     except KeyboardInterrupt:
         console.print("interrupted; every finished stage is kept")
         return INTERRUPTED

@@ -164,7 +164,7 @@ class _Reader:
         """Parse the numbers of all frames, and return them with the frame rate."""
         frames_word, _, rest = self._motion.partition("Frame Time:")
         header = frames_word.replace(":", " ").split()
-        if len(header) != 2 or header[0] != "Frames" or not header[1].isdigit() or not rest:
+        if len(header) != 2 or header[0] != "Frames" or not (header[1].isascii() and header[1].isdecimal()) or not rest:
             raise self._wrong("Frames: and Frame Time:", " ".join(header)[:40] or "none")
         try:
             # The frame time stands before the motion's numbers, so that it is the first of them.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -14,7 +15,7 @@ from jaxtyping import Float64
 from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, with_valid_frames
+from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, NotedReads, recognise, with_valid_frames
 from smplxpp.body.retarget import Skeleton
 from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.body.smpl_params import FAMILY_NAMES, from_smpl, rests_like_smpl, smpl_skeleton
@@ -329,8 +330,13 @@ def _moved(params: BodyParams, root: Float64[np.ndarray, "T 3"], rotvec: np.ndar
 
 
 def _read_content(content: Any, layout: str, person: int | None, source: str) -> Frames | None:
+    # Readers get records that note what is looked at: what nobody looks at is named.
+    if isinstance(content, Mapping):
+        content = NotedReads(content)
+    elif isinstance(content, list):
+        content = [NotedReads(one) if isinstance(one, Mapping) else one for one in content]
     try:
-        return LAYOUTS[layout].read(content, person)
+        frames = LAYOUTS[layout].read(content, person)
     except InputError as error:
         raise InputError(
             f"{source}: {error.subject}", expected=error.expected, received=error.received, remedy=error.remedy
@@ -342,6 +348,21 @@ def _read_content(content: Any, layout: str, person: int | None, source: str) ->
             received=f"{type(error).__name__}: {error}",
             remedy="see the layouts in `smplxpp params convert --help`",
         ) from error
+    if frames is not None:
+        _warn_of_what_is_left([content] if isinstance(content, NotedReads) else content, layout, source)
+    return frames
+
+
+def _warn_of_what_is_left(records: Any, layout: str, source: str) -> None:
+    """Name the arrays of a file that are not zero and that its layout's reader does not read."""
+    left = sorted({key for one in records if isinstance(one, NotedReads) for key in one.keys_left()})
+    if left:
+        # Files of frames get one text, so that it is shown once.
+        warnings.warn(
+            f"{re.sub(r'[0-9]{4,}', '#', source)}: not read in the layout {layout}: {', '.join(left[:12])}",
+            GeometryWarning,
+            stacklevel=5,
+        )
 
 
 def _content(path: Path) -> Any:

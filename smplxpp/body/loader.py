@@ -12,6 +12,7 @@ import numpy as np
 from smplxpp.body.layout import HAND_WIDTH, JOINT_NAMES
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import as_integer
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 
 _REQUIRED = ("v_template", "f", "shapedirs", "weights", "J_regressor", "kintree_table")
@@ -157,6 +158,12 @@ class _Builder:
     def _optional(self, key: str, shape: tuple[int | None, ...]) -> np.ndarray | None:
         return self._array(key, shape) if key in self.raw else None
 
+    def _count(self, key: str, most: int) -> int:
+        """Return a count of directions that the file states."""
+        value = np.asarray(dense_array(self.raw[key], subject=f"body file {self.path}: {key}"))
+        number = value.item() if value.size == 1 else value.tolist()
+        return as_integer(number, subject=f"body file {self.path}: {key}", least=0, most=most)
+
     def _names(self, key: str, count: int) -> tuple[str, ...] | None:
         if key not in self.raw:
             return None
@@ -174,8 +181,8 @@ class _Builder:
         width = basis.shape[2]
         # The file's own counts, else a body without expressions, else the two conventions of SMPL-X.
         if "num_betas" in self.raw:
-            shape = int(np.asarray(self.raw["num_betas"]))
-            expression = int(np.asarray(self.raw.get("num_expressions", width - shape)))
+            shape = self._count("num_betas", width)
+            expression = self._count("num_expressions", width) if "num_expressions" in self.raw else width - shape
         elif joint_count != max(JOINT_NAMES):
             shape, expression = width, 0
         elif width >= 400:

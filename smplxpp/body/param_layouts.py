@@ -35,6 +35,11 @@ _EASYMOCAP_FAMILIES: dict[int, Family] = {
     156: "smplh",
     165: "smplx",
 }
+# Parts of `poses` that AMASS writes a second time, under names of their own, and what fits write of the posed body,
+# which follows from the parameters.
+_COPIES = frozenset({"root_orient", "pose_body", "pose_hand", "pose_jaw", "pose_eye", "full_pose"}) | frozenset(
+    {"joints", "Jtr", "joints_3d", "vertices", "verts", "faces"}
+)
 _SMPL_SHAPE, _SMPL_PLACE = ("betas", "shape", "shapes", "beta"), ("trans", "transl", "translation")
 OPEN_BODY = "open_body"
 """What a file states as its `body` whose parameters are of the open body."""
@@ -82,6 +87,40 @@ def with_valid_frames(content: Any) -> tuple[Any, list[int]]:
     return {**content, **{name: value[held] for name, value in arrays.items()}}, np.flatnonzero(~valid).tolist()
 
 
+class NotedReads(dict[str, Any]):
+    """A record of a file that notes which of its entries a reader looked at, so that the others can be named."""
+
+    def __init__(self, record: Mapping[str, Any]) -> None:
+        super().__init__({str(key): value for key, value in record.items()})
+        self._read: set[str] = set()
+
+    def __getitem__(self, key: str) -> Any:
+        self._read.add(key)
+        return super().__getitem__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return an entry, as `dict.get` does."""
+        self._read.add(key)
+        return super().get(key, default)
+
+    def keys_left(self) -> list[str]:
+        """Return the names of arrays that no reader looked at and that are not zero, without copies of the poses."""
+        left: list[str] = []
+        # Of another person in the file only the id was looked at.
+        if not self._read - {"id"}:
+            return left
+        for key in self.keys() - self._read - _COPIES:
+            value = super().__getitem__(key)
+            try:
+                array = np.asarray(value)
+            except ValueError:  # a ragged list is no array
+                continue
+            # Single numbers describe the file (a count, a duration); arrays describe the person or the motion.
+            if array.dtype.kind in "iuf" and array.size > 1 and array.any():
+                left.append(key)
+        return sorted(left)
+
+
 @dataclass(frozen=True)
 class Layout:
     """A layout of body parameters with its reader.
@@ -97,9 +136,14 @@ class Layout:
     read: Callable[[Any, int | None], Frames | None]
 
 
-def _read_smplx(content: Mapping[str, Any], person: int | None) -> Frames:
-    """SMPL-X names: our own files, per-frame files, 4D-Dress; also SMPL's, whose body pose has two joints more."""
+def _read_smplx(content: Mapping[str, Any], person: int | None, *, complete_hands: bool | None = None) -> Frames:
+    """SMPL-X names: our own files, per-frame files, 4D-Dress; also SMPL's, whose body pose has two joints more.
+
+    `complete_hands` holds where the file does not state `flat_hand_mean`.
+    """
     values = {name: _flat_joints(name, content[name]) for name in ARRAY_NAMES if name in content}
+    if "expressions" in content:
+        values.setdefault("expression", np.asarray(content["expressions"]))
     family: Family | None = None
     body_pose = np.asarray(content["body_pose"])
     if body_pose.shape[-1] == 69 or body_pose.shape[-2:] == (23, 3) or body_pose.shape[-3:] == (23, 3, 3):
@@ -108,13 +152,15 @@ def _read_smplx(content: Mapping[str, Any], person: int | None) -> Frames:
         values["body_pose"] = _flat_joints("body_pose", joints[:, :21])
         family = "smpl"
     extras = {name: content[name] for name in ("fps", "flat_hand_mean", "v_shape") if content.get(name) is not None}
+    if complete_hands is not None:
+        extras.setdefault("flat_hand_mean", complete_hands)
     up = _text(content, "up", "up_axis")
     return Frames(BodyParams.from_mapping(values | extras), family=_family(content, family), up=up)
 
 
 def _read_avatarrex(content: Mapping[str, Any], person: int | None) -> Frames:
     """AvatarReX, THuman4: SMPL-X names, one row of betas, no eyes, hands without the mean hand."""
-    return _read_smplx({**content, "flat_hand_mean": content.get("flat_hand_mean", True)}, person)
+    return _read_smplx(content, person, complete_hands=True)
 
 
 def _read_talkbody4d(content: Mapping[str, Any], person: int | None) -> Frames:
@@ -143,9 +189,12 @@ def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
         )
     rate = content.get("mocap_framerate", content.get("mocap_frame_rate", content.get("fps")))
     blocks = _split(_without_smpl_hands(poses, "poses"), face_first=True)
+    # Speech motion (BEAT2, EMAGE) is AMASS with a row of expression coefficients for each frame.
+    face = next((content[key] for key in ("expression", "expressions") if key in content), None)
     params = BodyParams.from_mapping(
         {**blocks, "betas": content["betas"], "transl": content["trans"], "flat_hand_mean": True}
         | ({} if rate is None else {"fps": rate})
+        | ({} if face is None else {"expression": face})
     )
     up = _text(content, "up", "up_axis")
     return Frames(params, family=_family(content, family), up=up or (None if family == "smpl" else "z"))
@@ -219,8 +268,9 @@ def _read_easymocap(content: Any, person: int | None) -> Frames | None:
     blocks = _split(_easymocap_poses(poses), face_first=full)
     for name, key in (("left_hand_pose", "handl"), ("right_hand_pose", "handr")):
         # Its models take complete poses as they are, whatever else the record has.
-        if key in record and not full:
-            blocks[name] = record[key]
+        hand = record.get(key)
+        if hand is not None and not full:
+            blocks[name] = hand
     values = {**blocks, "betas": record["shapes"], "transl": np.zeros(3), "flat_hand_mean": full}
     if "expression" in record:
         values["expression"] = record["expression"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ from jaxtyping import Float32, UInt8
 
 from smplxpp.capture.distortion import Distortion, undistort
 from smplxpp.capture.window import Window
-from smplxpp.core import Camera, InputError
+from smplxpp.core import Camera, GeometryWarning, InputError
 from smplxpp.core.files.array_file import read_array
 from smplxpp.core.files.image_file import open_image
 
@@ -28,14 +29,64 @@ def read_color(path: Path) -> Image:
 
 
 def read_alpha(path: Path) -> Image:
-    """Read an 8-bit mask ("L"): the alpha channel if the file has one (mattes, cut-outs), else its brightness."""
+    """Read an 8-bit mask ("L") by the meaning of its values.
+
+    The first that holds:
+
+    * an alpha channel, or a palette with a transparent colour (mattes, cut-outs), is the opacity, unless it is opaque
+      everywhere above a picture of pure black and white, which is the mask then;
+    * colours, of a palette or of pixels, are parts of a person on black: what is not black is the person;
+    * values of at most 63 of 255 are ids (0 and 1, or numbers of parts), which no matte of a person has for its
+      largest value: what is not 0 is the person, as the readers of such data sets take it;
+    * else the brightness is the opacity, of 16 bits or of floats from 0 to 1, too.
+
+    Warns:
+        GeometryWarning: ids or colours that are taken for the person, once for a folder.
+    """
     image = open_image(path, remedy=_REMEDY)
-    if image.mode in ("RGBA", "LA", "PA"):
-        return image.getchannel("A")
-    if image.mode.startswith("I"):
+    if image.mode == "P" and "transparency" in image.info:
+        image = image.convert("RGBA")
+    if image.mode in ("RGBA", "LA", "PA", "La", "RGBa"):
+        alpha, below = image.getchannel("A" if "A" in image.getbands() else "a"), image.convert("L")
+        # A black and white picture with a channel that is opaque everywhere: a program added the channel on saving.
+        black_and_white = alpha.getextrema() == (255, 255) and sum(below.histogram()[1:255]) == 0
+        return below if black_and_white and below.getextrema() == (0, 255) else alpha
+    if image.mode == "P" or image.mode in ("RGB", "CMYK", "YCbCr", "LAB", "HSV"):
+        color = np.asarray(image.convert("RGB"))
+        # Compression tints grey by a few values; colours of parts differ by far more.
+        if (np.ptp(color, axis=2) > 48).mean() > 1e-3:
+            _warn_of_ids(path, "colours")
+            return _from_array(np.where(color.max(axis=2) > 16, 255, 0).astype(np.uint8))
+        image = image.convert("L")
+    values = np.asarray(image)
+    if values.dtype == bool:
+        return image.convert("L")
+    largest = float(values.max(initial=0))
+    if values.dtype.kind == "f":
+        values = values * (255.0 if largest <= 1.0 else 1.0)
+    elif 0 < largest <= _LARGEST_ID:
+        _warn_of_ids(path, f"values of at most {largest:.0f}")
+        values = np.where(values > 0, 255, 0)
+    elif image.mode.startswith("I") and largest > 255:
         # 16-bit grey; Pillow's own conversion would clip.
-        return _from_array((np.asarray(image, dtype=np.float64) / 257.0 + 0.5).astype(np.uint8))
-    return image if image.mode == "L" else image.convert("L")
+        values = values / 257.0
+    return image if image.mode == "L" and values.max(initial=0) == largest else _from_array(_as_bytes(values))
+
+
+# Data sets of human parsing know 18 (ATR) to 28 (Sapiens) parts; the mattes of a person reach 255.
+_LARGEST_ID = 63
+
+
+def _as_bytes(values: np.ndarray) -> UInt8[np.ndarray, "H W"]:
+    return np.clip(values.astype(np.float64) + 0.5, 0, 255).astype(np.uint8)
+
+
+def _warn_of_ids(path: Path, what: str) -> None:
+    warnings.warn(
+        f"masks in {path.parent}: {what} are no opacities; all that is not black is taken for the person",
+        GeometryWarning,
+        stacklevel=3,
+    )
 
 
 def read_labels(path: Path) -> Image:
@@ -59,12 +110,19 @@ def read_normals(path: Path) -> tuple[Image, bool]:
 
 
 def check_size(image: Image, path: Path, size: tuple[int, int], *, of: str) -> Image:
-    """Return the image if it has the expected width and height.
+    """Return the image if it has the expected width and height, its pixels as stored.
+
+    Where only the picture that its EXIF orientation describes has that size, a quarter turn away, it is turned: then
+    the calibration was made on pictures that a reader such as OpenCV's had turned.
 
     Raises:
         InputError: another size than expected.
     """
     if image.size != size:
+        if image.size == size[::-1] and image.info.get("orientation", 1) >= 5:
+            from PIL import ImageOps
+
+            return ImageOps.exif_transpose(image)
         raise InputError(
             f"file {path}",
             expected=f"{size[0]} x {size[1]} pixels, {of}",

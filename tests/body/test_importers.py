@@ -382,3 +382,26 @@ def test_frames_without_a_pose_are_told_where_that_is_asked_for(params, tmp_path
 def test_the_capture_s_frames_equal_its_stacked_file(captures):
     folder = captures / "woman_casual" / "params"
     assert_same(load_params(folder), load_params(folder / "params.npz"))
+
+
+@pytest.mark.parametrize("name", ["expression", "expressions"])
+def test_speech_motion_beside_amass_keys_keeps_its_face(tmp_path, name):
+    rows, rng = 4, np.random.default_rng(0)
+    face = rng.normal(size=(rows, 10)).astype(np.float32)
+    poses = rng.normal(0, 0.1, (rows, 165))
+    place = np.zeros((rows, 3))
+    np.savez(tmp_path / "a.npz", poses=poses, trans=place, betas=np.zeros(10), mocap_frame_rate=30, **{name: face})
+    np.testing.assert_array_equal(load_params(tmp_path / "a.npz", whose="body", up="y").expression, face)
+
+
+def test_arrays_that_nobody_reads_are_named_once(tmp_path):
+    rows = 3
+    poses, place = np.zeros((rows, 165)), np.zeros((rows, 3))
+    content = dict(poses=poses, trans=place, betas=np.zeros(10), mocap_frame_rate=30, dmpls=np.zeros((rows, 8)))
+    # What is zero moves nothing, a copy of the poses says nothing new, a single number describes the file.
+    np.savez(tmp_path / "a.npz", **content, pose_body=np.ones((rows, 63)), mocap_time_length=4.0)
+    load_params(tmp_path / "a.npz", whose="body", up="y")
+    np.savez(tmp_path / "b.npz", **content | {"dmpls": np.ones((rows, 8)), "soft": np.ones(4)})
+    with pytest.warns(GeometryWarning, match=r"not read in the layout amass: dmpls, soft$") as found:
+        load_params(tmp_path / "b.npz", whose="body", up="y")
+    assert len(found) == 1

@@ -139,6 +139,14 @@ def test_a_wrong_array_is_named_with_its_file(tmp_path, key, change, message):
     assert re.search(message, str(error.value))
 
 
+@pytest.mark.parametrize("key", ["num_betas", "num_expressions"])
+@pytest.mark.parametrize("value", [np.nan, 1e300, 3.7, -5, 10**6, "ten", [1, 2], b"\0", True])
+def test_counts_that_are_none_are_named(tmp_path, key, value):
+    path = write(tmp_path / "body.npz", small_model(55) | {"num_betas": 10, "num_expressions": 10} | {key: value})
+    with pytest.raises(InputError, match=rf"body\.npz: {key}.*whole number"):
+        load_body(path)
+
+
 def test_files_that_are_no_bodies(tmp_path):
     params = tmp_path / "params.npz"
     BodyParams.rest().save(params)

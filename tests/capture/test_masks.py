@@ -12,7 +12,10 @@ from PIL import Image
 
 from pipelines.cli import main
 from smplxpp.capture import open_capture
+from smplxpp.capture.views import check_size, read_alpha, read_color
+from smplxpp.core import GeometryWarning
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.image_file import image_orientation
 from tests.capture.scene import make_scene
 from tests.capture.writers import write_simple
 
@@ -47,6 +50,81 @@ def test_mattes_are_matched_to_images_by_name(rig, tmp_path, pattern, cut_out):
         np.testing.assert_array_equal(capture.mask(camera, frame), mask)
 
 
+def _stored(kind: str, mask: np.ndarray) -> Image.Image:
+    """A matte of 0 and 255 as other programs store it."""
+    inside = mask > 127
+    ids = inside * (1 + np.arange(mask.shape[1]) % 19)
+    if kind == "16 bits":
+        return Image.fromarray(mask.astype(np.uint16) * 257)
+    if kind == "8 bits in 16":
+        return Image.fromarray(mask.astype(np.uint16))
+    if kind == "floats":
+        return Image.fromarray(mask.astype(np.float32) / 255)
+    if kind == "one bit":
+        return Image.fromarray(inside)
+    if kind == "opaque channel":
+        return Image.fromarray(np.dstack([mask, mask, mask, np.full_like(mask, 255)]))
+    if kind == "transparent palette":
+        image = Image.fromarray(inside.astype(np.uint8)).convert("P")
+        image.putpalette([200, 10, 10] * 256)
+        image.info["transparency"] = bytes([0, 255])
+        return image
+    if kind == "zero and one":
+        return Image.fromarray(inside.astype(np.uint8))
+    if kind == "ids of parts":
+        return Image.fromarray(ids.astype(np.uint8))
+    if kind == "ids in 16 bits":
+        return Image.fromarray(ids.astype(np.uint16))
+    palette = np.random.default_rng(0).integers(40, 255, (256, 3), dtype=np.uint8)
+    palette[0] = 0
+    if kind == "parts in a palette":
+        image = Image.fromarray(ids.astype(np.uint8), mode="P")
+        image.putpalette(palette.tobytes())
+        return image
+    assert kind == "parts in colours"
+    return Image.fromarray(palette[ids])
+
+
+PLAIN = ("16 bits", "8 bits in 16", "floats", "one bit", "opaque channel", "transparent palette")
+IDS = ("zero and one", "ids of parts", "ids in 16 bits", "parts in a palette", "parts in colours")
+
+
+@pytest.mark.parametrize("kind", [*PLAIN, *IDS])
+def test_masks_are_read_by_the_meaning_of_their_values(tmp_path, kind):
+    rng = np.random.default_rng(1)
+    mask = np.where(rng.random((24, 32)) > 0.6, 255, 0).astype(np.uint8)
+    path = tmp_path / ("mask.tif" if kind == "floats" else "mask.png")
+    image = _stored(kind, mask)
+    image.save(path, **({"transparency": image.info["transparency"]} if "transparency" in image.info else {}))
+    if kind in IDS:
+        with pytest.warns(GeometryWarning, match=r"no opacities; all that is not black is taken for the person"):
+            found = read_alpha(path)
+    else:
+        found = read_alpha(path)
+    assert found.mode == "L"
+    np.testing.assert_array_equal(np.asarray(found), mask)
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+def test_a_quarter_turn_is_made_where_the_calibration_asks_for_it(tmp_path, orientation):
+    """Half a turn keeps the size, so that nothing tells what the calibration was made on: pixels stay as stored."""
+    pixels = np.random.default_rng(2).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "a.png"
+    Image.fromarray(pixels).save(path, exif=exif)
+    assert image_orientation(path) == orientation
+    stored = check_size(read_color(path), path, (30, 20), of="the size")
+    np.testing.assert_array_equal(np.asarray(stored), pixels)
+    turned = {6: -1, 8: 1}.get(orientation)
+    if turned is None:
+        with pytest.raises(InputError, match="expected 20 x 30 pixels"):
+            check_size(read_color(path), path, (20, 30), of="the size")
+    else:
+        found = check_size(read_color(path), path, (20, 30), of="the size")
+        np.testing.assert_array_equal(np.asarray(found), np.rot90(pixels, turned))
+
+
 def test_a_camera_whose_name_begins_another_keeps_its_own_mattes(tmp_path):
     scene = make_scene(names=("Cam1", "Cam10", "Cam2"))
     rig = write_simple(scene, tmp_path / "rig")
@@ -60,9 +138,9 @@ def test_a_camera_whose_name_begins_another_keeps_its_own_mattes(tmp_path):
 
 def test_masks_given_replace_those_of_the_capture(rig, tmp_path):
     (tmp_path / "mattes/A").mkdir(parents=True)
-    Image.new("L", (192, 256), 7).save(tmp_path / "mattes/A/000000.png")
+    Image.new("L", (192, 256), 207).save(tmp_path / "mattes/A/000000.png")
     capture = open_capture(rig, masks=tmp_path / "mattes")
-    assert (capture.mask("A", 0) == 7).all()
+    assert (capture.mask("A", 0) == 207).all()
     assert capture.mask("A", 1) is None and capture.mask("B", 0) is None
 
 

@@ -138,6 +138,15 @@ def test_errors_of_the_system_are_words_too(capsys, cube):
     assert "File exists" in fails(capsys, "metrics", cube, cube, "--samples", 50, "--out", cube / "x.csv")
 
 
+def test_memory_that_is_not_there_is_said_in_words(capsys, cube, monkeypatch):
+    def read(path: Path) -> None:
+        raise MemoryError("Unable to allocate 93.1 GiB for an array with shape (50000, 250000)")
+
+    monkeypatch.setattr("pipelines.commands.metrics.read_mesh", read)
+    said = fails(capsys, "metrics", cube, cube)
+    assert "93.1 GiB" in said and "smaller" in said
+
+
 def test_an_error_is_json_when_json_was_asked_for(capsys):
     assert main(["inspect", "nowhere", "--json"]) == 2
     error = json.loads(capsys.readouterr().out)["error"]

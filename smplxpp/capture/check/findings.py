@@ -15,6 +15,12 @@ Area = Literal["files", "splits", "masks", "parameters", "calibration"]
 KINDS: dict[str, tuple[Area, Status, str]] = {
     "file-damaged": ("files", "fail", "copy the file from its source again, or delete it to leave the view out"),
     "file-size": ("files", "fail", "give images, masks and calibration of one resolution"),
+    "image-turned": (
+        "files",
+        "warn",
+        "pixels count as stored; if the calibration was made by a reader that turns (OpenCV), turn the pixels and "
+        "remove the tag: exiftran -ai FILE, or PIL.ImageOps.exif_transpose",
+    ),
     "file-other": ("files", "fail", "correct the file, or delete it"),
     "left-aside": ("files", "warn", "docs/captures.md says what each layout's reader leaves aside, and why"),
     "rig-guessed": (

@@ -14,6 +14,7 @@ from smplxpp.capture import Capture
 from smplxpp.capture.check.findings import Finding, unreadable_finding
 from smplxpp.capture.check.silhouettes import MIN_SHARE, SilhouetteFit, body_silhouette, compare_silhouettes
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.image_file import image_orientation, image_size
 
 OPAQUE = 127
 """Opacity, of 255, above which a pixel of a mask counts as the person."""
@@ -79,6 +80,7 @@ def check_view(
 
     image = opened("image", reader.color)
     alpha = opened("mask", reader.alpha)
+    findings += _turned(capture, camera, frame, image)
     # Labels and normals are decoded for their errors alone.
     opened("label", reader.labels)
     opened("normal", reader.normals)
@@ -107,6 +109,21 @@ def check_view(
             ]
     fit = None if silhouette is None else compare_silhouettes(silhouette, mask)
     return ViewCheck(camera, frame, tuple(findings), float(mask.mean()), fit, plain)
+
+
+def _turned(capture: Capture, camera: str, frame: int, image: np.ndarray | None) -> Iterator[Finding]:
+    """Find images and masks that ask for a turn, by their EXIF orientation, which is not made."""
+    for kind in ("image", "mask"):
+        path = capture.file(camera, frame, kind)
+        if path is None or image is None:
+            continue
+        tag, source = image_orientation(path), capture.reader(camera).camera
+        # A quarter turn that brings the image to the calibration's size is made (`smplxpp.capture.views.check_size`).
+        if tag >= 5 and image_size(path) != (source.width, source.height):
+            continue
+        if tag != 1:
+            words = f"{kind} {path}: EXIF orientation {tag} asks for a turn or a mirroring of the stored pixels"
+            yield Finding("image-turned", words, camera, frame)
 
 
 def _wrong_mask(mask: Bool[np.ndarray, "H W"], silhouette: Bool[np.ndarray, "H W"] | None) -> tuple[str, str] | None:

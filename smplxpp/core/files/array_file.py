@@ -141,9 +141,9 @@ def check_dtype(text: str) -> np.dtype:
     """Return the numpy type of a type string of numbers, bools or texts.
 
     Raises:
-        ValueError: any other type, because objects are stored as pointers, and structures may contain objects.
+        ValueError: any other type, because nothing here has complex values, objects are stored as pointers, and structures may contain objects.
     """
-    match = re.fullmatch(r"([<>|=]?)([biufcSU])(\d{1,5})|(\?)", text)
+    match = re.fullmatch(r"([<>|=]?)([biufSU])(\d{1,5})|(\?)", text)
     if match is None:
         raise ValueError(f"arrays of type {text[:40]!r}")
     try:
@@ -207,10 +207,19 @@ def _read(stream: Any, size: int, subject: str, remedy: str, objects: ObjectRead
         # In chunks of a MiB, because one read of a compressed entry would hold its bytes twice.
         chunk, data = 1 << 20, np.empty(count * dtype.itemsize, dtype=np.uint8)
         for at in range(0, len(data), chunk):
-            piece = stream.read(min(chunk, len(data) - at))
-            data[at : at + chunk] = np.frombuffer(piece, dtype=np.uint8)
+            wanted = min(chunk, len(data) - at)
+            piece = stream.read(wanted)
+            # numpy would repeat a single byte over the whole chunk.
+            if len(piece) != wanted:
+                raise ValueError(f"{at + len(piece)} bytes where the header announces {len(data)}")
+            data[at : at + wanted] = np.frombuffer(piece, dtype=np.uint8)
         if stream.read(1):  # reading to the end also verifies the checksum of an archive's entry
             raise ValueError("more than the array")
+        if dtype.kind == "U":
+            # Python's texts have no code points beyond Unicode's last, nor halves of surrogate pairs.
+            points = data.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+            if ((points > 0x10FFFF) | ((points >= 0xD800) & (points < 0xE000))).any():
+                raise ValueError("texts with code points that are no characters")
         array = data.view(dtype).reshape(shape, order="F" if fortran_order else "C")
         # Native byte order, because compiled kernels take no other.
         return array.astype(dtype.newbyteorder("="), copy=False)

@@ -17,7 +17,9 @@ _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF")
 
 
 def open_image(path: str | Path, *, subject: str = "image file", remedy: str = "") -> Image:
-    """Open and decode an image; `info["raw_mode"]` tells how the file stores its pixels.
+    """Open and decode an image, its pixels as stored.
+
+    `info["raw_mode"]` tells how the file stores its pixels, `info["orientation"]` its EXIF orientation (1 to 8).
 
     Raises:
         InputError: missing, no regular file, no whole image of a known format, or too many pixels.
@@ -44,6 +46,15 @@ def image_mode(path: str | Path, *, subject: str = "image file", remedy: str = "
     return _open(regular_file(path, subject=subject, remedy=remedy), subject, remedy, decode=False).mode
 
 
+def image_orientation(path: str | Path, *, subject: str = "image file", remedy: str = "") -> int:
+    """Return the EXIF orientation that an image states, 1 (as stored) to 8; 1 without one.
+
+    Raises what `image_size` raises.
+    """
+    image = _open(regular_file(path, subject=subject, remedy=remedy), subject, remedy, decode=False)
+    return int(image.info["orientation"])
+
+
 def _open(source: Path | io.BytesIO, subject: str, remedy: str, *, decode: bool) -> Image:
     import PIL.Image
 
@@ -54,6 +65,7 @@ def _open(source: Path | io.BytesIO, subject: str, remedy: str, *, decode: bool)
             if image.width * image.height > max_pixels:
                 raise ValueError(f"{image.width} x {image.height} pixels, more than {max_pixels}")
             image.info["raw_mode"] = str(image.tile[0][3]) if image.tile else ""
+            image.info["orientation"] = _orientation(image)
             if decode:
                 image.load()
             return image
@@ -63,3 +75,12 @@ def _open(source: Path | io.BytesIO, subject: str, remedy: str, *, decode: bool)
         received = str(error)[:300] or type(error).__name__
         subject = f"{subject} {source}" if isinstance(source, Path) else subject
         raise InputError(subject, expected="a whole image", received=received, remedy=remedy) from None
+
+
+def _orientation(image: Image) -> int:
+    """Return tag 0x0112 of an image's EXIF data; 1 where there is none, or none that is defined."""
+    try:
+        stated = image.getexif().get(0x0112, 1)
+    except Exception:  # noqa: BLE001  broken EXIF data do not make the pixels unreadable
+        return 1
+    return stated if isinstance(stated, int) and 1 <= stated <= 8 else 1

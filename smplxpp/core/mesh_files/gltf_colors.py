@@ -97,10 +97,19 @@ def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "
     """Return the decoded image of a texture.
 
     Raises:
-        InputError: a missing file or a damaged image.
+        InputError: a missing file, a damaged image, or pictures of formats alone that are not read (KTX2, AVIF, DDS).
     """
     texture = document.entry("textures", use.get("index"))
-    webp = document.part(document.part(texture, "extensions"), "EXT_texture_webp")
+    extensions = document.part(texture, "extensions")
+    webp = document.part(extensions, "EXT_texture_webp")
+    if "source" not in texture and not webp and extensions:
+        # KHR_texture_basisu (KTX2), EXT_texture_avif, MSFT_texture_dds without a picture for other readers.
+        raise InputError(
+            "texture",
+            expected="a PNG, JPEG or WebP picture",
+            received=f"only the pictures of {', '.join(sorted(map(str, extensions)))}",
+            remedy="export the mesh with PNG or JPEG textures, or with one beside the compressed picture",
+        )
     index = document.number({"source": texture.get("source", webp.get("source"))}, "source")
     return document.pictures.get(index, lambda: _decoded(document, index))
 
@@ -115,6 +124,17 @@ def _decoded(document: GltfDocument, index: int) -> Image:
         data = document.resource(name)
     if data is None:
         raise InputError("picture", expected="a file in the mesh file's folder", received=repr(name[:80]))
+    # A picture of another format may stand in the place of PNG or JPEG, too: its first bytes tell.
+    known = {b"\xabKTX 20\xbb": "KTX2", b"DDS ": "DDS"}
+    kind = next((kind for start, kind in known.items() if data.startswith(start)), "")
+    kind = "AVIF" if data[4:12] in (b"ftypavif", b"ftypavis") else kind
+    if kind:
+        raise InputError(
+            f"picture {name[:80]!r}",
+            expected="PNG, JPEG or WebP",
+            received=kind,
+            remedy="export the mesh with PNG or JPEG textures",
+        )
     return decode_image(data, subject=f"picture {name[:80]!r}")
 
 

@@ -189,6 +189,23 @@ def test_lost_pictures_lose_colours_alone(tmp_path: Path, document, images):
     np.testing.assert_array_equal(raw.faces, FACES)
 
 
+@pytest.mark.parametrize(
+    ("texture", "start", "words"),
+    [
+        ({"extensions": {"KHR_texture_basisu": {"source": 0}}}, b"", "only the pictures of KHR_texture_basisu"),
+        ({"extensions": {"EXT_texture_avif": {"source": 0}}}, b"", "only the pictures of EXT_texture_avif"),
+        ({"source": 0}, b"\xabKTX 20\xbb\r\n", "received KTX2"),
+        ({"source": 0}, b"\0\0\0 ftypavif", "received AVIF"),
+    ],
+)
+def test_pictures_of_other_formats_are_named_with_the_remedy(tmp_path: Path, document, texture, start, words):
+    gltf, _ = document
+    gltf["images"] = [{"uri": "data:;base64," + base64.b64encode(start + bytes(64)).decode()}]
+    gltf["textures"] = [texture]
+    with pytest.warns(GeometryWarning, match=f"{words}.*PNG or JPEG textures"):
+        assert _read(tmp_path, document).vertex_colors is None
+
+
 def test_points_and_lines_are_left_out_and_counted(tmp_path: Path, document):
     document[0]["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}, "mode": 0})
     with pytest.warns(GeometryWarning, match="1 primitives of points or lines"):
