@@ -14,6 +14,7 @@ from pipelines.web.page import PageContent, page_files, single_page, write_page_
 from pipelines.web.server import PageServer
 from smplxpp.core.errors import InputError
 from tests.web.avatars import write_avatar
+from tests.web.chromium import Page, find_chromium
 
 FILES = {"index.html": b"<p>page", "player.js": b"let a", "me.avatar": b"bundle"}
 
@@ -70,6 +71,15 @@ def test_a_folder_keeps_what_else_is_in_it(tmp_path):
     assert sorted(path.name for path in paths) == ["index.html", "me.avatar", "player.js"]
     assert (tmp_path / "mine.txt").read_text() == "kept"
     assert "<title>A &amp; B</title>" in (tmp_path / "index.html").read_text()
+
+
+@pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+def test_a_folder_opened_from_disk_says_what_it_needs(tmp_path):
+    write_page_folder(tmp_path / "site", b"bundle", PageContent(name="A", sound=b"RIFF", lips=b"lips"))
+    with Page(tmp_path / "profile", flags=("--disable-gpu",)) as page:
+        page.go((tmp_path / "site" / "index.html").as_uri())
+        page.until("/opened from disk.*--single-file/.test(document.body.innerText.replace(/\\n/g, ' '))")
+        assert not [one for one in page.errors if "Uncaught" in one]
 
 
 def test_a_single_page_refers_to_nothing_outside():

@@ -53,11 +53,23 @@ function find(kind: "avatar" | "sound" | "lips"): Data | null {
     return bytes;
   }
   const named = document.body.getAttribute(BESIDE + kind);
-  return named ? download(named) : null;
+  if (!named) return null;
+  const bytes = download(named);
+  // Sound and lips are awaited after the avatar, whose own failure would leave theirs without a listener.
+  bytes.catch(() => {});
+  return bytes;
 }
 
 async function download(address: string): Promise<ArrayBuffer> {
-  const reply = await fetch(address);
+  // Browsers refuse pages from disk the files beside them, with an error that does not tell why.
+  if (location.protocol === "file:" && !/^[a-z]+:/i.test(address))
+    throw new Error("This page was opened from disk, where a browser does not let it read the files beside it. " +
+      "Serve its folder (smplxpp web --serve, or python -m http.server), or make one file with smplxpp web --single-file.");
+  const reply = await fetch(address).catch((error: Error) => {
+    const foreign = new URL(address, location.href).origin !== location.origin;
+    throw new Error(`${address}: ${error.message}` +
+      (foreign ? ". Another site must allow it by Access-Control-Allow-Origin (CORS)." : ""));
+  });
   if (!reply.ok) throw new Error(`${address}: the server says ${reply.status} ${reply.statusText}`);
   return reply.arrayBuffer();
 }
