@@ -141,7 +141,8 @@ def check_dtype(text: str) -> np.dtype:
     """Return the numpy type of a type string of numbers, bools or texts.
 
     Raises:
-        ValueError: any other type, because nothing here has complex values, objects are stored as pointers, and structures may contain objects.
+        ValueError: any other type, because nothing here has complex values, objects are stored as pointers, and
+            structures may contain objects.
     """
     match = re.fullmatch(r"([<>|=]?)([biufSU])(\d{1,5})|(\?)", text)
     if match is None:
