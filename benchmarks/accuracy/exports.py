@@ -1,32 +1,154 @@
-"""Measure splats in files of other programs: bytes, and decibels of what foreign readers get.
+"""Measure what the files of a student cost: bundles by reduction, and splats in files of other programs.
 
-    python -m benchmarks exports --source ME.avatar [--frame 3] [--pictures DIR]
-
-Each file is written by `smplxpp export`, read by a program that is not ours (`tests.formats.foreign`) and drawn by our
-rasteriser in three views 640 pixels high. PSNR is over the pixels that the person covers, of the worst view.
+python -m benchmarks exports bundles --run RUN --capture DIR [--frames 6] [--no-store]
+python -m benchmarks exports splats --source ME.avatar [--frame 3] [--pictures DIR]
 """
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import mean
+from typing import Annotated
 
 import numpy as np
+import torch
 import tyro
 from PIL import Image
 
+from avatar.data.sequence import AvatarSequence, MeasuredView
+from avatar.export.bundle import BundleConfig, BundleExtras, write_bundle
 from avatar.formats import Splats
 from avatar.formats.webavatar import typical_pose
+from avatar.losses.image_similarity import psnr_from_mse
+from avatar.metrics.view_quality import view_quality
+from avatar.models.model_file import load_avatar
+from avatar.models.student import Student
+from avatar.rendering.avatar_view import render_view
 from avatar.runtime import AvatarPlayer
 from avatar.runtime.skeleton import skeleton_body
 from avatar.runtime.splatting import Splatter
+from benchmarks.support.results import store_results
 from pipelines.commands.export import Export
 from pipelines.figures import VIEWS, fit_cameras
+from pipelines.runs import layout
 from smplxpp.body import load_params
+from smplxpp.capture import open_capture
+from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.spread import spread
+from smplxpp.template.template import Template
 from tests.formats.foreign import as_world, gsply_splats, pygltflib_splats, usd_splats, webavatar_splats
+
+WAYS = {
+    "exact, float32": BundleConfig(exact=True),
+    "as exported": BundleConfig(),
+    "blend shapes in steps of 0.1 mm, 2/1000": BundleConfig(position_step=1e-4, color_step=2e-3),
+    "blend shapes in steps of 0.4 mm, 8/1000": BundleConfig(position_step=4e-4, color_step=8e-3),
+}
+
+
+@dataclass
+class Row:
+    """Figures of one variant over views, by kind."""
+
+    psnr: dict[str, list[float]] = field(default_factory=dict)
+    near: list[float] = field(default_factory=list)
+
+    def add(self, kind: str, psnr: float, mse: float | None = None) -> None:
+        self.psnr.setdefault(kind, []).append(psnr)
+        if mse is not None:
+            self.near.append(psnr_from_mse(mse))
+
+
+@dataclass(frozen=True)
+class BundleBenchmark:
+    """Measure what the size of a bundle costs: megabytes and decibels of held-out views, by reduction.
+
+    Each row is a student drawn in the same held-out views: by torch from the full file, and by the runtime from
+    bundles of coarser and coarser numbers. `psnr` is that of the person against the photographs, `lost` what the full
+    student has more, `worst view` the largest loss of any single view, `to the full student` the least PSNR of a
+    picture against the torch student's. Loose clothes are where the field has them.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Trained run."""
+    capture: Path
+    """Folder of its capture."""
+    frames: int = 6
+    """Frames of each kind whose held-out views are measured."""
+    store: bool = True
+    """Store the figures."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        template = Template.load(self.run_folder / layout.TEMPLATE)
+        sequence = AvatarSequence(open_capture(self.capture), template)
+        student = load_avatar(self.run_folder / layout.STUDENT, sequence.rig)
+        assert isinstance(student, Student)
+        garments = self.run_folder / layout.GARMENTS
+        extras = BundleExtras(
+            name="benchmark", garments=load_garments(garments, template) if garments.is_file() else ()
+        )
+        # Write a bundle of each precision, and open it as a player would: figures are of the file, not of the arrays.
+        figures: dict[str, dict[str, float]] = {}
+        with tempfile.TemporaryDirectory() as folder:
+            players = {}
+            for name, config in WAYS.items():
+                sizes = write_bundle(Path(folder) / "a.avatar", student, extras, config)
+                figures[name] = {"megabytes": sizes["total"] / 1e6}
+                figures[name] |= {f"{part} kB": size / 1e3 for part, size in sizes.items() if part != "total"}
+                players[name] = AvatarPlayer(Path(folder) / "a.avatar", threads=1)
+        rows = {name: Row() for name in ("full student, torch", *WAYS)}
+        for item in sequence.measured_views(self.frames):
+            measure(rows, student, players, sequence, item)
+        # All are compared with photographs, and the bundles also with the full student, whose error they share.
+        full = rows["full student, torch"].psnr
+        stored = (self.run_folder / layout.COMPACT_STUDENT).stat().st_size
+        out = {"full student, torch": {"megabytes": stored / 1e6, **_means(full, full)}}
+        for name in WAYS:
+            out[name] = {**figures[name], **_means(rows[name].psnr, full), "to the full student": min(rows[name].near)}
+        print(json.dumps(out, indent=1))
+        if self.store:
+            command = f"python -m benchmarks exports bundles --run {self.run_folder.name} --capture {self.capture.name}"
+            store_results(f"bundle_{self.capture.name}", f"{command} --frames {self.frames}", out)
+
+
+def _means(psnr: dict[str, list[float]], full: dict[str, list[float]]) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for kind, values in psnr.items():
+        losses = [a - b for a, b in zip(full[kind], values, strict=True)]
+        words = kind.replace("_", " ")
+        out |= {f"{words}, psnr": mean(values), f"{words}, lost": mean(losses), f"{words}, worst view": max(losses)}
+        out[f"{words}, images"] = len(values)
+    return out
+
+
+@torch.no_grad()
+def measure(
+    rows: dict[str, Row],
+    student: Student,
+    players: dict[str, AvatarPlayer],
+    sequence: AvatarSequence,
+    item: MeasuredView,
+) -> None:
+    """Draw a view all ways."""
+    frame = item.frame if item.kind == "novel_view" else None
+    background = sequence.background
+    params, camera = sequence.params(item.frame), item.view.camera
+    posed = student(sequence.rig.pose(params, frame=frame), item.view.position[None])
+    rendering = render_view(posed, 0, item.view, background)
+    quality = view_quality(item.view, rendering.image, rendering.alpha, background, head=None)
+    rows["full student, torch"].add(item.kind, quality.psnr)
+    behind = tuple(background.tolist())
+    for name, player in players.items():
+        player.pose(params, frame=frame)
+        image, alpha = (torch.from_numpy(one) for one in player.draw(camera, background=behind))
+        psnr = view_quality(item.view, image, alpha, background, head=None).psnr
+        rows[name].add(item.kind, psnr, float((image.clamp(0, 1) - rendering.image.clamp(0, 1)).square().mean()))
+
 
 READERS: dict[str, Callable[[Path], Splats]] = {
     "a.ply": gsply_splats,
@@ -41,7 +163,12 @@ _WHITE = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class ExportsBenchmark:
-    """Measure all formats of splats."""
+    """Measure splats in files of other programs: bytes, and decibels of what foreign readers get.
+
+    Each file is written by `smplxpp export`, read by a program that is not ours (`tests.formats.foreign`) and drawn
+    by our rasteriser in three views 640 pixels high. PSNR is over the pixels that the person covers, of the worst
+    view.
+    """
 
     source: Path
     """Bundle of an avatar."""
@@ -100,4 +227,4 @@ def _psnr(image: np.ndarray, other: np.ndarray, alpha: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(ExportsBenchmark).run()
+    tyro.extras.subcommand_cli_from_dict({"bundles": BundleBenchmark, "splats": ExportsBenchmark}).run()

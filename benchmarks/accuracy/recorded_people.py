@@ -27,7 +27,7 @@ from avatar.speech.forced_alignment import align, load_recogniser, recognised_wo
 from avatar.speech.lips import LipNetwork, recognise_phonemes
 from avatar.speech.phonemes import CONSONANTS, VOWELS
 from avatar.speech.pronunciation import words_from_text
-from benchmarks.accuracy.given_texts import Taken
+from benchmarks.accuracy.aligner_gates import Taken
 from benchmarks.accuracy.live_lips import measure
 from benchmarks.accuracy.talking import closures_apart, milliseconds, shares, starts_apart, visemes_apart
 from benchmarks.support.results import store_results

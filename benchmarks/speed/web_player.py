@@ -1,13 +1,7 @@
-"""Time the page's WebAssembly kernels beside the native ones, and both renderers of the page.
+"""Time the page's WebAssembly kernels beside the native ones, by part and on one thread and two, and its renderers.
 
-    python -m benchmarks web_player --run RUN [--before MODULES] [--repeats 20] [--no-store]
-
-Milliseconds by part, the least of all poses: of the processor's time on one thread for the native kernels
-(`avatar.runtime`) and for the same C++ as WebAssembly in Node, which other work on the machine disturbs little, and of
-the clock for pictures in Chromium, which it disturbs much. Rows: the run's own student, and students of the run's sizes
-with Gaussians as they are sampled before any training. `--before` is the modules of the player when it deformed in
-TypeScript: in a checkout of `dfe96b4`, `cd web && npm ci && node build.mjs --tests` makes `web/build/modules.mjs`.
-Needs Node with `web/`'s tools (`npm ci` there), and Chromium for the pictures.
+python -m benchmarks web_player parts --run RUN [--before MODULES] [--repeats 20] [--no-store]
+python -m benchmarks web_player threads --run RUN [--rounds 10] [--no-store]
 """
 
 from __future__ import annotations
@@ -15,11 +9,13 @@ from __future__ import annotations
 import json
 import subprocess
 import tempfile
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
 from avatar.export.bundle import BundleExtras, write_bundle
@@ -28,6 +24,7 @@ from benchmarks.speed.runtime import from_the_front, poses_of, students_of
 from benchmarks.support.results import ROOT, store_results
 from pipelines.runs import layout
 from pipelines.web.page import PageContent, PageLight, single_page
+from pipelines.web.server import PageServer
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core import BodyParams, Camera
 from smplxpp.core.light import STUDIO, Irradiance, Relighting, panoramas
@@ -90,7 +87,15 @@ _PICTURES = """(async () => {
 
 @dataclass(frozen=True)
 class WebPlayerBenchmark:
-    """Time the page's parts."""
+    """Time the page's WebAssembly kernels beside the native ones, and both renderers of the page.
+
+    Milliseconds by part, the least of all poses: of the processor's time on one thread for the native kernels
+    (`avatar.runtime`) and for the same C++ as WebAssembly in Node, which other work on the machine disturbs little,
+    and of the clock for pictures in Chromium, which it disturbs much. Rows: the run's own student, and students of
+    the run's sizes with Gaussians as they are sampled before any training. `--before` is the modules of the player
+    when it deformed in TypeScript: in a checkout of `dfe96b4`, `cd web && npm ci && node build.mjs --tests` makes
+    `web/build/modules.mjs`. Needs Node with `web/`'s tools (`npm ci` there), and Chromium for the pictures.
+    """
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
     """Trained run."""
@@ -127,7 +132,7 @@ class WebPlayerBenchmark:
                     figures |= drawn(path, from_the_front(template), self.pictures)
         print(json.dumps(figures, indent=1))
         if self.store:
-            command = f"python -m benchmarks web_player --run {self.run_folder.name}"
+            command = f"python -m benchmarks web_player parts --run {self.run_folder.name}"
             store_results("web_player", command + (" --before MODULES" if self.before else ""), figures)
 
 
@@ -182,5 +187,135 @@ def drawn(path: Path, camera: Camera, pictures: int) -> dict[str, dict[str, floa
     return out
 
 
+THREADS = (1, 2)
+POSES = 8
+WHOLE = "pose to world"
+_PAGE = """<!doctype html><script>
+const worker = new Worker("worker.js", { type: "module" });
+const reply = () => new Promise((resolve, reject) => {
+  worker.onmessage = ({ data }) => resolve(data);
+  worker.onerror = (event) => reject(new Error(event.message));
+});
+const ready = reply();
+const round = (first) => { const rows = reply(); worker.postMessage(first); return rows; };
+</script>"""
+_WORKER = """
+import * as m from "./modules.js";
+const avatar = await m.readBundle(new Uint8Array(await (await fetch("me.avatar")).arrayBuffer()));
+const clock = () => performance.now(), { frames, framesPerSecond } = avatar.motion;
+const deformers = %s.map((threads) => new m.Deformer(avatar, clock, new m.Native(threads)));
+self.onmessage = ({ data: first }) => {
+  const rows = deformers.map(() => []), seen = [];
+  for (let k = first; k < first + %d; ++k) {
+    const pose = m.poseAt(avatar.motion, (k %% frames) / framesPerSecond);
+    deformers.forEach((deformer, which) => {
+      deformer.pose(pose);
+      const { count } = deformer.order([0, 0, -1, 3.5], 0.01, [], true), start = clock();
+      const records = deformer.recordsFor([0, 1, 3.5], count);
+      rows[which].push({ ...deformer.milliseconds, records: clock() - start });
+      seen[which] = Float32Array.from(records);
+      if (seen[which].some((value, i) => value !== seen[0][i])) throw new Error("threads change numbers");
+    });
+  }
+  self.postMessage({ rows, helped: deformers.map(({ native }) => native.helped) });
+};
+self.postMessage("ready");
+"""
+Row = dict[str, float]
+
+
+@dataclass(frozen=True)
+class WebThreadsBenchmark:
+    """Time a pose in the page and in the native library, on one thread and on two.
+
+    Milliseconds of the clock, by part: the least of all poses, and the median of the whole. One and two threads take
+    turns pose by pose, the native library and Chromium round by round, so that ratios are of one machine in one
+    state; where other work has the cores, a second thread gains nothing. The page is served with isolation headers,
+    and its worker runs the player's own modules, whose threads are workers; records of both numbers of threads are
+    compared, number by number. Rows: the run's own student, and students of the run's sizes with Gaussians as they
+    are sampled before any training. Needs Node with `web/`'s tools (`npm ci` there) and Chromium.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Trained run."""
+    rounds: int = 10
+    """Rounds of eight poses of each."""
+    store: bool = True
+    """Store the figures."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True)
+        figures: dict[str, Row] = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for name, student in students_of(self.run_folder).items():
+                path = Path(folder) / "me.avatar"
+                write_bundle(path, student, BundleExtras(name="benchmark", motion=poses_of(student)))
+                for variant, rows in compare(path, self.rounds).items():
+                    figures[f"{name} Gaussians, {variant}"] = rows
+        print(json.dumps(figures, indent=1))
+        if self.store:
+            command = f"python -m benchmarks web_player threads --run {self.run_folder.name} --rounds {self.rounds}"
+            store_results("web_threads", command, figures)
+
+
+def compare(path: Path, rounds: int) -> dict[str, Row]:
+    """Return milliseconds of a bundle's poses by variant and number of threads, and how many times as fast two are."""
+    files = {
+        "index.html": _PAGE.encode(),
+        "worker.js": (_WORKER % (json.dumps(THREADS), POSES)).encode(),
+        "modules.js": (WEB / "build" / "modules.mjs").read_bytes(),
+        "me.avatar": path.read_bytes(),
+    }
+    players = [AvatarPlayer(path, threads=threads, clock=time.perf_counter) for threads in THREADS]
+    found: dict[str, list[list[Row]]] = {variant: [[] for _ in THREADS] for variant in ("native", "WebAssembly")}
+    with (
+        PageServer(files) as server,
+        tempfile.TemporaryDirectory() as folder,
+        Page(Path(folder) / "profile") as page,
+    ):
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page.send("Page.navigate", url=server.address)
+        page.evaluate(_WAIT)
+        for k in range(rounds):
+            for rows, more in zip(found["native"], native_poses(players, POSES * k), strict=True):
+                rows += more
+            reported = json.loads(page.evaluate(f"round({POSES * k}).then(JSON.stringify)"))
+            for rows, more in zip(found["WebAssembly"], reported["rows"], strict=True):
+                rows += more
+        assert reported["helped"][1] > 0, "no second thread took part"
+        server.shutdown()
+    out: dict[str, Row] = {}
+    for variant, by_threads in found.items():
+        one, two = (summary(rows) for rows in by_threads)
+        out |= {f"{variant}, 1 thread": one, f"{variant}, 2 threads": two}
+        out[f"{variant}, times as fast"] = {part: one[part] / two[part] for part in one}
+    return out
+
+
+_WAIT = """new Promise((done) => {
+  const look = () => typeof ready === "undefined" ? setTimeout(look, 50) : done(ready);
+  look();
+})"""
+
+
+def native_poses(players: list[AvatarPlayer], first: int) -> list[list[Row]]:
+    """Return milliseconds of some poses, a list a player; the players take turns."""
+    rows: list[list[Row]] = [[] for _ in players]
+    for k in range(first, first + POSES):
+        for player, own in zip(players, rows, strict=True):
+            assert player.motion is not None
+            player.pose(player.motion.frame(k % len(player.motion)))
+            own.append({part: 1e3 * player.seconds[part] for part in PARTS})
+    return rows
+
+
+def summary(rows: list[Row]) -> Row:
+    """Return the least of each part and of the whole, and the median of the whole."""
+    whole = [sum(row[part] for part in PARTS) for row in rows]
+    least = {part: min(row[part] for row in rows) for part in rows[0]}
+    return {**least, WHOLE: min(whole), f"{WHOLE}, median": float(np.median(whole))}
+
+
 if __name__ == "__main__":
-    tyro.cli(WebPlayerBenchmark).run()
+    tyro.extras.subcommand_cli_from_dict({"parts": WebPlayerBenchmark, "threads": WebThreadsBenchmark}).run()

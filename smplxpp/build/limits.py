@@ -1,6 +1,6 @@
 """Limits of what a build measures, each defined once.
 
-Comments give the values of good and bad cases in the benchmark `nasty_scans` or on the captures, from which the two
+Comments give the values of good and bad cases in the benchmark `damaged_inputs` or on the captures, from which the two
 limits (warn, fail) were chosen: above all good cases, below the bad ones as far as they separate.
 """
 

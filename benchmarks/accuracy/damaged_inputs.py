@@ -1,9 +1,7 @@
-"""Build damaged, noisy, huge and mislabelled variants of the fixture's scan, and list the warnings of each build.
+"""Give damaged inputs: scans to builds, whose warnings are listed, and mutated files to every reader.
 
-    python -m benchmarks nasty_scans [--names whole mirrored ...]
-
-Each build is a process of its own, with exact parameters. Whole scans, and those with holes as scanners leave them, are
-to build without a warning that is not about what was done to them; the others are to be told.
+python -m benchmarks damaged_inputs scans [--names whole mirrored ...]
+python -m benchmarks damaged_inputs files [--inputs 100000] [--door capture]
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +24,9 @@ from benchmarks.support.results import FIXTURE, RESULTS, store_results
 from smplxpp.body import load_body, load_params
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from tests.fuzz.campaign import campaign
+from tests.fuzz.doors import doors
+from tests.fuzz.examine import CLEAN, OUTCOMES, READ, Findings
 
 SHOWN = 3
 
@@ -137,7 +139,11 @@ def variants(scan: Scan, joints: dict[str, np.ndarray]) -> dict[str, Callable[[]
 
 @dataclass(frozen=True)
 class NastyScans:
-    """Build variants of the fixture's scan and store what each build says."""
+    """Build damaged, noisy, huge and mislabelled variants of the fixture's scan, and list the warnings of each build.
+
+    Each build is a process of its own, with exact parameters. Whole scans, and those with holes as scanners leave
+    them, are to build without a warning that is not about what was done to them; the others are to be told.
+    """
 
     names: tuple[str, ...] = ()
     """Variants to build; by default all. The others keep what is stored of them."""
@@ -152,7 +158,7 @@ class NastyScans:
         stored = RESULTS / "nasty_scans.json"
         if self.names and stored.is_file():
             figures = json.loads(stored.read_text())["figures"] | figures
-        store_results("nasty_scans", "python -m benchmarks nasty_scans", figures)
+        store_results("nasty_scans", "python -m benchmarks damaged_inputs scans", figures)
 
 
 def _fixture() -> tuple[Scan, dict[str, np.ndarray]]:
@@ -200,5 +206,46 @@ def _verdict(scan: Scan) -> dict[str, object]:
         }
 
 
+@dataclass(frozen=True)
+class DamagedFiles:
+    """Send mutations of every kind of file through its reader, and count crashes, hangs and unclear errors.
+
+    A mutation is of bytes, of a text's tokens, of a structure's values, or of the file itself (a folder, a pipe or a
+    device in its place). Each is to be read, as what it then says, or refused with an error that says what is wrong;
+    one input may take 4 GiB of memory and a minute.
+
+    Attributes:
+        inputs: how many a door.
+        first: the first seed; the same seed is the same input.
+        door: doors alone whose names contain this.
+        jobs: doors at once.
+    """
+
+    inputs: int = 1000
+    first: int = 0
+    door: str = ""
+    jobs: int = 2
+
+    def run(self) -> bool:
+        """Print a line a door, with the place of what is neither read nor refused; true where there is nothing so."""
+        names = [name for name in doors() if self.door in name]
+        table: dict[str, dict[str, int]] = {}
+        with ThreadPoolExecutor(self.jobs) as pool:
+            for name, findings in zip(names, pool.map(self._tried, names), strict=True):
+                table[name] = {"inputs": self.inputs, **{outcome: findings.counts[outcome] for outcome in OUTCOMES}}
+                print(f"{name:24}", dict(findings.counts), flush=True)
+                for what, text in findings.examples.items():
+                    print(f"    {what}: {text.splitlines()[0]}")
+        total = {key: sum(row[key] for row in table.values()) for key in ("inputs", *OUTCOMES)}
+        if not self.door:
+            command = f"python -m benchmarks damaged_inputs files --inputs {self.inputs} --first {self.first}"
+            store_results("damaged_files", command, {**table, "all": total})
+        return total["inputs"] == total[READ] + total[CLEAN]
+
+    def _tried(self, name: str) -> Findings:
+        return campaign(name, self.inputs, first=self.first)
+
+
 if __name__ == "__main__":
-    tyro.cli(NastyScans, prog="python -m benchmarks nasty_scans").run()
+    ran = tyro.extras.subcommand_cli_from_dict({"scans": NastyScans, "files": DamagedFiles}).run()
+    sys.exit(1 if ran is False else 0)

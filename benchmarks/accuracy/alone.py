@@ -1,12 +1,9 @@
-"""Drive a template built from a bare scan, beside one built with true parameters and labels.
+"""Measure what photographs alone or a bare scan give: each step of a run against the truth, and the template driven.
 
-    python -m benchmarks driving_alone --captures DIR [--keep DIR] [--names woman_casual ...]
-
-Each capture's scan is built three times: alone (units, body and labels found), with exact parameters and labels found,
-and with exact parameters and true labels. Every visible vertex of a template is driven twice: by its template, in hard
-poses on the identity that it has, and by the authored weights of the true surface that it lies nearest to, on the true
-identity. The distance between the two is the error, mm. Where a template and the truth differ in the reference pose
-already (a label that is wrong, a body of another shape), the error says it.
+smplxpp build RUN --capture PHOTOGRAPHS; smplxpp train RUN --capture PHOTOGRAPHS --preset cpu
+smplxpp evaluate RUN --capture PHOTOGRAPHS
+python -m benchmarks alone photographs --run RUN --truth CAPTURE [--name NAME]
+python -m benchmarks alone driven --captures DIR [--keep DIR] [--names woman_casual ...]
 """
 
 from __future__ import annotations
@@ -14,28 +11,141 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import igl
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
+from scipy.spatial import cKDTree
 
+from benchmarks.accuracy.registration import bare_and_under
+from benchmarks.accuracy.training import evaluation_conditions, evaluation_figures
 from benchmarks.support.capture_truth import find_captures
 from benchmarks.support.results import RESULTS, store_results
 from pipelines.commands.build import Build
 from pipelines.commands.options import OptionalPath
-from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.layout import TEMPLATE, VALIDATE_STAGE
-from smplxpp.body import load_body, load_params
+from pipelines.runs.artefacts import load_params_of_run, load_scan, load_scan_labels, load_stacked_params
+from pipelines.runs.layout import BUILD_STAGES, EVALUATION, MODEL_STAGES, REGISTERED_PARAMS, TEMPLATE, VALIDATE_STAGE
+from pipelines.runs.stage import read_manifest
+from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core import BodyParams, GeometryWarning, TriangleMesh
+from smplxpp.capture import open_capture
+from smplxpp.core import LABELS, BodyParams, GeometryWarning, TriangleMesh
 from smplxpp.core.files.array_file import read_arrays
+from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from smplxpp.metrics.pose_error import pose_error
 from smplxpp.raster import outer_visible_points
+from smplxpp.segment import read_labels
 from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.template.template import Template
+
+COMMAND = (
+    "smplxpp build, train --preset cpu, evaluate; python -m benchmarks alone photographs --run RUN --truth CAPTURE"
+)
+_NEAR = 0.015
+"""Metres from the true scan within which a face has a true label."""
+
+
+@dataclass(frozen=True)
+class PhotographsAlone:
+    """Measure each step of a run from photographs, cameras and masks alone against the truth.
+
+    PHOTOGRAPHS is a folder with no more than `rgbs/`, `masks/`, the cameras and, in capture.json, what is held out,
+    of the capture CAPTURE, whose truth is looked at in measuring alone. PSNR stands beside that of the stored
+    trainings of the same capture on `exact` and on `tracked` inputs.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN")]
+    """Run that was built, trained and evaluated."""
+    truth: Path
+    """The capture that the photographs are of."""
+    name: str = ""
+    """Name in the result; the capture's by default."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        body, run, name = load_body(), self.run_folder, self.name or self.truth.resolve().name
+        exact = load_params(self.truth / "params" / "params.npz", body=body)
+        manifests = {stage: read_manifest(run / stage) for stage in (*BUILD_STAGES, *MODEL_STAGES)}
+        figures: dict[str, Any] = {
+            "seconds": {stage: one["seconds"] for stage, one in manifests.items() if one is not None},
+            "checks": [
+                {"stage": stage, **check}
+                for stage, one in manifests.items()
+                for check in (one or {}).get("checks", ())
+                if check["status"] != "pass"
+            ],
+            "body_of_the_reference_frame": body_error(body, load_params_of_run(run), exact.frame(0)),
+            "bodies": bodies(body, run, self.truth, exact),
+            "labels": label_accuracy(run, self.truth),
+        }
+        if (run / EVALUATION).is_file():
+            figures |= {**evaluation_conditions(run / EVALUATION), "evaluation": evaluation_figures(run / EVALUATION)}
+            figures["beside"] = beside(name)
+        print(json.dumps(figures, indent=1))
+        store_results(f"photographs_alone_{name}", COMMAND, figures)
+
+
+def body_error(body: BodyModel, found: BodyParams, true: BodyParams) -> dict[str, float]:
+    """Mean distance of vertices and of the 22 joints of the body in one frame, mm."""
+    a, b = body.forward(found).frame(0), body.forward(true).frame(0)
+    vertices = np.linalg.norm(a.vertices - b.vertices, axis=1)
+    joints = np.linalg.norm(a.joints - b.joints, axis=1)[:22]
+    return {"vertices_mm": float(1e3 * vertices.mean()), "joints_mm": float(1e3 * joints.mean())}
+
+
+def bodies(body: BodyModel, run: Path, capture: Path, exact: BodyParams) -> dict[str, Any]:
+    """Errors of all frames, training and held-out ones apart."""
+    frames, found = load_stacked_params(run / REGISTERED_PARAMS)
+    train = np.isin(frames, open_capture(capture).splits.train_frames)
+    covered = bare_and_under(capture, body.vertex_count)[1]
+    out = {}
+    for name, rows in (("training", np.flatnonzero(train)), ("held_out", np.flatnonzero(~train))):
+        if len(rows):
+            true = exact.select(np.asarray(frames)[rows])
+            out[name] = asdict(pose_error(found.select(rows), true, body, covered))
+    return out
+
+
+def label_accuracy(run: Path, capture: Path) -> dict[str, Any]:
+    """Share of the surface, by area, that has the label of the true scan's nearest vertex: whole, and by true label."""
+    path = capture / "scans" / "scan_000000.ply"
+    raw, (mesh, _, _) = read_raw_mesh(path), load_scan(run)
+    true = read_labels(
+        path.with_name("scan_000000_labels.npz"),
+        vertex_count=len(raw.vertices),
+        face_count=len(raw.faces),
+        label_set="capture",
+    )
+    distance, nearest = cKDTree(raw.vertices).query(mesh.face_centers)
+    known = (distance < _NEAR) & (true[nearest] >= 0)
+    right = load_scan_labels(run, mesh.face_count) == true[nearest]
+    areas = mesh.face_areas
+    by_label = {}
+    for label in LABELS:
+        own = known & (true[nearest] == label.id)
+        if own.any():
+            by_label[label.name] = float(areas[own] @ right[own] / areas[own].sum())
+    return {
+        "right": float(areas[known] @ right[known] / areas[known].sum()),
+        "by_label": by_label,
+        "share_near_the_true_surface": float(areas[known].sum() / areas.sum()),
+    }
+
+
+def beside(name: str) -> dict[str, Any]:
+    """The student's images of the stored trainings of the same capture."""
+    out = {}
+    for protocol, suffix in (("exact", ""), ("tracked", "_tracked")):
+        path = RESULTS / f"training_{name}_cpu{suffix}.json"
+        if path.is_file():
+            out[protocol] = json.loads(path.read_text())["figures"]["evaluation"]["student"]["views"]
+    return out
+
 
 _ANY_DETERMINANT = UnposeConfig(warn_below=-np.inf, fail_below=-np.inf)
 _BELONGS = 0.02
@@ -45,7 +155,14 @@ _PARTS = ("body", "upper", "lower", "shoes", "hair")
 
 @dataclass(frozen=True)
 class DrivingAlone:
-    """Build, drive and compare."""
+    """Drive a template built from a bare scan, beside one built with true parameters and labels.
+
+    Each capture's scan is built three times: alone (units, body and labels found), with exact parameters and labels
+    found, and with exact parameters and true labels. Every visible vertex of a template is driven twice: by its
+    template, in hard poses on the identity that it has, and by the authored weights of the true surface that it lies
+    nearest to, on the true identity. The distance between the two is the error, mm. Where a template and the truth
+    differ in the reference pose already (a label that is wrong, a body of another shape), the error says it.
+    """
 
     captures: Path
     """Folder of captures with truth."""
@@ -76,7 +193,7 @@ class DrivingAlone:
                 figures[folder.name] = rows
                 _print(folder.name, rows)
         if self.store:
-            store_results("driving_alone", "python -m benchmarks driving_alone --captures DIR", figures)
+            store_results("driving_alone", "python -m benchmarks alone driven --captures DIR", figures)
 
 
 def _builds(folder: Path, runs: Path) -> dict[str, Build]:
@@ -176,4 +293,4 @@ def _print(name: str, rows: dict[str, dict]) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(DrivingAlone).run()
+    tyro.extras.subcommand_cli_from_dict({"photographs": PhotographsAlone, "driven": DrivingAlone}).run()
