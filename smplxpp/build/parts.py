@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,11 +14,14 @@ from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
-from smplxpp.core import LABELS, OBJECT, Check, SkinWeights, StageOutput, TriangleMesh
+from smplxpp.core import LABELS, OBJECT, Check, GeometryWarning, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
 from smplxpp.metrics.comparison import MM
-from smplxpp.skinning import UnposeConfig, Unposed, unpose
+from smplxpp.skinning import UnposeConfig, Unposed, invertible_weights, unpose
 from smplxpp.transfer import TransferConfig, rigid_weights, transfer_weights
+
+_FOLDED = 1e-6
+"""Least determinant of a blended transform in trials of the T-pose: what is smaller has no inverse in float64."""
 
 
 def clean_scan(
@@ -65,6 +69,11 @@ def transfer_to_parts(
             settings = transfer_config(LABELS[part.label].name, body, config)
             mesh, source, found = _without_bridges(part.mesh, fit, body, settings, config.bridges)
         parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
+        # A few vertices whose blend folds flat in the scan's pose, as between thighs that touch, stop no build.
+        found, folded = invertible_weights(found, fit.posed_from_rest)
+        if folded.any():
+            message = "vertices blend limbs that are turned against each other; they follow the stronger one"
+            warnings.warn(f"{name}: {int(folded.sum())} of {len(folded)} {message}", GeometryWarning, stacklevel=2)
         weights[name] = found
         # Rows must sum to one, or blended transforms scale the part: T = sum_j w_j T_j is affine only then.
         report = weight_report(found)
@@ -73,6 +82,7 @@ def transfer_to_parts(
             "components": len(found.policies),
             "policies": sorted(set(found.policies)),
             "report": report.as_dict(),
+            "folded_vertices": int(folded.sum()),
             "web_faces": part.mesh.face_count - mesh.face_count,
             "web_area_share": 1.0 - float(mesh.face_areas.sum() / part.mesh.face_areas.sum()),
         }
@@ -80,6 +90,14 @@ def transfer_to_parts(
         checks += [
             Check(f"{name}: rows off partition of unity", report.row_sum_error, "", 1e-12, 1e-9),
             Check(f"{name}: negative weights and silent zero rows", report.negative + report.zero_rows, "", 0, 0),
+            Check(
+                f"{name}: share of folded vertices",
+                float(folded.mean()),
+                "",
+                0.0,
+                0.01,
+                explanation="whose blended transform had no inverse in the scan's pose; they follow one joint more",
+            ),
         ]
     return parts, weights, StageOutput(checks, numbers)
 
@@ -100,11 +118,12 @@ def _without_bridges(
     """
     source = np.arange(part.vertex_count)
     weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
-    # The limits of the inversion are lifted here: the next stage checks them on the part that is left.
-    limits = UnposeConfig(warn_below=0.0, fail_below=1e-9)
+    # Folded vertices lose their fold for the trial alone: those that are left with the part are counted later.
+    limits = UnposeConfig(warn_below=0.0, fail_below=_FOLDED)
     # Bridges in folds first, because these are cut where the scan lacks the gap; then what still tears.
     for find in [*(find_bridges,) * config.rounds, *(find_tears,) * config.rounds]:
-        rest = unpose(part.vertices, weights, fit.posed_from_rest, config=limits)
+        tried = invertible_weights(weights, fit.posed_from_rest, least=_FOLDED)[0]
+        rest = unpose(part.vertices, tried, fit.posed_from_rest, config=limits)
         bridge = find(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
         if not bridge.any():
             continue

@@ -6,10 +6,10 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float, Float64
 from numpy.typing import ArrayLike
 
-from smplxpp.core import GeometryWarning, InputError, PointsLike, WeightsLike, as_array, dense_weights
+from smplxpp.core import GeometryWarning, InputError, PointsLike, SkinWeights, WeightsLike, as_array, dense_weights
 from smplxpp.core.errors import one_line
 from smplxpp.core.foreign import point_arrays
 from smplxpp.skinning.linear_blend import blend_transforms, skin
@@ -170,6 +170,46 @@ def unpose(
         round_trip_max=float(round_trip.max(initial=0.0)),
     )
     return Unposed(shaped - offsets, determinant, report)
+
+
+def invertible_weights(
+    weights: SkinWeights, posed_from_rest: Float[np.ndarray, "J 4 4"], *, least: float = 0.05
+) -> tuple[SkinWeights, Bool[np.ndarray, " N"]]:
+    """Move the weights of folded vertices towards their strongest joint until their transforms can be inverted.
+
+    A row w becomes `(1 - t) w + t e`, with e the joint of the largest weight and the smallest t of 0.05, 0.1, ..., 1
+    whose blended transform has a determinant of at least `least`; with t = 1 it is a rotation, whose determinant is 1.
+
+    Args:
+        weights: skin weights of N vertices over J joints.
+        posed_from_rest: (J, 4, 4) transforms of the pose that the vertices are in.
+        least: determinant.
+
+    Returns:
+        The weights, the same object where nothing was to do, and the vertices (N,) that were changed.
+
+    Example:
+        >>> turned = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
+        >>> even = smplxpp.SkinWeights.from_dense(np.array([[0.5, 0.5], [0.0, 1.0]]))
+        >>> found, changed = smplxpp.skinning.invertible_weights(even, turned)
+        >>> changed.tolist(), found.dense()[0].round(2).tolist()
+        ([True, False], [0.65, 0.35])
+    """
+    dense = weights.dense()
+    changed = np.linalg.det(blend_transforms(dense, posed_from_rest)[:, :3, :3]) < least
+    if not changed.any():
+        return weights, changed
+    rows = np.flatnonzero(changed)
+    strongest = np.zeros((len(rows), weights.joint_count))
+    strongest[np.arange(len(rows)), dense[rows].argmax(axis=1)] = 1.0
+    left = np.ones(len(rows), dtype=bool)
+    for t in np.linspace(0.05, 1.0, 20):
+        mixed = (1.0 - t) * dense[rows] + t * strongest
+        done = left & (np.linalg.det(blend_transforms(mixed, posed_from_rest)[:, :3, :3]) >= least)
+        dense[rows[done]] = mixed[done]
+        left &= ~done
+    kept = {name: getattr(weights, name) for name in ("matched", "distance", "angle", "component", "policies")}
+    return SkinWeights.from_dense(dense, max_influences=weights.joint_indices.shape[1], **kept), changed
 
 
 def _checked(subject, vertices, weights, posed_from_rest, rest_offsets):

@@ -6,9 +6,14 @@ import warnings
 
 import igl
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.spatial import cKDTree
 
 from smplxpp.core import GeometryWarning, InputError, TriangleMesh, row_lengths
+from smplxpp.core.topology import component_labels
+
+_SAME_PLACE = 1e-6
+"""Share of a mesh's extent within which vertices are copies: round-off of files in float32 is a tenth of it."""
 
 # Other choices of axes: their name, and the permutation and signs that bring them to +Y up.
 _AXES = (
@@ -151,6 +156,33 @@ def consistent_winding(mesh: TriangleMesh, *, subject: str) -> TriangleMesh:
     faces = f.copy()
     faces[flipped] = faces[flipped][:, ::-1]
     return TriangleMesh(mesh.vertices, faces)
+
+
+def welded(mesh: TriangleMesh) -> tuple[TriangleMesh, Int64[np.ndarray, " N"]]:
+    """Make vertices at the same place one, and faces with the same corners; files cut meshes along texture seams.
+
+    Weights depend on the surface, not on how a file lists it: without this every seam is a border, and opens in motion.
+
+    Returns:
+        The mesh; it keeps unreferenced vertices, and a mesh whose faces would all vanish is returned as it is.
+        For each of the N vertices of `mesh` its vertex in it.
+    """
+    count = mesh.vertex_count
+    pairs = cKDTree(mesh.vertices).query_pairs(_SAME_PLACE * extent(mesh), output_type="ndarray")
+    index = component_labels(pairs, count).astype(np.int64) if len(pairs) else np.arange(count)
+    # Keep the order of first occurrence, so that a mesh without copies stays as it is.
+    _, first, index = np.unique(index, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))
+    first, index = np.sort(first), rank[index.reshape(-1)]
+    faces = index[mesh.faces]
+    corners = np.sort(faces, axis=1)
+    whole = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])
+    # Of faces with the same corners, as of sheets with two sides, the first one stays.
+    once = np.zeros(len(faces), dtype=bool)
+    once[np.unique(corners, axis=0, return_index=True)[1]] = True
+    if not (whole & once).any() or ((whole & once).all() and len(first) == count):
+        return mesh, np.arange(count)
+    return TriangleMesh(mesh.vertices[first], faces[whole & once]), index
 
 
 def restrict_source(

@@ -23,6 +23,7 @@ from smplxpp.transfer.checks import (
     consistent_winding,
     extent,
     restrict_source,
+    welded,
 )
 from smplxpp.transfer.config import TransferConfig
 from smplxpp.transfer.correspond import (
@@ -95,6 +96,8 @@ def transfer_weights(
     check_target(target)
     joint_count = weights.shape[1]
     source = consistent_winding(source, subject="source mesh")
+    # Copies of a vertex, as along texture seams, get one row of weights, which is handed back to all of them.
+    target, copies = welded(target)
     target = consistent_winding(target, subject="target mesh")
     size = extent(source)
     allowed = config.allowed_mask(joint_count)
@@ -144,12 +147,12 @@ def transfer_weights(
             answer /= np.maximum(total, _LEAST_SUM)[:, None]
         dense += share[:, None] * (answer - dense)
     return SkinWeights.from_dense(
-        dense,
+        dense[copies],
         max_influences=config.max_influences,
-        matched=matched,
-        distance=found.distance,
-        angle=found.angle,
-        component=component,
+        matched=matched[copies],
+        distance=found.distance[copies],
+        angle=found.angle[copies],
+        component=component[copies],
         policies=policies,
     )
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import stress_poses
 from smplxpp.core import BodyParams, GeometryWarning, InputError, SkinWeights
-from smplxpp.skinning import UnposeConfig, pose, unpose
+from smplxpp.skinning import UnposeConfig, invertible_weights, pose, unpose
 
 
 def random_rig(seed: int, joints: int = 6, vertices: int = 40, max_angle: float = 1.2):
@@ -104,6 +104,26 @@ def test_bounds_warn_and_fail():
     with pytest.raises(InputError, match=r"1 vertices below: 1 \("):
         unpose(np.ones((2, 3)), weights, hinge(170))
     unpose(np.ones((2, 3)), weights, hinge(119))
+
+
+def test_one_folded_vertex_is_mended_and_all_others_stay():
+    """One vertex between limbs turned by 170 degrees stopped the build of a whole person."""
+    weights = SkinWeights.from_dense(np.array([[1.0, 0.0], [0.5, 0.5], [0.5, 0.5], [0.8, 0.2]]))
+    for degrees in (170, 180):
+        found, changed = invertible_weights(weights, hinge(degrees))
+        assert changed.tolist() == [False, True, True, False]
+        assert np.array_equal(found.dense()[~changed], weights.dense()[~changed])
+        # The smallest step that suffices: the one before it would not.
+        assert (
+            unpose(np.ones((4, 3)), found, hinge(degrees), config=UnposeConfig(warn_below=0.0)).determinant[1] >= 0.05
+        )
+        strongest = found.dense()[1].max() - 0.025
+        assert blended_determinant([strongest, 1 - strongest], hinge(degrees)) < 0.05
+    assert invertible_weights(weights, hinge(120))[0] is weights
+
+
+def blended_determinant(weights, transforms) -> float:
+    return float(np.linalg.det(np.tensordot(weights, transforms[:, :3, :3], axes=1)))
 
 
 def test_the_body_itself_in_hard_poses():
