@@ -147,6 +147,21 @@ def test_memory_that_is_not_there_is_said_in_words(capsys, cube, monkeypatch):
     assert "93.1 GiB" in said and "smaller" in said
 
 
+def test_an_interrupt_while_modules_load_is_no_traceback():
+    program = """
+import sys
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name.startswith("rich"):
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+from pipelines import main
+sys.exit(main())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=900, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
 def test_an_error_is_json_when_json_was_asked_for(capsys):
     assert main(["inspect", "nowhere", "--json"]) == 2
     error = json.loads(capsys.readouterr().out)["error"]

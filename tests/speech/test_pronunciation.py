@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from avatar.speech.pronunciation import MAX_CHARACTERS, check_text, phones_from_word, pronounce, words_from_text
 from avatar.speech.spoken_text import speak_text
+from avatar.speech.voice import _pieces
 from smplxpp.core.errors import InputError
 
 
@@ -81,6 +82,13 @@ def test_numbers_signs_and_abbreviations_are_spoken(text, spoken):
 def test_no_digit_and_no_sign_of_money_is_left_for_the_voice(text):
     said = speak_text(text)
     assert not re.search("[0-9]", said) and said == " ".join(said.split())
+
+
+@given(st.text("ab ,;ˈ", max_size=3000))
+def test_long_sentences_are_cut_and_nothing_is_lost(ipa):
+    pieces = _pieces(ipa.strip())
+    assert max(map(len, pieces)) <= 400
+    assert "".join("".join(pieces).split()) == "".join(ipa.split())
 
 
 def test_words_of_the_dictionary_and_others():
