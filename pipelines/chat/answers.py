@@ -195,7 +195,8 @@ class Endpoint:
             raise InputError(
                 subject, expected=f"words within {self.silent:g} s", received="silence", remedy=_REMEDY
             ) from None
-        except (OSError, http.client.HTTPException) as error:
+        # UnicodeError: a host with an empty or too long part.
+        except (OSError, http.client.HTTPException, UnicodeError) as error:
             received = f"{type(error).__name__}: {str(error)[:200]}"
             raise InputError(subject, expected="an answer", received=received, remedy=_REMEDY) from None
         finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 import time
@@ -229,6 +230,11 @@ class Conversation:
         except InputError as error:
             if not turn.cancelled:
                 self._note(str(error))
+        except Exception as error:
+            # The page waits for an end of the answer, whatever went wrong in a voice or a partner.
+            logging.getLogger("smplxpp").exception("an answer failed")
+            if not turn.cancelled:
+                self._note(f"The answer failed: {type(error).__name__}.")
         if not turn.cancelled:
             self._tell({"kind": "answered", "turn": turn.number})
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import secrets
+import socket
+import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
@@ -20,6 +22,8 @@ from smplxpp.core.files.json_file import as_integer, as_object, as_text, parse_j
 
 MOST_BYTES = 1 << 16
 """Bytes of a message from the page: two seconds of sound."""
+_PATIENCE = 1.0
+"""Seconds that a page has to answer a closing message before it is cut off."""
 REPLACED = 4001
 """Websocket code that closes a conversation because another page replaces it."""
 
@@ -59,6 +63,7 @@ class ChatServer:
         log.setLevel(logging.CRITICAL)  # disconnecting pages and plain file requests are no errors here
         options: dict[str, Any] = {"max_size": MOST_BYTES, "compression": None, "logger": log, "server_header": None}
         options["process_request"] = self._process
+        options["close_timeout"] = _PATIENCE
         self._server = at_free_port(lambda at: serve(self._converse, HOST, at, **options), port)
         self._port = self._server.socket.getsockname()[1]
         sockets = [f"ws://{host}" for host in sorted(own_hosts(self._port))]
@@ -76,7 +81,7 @@ class ChatServer:
     def shutdown(self) -> None:
         """End the server and the conversation."""
         if self._connection is not None:
-            self._connection.close()
+            _end(self._connection)
         self._server.shutdown()
 
     def _process(self, connection: Any, request: Any) -> Any:
@@ -86,7 +91,7 @@ class ChatServer:
 
         hosts = own_hosts(self._port)
         upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
-        known = secrets.compare_digest(request.path.encode(), f"/{self._secret}".encode())
+        known = secrets.compare_digest(request.path.encode(errors="surrogateescape"), f"/{self._secret}".encode())
         ours = request.headers.get("Origin", "") in {f"http://{host}" for host in hosts}
         if upgrade and known and ours and request.headers.get("Host", "") in hosts:
             return None
@@ -100,7 +105,7 @@ class ChatServer:
 
         before, self._connection = self._connection, connection
         if before is not None:
-            before.close(REPLACED, "another page")
+            _end(before, REPLACED, "another page")
 
         def send(message: str | bytes) -> None:
             with suppress(ConnectionClosed):  # the loop that reads messages ends by itself when the page is gone
@@ -123,6 +128,16 @@ class ChatServer:
             conversation.close()
             if self._connection is connection:
                 self._connection = None
+
+
+def _end(connection: Any, code: int = 1000, reason: str = "") -> None:
+    """Close a connection; one whose page does not read is cut off after a second, because its sender blocks."""
+    closing = threading.Thread(target=connection.close, args=(code, reason), daemon=True)
+    closing.start()
+    closing.join(_PATIENCE)
+    if closing.is_alive():
+        with suppress(OSError):
+            connection.socket.shutdown(socket.SHUT_RDWR)
 
 
 def _take(conversation: Conversation, message: str | bytes) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import errno
+import sys
 from collections.abc import Callable, Collection, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import PurePosixPath
-from typing import TypeVar
+from typing import Any, TypeVar
 from urllib.parse import unquote, urlsplit
 
 from smplxpp.core.errors import InputError
@@ -56,7 +57,10 @@ def answer(
         files: contents by plain name; "index.html" is "/" too. hosts: names that may be asked for.
         address: path and query of the request. host: its header.
     """
-    name = unquote(urlsplit(address).path).removeprefix("/") or "index.html"
+    try:
+        name = unquote(urlsplit(address).path).removeprefix("/") or "index.html"
+    except ValueError:  # such as an unclosed bracket, which is no address
+        name = address
     content = files.get(name)
     if host not in hosts:
         status, content = HTTPStatus.FORBIDDEN, b"this server answers this machine alone\n"
@@ -87,6 +91,11 @@ class PageServer(ThreadingHTTPServer):
         self.files = files
         at_free_port(lambda at: super(PageServer, self).__init__((HOST, at), _Handler), port)
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of browsers that leave early or never finish a request; report other errors."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
+
     @property
     def address(self) -> str:
         """Return the address for a browser."""
@@ -102,6 +111,8 @@ class _Handler(BaseHTTPRequestHandler):
     server: PageServer
     server_version = "smplxpp"
     sys_version = ""
+    timeout = 30.0
+    """Seconds that a request may take to arrive, so that half a one does not hold its thread for ever."""
 
     def do_GET(self) -> None:
         self._answer(body=True)

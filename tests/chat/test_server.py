@@ -10,6 +10,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,7 +23,7 @@ pytest.importorskip("websockets", reason="extra chat")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from pipelines.chat.server import MOST_BYTES, REPLACED, ChatServer
+from pipelines.chat.server import MOST_BYTES, REPLACED, ChatServer, _end
 
 LIMIT = 900
 
@@ -165,3 +166,26 @@ def test_the_newest_page_takes_over(served):
             assert closed.value.rcvd.code == REPLACED
             second.send(json.dumps({"kind": "say", "text": "mine"}))
             assert told(second, "heard")["text"] == "mine"
+
+
+@pytest.mark.parametrize("path", [b"/\xff\xfe", b"http://["])
+def test_addresses_that_are_none_are_not_found(served, path):
+    with socket.create_connection(("127.0.0.1", served.port), timeout=LIMIT) as stream:
+        stream.sendall(b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1:" + str(served.port).encode() + b"\r\n\r\n")
+        assert re.match(rb"HTTP/1.1 (404|400) ", stream.recv(64))
+
+
+def test_a_connection_that_does_not_close_is_cut_off():
+    class Stuck:
+        """A connection whose closing blocks until its socket is shut."""
+
+        def __init__(self) -> None:
+            self.shut = threading.Event()
+            self.socket = SimpleNamespace(shutdown=lambda _: self.shut.set())
+
+        def close(self, code: int, reason: str) -> None:
+            self.shut.wait(LIMIT)
+
+    stuck = Stuck()
+    _end(stuck)
+    assert stuck.shut.is_set()

@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.cli import main
 from pipelines.web.page import PageContent, page_files, single_page, write_page_folder
-from pipelines.web.server import PageServer
+from pipelines.web.server import PageServer, answer
 from smplxpp.core.errors import InputError
 from tests.web.avatars import write_avatar
 from tests.web.chromium import Page, find_chromium
@@ -52,6 +52,7 @@ def test_the_server_gives_the_page_and_the_bundle_and_isolates_them(server):
 )
 def test_the_server_gives_nothing_else(server, path):
     assert get(server, path).status == 404
+    assert answer(FILES, server.hosts, "http://[", next(iter(server.hosts)))[0] == 404
 
 
 def test_the_server_answers_this_machine_alone(server):
