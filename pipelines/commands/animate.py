@@ -21,7 +21,7 @@ from pipelines.commands.templates import BUNDLE_SUFFIX, load_run_template
 from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
 from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
 from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.layout import GARMENTS
+from pipelines.runs.layout import GARMENTS, STUDENT
 from smplxpp.cloth import Garment, cut_garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
@@ -47,8 +47,9 @@ class Animate:
     the template has one."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
-    model: Literal["template", "student"] = "template"
-    """Model to draw: the textured template, or the trained student in the runtime. A bundle is a student."""
+    model: Literal["auto", "template", "student"] = "auto"
+    """Model to draw: the textured template, or the trained student in the runtime. auto: the student where the run has
+    one, unless --out, --colors or --loose-parts ask for what the template alone has. A bundle is a student."""
     outside: Literal["keep", "clamp"] = "keep"
     """Poses of a student outside the range of its training. keep: show them and print a note. clamp: limit each joint
     to the range."""
@@ -115,7 +116,14 @@ class Animate:
 
     @property
     def _of_student(self) -> bool:
-        return self.model == "student" or self.run_folder.suffix.lower() == BUNDLE_SUFFIX
+        if self.model != "auto" or self.run_folder.suffix.lower() == BUNDLE_SUFFIX:
+            return self.model == "student" or self.run_folder.suffix.lower() == BUNDLE_SUFFIX
+        of_template = self.out.suffix.lower() == ".glb" or self.colors != "scan" or bool(self.loose_parts)
+        return not of_template and (self.run_folder / STUDENT).is_file()
+
+    @property
+    def _drawn(self) -> str:
+        return "student" if self._of_student else "template"
 
     def _student_film(self) -> dict:
         """Draw the student frame by frame and write the film."""
@@ -192,7 +200,7 @@ class Animate:
             raise InputError(
                 "option codes trained",
                 expected="a student, without --interpolate",
-                received=f"the {self.model}, --interpolate {self.interpolate}",
+                received=f"the {self._drawn}, --interpolate {self.interpolate}",
             )
         if self.interpolate is not None:
             require_positive("option interpolate", self.interpolate)
@@ -200,7 +208,7 @@ class Animate:
                 raise InputError(
                     "option interpolate",
                     expected="a student (--model student, or a bundle), without --step",
-                    received=f"the {self.model}, --step {self.step}",
+                    received=f"the {self._drawn}, --step {self.step}",
                 )
         if suffix not in (*SUFFIXES, ".glb"):
             raise InputError(

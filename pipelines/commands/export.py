@@ -121,8 +121,9 @@ class Export:
         "auto"
     )
     """Format where the suffix does not tell: of a folder, or of an .npz."""
-    model: Literal["student", "template"] = "student"
-    """What a GLB or USD has: the student's splats in a pose, or the template with skeleton, expressions and motion."""
+    model: Literal["auto", "student", "template"] = "auto"
+    """What a GLB or USD has: the student's splats in a pose, or the template with skeleton, expressions and motion.
+    auto: the student where the source has one, else the template."""
     solid: OptionalPath = None
     """Write body and clothes as one closed surface there: .stl or .3mf (z up, on the bed), .ply or .glb (y up)."""
     params: OptionalPath = None

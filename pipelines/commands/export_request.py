@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pipelines.commands.options import ClothMode
+from pipelines.runs.layout import STUDENT
 from smplxpp.core import DEFAULT_FPS, BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_folder
 
@@ -45,7 +46,7 @@ class FileRequest:
         source: a run, or a bundle of its student.
         out: the file, or the folder of a series.
         format: one of `SUFFIXES`.
-        model: "student" or "template", for formats that hold either.
+        model: "student" or "template", for formats that hold either; "auto": the student where the source has one.
         params: parameters of the pose or the motion; None takes those of the source.
         rows: rows of the parameters: the first, the one after the last (None for the end), and the step.
         cloth: what moves loose clothes along the parameters.
@@ -57,7 +58,7 @@ class FileRequest:
     source: Path
     out: Path
     format: str
-    model: str = "student"
+    model: str = "auto"
     params: Path | None = None
     rows: tuple[int, int | None, int] = (0, None, 1)
     cloth: ClothMode = "simulate"
@@ -178,8 +179,13 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         InputError: options that do not go together, a source that lacks what is asked for, parameters of another body.
         MissingExtraError: a package of an extra that is not installed.
     """
-    # Find the module that writes this format; an OBJ always holds the template.
+    # Find the module that writes this format; an OBJ always holds the template, splats are always the student's.
     model = "template" if request.format == "obj" else request.model
+    if model == "auto":
+        of_either = ("template", request.format) in _BY_MODEL
+        trained = request.source.is_file() or (request.source / STUDENT).is_file()
+        model = "template" if of_either and not trained else "student"
+    request = replace(request, model=model)
     writers = _FOR_ANY_MODEL.get(request.format) or _BY_MODEL.get((model, request.format))
     if writers is None:
         raise InputError(

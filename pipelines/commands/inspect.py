@@ -18,6 +18,8 @@ from pipelines.runs.layout import (
     FIT_STAGE,
     REFINE_STAGE,
     RELIGHT_STAGE,
+    STUDENT,
+    TEMPLATE_GLB,
     TEMPLATE_STAGES,
     TRAIN_STAGES,
 )
@@ -87,7 +89,7 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         checks = _checks_of(metrics.get("checks"))
     # Suggest the command for the first stage to make; it leads to the rest.
     unfinished = [stage["stage"] for stage in stages if stage["state"] != "done"]
-    report = run / "report.html"
+    report, glb = run / "report.html", run / TEMPLATE_GLB
     summary = {
         "run": str(run),
         "subject": metrics["subject"] if isinstance(metrics.get("subject"), str) else None,
@@ -98,9 +100,18 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         "unfinished": unfinished,
         "remedy": _remedy(run, unfinished[0]) if unfinished else None,
         "report": str(report) if report.is_file() else None,
+        "glb": str(glb) if glb.is_file() else None,
+        "next": _next_command(run) if glb.is_file() and not unfinished else None,
         "checks": [check.__dict__ for check in checks],
     }
     return summary, checks
+
+
+def _next_command(run: Path) -> str:
+    """Return what a person with a finished template, and perhaps a student, is likely to do next."""
+    if (run / STUDENT).is_file():
+        return f"smplxpp web {run} --serve (the student in the browser), or smplxpp export {run} --out me.avatar"
+    return f"smplxpp animate {run} --params MOTION --out me.mp4, or with photographs smplxpp train {run} --capture DIR"
 
 
 def _remedy(run: Path, stage: str) -> str:
@@ -228,6 +239,10 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
         console.print(Text("report  ") + Text(summary["report"]), soft_wrap=True)
     else:
         console.print(Text("report  ") + Text("none yet; a finished build writes it", style="dim"))
+    if summary["glb"]:
+        console.print(Text("rigged  ") + Text(summary["glb"]), soft_wrap=True)
+    if summary["next"]:
+        console.print(Text("next    ") + Text(summary["next"], style="dim"), soft_wrap=True)
 
 
 def _check_table(checks: list[CheckRow]) -> Table:

@@ -43,7 +43,7 @@ def film(folder: Path, out: Path, *, source: str = "me.avatar", **options) -> tu
 
 
 def test_a_run_and_its_bundle_give_the_same_film(folder, tmp_path):
-    answer, of_run = film(folder, tmp_path / "a", source="run", model="student")
+    answer, of_run = film(folder, tmp_path / "a", source="run", model="auto")
     _, of_bundle = film(folder, tmp_path / "b")
     assert answer["frames"] == len(of_run) == len(of_bundle) == len(dance()) and answer["fps"] == 20.0
     for a, b in zip(of_run, of_bundle, strict=True):
@@ -65,7 +65,7 @@ def test_other_rates_keep_the_speed(folder, tmp_path):
     with pytest.raises(InputError, match="interpolate"):
         film(folder, tmp_path / "d", interpolate=90.0, step=2)
     with pytest.raises(InputError, match="interpolate"):
-        film(folder, tmp_path / "d", interpolate=90.0, source="run")
+        film(folder, tmp_path / "d", interpolate=90.0, source="run", model="template")
 
 
 def test_poses_beyond_the_training_are_said_and_held_back(folder, tmp_path):
@@ -123,7 +123,7 @@ def test_frames_of_the_training_take_their_codes(folder, tmp_path):
     _, plain = film(folder, tmp_path / "d", start=2, stop=4)
     later = [int(np.abs(a.astype(int) - b).max()) for a, b in zip(some, plain, strict=True)]
     assert later[0] >= 2 and later[1] == 0
-    for wrong in ({"interpolate": 40.0}, {"source": "run"}):
+    for wrong in ({"interpolate": 40.0}, {"source": "run", "model": "template"}):
         with pytest.raises(InputError, match="codes"):
             film(folder, tmp_path / "e", codes="trained", **wrong)
     write_dressed(tmp_path)

@@ -149,6 +149,18 @@ def test_the_template_moves_as_glb_and_stands_as_obj(folder, tmp_path, capsys):
     np.testing.assert_allclose(rest.vertices, template.vertices, atol=2e-7)
 
 
+def test_the_student_is_exported_where_there_is_one_else_the_template(folder, tmp_path, capsys):
+    export(capsys, folder / "run", "--out", tmp_path / "student.glb")
+    assert "skins" not in GlbReader(tmp_path / "student.glb").json
+    built = tmp_path / "built"
+    (built / TEMPLATE).parent.mkdir(parents=True)
+    (built / TEMPLATE).write_bytes((folder / "run" / TEMPLATE).read_bytes())
+    export(capsys, built, "--out", tmp_path / "template.glb")
+    assert "skins" in GlbReader(tmp_path / "template.glb").json
+    error = export(capsys, built, "--out", tmp_path / "a.ply")["error"]
+    assert "student" in error["expected"]
+
+
 def test_what_does_not_go_together_is_refused_before_anything_is_written(folder, tmp_path, capsys):
     shown = ("--params", folder / "motion.npz")
     bundle, run = folder / "me.avatar", folder / "run"
