@@ -68,6 +68,8 @@ class Source:
 
 _POLYGON = "polygonjs/polygonjs-assets, models/resources/renderpeople.com, OBJ without texture coordinates"
 _RENDERPEOPLE = "RenderPeople free sample: terms of renderpeople.com, no redistribution"
+_POKER = "sevendeucepoker72-ai/poker-3d at 4b888d2, public/models, written as OBJ with the texture"
+_CC_BY = "CC BY 4.0, RenderPeople (sketchfab.com/renderpeople)"
 _CRAGL = "CraGL/Hyperspectral-Inverse-Skinning, models (Vlasic et al. 2008, performance capture from silhouettes)"
 _FAUST = "DavidBoja/SMPL-Fitting, data/demo"
 _MPI = "MPI FAUST: non-commercial research"
@@ -114,6 +116,38 @@ SOURCES: tuple[Source, ...] = (
         "scan",
         ("scans/rp_fabienne_percy_posed_001_5k.obj",),
         should_stop=True,
+    ),
+    Source(
+        "Carla",
+        "a woman in a suit with a bun, arms apart; colours",
+        _POKER,
+        _CC_BY,
+        "scan",
+        ("people2/carla/carla.obj",),
+    ),
+    Source(
+        "Claudia",
+        "a woman in a blouse and trousers, arms apart; colours",
+        _POKER,
+        _CC_BY,
+        "scan",
+        ("people2/claudia/claudia.obj",),
+    ),
+    Source(
+        "Eric",
+        "a man in a suit, arms apart; colours",
+        _POKER,
+        _CC_BY,
+        "scan",
+        ("people2/eric/eric.obj",),
+    ),
+    Source(
+        "Nathan",
+        "a man who walks, centimetres",
+        "mehulkapadia5/open-theft-auto, assets/characters/nathan, written as OBJ",
+        _CC_BY,
+        "scan",
+        ("people2/nathan/nathan.obj",),
     ),
     Source(
         "Liam",

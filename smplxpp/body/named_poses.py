@@ -1,4 +1,4 @@
-"""Provide named poses: standing poses of people who are scanned, and stress poses that test a template's skinning.
+"""Provide named poses: standing and rare poses of people who are scanned, and stress poses that test a template's skin.
 
 Angles follow SMPL-X's T-pose (x to the person's left, y up, z to the front; joint frames are the world's axes).
 """
@@ -41,6 +41,44 @@ _LEGS: Mapping[str, tuple[_Rotations, _Rotations]] = {
         {"hip": ((-55, 0, 0),), "knee": ((75, 0, 0),), "ankle": ((-18, 0, 0),)},
     ),
 }
+# Legs and trunks of people who act, dance or do sports; the arms are those of `_RARE_ARMS`.
+_STRAIGHT: _Rotations = {"hip": ((0, 0, -4),)}
+_RARE: Mapping[str, tuple[_Rotations, _Rotations, _Rotations]] = {
+    "a knee drawn up": ({"hip": ((-85, 0, 0),), "knee": ((90, 0, 0),), "ankle": ((15, 0, 0),)}, _STRAIGHT, {}),
+    "a foot drawn up": ({"hip": ((-50, 0, 0),), "knee": ((105, 0, 0),), "ankle": ((15, 0, 0),)}, _STRAIGHT, {}),
+    "kicking forwards": (
+        {"hip": ((-75, 0, 0),), "knee": ((15, 0, 0),), "ankle": ((15, 0, 0),)},
+        _STRAIGHT,
+        {"pelvis": ((-10, 0, 0),)},
+    ),
+    "kicking sideways": ({"hip": ((0, 0, 50),), "knee": ((15, 0, 0),)}, _STRAIGHT, {"pelvis": ((0, 0, -8),)}),
+    "kicking back": (
+        {"hip": ((32, 0, 0),), "knee": ((55, 0, 0),), "ankle": ((15, 0, 0),)},
+        _STRAIGHT,
+        {"pelvis": ((12, 0, 0),)},
+    ),
+    "a deep step": (
+        {"hip": ((-75, 0, 0),), "knee": ((85, 0, 0),)},
+        {"hip": ((28, 0, 0),), "knee": ((35, 0, 0),), "ankle": ((-15, 0, 0),)},
+        {},
+    ),
+    "sitting on nothing": (
+        {"hip": ((-85, 0, 4),), "knee": ((92, 0, 0),), "ankle": ((-12, 0, 0),)},
+        {"hip": ((-85, 0, 4),), "knee": ((92, 0, 0),), "ankle": ((-12, 0, 0),)},
+        {"pelvis": ((10, 0, 0),), "spine1": ((10, 0, 0),), "spine2": ((6, 0, 0),)},
+    ),
+    "bent": (
+        {"hip": ((-12, 0, -4),), "knee": ((6, 0, 0),)},
+        {"hip": ((-12, 0, -4),), "knee": ((6, 0, 0),)},
+        {"pelvis": ((12, 0, 0),), "spine1": ((18, 0, 0),), "spine2": ((16, 0, 0),), "spine3": ((10, 0, 0),)},
+    ),
+    "bent deeply": (
+        {"hip": ((-24, 0, -4),), "knee": ((8, 0, 0),)},
+        {"hip": ((-24, 0, -4),), "knee": ((8, 0, 0),)},
+        {"pelvis": ((24, 0, 0),), "spine1": ((28, 0, 0),), "spine2": ((25, 0, 0),), "spine3": ((15, 0, 0),)},
+    ),
+}
+_RARE_ARMS = ("lowered", "spread", "raised", "forwards")
 
 
 def standing_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, "J 3"]]]:
@@ -58,8 +96,33 @@ def standing_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, 
                 yield f"{title}, the other way", _pose_of(joint_count, _ARMS[left], _ARMS[right], other, one)
 
 
-def _pose_of(joint_count: int, *parts: _Rotations) -> Float64[np.ndarray, "J 3"]:
-    """Return the axis-angle vectors of left arm, right arm, left leg and right leg, all other joints at rest."""
+def rare_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, "J 3"]]]:
+    """Yield names and axis-angle vectors, radians, of poses that few scans show: a leg drawn up or kicked, a deep step,
+    sitting on nothing, a bent trunk.
+
+    Args:
+        joint_count: of a body of the SMPL family.
+
+    Example:
+        >>> from smplxpp.body.named_poses import rare_poses
+        >>> name, vectors = next(rare_poses(55))
+        >>> name, vectors.shape
+        ('a knee drawn up, arms lowered', (55, 3))
+    """
+    for arm in _RARE_ARMS:
+        for name, (one, other, trunk) in _RARE.items():
+            yield f"{name}, arms {arm}", _pose_of(joint_count, _ARMS[arm], _ARMS[arm], one, other, trunk=trunk)
+            if one != other:
+                # A trunk that leans to a side leans to the other one.
+                turned = {k: tuple((x, -y, -z) for x, y, z in v) for k, v in trunk.items()}
+                yield (
+                    f"{name}, arms {arm}, the other way",
+                    _pose_of(joint_count, _ARMS[arm], _ARMS[arm], other, one, trunk=turned),
+                )
+
+
+def _pose_of(joint_count: int, *parts: _Rotations, trunk: _Rotations | None = None) -> Float64[np.ndarray, "J 3"]:
+    """Return the axis-angle vectors of left arm, right arm, left leg, right leg and trunk, other joints at rest."""
     mirror = np.array([1.0, -1.0, -1.0])
     place = {name: k for k, name in enumerate(JOINT_NAMES[joint_count])}
     out = np.tile(np.eye(3), (joint_count, 1, 1))
@@ -69,6 +132,9 @@ def _pose_of(joint_count: int, *parts: _Rotations) -> Float64[np.ndarray, "J 3"]
                 degrees = np.array(vector, dtype=np.float64) * (1.0 if side == "left" else mirror)
                 k = place[f"{side}_{joint}"]
                 out[k] = out[k] @ matrix_from_rotvec(np.radians(degrees))
+    for joint, vectors in (trunk or {}).items():
+        for vector in vectors:
+            out[place[joint]] = out[place[joint]] @ matrix_from_rotvec(np.radians(np.array(vector, dtype=np.float64)))
     return rotvec_from_matrix(out)
 
 

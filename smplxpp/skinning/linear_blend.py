@@ -5,6 +5,7 @@ The type of the result is the type of the arguments; in torch everything is diff
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -39,7 +40,7 @@ def forward_kinematics(
     # Offsets from each joint's parent; the root starts at its own place and the translation.
     xp = array_namespace(rotations)
     parents = np.asarray(parents)
-    levels = _levels(parents)
+    levels, places, back = _levels(tuple(parents.tolist()))
     offsets = rest_joints - rest_joints[..., np.maximum(parents, 0), :]
     root = levels[0]
     root_position = rest_joints[..., root, :]
@@ -47,12 +48,10 @@ def forward_kinematics(
         root_position = root_position + transl[..., None, :]
     # One batched product for each level of the tree; the results are put back in joint order at the end.
     turned, moved = [rotations[..., root, :, :]], [root_position]
-    for above, level in pairwise(levels):
-        parent = [above.index(parents[j]) for j in level]
+    for level, parent in zip(levels[1:], places, strict=True):
         parent_turned = turned[-1][..., parent, :, :]
         turned.append(parent_turned @ rotations[..., level, :, :])
         moved.append(moved[-1][..., parent, :] + (parent_turned @ offsets[..., level, :, None])[..., 0])
-    back = np.argsort([j for level in levels for j in level])
     turned = xp.concatenate(turned, -3)[..., back, :, :]
     joints = xp.concatenate(moved, -2)[..., back, :]
     # G_j [I, -J_j]: the rotation stays, the translation is joint - R J.
@@ -95,11 +94,15 @@ def skin(
     return xp.stack(posed, -1)
 
 
-def _levels(parents: np.ndarray) -> list[list[int]]:
-    """Return the joints grouped by their depth in the tree."""
-    levels = [[int(j) for j in np.flatnonzero(parents < 0)]]
+@lru_cache(maxsize=64)
+def _levels(parents: tuple[int, ...]) -> tuple[list[list[int]], list[list[int]], np.ndarray]:
+    """Return the joints grouped by their depth in the tree, the place of each joint's parent in the group above (from
+    the second group on), and the order that puts the groups' joints back."""
+    above = np.array(parents)
+    levels = [[int(j) for j in np.flatnonzero(above < 0)]]
     while sum(map(len, levels)) < len(parents):
-        level = [int(j) for j in np.flatnonzero(np.isin(parents, levels[-1]))]
+        level = [int(j) for j in np.flatnonzero(np.isin(above, levels[-1]))]
         assert level, "the joints do not form a tree"
         levels.append(level)
-    return levels
+    places = [[upper.index(parents[j]) for j in level] for upper, level in pairwise(levels)]
+    return levels, places, np.argsort([j for level in levels for j in level])

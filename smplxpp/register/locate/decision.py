@@ -28,6 +28,8 @@ class LocateBounds:
         doubtful_shape: mean square of betas above which the confidence falls.
         margin: difference of cost, millimetres, from which two facings are clearly distinct.
         good_cost: cost that good fits stay below, millimetres.
+        usual_cost: cost above which poses that are rare are tried, millimetres.
+        usual_covered: share of the surface below which they are.
     """
 
     least_covered: float = 0.5
@@ -37,9 +39,12 @@ class LocateBounds:
     doubtful_shape: float = 6.0
     margin: float = 4.0
     good_cost: float = 18.0
+    usual_cost: float = 15.0
+    usual_covered: float = 0.9
 
 
 _BOUNDS = LocateBounds()
+_LIMB_PARTS = ("left forearm", "right forearm", "left foot", "right foot")
 _HEAD_SHOWN = 0.5
 """Visible share of the head below which it may be missing; hair and hoods hide some of it."""
 
@@ -54,6 +59,16 @@ def no_person(found: Found) -> str:
             + unlike
         )
     return ""
+
+
+def is_doubtful(found: Found) -> bool:
+    """Return whether the body found leaves so much unexplained that a rare pose may explain it better."""
+    fit = found.misfit
+    return (
+        found.surface_cost > _BOUNDS.usual_cost
+        or fit.covered < _BOUNDS.usual_covered
+        or any(fit.parts[part] < 0.4 for part in _LIMB_PARTS)
+    )
 
 
 def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tuple[tuple[str, ...], float]:

@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
 from smplxpp.body import BodyModel
+from smplxpp.body.named_poses import rare_poses, standing_poses
 from smplxpp.core import SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.register.kinematics import Kinematics
-from smplxpp.register.locate.decision import confidence_of, findings_of, no_person, notes_of
+from smplxpp.register.locate.decision import confidence_of, findings_of, is_doubtful, no_person, notes_of
 from smplxpp.register.locate.heels import lift_heels
 from smplxpp.register.locate.icp import PinnedLandmarks
 from smplxpp.register.locate.located import BodyNotFoundError, Candidate, LocatedBody
@@ -23,6 +24,8 @@ from smplxpp.register.locate.second_look import look_again
 
 Labeller = Callable[[BodyParams], "Integer[np.ndarray, ' M'] | None"]
 """Labels every face of the surface, given the body in it, negative where unknown; None for no labels at all."""
+_RARER = 0.5
+"""Millimetres by which a body in a rare pose has to be the better one: such poses also bend into what is no person."""
 
 
 def locate_body(
@@ -62,15 +65,16 @@ def locate_body(
     mesh = _outward(mesh)
     pinned = PinnedLandmarks.of(body, landmarks) if landmarks else None
     search = Search(Kinematics(body), mesh, config, pinned, progress)
-    # Landmarks pull without limit during the search, and are robust afterwards.
-    found = search.candidates()
-    if pinned is not None:
-        pinned.make_robust()
-    # Limbs that the dressed body's surface does not show are searched once more before labels depend on them.
-    best, moved = search.finished(found[0]), tuple[str, ...]()
-    if not no_person(best):
-        best, moved = look_again(search, best, hints=hints)
-        best = lift_heels(search, best)
+    # Standing poses first; rare ones where none of these explains the surface, and then they have to explain it better.
+    found = search.candidates(standing_poses(body.joint_count))
+    best, moved = _settled(search, found[0], hints)
+    if is_doubtful(best):
+        rare = search.candidates(rare_poses(body.joint_count))
+        other, its = _settled(search, rare[0], hints)
+        if other.cost < best.cost - _RARER:
+            best, moved, found = other, its, [*rare, *found]
+        else:
+            found += rare
     reason = no_person(best)
     if labeller is not None and not reason:
         labels = labeller(best.state.to_params(body))
@@ -93,6 +97,21 @@ def locate_body(
             remedy="cut away everything but the person, check --up and --units, or place landmarks by hand",
         )
     return located
+
+
+def _settled(
+    search: Search, found: Found, hints: Mapping[str, Float[np.ndarray, " 3"]] | None
+) -> tuple[Found, tuple[str, ...]]:
+    """Fit a candidate to the end; search limbs that its surface does not show once more, before labels depend on them.
+
+    Returns:
+        the body; the limbs that moved.
+    """
+    best, moved = search.finished(found), tuple[str, ...]()
+    if not no_person(best):
+        best, moved = look_again(search, best, hints=hints)
+        best = lift_heels(search, best)
+    return best, moved
 
 
 def _candidate(found: Found) -> Candidate:

@@ -15,7 +15,7 @@ from smplxpp.register.locate.dressed import Dressed, Misfit, OuterBody, misfit
 from smplxpp.register.locate.icp import IcpTerm, PinnedLandmarks, Term, gauss_newton_step
 from smplxpp.register.locate.limbs import state_distance, try_hands, try_limbs
 from smplxpp.register.locate.proxy import BodyProxy, Region
-from smplxpp.register.locate.starts import centred, rank_starts
+from smplxpp.register.locate.starts import Poses, centred, rank_starts
 from smplxpp.register.normal_equations import Columns
 from smplxpp.register.observations import RegisterConfig
 from smplxpp.register.priors import Anatomy, Priors
@@ -138,11 +138,19 @@ class Search:
         many = BodyProxy.of(body, 4000, seed=config.seed)
         self.many, self.bare = many, many.select(np.flatnonzero(np.isin(many.region, (Region.HAND, Region.FACE))))
 
-    def candidates(self) -> list[Found]:
-        """Return the best candidates of both facings, fitted as dressed bodies, best first."""
+    def candidates(self, poses: Poses) -> list[Found]:
+        """Return the best candidates of both facings, fitted as dressed bodies, best first.
+
+        Landmarks pull without limit during the search, and are robust afterwards.
+
+        Args:
+            poses: to start from.
+        """
+        if self.pinned is not None:
+            self.pinned.cutoff = np.inf
         # 1. Start poses in all directions, refined by ICP whose reach falls from 30 to 15 cm.
         starts = rank_starts(
-            self.kinematics, self.few, self.coarse, directions=self.config.directions, keep=self.config.starts
+            self.kinematics, self.few, self.coarse, poses, directions=self.config.directions, keep=self.config.starts
         )
         followed = []
         for k, start in enumerate(starts):
@@ -166,6 +174,8 @@ class Search:
         for k, (_, name, state) in enumerate(distinct):
             out.append(self._measured(name, self._dressed(state)))
             self.progress("candidates", (k + 1) / len(distinct))
+        if self.pinned is not None:
+            self.pinned.make_robust()
         return sorted(out, key=lambda found: found.cost)
 
     def finished(self, found: Found, skin: np.ndarray | None = None) -> Found:

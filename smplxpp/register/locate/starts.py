@@ -1,17 +1,20 @@
-"""Rank the starts of the search: library poses in all directions, scaled to the height of the surface."""
+"""Rank the starts of a search: library poses in all directions, scaled to the height of the surface."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.body.named_poses import standing_poses
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.core.surface_points import SurfacePoints, truncated_distance
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.proxy import BodyProxy
+
+Poses = Iterable[tuple[str, Float64[np.ndarray, "J 3"]]]
+"""Names and axis-angle vectors of poses, radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +35,7 @@ class StartPose:
 
 
 def rank_starts(
-    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, *, directions: int, keep: int
+    kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, poses: Poses, *, directions: int, keep: int
 ) -> list[StartPose]:
     """Rank all poses in all directions by their distance to a surface, and return the best.
 
@@ -40,6 +43,7 @@ def rank_starts(
         kinematics: of the body.
         proxy: points of the body.
         surface: points of the scan.
+        poses: names and axis-angle vectors of the poses.
         directions: number of directions, evenly about the vertical axis.
         keep: number of starts to return, spread over the directions.
     """
@@ -47,7 +51,7 @@ def rank_starts(
     low, high = _ends(surface.points[:, 1])
     rise = _stature_direction(kinematics)
     found: list[StartPose] = []
-    for name, vectors in standing_poses(body.joint_count):
+    for name, vectors in poses:
         rotations = matrix_from_rotvec(vectors)
         # Scale the posed points to the height of the surface, and put them on its lowest point.
         state = _standing(kinematics, rotations)
