@@ -28,8 +28,6 @@ class LocateBounds:
         doubtful_shape: mean square of betas above which the confidence falls.
         margin: difference of cost, millimetres, from which two facings are clearly distinct.
         good_cost: cost that good fits stay below, millimetres.
-        usual_cost: cost above which poses that are rare are tried, millimetres.
-        usual_covered: share of the surface below which they are.
     """
 
     least_covered: float = 0.5
@@ -39,8 +37,6 @@ class LocateBounds:
     doubtful_shape: float = 6.0
     margin: float = 4.0
     good_cost: float = 18.0
-    usual_cost: float = 15.0
-    usual_covered: float = 0.9
 
 
 _BOUNDS = LocateBounds()
@@ -62,11 +58,14 @@ def no_person(found: Found) -> str:
 
 
 def is_doubtful(found: Found) -> bool:
-    """Return whether the body found leaves so much unexplained that a rare pose may explain it better."""
+    """Return whether the body found leaves so much unexplained that a rare pose may explain it better.
+
+    Wide skirts leave up to a sixth of a surface unexplained, and do not make a body doubtful.
+    """
     fit = found.misfit
     return (
-        found.surface_cost > _BOUNDS.usual_cost
-        or fit.covered < _BOUNDS.usual_covered
+        found.surface_cost > _BOUNDS.good_cost
+        or fit.covered < _BOUNDS.doubtful_covered
         or any(fit.parts[part] < 0.4 for part in _LIMB_PARTS)
     )
 

@@ -47,7 +47,6 @@ def rank_starts(
         directions: number of directions, evenly about the vertical axis.
         keep: number of starts to return, spread over the directions.
     """
-    body = kinematics.body
     low, high = _ends(surface.points[:, 1])
     rise = _stature_direction(kinematics)
     found: list[StartPose] = []

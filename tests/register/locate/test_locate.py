@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body, load_params
-from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
+from smplxpp.body.named_poses import rare_poses
+from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.register.kinematics import BodyState
+from smplxpp.register.landmarks import visible_vertices
 from smplxpp.register.locate import LocateConfig, locate_body
-from smplxpp.register.locate.decision import confidence_of
+from smplxpp.register.locate.decision import confidence_of, is_doubtful
 from smplxpp.register.locate.dressed import PARTS, Misfit
+from smplxpp.register.locate.proxy import Region, regions
 from smplxpp.register.locate.search import Found
 
 PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
@@ -89,6 +92,55 @@ def test_landmarks_overrule_the_surface(body, scan, truth):
     back = {"nose": [0.0, 1.45, -0.15], "left_wrist": [-0.5, 0.95, 0.0], "right_wrist": [0.5, 0.95, 0.0]}
     found = locate_body(body, scan, landmarks={k: np.array(v) for k, v in back.items()}, config=QUICK)
     assert abs(abs(found.candidates[0].facing_degrees) - 180.0) < 30.0
+
+
+# Bent down with straight legs, arms towards the floor, as to lift something; degrees.
+BENT = {
+    "pelvis": (30, 0, 0),
+    "spine1": (25, 0, 0),
+    "spine2": (25, 5, 0),
+    "spine3": (15, 0, 0),
+    "left_hip": (-28, 0, -3),
+    "right_hip": (-32, 0, 3),
+    "left_shoulder": (0, -75, -10),
+    "right_shoulder": (0, 65, 10),
+}
+
+
+@pytest.fixture(scope="module")
+def bent(body) -> tuple[TriangleMesh, BodyParams]:
+    """Return the surface of a body in that pose, dressed in clothes that stand off 15 mm, and the body."""
+    pose = np.zeros((1, body.joint_count, 3))
+    for joint, degrees in BENT.items():
+        pose[0, body.joint_names.index(joint)] = np.radians(degrees)
+    params = BodyParams.from_full_pose(
+        pose, betas=np.zeros(body.num_betas), expression=np.zeros(body.num_expressions), transl=np.zeros(3)
+    )
+    mesh = body.mesh(body.forward(params).vertices[0])
+    worn = np.isin(regions(body), (Region.TRUNK, Region.ARM, Region.LEG))
+    outer = np.isin(mesh.faces, visible_vertices(body)).all(axis=1)
+    return mesh.with_vertices(mesh.vertices + 0.015 * worn[:, None] * mesh.vertex_normals).submesh(outer)[0], params
+
+
+def test_a_body_that_no_standing_pose_explains_is_found_among_rare_poses(body, bent):
+    mesh, params = bent
+    found = locate_body(body, mesh, config=QUICK)
+    truth, posed = body.forward(params), body.forward(found.params)
+    assert found.candidates[0].pose in dict(rare_poses(body.joint_count))
+    assert np.linalg.norm(posed.vertices[0] - truth.vertices[0], axis=1).mean() < 0.025
+    assert np.linalg.norm(posed.joints[0, :22] - truth.joints[0, :22], axis=1).max() < 0.08
+
+
+def test_rare_poses_are_tried_only_where_standing_ones_leave_something_unexplained(located):
+    rare = {name for name, _ in rare_poses(55)}
+    assert not rare & {one.pose for one in located.candidates}
+    parts = dict.fromkeys(PARTS, 0.9)
+    state = BodyState(np.eye(3)[None, None], np.zeros((1, 3)), np.zeros(10), np.zeros((1, 10)))
+    plain = Found("standing", state, Misfit(0.004, 0.014, 0.95, 0.7, parts), 20.0, landmarks=0.0)
+    assert not is_doubtful(plain)
+    assert is_doubtful(replace(plain, misfit=replace(plain.misfit, covered=0.75)))
+    assert is_doubtful(replace(plain, misfit=replace(plain.misfit, bare=0.05)))
+    assert is_doubtful(replace(plain, misfit=replace(plain.misfit, parts={**parts, "left foot": 0.1})))
 
 
 def test_a_landmark_that_no_body_has_is_refused(body, scan):
