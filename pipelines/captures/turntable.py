@@ -33,7 +33,14 @@ from smplxpp.core import (
 from smplxpp.core.files import atomic_folder, atomic_write_bytes, atomic_write_text, jsonable, read_bytes
 from smplxpp.detect import load_detector
 from smplxpp.register import Observations
-from smplxpp.register.turntable import TurntableConfig, TurntableFit, leveled, register_turntable, turn_notes
+from smplxpp.register.turntable import (
+    LEAST_FRAMES,
+    TurntableConfig,
+    TurntableFit,
+    leveled,
+    register_turntable,
+    turn_notes,
+)
 
 CAMERA = "cam"
 """Name of the one camera."""
@@ -54,6 +61,8 @@ class TurntableCaptureConfig:
         keypoints: folder or file of keypoints of any detector; None: they are detected.
         matting: ONNX model that makes the masks; None: MediaPipe's segmentation.
         detector: "mediapipe", or an ONNX model.
+        hold_out: rows of the frames that neither shape nor training may see, to measure on; never 0, the reference;
+            empty: `held_out_frames`.
     """
 
     height: float | None = None
@@ -63,9 +72,10 @@ class TurntableCaptureConfig:
     keypoints: Path | None = None
     matting: Path | None = None
     detector: str = "mediapipe"
+    hold_out: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        require_at_least("option frames", self.most_frames, 4)
+        require_at_least("option frames", self.most_frames, LEAST_FRAMES)
         if self.height is not None:
             require_between("option height", self.height, 0.5, 2.6)
         if self.focal_mm is not None:
@@ -82,6 +92,7 @@ class TurntableCapture:
         found: poses, shape and camera, in the world of the search.
         lens: what was known of the lens.
         notes: what one camera left open, and faults of the inputs.
+        held_out: numbers of the frames that are held out.
     """
 
     out: Path
@@ -89,6 +100,7 @@ class TurntableCapture:
     found: TurntableFit
     lens: Lens
     notes: tuple[str, ...]
+    held_out: tuple[int, ...]
 
     def numbers(self) -> dict[str, Any]:
         """Return the figures of the command's summary."""
@@ -132,20 +144,23 @@ def make_turntable_capture(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("--out", expected="a new or an empty folder", received=str(out), remedy="name another folder")
     with turn_frames(source, config.most_frames) as (frames, given), atomic_folder(out) as root:
-        if len(frames) < 4:
+        if len(frames) < LEAST_FRAMES:
             raise InputError(
-                f"turn {source}", expected="at least 4 frames, better 8 and more", received=f"{len(frames)}"
+                f"turn {source}",
+                expected=f"at least {LEAST_FRAMES} frames, better 8 and more",
+                received=f"{len(frames)}",
             )
+        held_out = held_out_frames(len(frames), config.hold_out)
         camera, lens = _write_images(root, frames, given, config, progress)
         write_plain_cameras_json(root / "cameras.json", {CAMERA: camera})
         atomic_write_text(root / "capture.json", json.dumps({"background": None}) + "\n")
         _write_masks(root, frames, given, config, progress)
         _write_keypoints(root, frames, given, config, progress)
-        found, notes = _register(root, body, lens, config, progress)
+        found, notes = _register(root, body, lens, config, held_out, progress)
         params, placed = leveled(found, body)
         write_plain_cameras_json(root / "cameras.json", {CAMERA: placed})
         params.save(root / "params" / "params.npz")
-        made = TurntableCapture(out, len(frames), found, lens, notes)
+        made = TurntableCapture(out, len(frames), found, lens, notes, held_out)
         _describe(root, out.name, made)
     return made
 
@@ -297,13 +312,17 @@ def _by_frame(folder: Path, frames: list[TurnFrame], what: str) -> dict[int, Pat
 
 
 def _register(
-    root: Path, body: BodyModel, lens: Lens, config: TurntableCaptureConfig, progress: ProgressCallback
+    root: Path,
+    body: BodyModel,
+    lens: Lens,
+    config: TurntableCaptureConfig,
+    held_out: tuple[int, ...],
+    progress: ProgressCallback,
 ) -> tuple[TurntableFit, tuple[str, ...]]:
     """Fit poses, shape and camera to keypoints and masks."""
     capture = open_capture(root)
     keypoints = capture.keypoints(CAMERA)
     frames = capture.frames
-    held_out = held_out_frames(len(frames))
     observed = Observations(
         frames=frames,
         cameras=capture.cameras,
@@ -316,8 +335,20 @@ def _register(
     return found, (*turn_notes(found, body, stature=config.height), *found.fit.notes)
 
 
-def held_out_frames(count: int) -> tuple[int, ...]:
-    """Return the frames that are held out of a turn of a number of frames: every tenth of 20 and more."""
+def held_out_frames(count: int, chosen: tuple[int, ...] = ()) -> tuple[int, ...]:
+    """Return the frames that are held out of a turn of a number of frames: the chosen, else every tenth of 20 and more.
+
+    Raises:
+        InputError: chosen frames that the turn does not have, the reference, or so many that too few are left.
+    """
+    if chosen:
+        if not set(chosen) <= set(range(1, count)) or count - len(set(chosen)) < LEAST_FRAMES:
+            raise InputError(
+                "option hold-out",
+                expected=f"numbers of frames, 1 to {count - 1}, of which {LEAST_FRAMES} are left with frame 0",
+                received=" ".join(map(str, chosen)),
+            )
+        return tuple(sorted(set(chosen)))
     if count < _HOLD_OUT_FROM:
         return ()
     return tuple(range(_HOLD_OUT_EVERY // 2, count, _HOLD_OUT_EVERY))
@@ -325,7 +356,7 @@ def held_out_frames(count: int) -> tuple[int, ...]:
 
 def _describe(root: Path, name: str, made: TurntableCapture) -> None:
     """Write capture.json, which says of what kind the capture is and what is not known."""
-    held_out = held_out_frames(made.frames)
+    held_out = made.held_out
     train = [frame for frame in range(made.frames) if frame not in held_out]
     content = {
         "name": name,

@@ -40,6 +40,9 @@ class CaptureTurntable:
     """ONNX model of your own that makes the masks; by default MediaPipe's rough segmentation (extra `detect`)."""
     detector: str = "mediapipe"
     """mediapipe (extra `detect`), or the path of your own pose model.onnx."""
+    hold_out: tuple[int, ...] = ()
+    """Numbers of the frames, from 0, to keep from shape and training, to measure on. By default every tenth of 20 and
+    more."""
     body: OptionalPath = None
     """SMPL-X-layout body file; the open body by default."""
     json: bool = False
@@ -59,6 +62,7 @@ class CaptureTurntable:
             keypoints=self.keypoints,
             matting=self.matting,
             detector=self.detector,
+            hold_out=self.hold_out,
         )
         with shared_progress(enabled=not self.json) as progress:
             made = make_turntable_capture(self.source, self.out, config, body=load_body(self.body), progress=progress)

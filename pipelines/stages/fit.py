@@ -1,4 +1,4 @@
-"""Stage 70: fit Gaussians that are bound to the template's triangles to the views of one frame."""
+"""Stage 70: fit Gaussians that are bound to the template's triangles to the views of one frame, or of a turn."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from avatar.data.one_frame import frames_beside
 from avatar.data.views import View
 from avatar.formats import write_splat_ply
 from avatar.gaussians import BoundGaussians, load_bound, save_bound
@@ -73,24 +74,29 @@ class FitStage(ModelStage):
             return digest.hexdigest()
 
         out = {TEMPLATE: scene.digests[TEMPLATE], "capture/pose": of(_posed(trainer))}
-        # A fit reads one frame only, so that the content of each file can be hashed (a training hashes names and
-        # sizes).
+        beside = frames_beside(capture, scene.frame)
+        for frame in beside:
+            params = capture.params(frame)
+            out[f"capture/pose {frame}"] = "" if params is None else of(scene.template.pose(params)[0])
+        # A fit reads few frames, so that the content of each file can be hashed (a training hashes names and sizes).
         for name in (*capture.splits.train_cameras, *capture.splits.novel_view_cameras):
             camera = capture.cameras[name]
             out[f"capture/{name} camera"] = of(camera.K, camera.cam_from_world)
             if name in capture.recording.distortions:
                 out[f"capture/{name} lens"] = repr(capture.recording.distortions[name])
             for kind in ("image", "mask"):
-                path = capture.file(name, scene.frame, kind)
-                if path is not None:
-                    out[f"capture/{name} {kind}"] = sha256_file(path)
+                for frame in (scene.frame, *beside):
+                    path = capture.file(name, frame, kind)
+                    if path is not None:
+                        which = f"{kind} {frame}" if frame in beside else kind
+                        out[f"capture/{name} {which}"] = sha256_file(path)
         return out
 
     def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
         # The overlap of silhouettes is measured before the fit, which would hide a wrong pose.
         scene = fit_scene(trainer.scene, GROUNDS[self.ground](trainer.scene.template))
         overlap = silhouette_overlap(scene.template.mesh.with_vertices(scene.vertices), list(scene.train))
-        views = {view.name: view for view in (*scene.held_out, *scene.train)}
+        views = {view.name: view for view in (*scene.held_out, *scene.shown)}
 
         def preview(images: Mapping[str, np.ndarray]) -> None:
             _write_strips(session.folder, images, views, scene.background)
@@ -112,7 +118,7 @@ class FitStage(ModelStage):
         shutil.copyfile(session.folder / METRICS_FILE, folder / METRICS_FILE)
         # Show all held-out views and a few training views.
         held_out = [view.name for view in scene.held_out]
-        train = [view.name for view in scene.train]
+        train = [view.name for view in scene.shown]
         shown = (*held_out, *spread(train, PREVIEWED_TRAINING_VIEWS))
         _write_strips(folder, {name: result.images[name] for name in shown}, views, scene.background)
         # The first evaluation, before any step, is the reference for the gain of PSNR.

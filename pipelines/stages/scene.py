@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from avatar.data.one_frame import frames_beside
 from avatar.data.views import read_views
 from avatar.training.scene import TrainScene, hold_out_cameras, prepare_scene, silhouette_overlap, with_cameras
 from pipelines.runs import layout
@@ -98,9 +99,10 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
             remedy="name a file with --params, convert your fit with `smplxpp params convert`, or make one with "
             "`smplxpp register`",
         )
-    # Reduce the training frames to this one; held-out cameras remain for measuring.
-    splits = capture.splits
-    capture = replace(capture, splits=Splits(splits.train_cameras, splits.novel_view_cameras, (frame,), ()))
+    # Reduce the training frames to this one, or a turn's to those that show its sides; held-out cameras remain for
+    # measuring.
+    splits, frames = capture.splits, (frame, *frames_beside(capture, frame))
+    capture = replace(capture, splits=Splits(splits.train_cameras, splits.novel_view_cameras, frames, ()))
     overlap = silhouette_overlap(
         template.mesh.with_vertices(template.pose(params)[0]), read_views(capture, frame, splits.train_cameras)
     )

@@ -1,4 +1,7 @@
-"""Fit: one frame's views turn a posed template into textured Gaussians bound to its triangles."""
+"""Fit: one frame's views turn a posed template into textured Gaussians bound to its triangles.
+
+Of a person who turns before one camera a frame shows one side; there the views of all frames are fitted together.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.data.one_frame import FRAME, OneFrame
+from avatar.data.one_frame import OneFrame, PosedViews, other_sides
 from avatar.data.sequence import Item, camera_centers_of
 from avatar.data.views import View, read_views
 from avatar.export.posed import posed_splats
@@ -39,6 +42,7 @@ class FitScene:
         train: whole training views, each with a unique name.
         held_out: whole views for evaluations, each with a unique name.
         background: sRGB in [0, 1] behind the person.
+        others: further frames to fit to, of a person who turns before one camera.
     """
 
     template: Template
@@ -46,6 +50,12 @@ class FitScene:
     train: Sequence[View]
     held_out: Sequence[View] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    others: Sequence[PosedViews] = ()
+
+    @property
+    def shown(self) -> tuple[View, ...]:
+        """All training views."""
+        return (*self.train, *(view for one in self.others for view in one.views))
 
     __repr__ = one_line
 
@@ -59,7 +69,7 @@ class FitScene:
 
 
 def fit_scene(scene: TrainScene, template: Template) -> FitScene:
-    """Return what the fit is made on: the reference frame's whole views, and a template in that frame's pose.
+    """Return the reference frame's whole views, the template in its pose, and for a turn the other frames' as well.
 
     Args:
         scene: its capture and reference frame.
@@ -72,6 +82,7 @@ def fit_scene(scene: TrainScene, template: Template) -> FitScene:
         read_views(capture, frame, capture.splits.train_cameras),
         read_views(capture, frame, capture.splits.novel_view_cameras),
         capture.recording.background or (0.0, 0.0, 0.0),
+        other_sides(capture, frame, template),
     )
 
 
@@ -132,8 +143,8 @@ def fit_gaussians(
     )
     progress = run_training(task, loop, Path(folder), key=key, report=report)
     # Figures and images of all views, and the Gaussians in the world.
-    names = [view.name for view in (*scene.held_out, *scene.train)]
-    measured = {name: task.measure(task.sequence.whole_view(name), FRAME) for name in names}
+    names = [view.name for view in (*scene.held_out, *scene.shown)]
+    measured = {name: task.measure(task.sequence.whole_view(name), task.sequence.frame_of(name)) for name in names}
     quality = {name: of_view for name, (of_view, _) in measured.items()}
     images = {name: image for name, (_, image) in measured.items()}
     gaussians = task.student.gaussians.snapshot()
@@ -155,18 +166,22 @@ class FitTask(PhotometricTask):
             scene.vertices,
             scene.train,
             scene.held_out,
+            others=scene.others,
             background=scene.background,
             margin=config.margin,
             device=device,
         )
         # Initial Gaussians with colours from the photographs; the student has no field and no blend shapes.
-        start = initial_gaussians(frame.rig, scene.vertices, scene.train, config.sampling, detail=config.detail)
+        start = initial_gaussians(
+            frame.rig, scene.vertices, scene.train, config.sampling, others=scene.others, detail=config.detail
+        )
         self.fit_config, self.held_out = config, bool(scene.held_out)
         self.student = Student(StudentConfig(field=None), frame.rig, start, ())
         super().__init__(frame, self.student, config.photometric(), [], context)
         # Boxes of the head, for figures of its own.
-        corners = scene.vertices[head_vertices(scene.template)]
-        self.heads = {view.name: head_box(corners, view.camera) for view in (*scene.train, *scene.held_out)}
+        head = head_vertices(scene.template)
+        posed = (PosedViews(scene.vertices, (*scene.train, *scene.held_out)), *scene.others)
+        self.heads = {v.name: head_box(one.vertices[head], v.camera) for one in posed for v in one.views}
 
     def name_of(self, item: Item) -> str:
         """Return the name of the step's view."""

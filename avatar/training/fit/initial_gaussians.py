@@ -12,6 +12,7 @@ from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter, sobel
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avatar.data.one_frame import PosedViews
 from avatar.data.views import View
 from avatar.gaussians import BoundGaussians, SamplingConfig, sample_on_mesh, triangle_frames, world_from_frames
 from avatar.rig.rig import Rig
@@ -30,6 +31,7 @@ def initial_gaussians(
     views: Sequence[View],
     sampling: SamplingConfig,
     *,
+    others: Sequence[PosedViews] = (),
     detail: float = 0.0,
 ) -> BoundGaussians:
     """Sample Gaussians on a template and colour them from whole views of it.
@@ -39,33 +41,40 @@ def initial_gaussians(
         vertices: of the template in the views' frame, metres.
         views: whole photographs of the frame.
         sampling: number and distribution of the Gaussians, and the seed.
+        others: further frames, which show other sides.
         detail: additional density where the photographs change quickly, see `density_of_detail`; 0: none.
     """
+    frames = (PosedViews(vertices, views), *others)
     start = sample_on_mesh(rig.template, sampling)
     # A first sample measures the gradient magnitude of the photographs; the second one follows it.
     if detail:
-        rates, seen = _measure_colors(rig, vertices, start, [changes(view) for view in views])
+        of_changes = [PosedViews(one.vertices, [changes(view) for view in one.views]) for one in frames]
+        rates, seen = _measure_colors(rig, start, of_changes)
         density = density_of_detail(rig.template, start.face_index.numpy(), rates.cpu().numpy(), seen, detail)
         start = sample_on_mesh(rig.template, sampling, density=density)
-    return replace(start.to(device=rig.device), dc=_measure_colors(rig, vertices, start, views)[0])
+    return replace(start.to(device=rig.device), dc=_measure_colors(rig, start, frames)[0])
 
 
 def _measure_colors(
-    rig: Rig, vertices: Float[np.ndarray, "V 3"], gaussians: BoundGaussians, views: Sequence[View]
+    rig: Rig, gaussians: BoundGaussians, frames: Sequence[PosedViews]
 ) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
-    """Return the colours of Gaussians on a template at `vertices` in the views, and whether any view shows each."""
+    """Return the mean colours of Gaussians on a template over all views, and whether any view shows each."""
     mouth_tolerance = 0.002  # metres behind the z-buffer: teeth are a centimetre behind the lips
-    # Centres and normals of the Gaussians in the world, on the mesh in the frame's pose.
     gaussians = gaussians.to(device=rig.device)
-    placed = world_from_frames(gaussians, triangle_frames(rig.pose_from_vertices(vertices).rest, rig.faces))
-    return colors_from_views(
-        placed.means.double().cpu().numpy(),
-        placed.normals.double().cpu().numpy(),
-        gaussians.dc,
-        mesh=rig.template.mesh.with_vertices(vertices),
-        views=views,
-        tolerance=np.where(_in_mouth(rig, gaussians), mouth_tolerance, DEPTH_TOLERANCE),
-    )
+    tolerance = np.where(_in_mouth(rig, gaussians), mouth_tolerance, DEPTH_TOLERANCE)
+    total, weight = np.zeros((len(gaussians), 3)), np.zeros(len(gaussians))
+    for frame in frames:
+        # Centres and normals of the Gaussians in the world, on the mesh in the frame's pose.
+        placed = world_from_frames(gaussians, triangle_frames(rig.pose_from_vertices(frame.vertices).rest, rig.faces))
+        summed, weights = _weighted_colors(
+            placed.means.double().cpu().numpy(),
+            placed.normals.double().cpu().numpy(),
+            mesh=rig.template.mesh.with_vertices(frame.vertices),
+            views=frame.views,
+            tolerance=tolerance,
+        )
+        total, weight = total + summed, weight + weights
+    return _mean_colors(total, weight, gaussians.dc)
 
 
 def _in_mouth(rig: Rig, gaussians: BoundGaussians) -> Bool[np.ndarray, " N"]:
@@ -98,6 +107,29 @@ def colors_from_views(
     Returns:
         Colours, and whether any view shows each point.
     """
+    depths = np.full(len(points), DEPTH_TOLERANCE) if tolerance is None else tolerance
+    return _mean_colors(*_weighted_colors(points, normals, mesh=mesh, views=views, tolerance=depths), fallback)
+
+
+def _mean_colors(
+    total: Float64[np.ndarray, "N 3"], weight: Float64[np.ndarray, " N"], fallback: Float[Tensor, "N 3"]
+) -> tuple[Float32[Tensor, "N 3"], Bool[np.ndarray, " N"]]:
+    """Return weighted means, the fallback where no view has any weight, and where some view has."""
+    seen = weight > 0
+    colors = fallback.detach().cpu().numpy().copy()
+    colors[seen] = total[seen] / weight[seen, None]
+    return torch.tensor(colors, dtype=torch.float32, device=fallback.device), seen
+
+
+def _weighted_colors(
+    points: Float64[np.ndarray, "N 3"],
+    normals: Float64[np.ndarray, "N 3"],
+    *,
+    mesh: TriangleMesh,
+    views: Sequence[View],
+    tolerance: Float[np.ndarray, " N"],
+) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, " N"]]:
+    """Return the weighted sums of colours of `colors_from_views` over the views, and the sums of weights."""
     min_cosine = 0.2  # surfaces at flatter angles project into pixels of the silhouette
     min_opacity = 0.99
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
@@ -119,7 +151,7 @@ def colors_from_views(
         seen = (
             inside & (cosine > min_cosine) & np.isfinite(farthest[row, column]) & (opacity[row, column] > min_opacity)
         )
-        seen &= depth <= nearest[row, column] + (DEPTH_TOLERANCE if tolerance is None else tolerance)
+        seen &= depth <= nearest[row, column] + tolerance
         # Sample the image bilinearly at the visible points, and add with weight cos^2 (f / distance)^2.
         index = np.flatnonzero(seen)
         image = view.foreground.cpu().numpy() / 255.0
@@ -129,10 +161,7 @@ def colors_from_views(
             [map_coordinates(image[..., k], at, order=1, mode="nearest") for k in range(3)], axis=1
         )
         weight[index] += w
-    seen = weight > 0
-    colors = fallback.detach().cpu().numpy().copy()
-    colors[seen] = total[seen] / weight[seen, None]
-    return torch.tensor(colors, dtype=torch.float32, device=fallback.device), seen
+    return total, weight
 
 
 def changes(view: View) -> View:
