@@ -8,10 +8,13 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
+from scipy.ndimage import laplace
 
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.files import IMAGE_SUFFIXES
@@ -23,6 +26,7 @@ _DIAGONAL_MM = 43.27  # of a frame of 35 mm film, to which equivalent focal leng
 _PHONE_MM = 27.0  # main cameras of phones, filming: 24 to 30 mm
 _UNKNOWN_LENS, _STATED_LENS = 0.25, 0.03  # standard deviations of log f
 _FFMPEG_SECONDS = 900
+_SHARPNESS_PIXELS = 256  # of a frame that is judged: finer detail is noise of the sensor, and minutes have 2000 frames
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Lens:
 
 @contextmanager
 def turn_frames(source: Path, most: int) -> Iterator[tuple[list[TurnFrame], Capture | None]]:
-    """Give the frames of a source, evenly spread, and the capture that it is; frames of a video last for the block.
+    """Give the frames of a source, evenly spread, and the capture that it is; a video's last for the block.
 
     Args:
         source: folder of photographs, video, or folder of a capture by one camera.
@@ -91,7 +95,7 @@ def last_number(path: Path) -> int | None:
 
 
 def decoded_frames(video: Path, folder: Path, most: int) -> list[TurnFrame]:
-    """Decode evenly spread frames of a video into PNG files, upright as its rotation flag says.
+    """Decode the sharpest frames of equal intervals of a video into PNG files, upright as its rotation flag says.
 
     Raises:
         MissingExtraError: imageio-ffmpeg is not installed.
@@ -102,20 +106,53 @@ def decoded_frames(video: Path, folder: Path, most: int) -> list[TurnFrame]:
     except ImportError:
         raise MissingExtraError("imageio-ffmpeg", extra="video", purpose="reading videos") from None
     program = imageio_ffmpeg.get_ffmpeg_exe()
-    try:
-        count, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"video {video}", expected="a video", received=str(error).splitlines()[0][:200]) from None
-    # The rate at which the wanted number of frames comes out; never more than there are.
-    rate = min(most, count) / max(seconds, 1e-3)
-    command = [program, "-nostdin", "-v", "error", "-i", str(video), "-vf", f"fps={rate:.6f}", "-frames:v", str(most)]
-    done = subprocess.run(
-        [*command, str(folder / "%06d.png")], capture_output=True, text=True, timeout=_FFMPEG_SECONDS, check=False
-    )
-    paths = sorted(folder.glob("*.png"))
-    if done.returncode or not paths:
-        raise InputError(f"video {video}", expected="frames that can be decoded", received=done.stderr[:300])
-    return [TurnFrame(path, last_number(path)) for path in paths]
+    # All frames, small and grey, show which of them are sharp; those that are chosen are decoded whole.
+    side = _SHARPNESS_PIXELS
+    small = _ffmpeg(program, video, f"scale={side}:{side},format=gray", "-f", "rawvideo", "-")
+    grey = np.frombuffer(small, np.uint8)
+    chosen = sharpest_of_intervals(grey[: len(grey) // side**2 * side**2].reshape(-1, side, side), most)
+    if not chosen:
+        raise InputError(f"video {video}", expected="frames that can be decoded", received="none")
+    picked = "+".join(f"eq(n\\,{number})" for number in chosen)
+    _ffmpeg(program, video, f"select={picked},format=rgb24", str(folder / "%06d.png"))
+    return [TurnFrame(path, last_number(path)) for path in sorted(folder.glob("*.png"))]
+
+
+def sharpest_of_intervals(frames: UInt8[np.ndarray, "T H W"], most: int) -> list[int]:
+    """Return the sharpest frame of each of `most` equal intervals, by the variance of the Laplacian.
+
+    Candidates are the middle halves of the intervals, so that neighbours of the choice are 0.5 to 1.5 intervals apart.
+
+    Args:
+        frames: all of a video, grey.
+        most: number of frames to choose; all are taken where there are no more.
+    """
+    if len(frames) <= most:
+        return list(range(len(frames)))
+    sharp = np.array([laplace(frame.astype(np.float32)).var() for frame in frames])
+    ends = np.linspace(0, len(frames), most + 1)
+    chosen = []
+    for first, last in pairwise(ends):
+        quarter = (last - first) / 4
+        low = int(first + quarter)
+        chosen.append(low + int(sharp[low : max(low + 1, int(np.ceil(last - quarter)))].argmax()))
+    return chosen
+
+
+def _ffmpeg(program: str, video: Path, filters: str, *output: str) -> bytes:
+    """Return what FFmpeg writes to its output for a video, every frame once.
+
+    Raises:
+        InputError: a file that is no video.
+    """
+    command = [program, "-nostdin", "-v", "error", "-i", str(video), "-vf", filters, "-fps_mode", "passthrough"]
+    done = subprocess.run([*command, *output], capture_output=True, timeout=_FFMPEG_SECONDS, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        raise InputError(
+            f"video {video}", expected="a video that can be decoded", received=(said or ["nothing"])[0][:200]
+        )
+    return done.stdout
 
 
 def _of_capture(capture: Capture, most: int) -> list[TurnFrame]:
