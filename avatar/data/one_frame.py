@@ -45,6 +45,12 @@ def frames_beside(capture: Capture, frame: int) -> tuple[int, ...]:
     return tuple(spread([one for one in capture.splits.train_frames if one != frame], _MOST_OTHERS))
 
 
+def views_of_turn(capture: Capture) -> int:
+    """Return the number of views of a person who turns before one camera that a fit compares; 0 for other captures."""
+    frames = capture.splits.train_frames
+    return 1 + len(frames_beside(capture, frames[0])) if capture.kind == TURNTABLE and frames else 0
+
+
 def other_sides(capture: Capture, frame: int, template: Template) -> tuple[PosedViews, ...]:
     """Read the frames of `frames_beside` with the template in them; views are named by camera and frame.
 

@@ -91,12 +91,16 @@ class TrainConfig:
         for step in self.iterations:
             require_choice("iterations of a step", step, ("fit", *_TRAININGS))
 
-    def recipe(self, preset: str | TrainingPreset = "cpu", *, cloth: Literal["auto", "none"] = "auto") -> Recipe:
+    def recipe(
+        self, preset: str | TrainingPreset = "cpu", *, cloth: Literal["auto", "none"] = "auto", turn_views: int = 0
+    ) -> Recipe:
         """Return the configurations of all steps; whether poses are refined is decided when the capture is known.
 
         Args:
             preset: name of a preset, or a preset of your own.
             cloth: "auto": clothes that leave skinning and that a simulation improves are simulated; "none": no clothes.
+            turn_views: number of views of a person who turns before one camera, see `TrainingPreset.for_turn`; 0 where
+                all cameras see the same moment.
 
         Raises:
             InputError: an unknown preset.
@@ -104,6 +108,7 @@ class TrainConfig:
         """
         # Seed and share of the iterations first, then single options, which therefore are taken as given.
         chosen = training_preset(preset) if isinstance(preset, str) else preset
+        chosen = chosen.for_turn(turn_views) if turn_views else chosen
         chosen = self._changed(chosen.with_seed(self.seed).shortened(self.iterations_share))
         if self.batch is not None:
             chosen = with_batch(chosen, self.batch)
@@ -111,11 +116,11 @@ class TrainConfig:
             chosen = with_perceptual(chosen)
         return Recipe(
             preset=chosen,
-            teacher=self.teacher,
+            teacher=self.teacher and not turn_views,
             perceptual=choose_perceptual(self.perceptual, chosen),
             blend_shapes=self.blend_shapes,
             max_megabytes=self.max_megabytes,
-            cloth=None if cloth == "none" else ClothConfig(parts=self.loose_parts or None),
+            cloth=None if cloth == "none" or turn_views else ClothConfig(parts=self.loose_parts or None),
         )
 
     def refinement(self, *, wanted: bool) -> RefineConfig | None:

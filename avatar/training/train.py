@@ -14,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+from avatar.data.one_frame import views_of_turn
 from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.losses.perceptual import load_metric
@@ -111,6 +112,7 @@ def train(
     template.save(folder / TRAINING_FILES.template)
     template = Template.load(folder / TRAINING_FILES.template)
     capture = hold_out_cameras(capture, config.hold_out)
+    recipe = config.recipe(preset, cloth=cloth, turn_views=views_of_turn(capture))
     training = _Training(folder, config, recipe, report)
     reference = _reference_pose(capture, config.template_frame)
     if reference is not None:

@@ -115,6 +115,7 @@ class Train:
         require_avatar("training an avatar")
         if int(os.environ.get("RANK") or 0):
             logging.disable(logging.WARNING)  # rank 0 logs the same warnings
+        from avatar.data.one_frame import views_of_turn
         from avatar.training.engine.processes import join_processes
         from avatar.training.engine.resources import choose_device
         from avatar.training.recipe import with_batch
@@ -128,15 +129,22 @@ class Train:
         keep_out_of_capture(self.run_folder, self.capture, subject="RUN")
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         config, steps = self.config(), self.steps()
-        recipe = config.recipe(self.preset, cloth=self.cloth)
+        config.recipe(self.preset, cloth=self.cloth)
         with join_processes(choose_device(self.device)) as together:
-            # Every process needs a pose of each step.
-            recipe = replace(recipe, preset=with_batch(recipe.preset, least=together.world_size))
             # Rank 0 decides and opens the scene, so that all ranks train with the same steps on the same data.
             first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
-            recipe = replace(recipe, refine=config.refinement(wanted=first))
             refines = first and "refine" in steps
             scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs, refined=not refines))
+            recipe = config.recipe(self.preset, cloth=self.cloth, turn_views=views_of_turn(scene.capture))
+            # Every process needs a pose of each step.
+            preset = with_batch(recipe.preset, least=together.world_size)
+            recipe = replace(recipe, preset=preset, refine=config.refinement(wanted=first))
+            if not recipe.teacher and self.stage in ("teacher", "cloth"):
+                raise InputError(
+                    "option stage",
+                    expected="fit, bake or compensate",
+                    received=f"{self.stage}, which the training of a turn and one without a teacher do not have",
+                )
             held_out = bool(scene.capture.splits.novel_view_cameras)
 
             def bar(name: str, total: int) -> AbstractContextManager:

@@ -52,7 +52,33 @@ def initial_gaussians(
         rates, seen = _measure_colors(rig, start, of_changes)
         density = density_of_detail(rig.template, start.face_index.numpy(), rates.cpu().numpy(), seen, detail)
         start = sample_on_mesh(rig.template, sampling, density=density)
-    return replace(start.to(device=rig.device), dc=_measure_colors(rig, start, frames)[0])
+    colors, seen = _measure_colors(rig, start, frames)
+    if others:
+        colors = _unseen_from_neighbours(rig, start, colors, seen)
+    return replace(start.to(device=rig.device), dc=colors)
+
+
+def _unseen_from_neighbours(
+    rig: Rig, gaussians: BoundGaussians, colors: Float32[Tensor, "N 3"], seen: Bool[np.ndarray, " N"]
+) -> Float32[Tensor, "N 3"]:
+    """Give Gaussians that no view shows the colour of the nearest seen one, on clothes and hair of the same part.
+
+    One camera sees neither armpits nor the skin under clothes, which shows through between the Gaussians of the cloth.
+    The inside of the mouth keeps the template's colours.
+    """
+    faces = rig.template.faces[gaussians.face_index.cpu().numpy()]
+    places = rig.template.vertices[faces].mean(axis=1)
+    part = rig.template.vertex_part[faces[:, 0]]
+    lacking = ~seen & ~_in_mouth(rig, gaussians)
+    out = colors.cpu().numpy().copy()
+    for one in np.unique(part[lacking]):
+        # Skin borrows from what covers it; a part of which nothing is seen borrows from any other.
+        known = np.flatnonzero(seen & ((part == one) | (one == 0)))
+        known = known if len(known) else np.flatnonzero(seen)
+        rows = np.flatnonzero(lacking & (part == one))
+        if len(known):
+            out[rows] = out[known[cKDTree(places[known]).query(places[rows])[1]]]
+    return torch.tensor(out, dtype=colors.dtype, device=colors.device)
 
 
 def _measure_colors(
