@@ -56,6 +56,13 @@ def test_poses_and_shape_of_one_view_a_pose(turn, found):
     assert found.turned == pytest.approx(360.0 * (FRAMES - 1) / FRAMES, abs=6.0)
 
 
+def test_the_stated_uncertainty_of_the_lens_covers_its_error(turn, found):
+    # The equations alone stated a third of it: errors of keypoints are not independent, as they take them to be.
+    error = abs(np.log(found.camera.K[0, 0] / turn.camera.K[0, 0]))
+    assert error < 2.0 * found.focal_spread and 0.05 < found.focal_spread < 0.2
+    assert "percent: state --focal-mm" in " ".join(turn_notes(found, BODY, stature=None))
+
+
 def test_the_world_stands_on_its_floor_and_nothing_moves_in_the_image(found):
     params, camera = leveled(found, BODY)
     before, after = BODY.forward(found.fit.params), BODY.forward(params)

@@ -63,9 +63,7 @@ def turn_notes(found: TurntableFit, body: BodyModel, *, stature: float | None) -
         )
     if found.focal_spread > 0.02:
         share = 100 * found.focal_spread
-        out.append(
-            f"focal length {found.camera.K[0, 0]:.0f} px, known to {share:.0f} percent at best: state --focal-mm"
-        )
+        out.append(f"focal length {found.camera.K[0, 0]:.0f} px, known to {share:.0f} percent: state --focal-mm")
     # Directions from which the camera sees the body, about the vertical.
     state = BodyState.of_params(body, found.fit.params)
     root = int(np.flatnonzero(body.parents < 0)[0])
