@@ -183,3 +183,7 @@ def test_a_kind_that_the_cameras_contradict_is_refused(made, tmp_path):
 
 def test_of_many_frames_some_are_held_out_but_never_the_reference():
     assert held_out_frames(8) == () and held_out_frames(60) == (5, 15, 25, 35, 45, 55)
+    assert held_out_frames(8, (5, 2)) == (2, 5)
+    for wrong in ((0,), (8,), (1, 2, 3, 4, 5)):
+        with pytest.raises(InputError, match="hold-out: expected numbers of frames, 1 to 7"):
+            held_out_frames(8, wrong)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from avatar.training.presets import TRAINING_PRESETS, training_preset, with_iterations
+from avatar.training.recipe import TrainConfig
 from smplxpp.core.errors import InputError
 
 STAGES = ("fit", "teacher", "bake", "compensate")
@@ -86,3 +87,13 @@ def test_the_bakes_student_has_no_blend_shapes(name):
 def test_an_unknown_name_is_refused():
     with pytest.raises(InputError, match="'paper' or 'gpu' or 'paper-small' or 'cpu' or 'demo'"):
         training_preset("tpu")
+
+
+def test_of_a_turn_a_student_is_fitted_without_a_teacher_and_options_still_count():
+    recipe = TrainConfig(iterations_share=0.5, iterations={"bake": 7}).recipe("cpu", turn_views=8)
+    assert not recipe.teacher and recipe.cloth is None
+    preset, own = recipe.preset, training_preset("cpu")
+    assert preset.fit.iterations == 100 and preset.fit.sampling.sh_degree == 0
+    assert preset.fit.sampling.count == own.fit.sampling.count
+    assert preset.bake.iterations == 7 and preset.bake.attributes == preset.compensate.attributes == 0.0
+    assert TrainConfig().recipe("cpu").preset == own

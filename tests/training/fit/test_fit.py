@@ -8,20 +8,33 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.data.one_frame import PosedViews
 from avatar.data.views import View
 from avatar.export.posed import posed_splats
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.metrics.view_quality import head_box
+from avatar.rig.rig import Rig
 from avatar.training.engine.learning_rates import LearningRates
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.optimization_task import DivergedError
 from avatar.training.engine.resources import choose_device
 from avatar.training.fit.config import FitConfig
 from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
-from smplxpp.core import Camera, InputError
+from avatar.training.fit.initial_gaussians import initial_gaussians
+from avatar.training.presets import TRAINING_PRESETS
+from smplxpp.core import Camera, InputError, matrix_from_rotvec
 from tests.dolls.standing import HELD_OUT, TRAIN, doll
 
 CONFIG = FitConfig(sampling=SamplingConfig(count=2500), iterations=60, evaluations=3, margin=4)
+
+
+def turned(name: str, number: int) -> PosedViews:
+    """Return the doll turned so that the photograph of a camera is taken by one that stands elsewhere."""
+    turn = np.eye(4)
+    turn[:3, :3] = matrix_from_rotvec(np.array([0.0, 0.7 * number, 0.0]))
+    seen = view(name)
+    camera = replace(seen.camera, cam_from_world=seen.camera.cam_from_world @ turn.T, name=f"cam {number}")
+    return PosedViews(doll().template.vertices @ turn[:3, :3].T, [replace(seen, camera=camera)])
 
 
 def view(name: str) -> View:
@@ -36,6 +49,10 @@ def scene(**changes) -> FitScene:
         "held_out": [view(name) for name in HELD_OUT],
     }
     return FitScene(**{**parts, **changes})
+
+
+def scene_of(front: FitScene, others: list[PosedViews]) -> FitScene:
+    return replace(front, others=others)
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +81,39 @@ def test_images_are_whole_and_previews_show_the_held_out_views(fitted):
     np.testing.assert_array_equal(previews[-1]["Held1"], result.images["Held1"])
     error = np.abs(result.images["Held0"].astype(int) - doll().images["Held0"])
     assert error.mean() < 4
+
+
+def test_a_fit_of_one_view_knows_one_side_and_the_frames_of_a_turn_know_all(tmp_path, fitted):
+    # The photographs of a rig are those of a turn, if the doll turns and the camera stands still.
+    others = [turned(name, number) for number, name in enumerate(TRAIN[1:], start=1)]
+    config = TRAINING_PRESETS["cpu"].for_turn(len(TRAIN)).fit
+    config = replace(config, sampling=replace(config.sampling, count=2500, head_share=None), iterations=60, margin=4)
+    front = scene(train=[view(TRAIN[0])])
+    one, turn = (fit_gaussians(it, config, tmp_path / str(k)) for k, it in enumerate((front, scene_of(front, others))))
+    assert set(turn.quality) == {TRAIN[0], *HELD_OUT, *(f"cam {k}" for k in range(1, len(TRAIN)))}
+
+    def held_out(result):
+        return np.mean([result.quality[name].psnr for name in HELD_OUT])
+
+    rig = held_out(fitted[0])
+    assert held_out(turn) > rig - 1.5 and held_out(turn) > held_out(one) + 3.0
+    # An item of a turn has one view, with the pose of its frame.
+    task = FitTask(scene_of(front, others), config)
+    shown = {task.micro_batches(k)[0] for k in range(len(TRAIN))}
+    assert {item.frame for item in shown} == set(range(len(TRAIN)))
+    assert {item.cameras for item in shown} == {(name,) for name in task.sequence.train_cameras}
+
+
+def test_what_no_view_of_a_turn_shows_has_the_colour_beside_it():
+    # Of the doll's skin under its clothes nothing is seen: the template's red must not shine through.
+    template = doll().template
+    red = replace(template, vertex_colors=np.full((len(template.vertices), 3), [255, 0, 0], np.uint8))
+    others = [turned(name, number) for number, name in enumerate(TRAIN[1:], start=1)]
+    start = initial_gaussians(Rig(red), red.vertices, [view(TRAIN[0])], CONFIG.sampling, others=others)
+    alone = initial_gaussians(Rig(red), red.vertices, [view(TRAIN[0])], CONFIG.sampling)
+    pure = torch.tensor([1.0, 0.0, 0.0])
+    assert (alone.dc - pure).abs().amax(1).lt(1e-3).float().mean() > 0.3
+    assert not (start.dc - pure).abs().amax(1).lt(1e-3).any()
 
 
 def test_what_comes_out_is_bound_posed_and_free_of_gradients(fitted):
