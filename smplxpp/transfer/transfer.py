@@ -34,7 +34,7 @@ from smplxpp.transfer.correspond import (
     settle_unmatched,
     vertex_components,
 )
-from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
+from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes, unworn_arms
 from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 
@@ -103,9 +103,20 @@ def transfer_weights(
     allowed = config.allowed_mask(joint_count)
     if allowed is not None and config.confident is None:
         source, weights = restrict_source(source, weights, allowed)
-    # Match vertices to the source; find the confident ones among the matched.
+    # Match vertices to the source.
     found = closest_points(source, target)
     check_placement(source, target, found.distance)
+    # Find the rings that go around one limb, and leave out arms that are not in the sleeves.
+    limbs = None
+    if config.confident is not None and found.distance.max() > config.around[0] * size:
+        axes = limb_axes(source, weights, size, config)
+        if axes:
+            limbs = enclosed_by_one(target, axes, joint_count)
+            unworn = unworn_arms(target, axes, limbs, size, config, joint_count)
+            if unworn.any():
+                source, weights = restrict_source(source, weights, ~unworn)
+                found = closest_points(source, target)
+    # Find the confident vertices among the matched ones.
     component = vertex_components(target)
     limit = config.max_distance * extent(target)
     found, normals = face_outward(found, target, component, max_distance=limit)
@@ -116,10 +127,6 @@ def transfer_weights(
     matched = found.matched(max_distance=limit, max_angle=angle)
     near = min(limit, (config.confident or 0.0) * size)
     confident = found.matched(max_distance=near, max_angle=angle) & (config.confident is not None)
-    # Find the rings that go around one limb, and let these vertices follow it, however far off it is.
-    limbs = None
-    if config.confident is not None:
-        limbs = _limbs(source, weights, target, found, size, config)
     # Compute each vertex's own value, then smooth the values over the surface.
     values = _values(source, weights, _Matches(target, normals, found, component, confident), allowed, size, config)
     far_off = np.zeros(len(values))
@@ -221,21 +228,6 @@ def _values(
     return out
 
 
-def _limbs(
-    source: TriangleMesh,
-    weights: np.ndarray,
-    target: TriangleMesh,
-    found: Correspondence,
-    size: float,
-    config: TransferConfig,
-) -> Enclosure | None:
-    """Return which vertices go around one limb; None where all cloth is so near that this does not matter."""
-    if found.distance.max() <= config.around[0] * size:
-        return None
-    axes = limb_axes(source, weights, size, config)
-    return enclosed_by_one(target, axes, weights.shape[1]) if axes else None
-
-
 def _published(
     at: _Matches, source: TriangleMesh, weights: np.ndarray, size: float, config: TransferConfig
 ) -> np.ndarray:
@@ -243,7 +235,7 @@ def _published(
     used = np.flatnonzero(weights.any(axis=0))
     out = np.zeros((at.target.vertex_count, weights.shape[1]))
     out[:, used] = _anchor_weights(
-        at, at.found.interpolate(source, weights[:, used]), config.length_scale * size, config
+        at, at.found.interpolate(source, weights[:, used]), config.published_length * size, config
     )
     return out
 

@@ -9,12 +9,12 @@ import pytest
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import WORN_POSES, worn_poses
 from smplxpp.core import TriangleMesh
-from smplxpp.people.garments.mannequin import Mannequin
+from smplxpp.people.garments.mannequin import Mannequin, shares
 from smplxpp.people.garments.wardrobe import Case, garments_of, scan
 from smplxpp.skinning import skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.checks import extent
-from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes
+from smplxpp.transfer.enclosed import empty_tubes, enclosed_by_one, limb_axes
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +105,26 @@ def test_joints_with_other_names_have_no_axes(mannequin, worn):
     names = tuple(f"bone {k}" for k in range(mannequin.body.joint_count))
     case = worn("hakama")
     assert limb_axes(case.source, mannequin.body.weights, 1.9, TransferConfig(joint_names=names)) == []
+
+
+def test_a_coat_over_the_shoulders_does_not_follow_the_arms_under_it(mannequin, worn):
+    """Its empty sleeves hang beside the arms, which took them and the coat along: 100 mm off in the mean."""
+    case = worn("coat with empty sleeves")
+    config = TransferConfig.for_label("outer")
+    dense = transfer_weights(case.source, mannequin.body.weights, case.mesh, config=config).dense()
+    assert shares(mannequin.body, dense, ("shoulder", "elbow", "wrist")).max() < 1e-9
+    axes = limb_axes(case.source, mannequin.body.weights, extent(case.source), config)
+    tubes = empty_tubes(case.mesh, axes, extent(case.source))
+    sleeves = np.abs(case.mesh.vertices[:, 0]) > 0.4
+    assert tubes[sleeves & (case.mesh.vertices[:, 1] < 0.2)].all()
+    assert not tubes[np.abs(case.mesh.vertices[:, 0]) < 0.2].any()
+
+
+@pytest.mark.parametrize("name", ["wide sleeves", "hakama", "scarf", "mini skirt"])
+def test_tubes_that_a_limb_is_in_and_sheets_are_not_empty(mannequin, worn, name):
+    case = worn(name)
+    axes = limb_axes(case.source, mannequin.body.weights, extent(case.source), TransferConfig())
+    assert not empty_tubes(case.mesh, axes, extent(case.source)).any()
 
 
 def cut_along_seams(mesh: TriangleMesh) -> tuple[TriangleMesh, np.ndarray]:

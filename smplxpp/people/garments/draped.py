@@ -261,7 +261,7 @@ def _coat_over_shoulders(mannequin: Mannequin) -> ClothMesh:
             ),
             axis=-1,
         )
-        share = ramp(down, 0.0, 0.25)[..., None]
+        share = ramp(down[:, 0], 0.0, 0.25)[:, None, None]
         points = ((1 - share) * first + share * ring).reshape(-1, 3)
         tube = facing_out(
             mannequin.unweighted(points, grid_faces(40, len(rim), closed=True)),
