@@ -35,6 +35,8 @@ def template_writers(request: FileRequest) -> Writers:
     # An OBJ has no skeleton: its surfaces are posed here. GLB and USD store skeleton and motion.
     template = load_run_template(request.source)
     params = None if request.params is None else load_params_for(template, request.params)
+    # A motion places the person by itself; in the T-pose she stands on the floor.
+    template = template.on_floor() if params is None else template
     if request.format == "obj":
         return _surfaces(request, template, params)
     if request.is_series:

@@ -213,8 +213,9 @@ def assemble(folder: Path, build: BuildContext) -> StageOutput:
         build.config,
     )
     template.save(folder / "smplxpp.npz")
-    write_glb(folder / "template.glb", template)
-    write_obj(folder / "template.obj", template)
+    # Other programs expect a figure that stands on the floor.
+    write_glb(folder / "template.glb", template.on_floor())
+    write_obj(folder / "template.obj", template.on_floor())
     return output
 
 

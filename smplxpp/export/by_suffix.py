@@ -43,6 +43,9 @@ def export_template(path: str | Path, template: Template, *, animation: BodyPara
             received=f"{frames} frames",
             remedy="export a motion as .glb or .usdc",
         )
+    # A motion places the person by itself; in the T-pose she stands on the floor. Our own files keep the body's frame.
+    if animation is None and suffix != ".npz":
+        template = template.on_floor()
     if suffix == ".glb":
         write_glb(path, template, animation=animation)
     elif suffix in _USD:

@@ -204,6 +204,21 @@ class Template:
             weights=weights,
         )
 
+    def on_floor(self) -> Template:
+        """Return the same person with the soles of the T-pose at y = 0, where other programs expect a standing figure.
+
+        The template itself keeps the body model's frame, whose origin lies near the pelvis: parameters refer to it.
+        Vertices and rest joints move by the same height, so that every pose does, too.
+
+        Example:
+            >>> float(abs(template.on_floor().vertices[:, 1].min()))
+            0.0
+        """
+        # Vertices without a face, such as the body's below shoes, do not stand on the floor.
+        lift = np.array([0.0, -float(self.vertices[np.unique(self.faces), 1].min()), 0.0])
+        body = replace(self.body, v_template=self.body.v_template + lift)
+        return replace(self, vertices=self.vertices + lift, body=body)
+
     @cached_property
     def _dense_weights(self) -> Float64[np.ndarray, "V J"]:
         return self.weights.dense()

@@ -16,8 +16,8 @@ def small_template() -> Template:
 
 
 def test_a_suffix_chooses_the_writer(tmp_path, small_template):
-    write_glb(tmp_path / "own.glb", small_template)
-    write_obj(tmp_path / "own.obj", small_template)
+    write_glb(tmp_path / "own.glb", small_template.on_floor())
+    write_obj(tmp_path / "own.obj", small_template.on_floor())
     for name in ("glb", "obj"):
         assert small_template.export(tmp_path / f"by.{name}") == tmp_path / f"by.{name}"
         assert (tmp_path / f"by.{name}").read_bytes() == (tmp_path / f"own.{name}").read_bytes()

@@ -76,6 +76,17 @@ def test_rest_is_the_t_pose(template):
     assert np.allclose(template.joints, template.body.joint_regressor @ template.vertices[: template.body.vertex_count])
 
 
+def test_who_stands_on_the_floor_is_lifted_in_every_pose(template):
+    standing = template.on_floor()
+    assert standing.vertices[np.unique(standing.faces), 1].min() == 0
+    lift = standing.vertices - template.vertices
+    np.testing.assert_allclose(standing.joints - template.joints, np.broadcast_to(lift[0], (55, 3)), atol=2e-6)
+    rng = np.random.default_rng(3)
+    turns = {"body_pose": rng.normal(0, 0.3, (1, 63)), "global_orient": rng.normal(0, 1, (1, 3))}
+    params = replace(BodyParams.rest(betas=template.betas, expressions=6), **turns)
+    np.testing.assert_allclose(standing.pose(params) - template.pose(params), lift[None], atol=2e-6)
+
+
 def test_pose_correctives_hand_means_and_hand_components_survive_the_file(tmp_path):
     rng = np.random.default_rng(2)
     random = random_template(joint_count=55, pose_correctives=True)
