@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from smplxpp.core.errors import MissingExtraError
+from smplxpp.core.lazy import import_extra
 
 OPSET = 17
 """Version of the ONNX operators."""
@@ -106,11 +107,7 @@ class Graph:
 
 
 def _onnx() -> ModuleType:
-    try:
-        import onnx
-        import onnx.checker
-        import onnx.helper
-        import onnx.numpy_helper
-    except ImportError:
-        raise MissingExtraError("onnx", extra="onnx", purpose="an avatar as ONNX") from None
+    onnx = import_extra("onnx", extra="onnx", purpose="an avatar as ONNX")
+    for name in ("checker", "helper", "numpy_helper"):
+        import_module(f"onnx.{name}")
     return onnx

@@ -12,8 +12,9 @@ from avatar.speech.audio_features import amplified, clear_pauses, find_pauses, s
 from avatar.speech.lips import LipNetwork, alignment_score
 from avatar.speech.phonemes import CONSONANTS, SILENCE, VOWELS, Phoneme, Speech, Word
 from avatar.speech.pronunciation import EXTRA, check_text, no_words_error, phones_from_word, words_from_text
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.sound_file import Sound
+from smplxpp.core.lazy import import_extra
 
 _RATE = 16_000
 # Gates on `alignment_score`, in nats a row of 10 ms; `python -m benchmarks given_texts` measures right and wrong texts.
@@ -88,10 +89,7 @@ def load_recogniser() -> Any:
     Raises:
         MissingExtraError: pocketsphinx is not installed.
     """
-    try:
-        import pocketsphinx
-    except ImportError:
-        raise MissingExtraError("pocketsphinx", extra=EXTRA, purpose="phonemes of a recording") from None
+    pocketsphinx = import_extra("pocketsphinx", extra=EXTRA, purpose="phonemes of a recording")
     return pocketsphinx.Decoder(samprate=float(_RATE), loglevel="FATAL")
 
 

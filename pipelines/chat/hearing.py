@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Float32, Int16
 
 from avatar.speech.forced_alignment import NotEnglishError, hypothesis, judge, listen_for_words
-from smplxpp.core import InputError, MissingExtraError, require_positive
+from smplxpp.core import InputError, require_positive
 from smplxpp.core.files.onnx_file import OnnxModel
 from smplxpp.core.files.sound_file import Sound
+from smplxpp.core.lazy import import_extra
 
 # Sample rate (Hz) and block length (samples, 32 ms) of Silero's model; pocketsphinx takes the same rate.
 RATE = 16_000
@@ -205,10 +206,7 @@ class Recogniser:
     """Seconds below which an utterance is not doubted: a word or two tell no language."""
 
     def __init__(self) -> None:
-        try:
-            import pocketsphinx
-        except ImportError:
-            raise MissingExtraError("pocketsphinx", extra="chat", purpose="recognising spoken words") from None
+        pocketsphinx = import_extra("pocketsphinx", extra="chat", purpose="recognising spoken words")
         self._decoder = pocketsphinx.Decoder(samprate=float(RATE), loglevel="FATAL")
         self._open = False
         self._samples: list[np.ndarray] = []

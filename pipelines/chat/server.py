@@ -17,8 +17,9 @@ import numpy as np
 from pipelines.chat.conversation import ChatParts, Conversation, Turn
 from pipelines.web.page import chat_files
 from pipelines.web.server import HOST, answer, at_free_port, own_hosts
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_object, as_text, parse_json
+from smplxpp.core.lazy import import_extra
 
 MOST_BYTES = 1 << 16
 """Bytes of a message from the page: two seconds of sound."""
@@ -52,10 +53,7 @@ class ChatServer:
         port: int = 0,
         report: Callable[[Turn], None] = lambda _: None,
     ) -> None:
-        try:
-            from websockets.sync.server import serve
-        except ImportError:
-            raise MissingExtraError("websockets", extra="chat", purpose="a conversation in a page") from None
+        serve = import_extra("websockets.sync.server", extra="chat", purpose="a conversation in a page").serve
         self._parts, self._report = parts, report
         self._secret = secrets.token_urlsafe(24)
         self._connection: Any = None

@@ -18,9 +18,10 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from pipelines.figures import encode_png
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_path, atomic_write_bytes
 from smplxpp.core.files.sound_file import Sound, wave_bytes
+from smplxpp.core.lazy import import_extra
 
 FRAME_FOLDER = ""  # the suffix of a folder of pictures
 SUFFIXES = (".mp4", ".gif", FRAME_FOLDER)
@@ -56,11 +57,8 @@ def write_film(
 def _write_mp4(
     path: Path, frames: Iterable[np.ndarray], fps: float, size: tuple[int, int], sound: Sound | None = None
 ) -> None:
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise MissingExtraError("imageio-ffmpeg", extra="video", purpose="writing MP4") from None
-    program = imageio_ffmpeg.get_ffmpeg_exe()
+    package = import_extra("imageio_ffmpeg", extra="video", purpose="writing MP4", named="imageio-ffmpeg")
+    program = package.get_ffmpeg_exe()
     with (
         atomic_path(path) as temporary,
         tempfile.TemporaryFile() as output,
@@ -91,7 +89,7 @@ def _write_mp4(
         output.seek(0)
         words = output.read().decode(errors="replace")
         # An encoder whose disk is full may end with 0: what counts is the film.
-        if encoder.returncode or imageio_ffmpeg.count_frames_and_secs(str(temporary))[0] != count:
+        if encoder.returncode or package.count_frames_and_secs(str(temporary))[0] != count:
             raise _encoder_error(encoder.returncode, words)
 
 

@@ -9,7 +9,8 @@ from functools import wraps
 from io import StringIO
 from typing import Any
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
+from smplxpp.core.lazy import import_extra
 
 log = logging.getLogger(__name__)
 
@@ -20,10 +21,7 @@ def start_server(label: str, *, host: str, port: int) -> Any:
     Raises:
         MissingExtraError: viser is not installed.
     """
-    try:
-        import viser
-    except ImportError:
-        raise MissingExtraError("viser", extra="viewer", purpose="the viewer") from None
+    viser = import_extra("viser", extra="viewer", purpose="the viewer")
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it tells of every connection
     with redirect_stdout(StringIO()):  # and viser of its address, whatever it is asked for
         return viser.ViserServer(host=host, port=port, label=label, verbose=False)

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import regular_file
+from smplxpp.core.lazy import import_extra
 
 _STREAM = re.compile(r"Stream #\d+:\d+.*?: Video: .*?(?<![\dx])(\d{2,5})x(\d{2,5})")
 _RATE = re.compile(r"Stream #\d+:\d+.*?: Video: .*?([\d.]+) fps")
@@ -142,8 +143,5 @@ def video_sound(video: Video, rate: int) -> Float64[np.ndarray, " S"]:
 
 
 def _program() -> str:
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise MissingExtraError("imageio-ffmpeg", extra="video", purpose="reading videos") from None
-    return imageio_ffmpeg.get_ffmpeg_exe()
+    package = import_extra("imageio_ffmpeg", extra="video", purpose="reading videos", named="imageio-ffmpeg")
+    return str(package.get_ffmpeg_exe())

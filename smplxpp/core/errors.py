@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeAlias
@@ -55,13 +56,41 @@ class MissingExtraError(ImportError):
         extra: extra of smplxpp that installs it.
         purpose: what needs it.
         apt: system packages that it needs on Debian and Ubuntu, for a package that is installed but does not start.
+        reason: why a package that is installed does not start, in its own words.
     """
 
-    def __init__(self, package: str, *, extra: str, purpose: str, apt: str = "") -> None:
-        message = f"{purpose} needs {package}, which is not installed: pip install 'smplxpp[{extra}]'"
+    def __init__(self, package: str, *, extra: str, purpose: str, apt: str = "", reason: str = "") -> None:
+        # The packages by name, because smplxpp itself may have been installed from a folder or a wheel.
+        wanted = " ".join(f"'{one}'" for one in requirements_of_extra(extra)) or f"'.[{extra}]' in its folder"
+        message = f"{purpose} needs {package}, which is not installed: pip install {wanted} (extra {extra})"
         if apt:
             message = f"{purpose} needs {package}, which lacks libraries of the system: apt-get install {apt}"
+        elif reason:
+            message = f"{purpose} needs {package}, which is installed and does not start: {reason}"
         super().__init__(message)
+
+
+def requirements_of_extra(extra: str) -> list[str]:
+    """Return the packages that an extra of smplxpp installs, as pip takes them; none where the metadata lack it."""
+    from importlib.metadata import PackageNotFoundError, requires  # slow to import, and seldom needed
+
+    try:
+        stated = requires("smplxpp") or []
+    except PackageNotFoundError:
+        return []
+    out: list[str] = []
+    pending = [extra]
+    for name in pending:
+        for requirement, marker in (one.split(";", 1) for one in stated if ";" in one):
+            if re.search(rf"extra == .{re.escape(name)}.\s*$", marker) is None:
+                continue
+            # An extra may consist of others.
+            others = re.match(r"smplxpp\[(.*)\]", requirement)
+            if others:
+                pending += [one for one in others[1].split(",") if one not in pending]
+            elif requirement.strip() not in out:
+                out.append(requirement.strip())
+    return out
 
 
 def one_line(result: Any) -> str:

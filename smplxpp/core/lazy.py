@@ -13,14 +13,15 @@ OPEN3D_NEEDS = "libusb-1.0-0 libgl1 libegl1 libx11-6"
 """Debian's packages without which open3d does not start."""
 
 
-def import_extra(package: str, *, extra: str, purpose: str, apt: str) -> ModuleType:
-    """Import an optional package.
+def import_extra(package: str, *, extra: str, purpose: str, apt: str = "", named: str = "") -> ModuleType:
+    """Import an optional package, or a module of one.
 
     Args:
-        package: its name.
+        package: its name in Python.
         extra: the extra of smplxpp that installs it.
         purpose: what needs it.
         apt: system packages without which it does not start.
+        named: the name under which pip knows it, where that differs.
 
     Raises:
         MissingExtraError: it is not installed, or does not start.
@@ -29,8 +30,11 @@ def import_extra(package: str, *, extra: str, purpose: str, apt: str) -> ModuleT
         return import_module(package)
     except (ImportError, OSError) as error:
         # Another missing module, or a library that does not load, means that the package itself is there.
-        missing = isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == package
-        raise MissingExtraError(package, extra=extra, purpose=purpose, apt="" if missing else apt) from error
+        absent = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+        named = named or package.partition(".")[0]
+        if absent == package.partition(".")[0]:
+            raise MissingExtraError(named, extra=extra, purpose=purpose) from None
+        raise MissingExtraError(named, extra=extra, purpose=purpose, apt=apt, reason=str(error)[:300]) from error
 
 
 def lazy_exports(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -182,7 +182,7 @@ def mediapipe_package(purpose: str) -> Any:
             "mediapipe",
             expected="a version from 0.10.14 to 0.10.21, whose wheel has the models",
             received=str(getattr(mediapipe, "__version__", "another")),
-            remedy="pip install 'smplxpp[detect]'",
+            remedy="pip install 'mediapipe>=0.10.14,<=0.10.21'",
         )
     return mediapipe
 

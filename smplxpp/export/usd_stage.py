@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module, metadata
+from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.lazy import import_extra
 
 SUFFIXES = (".usdc", ".usda", ".usd")
 _MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdVol", "Vt")
@@ -22,10 +23,9 @@ def usd_modules(purpose: str) -> SimpleNamespace:
     Raises:
         MissingExtraError: no usd-core.
     """
-    try:
-        return SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in _MODULES})
-    except ImportError:
-        raise MissingExtraError("usd-core", extra="usd", purpose=purpose) from None
+    return SimpleNamespace(
+        **{name: import_extra(f"pxr.{name}", extra="usd", purpose=purpose, named="usd-core") for name in _MODULES}
+    )
 
 
 @contextmanager

@@ -257,7 +257,7 @@ def test_a_mesh_goes_to_trimesh_its_viewer_and_open3d(monkeypatch):
         monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match="pip install trimesh"):
         mesh.to_trimesh()
-    with pytest.raises(MissingExtraError, match=r"smplxpp\[scan\]"):
+    with pytest.raises(MissingExtraError, match=r"extra scan"):
         mesh.to_open3d()
 
 

@@ -151,7 +151,7 @@ def test_an_encoder_that_loses_frames_is_found_out(run, params, tmp_path, monkey
 
 def test_mp4_without_its_extra(run, params, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(MissingExtraError, match=r"smplxpp\[video\]"):
+    with pytest.raises(MissingExtraError, match=r"extra video"):
         Animate(run, params, tmp_path / "wave.mp4", height=60, json=True).run()
     assert not (tmp_path / "wave.mp4").exists()
 

@@ -212,7 +212,7 @@ def test_a_template_that_stands_elsewhere_than_the_images_is_refused(tmp_path, c
 def test_a_missing_extra_is_named(fitted, capture, capsys, monkeypatch):
     monkeypatch.setattr(options, "find_spec", lambda name: None)
     assert fit(fitted, capture) == 2
-    assert "smplxpp[avatar]" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert "(extra avatar)" in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
 def test_the_terminal_shows_figures_and_where_things_are(own, capture, capsys):

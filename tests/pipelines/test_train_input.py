@@ -193,7 +193,7 @@ def test_options_that_make_no_sense(run, original, capsys, options, word):
 
 def test_a_missing_extra_is_named(run, original, capsys, monkeypatch):
     monkeypatch.setattr(options, "find_spec", lambda name: None)
-    assert "smplxpp[avatar]" in refused(capsys, run, original)
+    assert "(extra avatar)" in refused(capsys, run, original)
 
 
 def test_a_perceptual_metric_that_is_not_installed(run, original, capsys, monkeypatch):

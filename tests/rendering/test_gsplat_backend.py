@@ -113,7 +113,7 @@ def test_kernels_that_were_not_compiled(fake_gsplat):
 def test_missing_gsplat_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    with pytest.raises(MissingExtraError, match=r"smplxpp\[cuda\]"):
+    with pytest.raises(MissingExtraError, match=r"extra cuda"):
         rasterize_gsplat(*arguments(random_scene(43)), RasterSettings(45, 37))
 
 

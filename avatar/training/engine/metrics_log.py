@@ -8,8 +8,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files import as_integer, as_object, as_text, atomic_write_text, jsonable, parse_json, read_bytes
+from smplxpp.core.lazy import import_extra
 
 log = logging.getLogger(__name__)
 _MOST_BYTES = 1 << 30  # 1 GiB; the lines of a million steps have some hundred megabytes
@@ -74,10 +75,10 @@ class TensorboardLog:
     """
 
     def __init__(self, folder: Path, *, redone: int) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            raise MissingExtraError("tensorboard", extra="tensorboard", purpose="the log for TensorBoard") from None
+        # torch has the writer, which needs the package.
+        import_extra("tensorboard", extra="tensorboard", purpose="the log for TensorBoard")
+        from torch.utils.tensorboard import SummaryWriter
+
         self._writer = SummaryWriter(str(folder), purge_step=redone)
 
     def add(self, entry: Mapping[str, Any]) -> None:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes, regular_file
+from smplxpp.core.lazy import import_extra
 
 
 class OnnxModel:
@@ -35,10 +36,7 @@ class OnnxModel:
     """
 
     def __init__(self, path: str | Path, *, kind: str, extra: str, threads: int = 2, shown: Sequence[str] = ()) -> None:
-        try:
-            import onnxruntime
-        except ImportError:
-            raise MissingExtraError("onnxruntime", extra=extra, purpose=f"a {kind} in ONNX") from None
+        onnxruntime = import_extra("onnxruntime", extra=extra, purpose=f"a {kind} in ONNX")
         self.path = regular_file(path, subject=kind, remedy="name an existing ONNX file")
         self.subject = f"{kind} {path}"
         options = onnxruntime.SessionOptions()

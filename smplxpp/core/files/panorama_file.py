@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes, regular_file
+from smplxpp.core.lazy import import_extra
 
 # Bounds of both formats: a file of half a GiB, and a picture of 8192 x 8192 pixels (805 MB as float32).
 _MAX_BYTES, _MAX_PIXELS = 1 << 29, 1 << 26
@@ -127,10 +128,7 @@ def read_openexr(path: str | Path) -> Float32[np.ndarray, "H W 3"]:
         MissingExtraError: the library OpenEXR is not installed.
     """
     subject, file_path = f"light {path}", str(regular_file(path, subject="light"))
-    try:
-        import OpenEXR
-    except ImportError:
-        raise MissingExtraError("OpenEXR", extra="exr", purpose=f"reading {path}") from None
+    OpenEXR = import_extra("OpenEXR", extra="exr", purpose=f"reading {path}")
     try:
         # The header alone first, so that a large picture is refused before its pixels are decoded.
         with OpenEXR.File(file_path, separate_channels=True, header_only=True) as file:

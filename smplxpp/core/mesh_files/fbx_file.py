@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.lazy import import_extra
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, warn
 from smplxpp.core.mesh_files.texture import MISSING_GRAY, TextureCache, sample_texture
 
@@ -34,11 +35,8 @@ def read_fbx(path: Path) -> RawMesh:
         MissingExtraError: assimp's bindings are not installed.
         InputError: a file that assimp refuses, or one without a triangle.
     """
-    try:
-        import assimp_py
-    except ImportError:
-        purpose = f"reading {path.name} (or convert it to GLB with a 3D program)"
-        raise MissingExtraError("assimp-py", extra="fbx", purpose=purpose) from None
+    purpose = f"reading {path.name} (or convert it to GLB with a 3D program)"
+    assimp_py = import_extra("assimp_py", extra="fbx", purpose=purpose, named="assimp-py")
     subject = f"mesh file {path}"
     data = read_bytes(path, subject="mesh file", most=_MOST_BYTES)
     if not (data.startswith(_BINARY) or b"FBXHeaderExtension" in data[:4096]):

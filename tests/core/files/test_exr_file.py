@@ -60,5 +60,5 @@ def test_others_are_refused(tmp_path):
 def test_without_the_library_the_extra_is_named(tmp_path, monkeypatch):
     write_openexr(tmp_path / "a.exr", LIGHT)
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(MissingExtraError, match=r"smplxpp\[exr\]"):
+    with pytest.raises(MissingExtraError, match=r"extra exr"):
         read_panorama(tmp_path / "a.exr")

@@ -67,5 +67,5 @@ def test_without_ffmpeg_the_extra_is_named(tmp_path, monkeypatch):
     (tmp_path / "a.aiff").write_bytes(aiff(TONE, RATE))
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingExtraError, match=r"reading AIFF.*smplxpp\[video\]"):
+    with pytest.raises(MissingExtraError, match=r"reading AIFF.*extra video"):
         read_sound(tmp_path / "a.aiff")
