@@ -17,14 +17,14 @@ from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.lazy import import_extra
 
 _RATE = 16_000
-# Gates on `alignment_score`, in nats a row of 10 ms; `python -m benchmarks given_texts` measures right and wrong texts.
+# Gates on `alignment_score`, in nats a row of 10 ms; `python -m benchmarks aligner_gates texts` measures right and wrong texts.
 MIN_SCORE_OF_TEXT = 0.0
 """A given text that scores less belongs to another recording."""
 MIN_SCORE_OF_WORDS = -0.35
 """Recognised words that score less are no words: some may be wrong, but most of their phonemes are right."""
 MIN_ENGLISH = 0.605
 """Recognised words with a lower `Recognition.score` belong to another language, music or noise. Chosen on recordings of
-people in seven languages; `python -m benchmarks spoken_languages` measures it."""
+people in seven languages; `python -m benchmarks aligner_gates languages` measures it."""
 _AGREEMENT = 0.25  # weight of the agreement, nats a row, beside the words' probability
 _SHORT = 0.12  # seconds; over the length of the words it is what a short recording scores less, as chance varies more
 

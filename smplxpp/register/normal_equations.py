@@ -60,13 +60,23 @@ class Columns:
     def jacobian(self, motion: PointsMotion) -> Float64[np.ndarray, "N 3 _"]:
         """Return the derivatives of points by a frame's unknowns, followed by those by the shape."""
         points = len(motion.points)
+        # A motion of exactly these joints needs no selection, which would copy most of it.
+        pose = motion.pose if motion.joints is self.joints else motion.pose[:, :, self._places(motion)]
         parts = [
-            motion.pose[:, :, self.joints].reshape(points, 3, -1),
+            pose.reshape(points, 3, -1),
             np.broadcast_to(np.eye(3), (points, 3, 3)),
             motion.expression[..., : self.expressions],
             motion.shape,
         ]
         return np.concatenate(parts, axis=2)
+
+    def _places(self, motion: PointsMotion) -> Int64[np.ndarray, " _"]:
+        """Return where the free joints stand among the joints of a motion."""
+        places = np.full(self.joint_count, -1)
+        places[motion.joints] = np.arange(len(motion.joints))
+        if (places[self.joints] < 0).any():
+            raise ValueError("the motion lacks derivatives by joints that are free")
+        return places[self.joints]
 
 
 @dataclass(frozen=True, eq=False)

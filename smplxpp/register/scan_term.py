@@ -116,7 +116,7 @@ class ScanTerm:
         # The closest point is held at its place on its face while the body moves: dd = direction . J dx (point to
         # plane).
         points = self.body_points.mixed(index, weight_of)
-        jacobian = equations.columns.jacobian(kinematics.motion(points, posture))
+        jacobian = equations.columns.jacobian(kinematics.motion(points, posture, equations.columns.joints))
         rows, root = np.einsum("nx,nxp->np", direction, jacobian, optimize=True), np.sqrt(weight)
         equations.add(row, rows * root[:, None], residual * root, shape=shape)
 

@@ -189,7 +189,7 @@ class SilhouetteTerm:
         # A vertex may be at the rim of several cameras; its derivative by the pose is the same and computed once.
         used, place = np.unique(index, return_inverse=True)
         points = self.surface.points.select(self.index[used])
-        jacobian = equations.columns.jacobian(kinematics.motion(points, posture))
+        jacobian = equations.columns.jacobian(kinematics.motion(points, posture, equations.columns.joints))
         rows = np.einsum("nx,nxp->np", direction, jacobian[place.reshape(-1)], optimize=True)
         root = np.sqrt(weight)
         equations.add(row, rows * root[:, None], residual * root, shape=shape)

@@ -155,7 +155,7 @@ class Dressed:
         weight, residual = np.where(below, inside, weight), np.where(below, found.distance, residual)
         # Jacobian of the distances: the place moves with the body, d(distance) = -n . dx.
         points = self.outer.points.mixed(found.corners, found.bary)
-        jacobian = equations.columns.jacobian(kinematics.motion(points, posture))
+        jacobian = equations.columns.jacobian(kinematics.motion(points, posture, equations.columns.joints))
         rows = np.einsum("nx,nxp->np", -found.normal, jacobian, optimize=True)
         root = np.sqrt(weight[alone])
         equations.add(0, rows[alone] * root[:, None], residual[alone] * root, shape=True)
@@ -164,7 +164,7 @@ class Dressed:
 
     def _add_bare(self, equations: NormalEquations, kinematics: Kinematics, posture: Posture) -> None:
         """Add the distances of the body's hands and face to the surface, along its normal."""
-        motion = kinematics.motion(self.bare.points, posture)
+        motion = kinematics.motion(self.bare.points, posture, equations.columns.joints)
         _, normals = self.bare.posed(kinematics, posture)
         _, nearest = self.surface.tree.query(position_normal_features(motion.points, normals))
         apart, normal = motion.points - self.surface.points[nearest], self.surface.normals[nearest]

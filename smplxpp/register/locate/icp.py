@@ -66,7 +66,7 @@ class IcpTerm:
 
     def add(self, equations: NormalEquations, kinematics: Kinematics, posture: Posture) -> None:
         """Add the pairs of both directions to the normal equations."""
-        motion = kinematics.motion(self.proxy.points, posture)
+        motion = kinematics.motion(self.proxy.points, posture, equations.columns.joints)
         points = motion.points
         _, normals = self.proxy.posed(kinematics, posture)
         jacobian = equations.columns.jacobian(motion)

@@ -7,6 +7,7 @@ is tried in the poses of a grid while the rest of the body is held; the nearest 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -33,21 +34,14 @@ def try_limbs(kinematics: Kinematics, proxy: BodyProxy, surface: SurfacePoints, 
     """Replace each arm and leg by the pose of the grid that brings body and surface nearest, if one is nearer."""
     place = {name: k for k, name in enumerate(kinematics.body.joint_names)}
     best = state_distance(kinematics, proxy, surface, state)
-    for joints, tried in (
-        (("shoulder", "elbow", "wrist"), list(_arms())),
-        (("hip", "knee", "ankle"), list(_legs())),
-    ):
+    for limb, joints in (("arm", ("shoulder", "elbow", "wrist")), ("leg", ("hip", "knee", "ankle"))):
         for side in ("left", "right"):
             index = [place[f"{side}_{joint}"] for joint in joints]
-            mirror = np.ones(3) if side == "left" else MIRROR
             # A pose of the grid replaces the limb if it is nearer by half a per cent of the whole distance.
             chosen = state
-            for vectors in tried:
+            for tried in _grid(limb, side):
                 rotations = state.rotations.copy()
-                rotations[0, index] = np.eye(3)
-                for k, rotvecs in zip(index, vectors, strict=False):
-                    for vector in rotvecs:
-                        rotations[0, k] = rotations[0, k] @ matrix_from_rotvec(np.radians(vector * mirror))
+                rotations[0, index] = tried
                 other = replace(state, rotations=rotations)
                 cost = state_distance(kinematics, proxy, surface, other)
                 if cost < best * (1.0 - 0.005):
@@ -61,6 +55,20 @@ def state_distance(
 ) -> float:
     """Return the mean distance between body and surface in both directions, metres, truncated at `far`."""
     return truncated_distance(*proxy.posed(kinematics, kinematics.posture(state, 0)), surface, far=far)
+
+
+@cache
+def _grid(limb: str, side: str) -> list[Float64[np.ndarray, "3 3 3"]]:
+    """Return the rotations of the three joints of an arm or a leg in all poses of its grid."""
+    mirror = np.ones(3) if side == "left" else MIRROR
+    out = []
+    for vectors in _arms() if limb == "arm" else _legs():
+        rotations = np.tile(np.eye(3), (3, 1, 1))
+        for k, rotvecs in enumerate(vectors):
+            for vector in rotvecs:
+                rotations[k] = rotations[k] @ matrix_from_rotvec(np.radians(vector * mirror))
+        out.append(rotations)
+    return out
 
 
 def _arms() -> list[LimbPose]:

@@ -178,6 +178,14 @@ class Search:
             self.pinned.make_robust()
         return sorted(out, key=lambda found: found.cost)
 
+    def at_rest(self) -> Found:
+        """Return the body at rest in the middle of the surface, as it is before any search."""
+        body, center = self.kinematics.body, self.fine.points.mean(axis=0)
+        rotations = np.tile(np.eye(3), (1, body.joint_count, 1, 1))
+        center = center - body.v_template.mean(axis=0)
+        state = BodyState(rotations, center[None], np.zeros(body.num_betas), np.zeros((1, body.num_expressions)))
+        return self._measured("rest", state)
+
     def finished(self, found: Found, skin: np.ndarray | None = None) -> Found:
         """Fit a candidate with its fingers to all points.
 

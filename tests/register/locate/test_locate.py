@@ -14,8 +14,8 @@ from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotve
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.landmarks import visible_vertices
-from smplxpp.register.locate import LocateConfig, locate_body
-from smplxpp.register.locate.decision import confidence_of, is_doubtful
+from smplxpp.register.locate import BodyNotFoundError, LocateConfig, locate_body
+from smplxpp.register.locate.decision import confidence_of, is_doubtful, no_person
 from smplxpp.register.locate.dressed import PARTS, Misfit
 from smplxpp.register.locate.proxy import Region, regions
 from smplxpp.register.locate.search import Found
@@ -174,8 +174,21 @@ def test_a_box_is_nobody(body):
     corners = np.array([[x, y, z] for x in (0, 0.6) for y in (0, 1.7) for z in (0, 0.4)], dtype=np.float64)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    with pytest.raises(InputError, match="one whole person"):
+    with pytest.raises(BodyNotFoundError, match=r"one whole person.*convex") as refused:
         locate_body(body, TriangleMesh(corners, faces), config=QUICK)
+    # The body that the error shows stands in the middle of the box.
+    shown = body.forward(refused.value.params).vertices[0]
+    assert np.abs(shown.mean(axis=0) - corners.mean(axis=0)).max() < 0.1 and refused.value.confidence == 0.0
+
+
+def test_a_body_that_explains_little_of_a_surface_is_no_person():
+    parts = dict.fromkeys(PARTS, 0.9)
+    state = BodyState(np.eye(3)[None, None], np.zeros((1, 3)), np.zeros(10), np.zeros((1, 10)))
+    whole = Found("by hand", state, Misfit(0.005, 0.015, 0.95, 0.7, parts), 10.0, landmarks=0.0)
+    assert no_person(whole) == ""
+    assert "explains 40%" in no_person(replace(whole, misfit=replace(whole.misfit, covered=0.4)))
+    assert "20% of its hands" in no_person(replace(whole, misfit=replace(whole.misfit, shown=0.2)))
+    assert "unlike any person" in no_person(replace(whole, state=replace(state, betas=np.full(10, 6.0))))
 
 
 def test_a_person_in_centimetres_is_refused_with_the_options_named(body, scan):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import standing_poses
@@ -11,7 +12,7 @@ from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from smplxpp.core.surface_points import SurfacePoints
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.landmarks import visible_vertices
-from smplxpp.register.locate.persons import heads, largest_piece, people_apart
+from smplxpp.register.locate.persons import convex_share, heads, largest_piece, people_apart
 
 BODY = load_body()
 
@@ -46,6 +47,19 @@ def test_one_person_is_one_piece_with_one_head(person):
     (head,) = _heads(person)
     # Its centre lies a head's radius below the crown.
     assert abs(head[0]) < 0.02 and 0.06 < person.vertices[:, 1].max() - head[1] < 0.16
+
+
+def test_a_box_and_a_ball_lie_on_their_hull_and_no_person_does(person):
+    corners = np.array([[x, y, z] for x in (0, 0.6) for y in (0, 1.7) for z in (0, 0.4)], dtype=np.float64)
+    ball = np.random.default_rng(0).normal(size=(4000, 3))
+    round_ones = ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    for points in (corners, round_ones):
+        hull = ConvexHull(points, qhull_options="QJ")
+        assert convex_share(TriangleMesh(points, hull.simplices.astype(np.int64))) > 0.95
+    assert 0.1 < convex_share(person) < 0.4
+    # Nor does a flat wall pass for a person.
+    wall = TriangleMesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    assert convex_share(wall) > 0.95
 
 
 def test_two_people_are_two_pieces_and_two_heads(person):
