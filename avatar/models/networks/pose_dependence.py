@@ -28,17 +28,20 @@ def seen_joints(template: Template, steps: int) -> Bool[np.ndarray, "V 21"]:
 def joint_steps(template: Template) -> Int64[np.ndarray, "V 21"]:
     """Count, for each vertex, the steps from each joint of theta to the nearest joint with skin weight on it."""
     parents = np.asarray(template.body.parents)
-    # Adjacency of the skeleton; then grow the set of carrying joints step by step (breadth-first search).
+    # Steps between two joints: the powers of the skeleton's adjacency reach one step further each (breadth-first).
     near = np.eye(len(parents), dtype=bool)
     children = np.flatnonzero(parents >= 0)
     near[children, parents[children]] = near[parents[children], children] = True
-    # (V, J) joints that carry each vertex have distance 0; all others start at a bound that no skeleton exceeds.
+    reached, between = np.eye(len(parents), dtype=bool), np.full((len(parents), len(parents)), len(parents))
+    for count in range(len(parents)):
+        between = np.where(reached, np.minimum(between, count), between)
+        reached = reached @ near
+    # The nearest carrying joint counts. Few joints carry a vertex, so that this visits each joint's vertices alone.
     seen = template.weights.dense() > MIN_SKIN_WEIGHT
-    steps = np.where(seen, 0, len(parents))
-    for count in range(1, len(parents)):
-        # Boolean matrix product: joints one step further from the set.
-        seen = seen @ near
-        steps = np.where(seen, np.minimum(steps, count), steps)
+    steps = np.full(seen.shape, len(parents))
+    for joint, carried in enumerate(seen.T):
+        rows = np.flatnonzero(carried)
+        steps[rows] = np.minimum(steps[rows], between[joint])
     # theta leaves out the root (joint 0) and the joints of face and hands.
     return steps[:, 1 : BODY_JOINTS + 1].astype(np.int64)
 
