@@ -17,7 +17,7 @@ from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.lazy import import_extra
 
 _RATE = 16_000
-# Gates on `alignment_score`, in nats a row of 10 ms; `python -m benchmarks aligner_gates` measures right and wrong ones.
+# Gates on `alignment_score`, nats a row of 10 ms; `python -m benchmarks aligner_gates` measures right and wrong ones.
 MIN_SCORE_OF_TEXT = 0.0
 """A given text that scores less belongs to another recording."""
 MIN_SCORE_OF_WORDS = -0.35
