@@ -12,7 +12,7 @@ import numpy as np
 
 from pipelines.viewer.run_scene import RunScene
 from pipelines.viewer.run_session import COLORINGS, TURNED, RunSession
-from pipelines.viewer.server import address_of, one_at_a_time, start_server, stop_server
+from pipelines.viewer.server import address_of, one_at_a_time, plain_markdown, start_server, stop_server
 from smplxpp.core.files.image_file import open_image
 
 log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ class RunWindow:
         gui, session = self.server.gui, self.session
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        gui.add_markdown(f"**{session.run.resolve().name}**")
+        gui.add_markdown(f"**{plain_markdown(session.run.resolve().name)}**")
         self._status = gui.add_markdown("")
         # A slider needs a range, also where there is one frame; it is disabled then.
         last = len(session.motion.numbers) - 1
@@ -199,7 +199,8 @@ class RunWindow:
         of = "no Gaussians yet" if session.source is None else f"Gaussians: {session.source.words}"
         changed = ", changed by hand" if session.turned or session.expression else ""
         count = len(session.motion.numbers)
-        return f"frame {session.frame} of {session.motion.source} ({count}){changed}  \n{of}"
+        source = plain_markdown(str(session.motion.source))
+        return f"frame {session.frame} of {source} ({count}){changed}  \n{of}"
 
     @one_at_a_time
     def look_again(self) -> None:

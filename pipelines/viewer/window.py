@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.viewer.picking import first_hit, line_under, middle_of_limb
 from pipelines.viewer.run_scan import label_again
 from pipelines.viewer.scene import MODES, ScanScene, legend
-from pipelines.viewer.server import address_of, one_at_a_time, start_server, stop_server
+from pipelines.viewer.server import address_of, one_at_a_time, plain_markdown, start_server, stop_server
 from pipelines.viewer.session import CHOICE, LabelSession, UncertainRegion, lies_within, uncertain_regions
 from smplxpp.core.labels import LABEL_BY_NAME, LABELS, UPPER
 from smplxpp.segment.corrected_faces import stroked_faces
@@ -78,7 +78,7 @@ class LabelWindow:
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        gui.add_markdown(f"**{self.run.resolve().name}**")
+        gui.add_markdown(f"**{plain_markdown(self.run.resolve().name)}**")
         self._status = gui.add_markdown("")
         self._mode = gui.add_dropdown("Colours", MODES, initial_value=MODES[0] if self.session.has_labels else MODES[1])
         self._painted = gui.add_checkbox("Show corrected", True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import socket
 import threading
@@ -15,6 +16,7 @@ from pipelines.commands import view as label_command
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, RegisterInputs, save_build
 from pipelines.viewer.run_scan import label_again, open_session
+from pipelines.viewer.server import plain_markdown
 from pipelines.viewer.session import LabelledScan, LabelSession
 from pipelines.viewer.window import LabelWindow, open_window
 from smplxpp.core import HAIR, LOWER, SHOE, UPPER, InputError, concatenate_meshes
@@ -63,6 +65,32 @@ def test_it_answers_on_this_machine_alone_and_ends(scan, tmp_path):
     with socket.socket() as one:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         one.bind(("127.0.0.1", port))  # it is free again
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        ("127.0.0.1:{}", "http://evil.example", 403),
+        ("evil.example:{}", None, 403),
+        ("evil.example:{}", "http://evil.example:{}", 403),
+        ("localhost:{}", "http://localhost:{}", 200),
+        ("127.0.0.1:{}", None, 200),
+    ],
+)
+def test_no_page_of_another_site_may_look(window, host, origin, status):
+    port = window.server.get_port()
+    headers = {"Host": host.format(port)} | ({} if origin is None else {"Origin": origin.format(port)})
+    for upgrade in ({}, {"Upgrade": "websocket", "Connection": "Upgrade"}):
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=900)
+        connection.request("GET", "/", headers=headers | upgrade)
+        # A handshake without its key is a bad request, of those who may ask.
+        assert connection.getresponse().status in ((status,) if status == 403 else (200, 400, 426))
+        connection.close()
+
+
+def test_names_are_no_markup():
+    text = plain_markdown("<img src=x onerror=alert(1)> [a](javascript:b) **c** `d` don't")
+    assert "<" not in text and "](" not in text and "**" not in text.replace("\\*", "") and "don't" in text
 
 
 def test_a_click_does_what_the_tool_does(window, scan):
