@@ -164,18 +164,18 @@ class TriangleMesh:
     @cached_property
     def vertex_normals(self) -> Float64[np.ndarray, "N 3"]:
         """Unit vertex normals, faces weighted by their angle at the vertex (Thuermer and Wuethrich 1998)."""
-        t, normals = self.triangles, self.face_normals
-        out = np.zeros_like(self.vertices)
-        for k in range(3):
-            # Unit vectors of the two edges at corner k.
-            u = normalize_rows(t[:, (k + 1) % 3] - t[:, k])
-            v = normalize_rows(t[:, (k + 2) % 3] - t[:, k])
-            # arctan2 of |u x v| and u . v is accurate for angles near 0 and pi, where arccos is not.
-            angle = np.arctan2(row_lengths(np.cross(u, v)), np.einsum("ij,ij->i", u, v))
-            # `bincount` sums in a fixed order, so that normals are equal from run to run.
-            for axis in range(3):
-                out[:, axis] += np.bincount(self.faces[:, k], angle * normals[:, axis], minlength=len(out))
-        return normalize_rows(out)
+        import igl  # here, because most users of a mesh need no normals
+
+        # libigl returns NaN around faces without area, at vertices without a face, and where normals cancel.
+        solid = self.face_areas > 0
+        faces, normals = (
+            (self.faces, self.face_normals) if solid.all() else (self.faces[solid], self.face_normals[solid])
+        )
+        if not len(faces):
+            return np.zeros_like(self.vertices)
+        by_angle = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
+        out = igl.per_vertex_normals(self.vertices, faces, by_angle, normals)
+        return np.where(np.isfinite(out), out, 0.0)
 
     @cached_property
     def referenced(self) -> Int64[np.ndarray, " n"]:

@@ -117,7 +117,10 @@ def prefer_facing(
 def face_outward(
     found: Correspondence, target: TriangleMesh, component: Int32[np.ndarray, " N"], *, max_distance: float
 ) -> tuple[Correspondence, Float64[np.ndarray, "N 3"]]:
-    """Flip the normals of components that are inside out, where most near vertices face against the source.
+    """Flip the normals of components that are inside out.
+
+    A closed component (a bag, a buckle) is inside out if it encloses a negative volume, however it lies on the source:
+    the side that touches the body faces against it. Of an open one most near vertices face against the source.
 
     Args:
         found: closest points.
@@ -137,7 +140,8 @@ def face_outward(
     outward = np.bincount(component, near & (found.angle <= np.pi / 2), minlength=count)
     size = np.bincount(component, minlength=count)
     inward = np.bincount(component, against, minlength=count)
-    turned = ((inward > 2 * outward) & (inward > 0.1 * size))[component]
+    closed, negative = _enclosed(target, component, count)
+    turned = np.where(closed, negative, (inward > 2 * outward) & (inward > 0.1 * size))[component]
     if not turned.any():
         return found, target.vertex_normals
     warnings.warn(
@@ -148,6 +152,20 @@ def face_outward(
     )
     angle = np.where(turned, np.pi - found.angle, found.angle)
     return replace(found, angle=angle), np.where(turned[:, None], -1.0, 1.0) * target.vertex_normals
+
+
+def _enclosed(
+    target: TriangleMesh, component: Int32[np.ndarray, " N"], count: int
+) -> tuple[Bool[np.ndarray, " P"], Bool[np.ndarray, " P"]]:
+    """Return which components are closed (every edge has two faces), and which enclose a negative volume."""
+    edges, faces_at = target.edges_with_counts
+    open_edges = np.bincount(component[edges[:, 0]], faces_at != 2, minlength=count)
+    of_face = component[target.faces[:, 0]]
+    # Six times the volume by the divergence theorem, about a point near the part, which keeps the digits.
+    arm = target.face_centers - target.vertices.mean(axis=0)
+    volume = np.bincount(of_face, np.einsum("ij,ij->i", arm, target.face_cross), minlength=count)
+    has_faces = np.bincount(of_face, minlength=count) > 0
+    return has_faces & (open_edges == 0), volume < 0
 
 
 def vertex_components(mesh: TriangleMesh) -> Int32[np.ndarray, " N"]:

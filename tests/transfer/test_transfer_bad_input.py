@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -135,6 +136,19 @@ def test_a_target_inside_out_is_turned_with_a_warning(config):
     with pytest.warns(GeometryWarning, match="inside out"):
         result = transfer_weights(SOURCE, WEIGHTS, inverted, config=config)
     assert np.abs(result.dense() - transfer_weights(SOURCE, WEIGHTS, COAT, config=config).dense()).max() < 1e-6
+
+
+def test_a_closed_bag_on_the_back_is_not_inside_out():
+    """The side that lies on the body faces against it; the volume that the bag encloses says which way is out."""
+    bag = trimesh.creation.box((0.3, 0.3, 0.12)).subdivide().subdivide().subdivide()
+    lying = TriangleMesh(bag.vertices + [0, 0, SOURCE.vertices[:, 2].min() - 0.062], bag.faces)
+    weights = transfer_weights(SOURCE, WEIGHTS, lying)  # a warning would be an error
+    # The side on the back is turned away from it: nothing there is matched as if it were cloth.
+    assert np.degrees(weights.angle[lying.vertices[:, 2] > lying.vertices[:, 2].max() - 1e-6]).min() > 90
+    inverted = TriangleMesh(lying.vertices, lying.faces[:, ::-1])
+    with pytest.warns(GeometryWarning, match=f"{lying.vertex_count} of {lying.vertex_count} vertices"):
+        turned = transfer_weights(SOURCE, WEIGHTS, inverted)
+    assert np.abs(turned.dense() - weights.dense()).max() < 1e-9
 
 
 @pytest.mark.parametrize("scale", [0.001, 0.01, 100.0, 1000.0])
