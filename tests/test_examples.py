@@ -26,6 +26,7 @@ FILES = {
     "02_transfer_weights": {"as_published.ply", "default.ply", "default_for_lower_clothes.ply"},
     "03_metrics": {"comparison.json"},
     "04_animate": {"motion.glb", "squat.ply", "squat.png", "high_step.png", "arms_overhead.png", "twist.png"},
+    "06_own_meshes": {"body.ply", "weights.npz", "skirt.obj", "garment_weights.json"},
     "05_fit": {"metrics.jsonl", "splats.ply", "Cam004.png"},
 }
 
@@ -88,6 +89,7 @@ def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path, built
         "03": check_metrics,
         "04": check_animate,
         "05": check_fit,
+        "06": check_own_meshes,
     }[name[:2]]
     check(text, out)
 
@@ -120,6 +122,17 @@ def check_animate(text: str, out: Path) -> None:
     squat = trimesh.load(out / "squat.ply", process=False)
     standing = 1.5
     assert 0.5 < squat.extents[1] < standing
+
+
+def check_own_meshes(text: str, out: Path) -> None:
+    """A skirt of another program, in centimetres: as good as the same transfer of our own arrays."""
+    found, names = smplxpp.SkinWeights.load(out / "garment_weights.json")
+    assert "valid True" in text and found.joint_indices.shape[1] == 4 and len(names) == found.joint_count == 55
+    topology = np.load(ROOT / "data" / "fixtures" / "person" / "geometry" / "topology.npz")
+    layers = smplxpp.TriangleMesh(topology["v_tpose"], topology["faces"])
+    skirt, used = layers.submesh(topology["face_part"] == topology["part_names"].tolist().index("lower"))
+    assert len(found) == skirt.vertex_count
+    assert smplxpp.metrics.total_variation(found, topology["weights"][used]).mean() < 0.1
 
 
 def check_fit(text: str, out: Path) -> None:
