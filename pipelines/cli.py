@@ -51,6 +51,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "a run in the browser: layers, weights, Gaussians, photographs, frames, and a running training",
     ),
     "inspect": ("pipelines.commands.inspect", "Inspect", "summarise a run: stages, times, numbers against their gates"),
+    "check": (
+        "pipelines.commands.check",
+        "CheckMesh",
+        "a verdict on any mesh or template: faults, penetration, stretch, weights, each in colour",
+    ),
     "fit": (
         "pipelines.commands.fit",
         "Fit",

@@ -209,7 +209,8 @@ def flat_row(frame: dict[str, Any]) -> dict[str, Any]:
         # Normals are read for both directions together.
         for key in ("normal_angle_deg", "normal_consistency"):
             values = [(result[way] or {}).get(key) for way in ("pred_to_gt", "gt_to_pred")]
-            row[prefix + key] = None if None in values else float(np.mean(values))
+            known = [value for value in values if value is not None]
+            row[prefix + key] = float(np.mean(known)) if len(known) == 2 else None
         for direction in ("pred_to_gt", "gt_to_pred"):
             for key, value in (result[direction] or {}).items():
                 row[f"{prefix}{direction}.{key}"] = value

@@ -19,10 +19,9 @@ from smplxpp.metrics.intersection import (
     penetration,
     signed_distance,
 )
-from smplxpp.metrics.mirror import mirror_ratio
-from smplxpp.metrics.mirror_views import mirrored_by_views
+from smplxpp.metrics.mirror import mirror_ratio, mirrored_by_views
 from smplxpp.metrics.pose_error import PoseError, mean_pose_error, pose_error
-from smplxpp.metrics.quality import MeshQuality, doubtful_pair, mesh_quality
+from smplxpp.metrics.quality import MeshQuality, doubtful_pair, faulty_faces, mesh_quality
 from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
 from smplxpp.metrics.self_intersection import self_intersections
 from smplxpp.metrics.stretch import StretchReport, edge_stretch, flipped_faces, stretch_report
@@ -53,6 +52,7 @@ __all__ = [
     "doubtful_pair",
     "edge_stretch",
     "far_patches",
+    "faulty_faces",
     "flipped_faces",
     "hausdorff",
     "interpenetration",

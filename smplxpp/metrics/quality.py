@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Integer
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.foreign import MeshLike, as_mesh
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.topology import component_labels
+from smplxpp.core.topology import component_labels, edge_groups
 from smplxpp.metrics.sampling import require_surface
 from smplxpp.metrics.self_intersection import self_intersections
 
@@ -121,6 +121,38 @@ def mesh_quality(mesh: MeshLike, *, self_intersection: bool = False) -> MeshQual
         area_m2=float(mesh.face_areas.sum()),
         self_intersections=len(self_intersections(mesh)) if self_intersection else None,
     )
+
+
+def faulty_faces(mesh: MeshLike) -> dict[str, Bool[np.ndarray, " M"]]:
+    """Return which faces have each fault that a mesh can have, by the fault's name, worst first.
+
+    A needle has a circumradius over 200 times its inradius; a face that cuts another does so away from common vertices.
+
+    Example:
+        >>> faults = faulty_faces(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [1, 0, 2]]))
+        >>> {name: int(faces.sum()) for name, faces in faults.items() if faces.any()}
+        {'faces that repeat another': 1}
+    """
+    mesh = as_mesh(mesh)
+    require_surface(mesh, "mesh")
+    order, _, count = edge_groups(mesh.faces)
+    crowded, cutting = np.zeros(mesh.face_count, dtype=bool), np.zeros(mesh.face_count, dtype=bool)
+    crowded[order[np.repeat(count > 2, count)] // 3] = True
+    # Winding means something where every edge has at most two faces.
+    wound = flipped_against_majority(mesh) if inconsistent_edges(mesh).any() else np.zeros_like(crowded)
+    cutting[self_intersections(mesh).ravel()] = True
+    corners = np.sort(mesh.faces, axis=1)
+    by_corners = np.lexsort(corners.T[::-1])
+    repeats = np.zeros_like(crowded)
+    repeats[by_corners[1:]] = (corners[by_corners[1:]] == corners[by_corners[:-1]]).all(axis=1)
+    return {
+        "faces at an edge of three": crowded,
+        "faces that repeat another": repeats,
+        "faces wound the other way": wound & ~repeats,
+        "faces without area": mesh.face_areas == 0,
+        "faces that cut another": cutting,
+        "needles": (aspect_ratios(mesh) > 100.0) & (mesh.face_areas > 0),
+    }
 
 
 def aspect_ratios(mesh: TriangleMesh) -> Float64[np.ndarray, " M"]:

@@ -18,7 +18,7 @@ from smplxpp.capture.calibrations import read_calibration
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color, read_normals
 from smplxpp.capture.views import read_labels as read_label_image
-from smplxpp.core import BodyParams, TriangleMesh
+from smplxpp.core import BodyParams, SkinWeights, TriangleMesh
 from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
@@ -359,6 +359,16 @@ def _basic_doors() -> list[Door]:
 
 
 @cache
+def _weight_doors() -> list[Door]:
+    weights = SkinWeights.from_dense(np.random.default_rng(0).dirichlet([1.0] * 4, 6))
+
+    def make(folder: Path, suffix: str) -> Path:
+        weights.save(folder / f"w{suffix}", joint_names=["a", "b", "c", "d"])
+        return folder / f"w{suffix}"
+
+    return [Door(f"skin weights {s}", lambda f, s=s: make(f, s), SkinWeights.load) for s in (".npz", ".json")]
+
+
 def doors() -> dict[str, Door]:
     """Every door by name."""
     every = [_capture_door(name) for name in WRITERS] + [_calibration_door(name) for name in CALIBRATIONS]
@@ -373,6 +383,7 @@ def doors() -> dict[str, Door]:
         + sound_doors()
         + face_doors()
         + _detector_doors()
+        + _weight_doors()
         + _basic_doors()
     )
     every += run_doors()
