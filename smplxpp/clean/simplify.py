@@ -17,9 +17,10 @@ from smplxpp.core.topology import component_labels, edge_groups, manifold_corner
 # Fraction of an edge. Vertices joined by an edge below this fraction of the mean edge coincide (0.09 mm on a garment of
 # 20,000 faces); doubled vertices are separated by this fraction of their distance to their neighbours.
 _COINCIDENT = 1e-2
-# Diagonal of the box, metres, at which the collapses are done. Between .5 and 5 of it surfaces are off by the same
-# within 3 % (body, scan and five garments at a quarter and a tenth of their faces); at 100 the budget is not reached.
-_DIAGONAL = 2.0
+# Diagonals of the box at which the library's absolute thresholds fit, and the one that others are scaled to. Within
+# them surfaces are off by the same within 3 % (body, scan and five garments at a quarter and a tenth of their faces),
+# so that what is in metres stays as it is; at 100 the budget is not reached.
+_FITTING, _DIAGONAL = (0.2, 5.0), 2.0
 # Exponents by which the library's threshold grows from pass to pass.
 _AGGRESSIVENESS = (3, 5, 7)
 
@@ -49,7 +50,7 @@ def simplify(mesh: MeshLike, face_budget: int) -> Simplified:
     """Collapse edges by quadric error (Garland and Heckbert 1997) down to about `face_budget` faces.
 
     - Border vertices stay, so that a mesh whose border alone needs more faces ends above the budget, with a warning.
-    - The unit of the mesh does not matter: it is scaled to the size of a person before its edges are collapsed.
+    - The unit of the mesh does not matter: a small or a large one is scaled before its edges are collapsed.
     - Where the collapses make a non-manifold edge or a face opposed to the nearest source face, the source's faces are
       restored and locked, and the rest is simplified again. If locked faces of a fine source would take half of the
       budget, it is first simplified to the geometric mean of its faces and the budget.
@@ -143,8 +144,8 @@ def _collapse(mesh: TriangleMesh, locked: np.ndarray, face_budget: int) -> tuple
     free, used = mesh.submesh(~locked)
     budget = min(max(4, face_budget - int(locked.sum())), free.face_count)
     faces = free.faces.astype(np.int32)
-    # The library's thresholds of the quadric error are absolute, and fit metres.
-    scale = _DIAGONAL / (mesh.bbox_diagonal or 1.0)
+    size = mesh.bbox_diagonal or 1.0
+    scale = 1.0 if _FITTING[0] <= size <= _FITTING[1] else _DIAGONAL / size
     scaled, least = scale * free.vertices, free.face_count + 1
     # Low aggressiveness keeps the order of the quadrics well; more is tried only while it leaves too many faces.
     for aggressiveness in _AGGRESSIVENESS:

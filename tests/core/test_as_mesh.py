@@ -134,6 +134,7 @@ def calls(mesh) -> dict[str, object]:
         "doubtful_pair": lambda: metrics.doubtful_pair(mesh, mesh),
         "edge_stretch": lambda: metrics.edge_stretch(mesh, outer),
         "far_patches": lambda: metrics.far_patches(mesh, half, mesh, far=0.1),
+        "faulty_faces": lambda: metrics.faulty_faces(mesh),
         "flipped_faces": lambda: metrics.flipped_faces(mesh, outer),
         "hausdorff": lambda: metrics.hausdorff(mesh, outer).as_dict(),
         "interpenetration": lambda: metrics.interpenetration(mesh, outer),
