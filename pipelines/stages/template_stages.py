@@ -59,7 +59,7 @@ from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics.comparison import MM
 from smplxpp.register.locate import BodyNotFoundError
-from smplxpp.segment import Corrections
+from smplxpp.segment import UNSURE, Corrections
 from smplxpp.template.template import Template
 
 
@@ -148,11 +148,13 @@ def segment(folder: Path, build: BuildContext) -> StageOutput:
         labels_before_hand=before.face_labels,
         confidence_before_hand=before.confidence,
     )
-    # A coloured mesh for mesh viewers, with labels as face properties.
+    # A coloured mesh for mesh viewers, pale where labels are not sure, with labels as face properties.
+    sure = np.ones(scan.mesh.vertex_count, dtype=bool)
+    sure[scan.mesh.faces[result.confidence < UNSURE]] = False
     write_ply(
         folder / "labels.ply",
         scan.mesh,
-        vertex_colors=display_colors(vertex_labels(scan.mesh, result.face_labels)),
+        vertex_colors=display_colors(vertex_labels(scan.mesh, result.face_labels), sure),
         face_properties={
             "label": result.face_labels,
             "confidence": result.confidence,

@@ -22,7 +22,7 @@ from smplxpp.core.files.json_file import jsonable
 from smplxpp.detect import load_detector
 from smplxpp.register import ScanObservation, bare_of_scan, read_landmarks
 from smplxpp.register.locate import BodyNotFoundError, LocatedBody, locate_body
-from smplxpp.segment import label_by_body
+from smplxpp.segment import UNSURE, label_by_body
 
 _CERTAIN = 0.4
 """Certainty from which a detector's point proposes the pose of a limb: less is seen by few views, or only by some."""
@@ -194,7 +194,7 @@ def _confirmed(
 def certain_labels(
     mesh: TriangleMesh, body: BodyModel, colors: UInt8[np.ndarray, "N 3"] | None, params: BodyParams
 ) -> Int64[np.ndarray, " M"]:
-    """Return labels of a scan's faces by its colours and a body in it; -1 where the confidence is below 0.6."""
-    least_confidence = 0.6  # a wrong label pulls the fit, a missing one only slows it
+    """Return labels of a scan's faces by its colours and a body in it; -1 where it is not sure."""
+    # A wrong label pulls the fit, a missing one only slows it.
     labelled = label_by_body(mesh, body, params, colors=colors)
-    return np.where(labelled.confidence >= least_confidence, labelled.face_labels, BACKGROUND)
+    return np.where(labelled.confidence >= UNSURE, labelled.face_labels, BACKGROUND)

@@ -1,6 +1,7 @@
 """Segmentation of a scan: label files, label maps, or the fitted body in, a label with its confidence a face out."""
 
 from smplxpp.segment.by_body import ByBodyConfig, label_by_body
+from smplxpp.segment.by_body_confidence import UNSURE
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import holds_labels, labels_from_colors, read_label_map, read_labels
 from smplxpp.segment.labels import LABEL_SETS, LabelSet, find_label_set, map_labels
@@ -18,6 +19,7 @@ __all__ = [
     "SegmentConfig",
     "SegmentedScan",
     "StrokeCorrection",
+    "UNSURE",
     "find_label_set",
     "holds_labels",
     "label_by_body",

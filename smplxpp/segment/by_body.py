@@ -17,7 +17,8 @@ The terms are found one after the other:
 5. `by_body_outfit`: the outline of the clothes. The unknowns are the four borders between shoe, skin, lower, skin and
    upper along the column, and the end of the sleeve. Their cost sums the KL divergence of each ring's colours from its
    run's, likelihood ratios of skin by colour and distance, and priors on usual clothes. Dynamic programming over rings
-   gives the exact minimum; the sum over all outlines (forward-backward) gives P(label) of every ring.
+   gives the exact minimum; the sum over all outlines (forward-backward) gives P(label) of every ring. Without colours
+   `by_body_shape` finds the same from hems, folds, feet and distances, which `by_body_hems` measures.
 6. `by_body_prior`: P(label | place), the outline softened by the uncertainty of its borders.
 7. `by_body_colors.label_costs`: P(colour | label) by expectation maximisation, averaged over neighbours of like colour.
 8. `graph_cut`: alpha-expansion of the energy, with weights w that prefer concave folds and edges of colour.
@@ -26,7 +27,7 @@ The terms are found one after the other:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64, Num
@@ -44,14 +45,16 @@ from smplxpp.core import (
 )
 from smplxpp.core.topology import face_adjacency
 from smplxpp.raster import outer_visible_points
-from smplxpp.segment.by_body_chart import TRUNK, BodyChart, chart_of_scan, in_arm, in_column
+from smplxpp.segment.by_body_chart import FOOT, LEG, TRUNK, BodyChart, chart_of_scan, in_arm, in_column
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
+from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_shoes, roughness
 from smplxpp.segment.by_body_layers import Layers, find_layers
 from smplxpp.segment.by_body_objects import FoundObjects, find_objects
 from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.by_body_rings import ARM_END, ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
+from smplxpp.segment.by_body_shape import ShapeEvidence, outfit_by_shape
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.segment import SegmentedScan
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors, likeness
@@ -160,10 +163,13 @@ def label_by_body(
     labels = absorb_islands(mesh, cut, share[rows, cut], pairs, ends, config.smoothing)
     # Confidence is bounded by the outline's and falls with the body's misfit. 5 mm is the tolerance of visibility: less
     # than the gap between layers of clothes, more than the scan's noise.
-    own = np.minimum(share[rows, labels], confidence_bound(found.chart, labels, found.outfit, found.layers))
+    bound = confidence_bound(found.chart, labels, found.outfit, found.layers, colored=lab is not None)
+    own = np.minimum(share[rows, labels], bound)
     confidence = own * min(1.0, BODY_ELSEWHERE / max(found.misfit, 1e-9))
     seen = outer_visible_points(mesh, mesh.face_centers, tolerance=0.005)
-    notes = notes_on_labels(mesh, labels, confidence, found.outfit, found.skin, misfit=found.misfit)
+    notes = notes_on_labels(
+        found.chart, mesh.face_areas, labels, confidence, found.outfit, found.skin, misfit=found.misfit
+    )
     notes = (*found.objects.notes, *notes)
     return SegmentedScan(
         labels, confidence, seen, int((labels != cut).sum()), before / COST_SCALE, after / COST_SCALE, notes=notes
@@ -218,9 +224,13 @@ def weigh_evidence(
     # A scan has a chest if 1 % of its area lies above 1.05 m of the standard trunk.
     column = rings(in_column(chart), layers.hair | layers.coat, chart.height, 0.0, COLUMN_END)
     arm = rings(in_arm(chart), layers.hair, chart.reach, ARM_START, ARM_END)
-    outline = config.outfit if lab is not None else replace(config.outfit, habit=1.0)
-    chest = (chart.region == TRUNK) & (chart.height > 1.05)
-    outfit = find_outfit(column, arm, outline, misfit=misplaced, chest=area[chest].sum() > 0.01 * area.sum())
+    top = (chart.region == TRUNK) & (chart.height > 1.05)
+    chest = bool(area[top].sum() > 0.01 * area.sum())
+    if lab is None:
+        used = np.where(layers.hair | layers.coat, 0.0, area)
+        outfit = outfit_by_shape(_shape_evidence(mesh, chart, column, arm, area=used, chest=chest))
+    else:
+        outfit = find_outfit(column, arm, config.outfit, misfit=misplaced, chest=chest)
     prior = place_prior(chart, outfit, layers, softness=config.softness, body_softness=config.body_softness)
     # Costs of colour are averaged over faces of like colour, and the distance to the body is added.
     blend = Blend.of(
@@ -249,6 +259,39 @@ def weigh_evidence(
     costs[objects.faces] += _CERTAIN
     costs[:, OBJECT.id] = np.where(objects.faces, 0.0, _CERTAIN)
     return Evidence(chart, outfit, skin, layers, objects, misfit, costs)
+
+
+def _shape_evidence(
+    mesh: TriangleMesh, chart: BodyChart, column: Rings, arm: Rings, *, area: Float64[np.ndarray, " M"], chest: bool
+) -> ShapeEvidence:
+    """Measure hems along both legs and the trunk and along both arms, folds, feet, and how far the legs are apart."""
+    legs, arms = np.isin(chart.region, (LEG, FOOT)), in_arm(chart)
+    left = chart.side > 0
+
+    def hems(place: np.ndarray, tubes: tuple[np.ndarray, ...], rings: Rings) -> Hems:
+        return Hems.of(
+            place,
+            chart.turn,
+            tubes=tubes,
+            distance=chart.distance,
+            area=area,
+            start=rings.start,
+            count=len(rings),
+        )
+
+    return ShapeEvidence(
+        column,
+        arm,
+        hems(chart.height, (legs & left, legs & ~left, chart.region == TRUNK), column),
+        hems(chart.reach, (arms & left, arms & ~left), arm),
+        nats_for_shoes(chart, area),
+        (
+            roughness(mesh, (chart.region == TRUNK) & (chart.height > 1.0) & (chart.height < 1.3) & (area > 0)),
+            roughness(mesh, (chart.region == LEG) & (chart.height > 0.55) & (chart.height < 0.75) & (area > 0)),
+        ),
+        legs_apart(chart, area, len(column)),
+        chest,
+    )
 
 
 _CERTAIN = 12.0

@@ -6,7 +6,7 @@ size: a sleeve's length is a share of the arm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -36,6 +36,7 @@ class BodyChart:
         height: along the column of feet, legs, trunk, neck and head, standard metres (`SOLE` to `TOP`).
         reach: along the arm from the shoulder joint, standard metres (0 to `FINGERTIP`); negative on the trunk.
         azimuth: about the head's (and the trunk's) vertical axis, radians: 0 in front, pi at the back.
+        turn: about the axis of the own limb, on the trunk the azimuth, radians.
         face_height: within the head: 0 at the chin, 1 at the top.
         distance: of a scan's faces to the body, metres along the body's normal, negative within; 0 on the body.
         side: +1 left, -1 right.
@@ -45,12 +46,13 @@ class BodyChart:
     height: Float64[np.ndarray, " n"]
     reach: Float64[np.ndarray, " n"]
     azimuth: Float64[np.ndarray, " n"]
+    turn: Float64[np.ndarray, " n"]
     face_height: Float64[np.ndarray, " n"]
     distance: Float64[np.ndarray, " n"]
     side: Int64[np.ndarray, " n"]
 
     def __getitem__(self, index: np.ndarray) -> BodyChart:
-        names = ("region", "height", "reach", "azimuth", "face_height", "distance", "side")
+        names = ("region", "height", "reach", "azimuth", "turn", "face_height", "distance", "side")
         return BodyChart(*(getattr(self, name)[index] for name in names))
 
     @property
@@ -117,7 +119,30 @@ def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
     chin = y[head & (z > middle)].min()
     face_height = (y - chin) / (y.max() - chin)
     left = np.where(x >= 0, 1, -1)
-    return BodyChart(region, height, reach, azimuth, face_height, np.zeros(len(y)), left)
+    turn = _turns(vertices, region, azimuth, at)
+    return BodyChart(region, height, reach, azimuth, turn, face_height, np.zeros(len(y)), left)
+
+
+def _turns(
+    vertices: np.ndarray, region: np.ndarray, azimuth: np.ndarray, at: dict[str, np.ndarray]
+) -> Float64[np.ndarray, " V"]:
+    """Return the angle of each vertex about the bones of its own limb, in the rest pose; elsewhere the azimuth."""
+    out = azimuth.copy()
+    x, y, z = vertices.T
+    middle = at["pelvis"][0]
+    for sign, side in ((1, "left"), (-1, "right")):
+        own = sign * (x - middle) >= 0
+        # Bones are polylines: of the leg over y, of the arm over the distance from the middle of the body.
+        leg = own & np.isin(region, (LEG, FOOT))
+        bones = np.stack([at[f"{side}_{name}"] for name in ("ankle", "knee", "hip")])
+        center = [np.interp(y[leg], bones[:, 1], bones[:, axis]) for axis in (0, 2)]
+        out[leg] = np.arctan2(x[leg] - center[0], z[leg] - center[1])
+        arm = own & np.isin(region, (ARM, HAND))
+        bones = np.stack([at[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist")])
+        along = sign * (bones[:, 0] - middle)
+        center = [np.interp(sign * (x[arm] - middle), along, bones[:, axis]) for axis in (1, 2)]
+        out[arm] = np.arctan2(y[arm] - center[0], z[arm] - center[1])
+    return out
 
 
 def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> BodyChart:
@@ -148,7 +173,7 @@ def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> Bo
     height, reach = (
         value[nearest] + _between_vertices(posed, value, nearest, beside) for value in (own.height, own.reach)
     )
-    return BodyChart(place.region, height, reach, place.azimuth, place.face_height, distance, place.side)
+    return replace(place, height=height, reach=reach, distance=distance)
 
 
 def _between_vertices(

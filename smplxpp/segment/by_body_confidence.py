@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.ndimage import maximum_filter1d
 
-from smplxpp.core import LABELS, SKIN, UPPER, TriangleMesh
-from smplxpp.segment.by_body_chart import LEG, TRUNK, BodyChart, in_arm, in_column
+from smplxpp.core import LABELS, SKIN, UPPER
+from smplxpp.segment.by_body_chart import ARM, LEG, REGION_NAMES, TRUNK, BodyChart, in_arm, in_column
 from smplxpp.segment.by_body_colors import SkinModel
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import RUNS, Outfit
@@ -24,8 +24,12 @@ _BORDERS = {
 }
 
 
+UNSURE = 0.6
+"""Confidence below which a label is not sure: it is told, drawn pale, and taken for no label by fits."""
+
+
 def confidence_bound(
-    chart: BodyChart, labels: Int64[np.ndarray, " M"], outfit: Outfit, layers: Layers
+    chart: BodyChart, labels: Int64[np.ndarray, " M"], outfit: Outfit, layers: Layers, *, colored: bool = True
 ) -> Float64[np.ndarray, " M"]:
     """Return the upper bound of each face's confidence: P(its label) over all outlines of the clothes.
 
@@ -51,6 +55,9 @@ def confidence_bound(
         most[upper & np.isin(chart.region, (TRUNK, LEG))] *= 0.55
     if not layers.coat.any():
         most[upper] *= 0.93
+    # Without colours skin and what lies on it like skin, leggings and tight tops, look the same.
+    if not colored and outfit.unclothed:
+        most[(labels == SKIN.id) & np.isin(chart.region, (TRUNK, ARM, LEG))] *= 0.55
     return most
 
 
@@ -68,7 +75,8 @@ def _around(shares: np.ndarray) -> np.ndarray:
 
 
 def notes_on_labels(
-    mesh: TriangleMesh,
+    chart: BodyChart,
+    area: Float64[np.ndarray, " M"],
     labels: Int64[np.ndarray, " M"],
     confidence: Float64[np.ndarray, " M"],
     outfit: Outfit,
@@ -95,11 +103,22 @@ def notes_on_labels(
     out.extend(f"it is a close call {words}" for words in dict.fromkeys(close))
     if outfit.one_piece:
         out.append("no seam at the waist: taken as one garment (dress, jumpsuit), labelled upper")
-    # Labels of which more than 15 % of the area has a confidence below 0.6.
-    area = mesh.face_areas
-    for label in LABELS:
-        own = labels == label.id
-        total = area[own].sum()
-        if total > 0 and (low := area[own & (confidence < 0.6)].sum()) > 0.15 * total:
-            out.append(f"{low / total:.0%} of the faces labelled {label.name} are uncertain")
+    elif outfit.unclothed:
+        out.append("no hem on trunk, arms and legs: taken as bare skin; tight clothes may look the same")
+    # The parts of the body on which most of the uncertain area lies, if that is more than 5 % of the surface.
+    low = confidence < UNSURE
+    pairs = np.stack([chart.region[low], labels[low]], axis=1)
+    share = float(area[low].sum() / max(area.sum(), 1e-12))
+    if share > 0.05:
+        kinds, which = np.unique(pairs, axis=0, return_inverse=True)
+        total = np.bincount(which.ravel(), area[low]) / area.sum()
+        parts = [
+            f"{REGION_NAMES[kinds[k, 0]]} as {LABELS[kinds[k, 1]].name} {total[k]:.0%}"
+            for k in np.argsort(-total)[:3]
+            if total[k] > 0.01
+        ]
+        out.append(
+            f"not sure of {int(low.sum())} faces, {share:.0%} of the surface ({', '.join(parts)}): look at the labels, "
+            "correct them with `smplxpp label`, or give --labels, colours or photographs"
+        )
     return tuple(out)

@@ -1,4 +1,4 @@
-"""Find the outline of the clothes: where shoes, legs, trousers, shirt and sleeves begin and end along the body.
+"""Find by colour where shoes, legs, trousers, shirt and sleeves begin and end along the body: the outline of clothes.
 
 The column of feet, legs and trunk is cut into runs of shoe, skin, lower, skin and upper, the arm into sleeve and skin;
 any run may be empty. The unknowns are the borders b_1..b_4 of the runs. The cost of an outline, in nats, is the sum
@@ -22,7 +22,7 @@ from jaxtyping import Float64
 
 from smplxpp.core.labels import LABELS, LOWER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import HIP, KNEE, WRIST
-from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, Rings, cloth_against_skin, steps
+from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, Rings
 
 # Height of the usual waist, standard metres.
 _WAIST = 0.98
@@ -49,9 +49,6 @@ class OutfitConfig:
         split_at_legs: the same about visible legs, lower because a suit of one colour is more usual than a jumpsuit.
         midriff: cost of skin between two garments.
         crease: bonus of a border with a full step (10 mm) of the distance to the body.
-        alone: cost of a ring's distance to the body, a nat of log ratio, for scans without colours.
-        hem: bonus of a border between skin and cloth with a full step outwards (20 mm), for scans without colours.
-        habit: 0 to 1, weight of usual clothes (sleeves, trousers, a waist at the waist), for scans without colours.
     """
 
     samples: float = 8.0
@@ -66,9 +63,6 @@ class OutfitConfig:
     split_at_legs: float = 6.0
     midriff: float = 12.0
     crease: float = 12.0
-    alone: float = 0.4
-    hem: float = 68.0
-    habit: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +92,11 @@ class Outfit:
     @property
     def has_lower(self) -> bool:
         return self.lower_end > self.lower_start
+
+    @property
+    def unclothed(self) -> bool:
+        """Return whether neither an upper nor a lower garment was found."""
+        return not self.has_lower and self.upper_start >= COLUMN_END - 1e-9
 
     @property
     def one_piece(self) -> bool:
@@ -180,9 +179,6 @@ def _cross_costs(rings: Rings, n: np.ndarray) -> Float64[np.ndarray, "R1 R1"]:
 
 def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[np.ndarray, np.ndarray]:
     """Return (R,) nats of each ring as cloth and as skin, because skin lies on the body and cloth above it."""
-    if config.habit:
-        ratio = config.alone * cloth_against_skin(rings.distance, 0.05 * rings.spread) * rings.weight
-        return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
     spread = np.hypot(0.5 * misfit, 0.003)
     z = rings.distance / spread
     # A normal distribution for skin against an exponential one of mean 12 mm for cloth, bounded to [-0.7, 3] nats.
@@ -201,28 +197,21 @@ def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: b
     mean = np.convolve(rings.distance, np.ones(2) / 2, mode="valid")
     jump = np.concatenate([[0.0, 0.0], np.abs(mean[2:] - mean[:-2]), [0.0, 0.0]])
     fold = config.crease * np.clip(jump / 0.010, 0.0, 1.0)
-    # Without colours hems are most of what tells skin from cloth, which steps out from it.
-    hem = config.habit * config.hem * steps(rings)
     middle = 0.5 * (place[1:] + place[:-1])
     on_foot = _between(8.0 * (middle < 0.045))  # nats of a ring of the foot in trousers or a dress
-    # Without colours distances alone tell who wears nothing, so that a bare pelvis costs a quarter.
-    bare_pelvis = config.bare_pelvis * (1.0 - 0.75 * config.habit)
-    skin = runs.skin + _between(bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
+    skin = runs.skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
     # Priors on the place and length of each run: linear penalties outside of the usual range, and a waist at its
     # height.
-    shoe = runs.shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, -np.maximum(-hem[j], 0.0))
+    shoe = runs.shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
     usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
     usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
     at_waist = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0)
     # Visible legs: cloth within 25 mm of the thighs on average, where a skirt hangs farther.
     legs_show = float(rings.distance[(middle > 0.5) & (middle < 0.75)].mean()) < 0.025
     split = at_waist + config.split_at_legs if legs_show else config.split
-    # Habits: two garments rather than one (10 nats), and covered legs (0.25 nats a ring).
-    habit = at_waist - 10.0 + _between(np.where(middle < _WAIST, 0.25, 0.0))[0][i]
-    split = (1.0 - config.habit) * split + config.habit * habit
     # Where a scan ends below the chest, one garment about the legs is the lower one.
     first, second = (split, 0.0) if chest else (0.0, np.where(_between(rings.weight) > 0, config.split, 0.0))
-    lower = np.where(empty, 6.0, runs.cloth + first + usual + on_foot - np.maximum(hem[i], 0.0))
+    lower = np.where(empty, 6.0, runs.cloth + first + usual + on_foot)
     midriff = skin + np.where(empty, 0.0, config.midriff)
     upper = runs.top + second + on_foot + _usual(place[i], -0.1, COLUMN_END, 60.0) - np.where(i > 0, fold[i], 0.0)
     return [shoe, skin, lower, midriff, upper]
@@ -280,9 +269,7 @@ def _arm_costs(rings: Rings, config: OutfitConfig, misfit: float, *, skin_colore
     runs = _RunCosts.of(rings, config, misfit)
     # A shirt in another colour than skin has no sleeves in the colour of skin, so that these cost as much as shoes do.
     sleeve = runs.cloth if skin_colored else runs.shoe
-    cost = sleeve[0] + runs.skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
-    cost = cost - config.habit * config.hem * np.maximum(-steps(rings), 0.0)
-    return cost + config.habit * _usual(rings.places, 0.15, 1.0, 20.0)  # at least short sleeves
+    return sleeve[0] + runs.skin[:, -1] + _usual(rings.places, ARM_START - 0.1, WRIST + 0.04, 40.0)
 
 
 def _margin(cost: np.ndarray, place: np.ndarray, best: int) -> float:

@@ -9,6 +9,7 @@ from smplxpp.core.labels import HAIR, LABELS, LOWER, OUTER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HEAD, LEG, NECK, NECK_BASE, TRUNK, WRIST, BodyChart
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import Outfit
+from smplxpp.segment.by_body_rings import COLUMN_END
 
 # Probability of each label in a region independent of the outline: the frequency of exceptions (a bag, a rolled
 # sleeve).
@@ -88,7 +89,11 @@ def _column(height: np.ndarray, outfit: Outfit, softness: float) -> np.ndarray:
     for k, border in enumerate(borders):
         # A garment that is not worn has no border.
         never = (k == 0 and outfit.shoe_top <= 0) or (k == 3 and outfit.upper_start <= 0)
-        above.append(np.ones(len(height)) if never else _above(height, border, softness))
+        # Nor has one that begins where the column ends: a bare trunk is bare up to the neck.
+        nowhere = border >= COLUMN_END - 1e-9
+        above.append(
+            np.zeros(len(height)) if nowhere else np.ones(len(height)) if never else _above(height, border, softness)
+        )
     above.append(np.zeros(len(height)))
     above = list(np.minimum.accumulate(above))
     for k, label in enumerate((SHOE, SKIN, LOWER, SKIN, UPPER)):

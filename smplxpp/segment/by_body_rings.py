@@ -100,27 +100,6 @@ class Rings:
         return bool(between.any() and self.skin[between, 0].mean() > 1.0)
 
 
-def steps(rings: Rings) -> Float64[np.ndarray, " R1"]:
-    """Return the step of the distance at each start of a ring and at the end, -1 to 1 for full ones, positive outwards.
-
-    The difference of two rings on each side, less the median slope of the rings around, because a hem is sharp, while
-    the misfit of the body changes over a limb. Half of a full step is reached at 3 mm, as tight clothes have it, the
-    other half at 20 mm, so that the wider of two steps is the hem.
-    """
-    # Rings without faces, of coarse meshes, take the distance between their neighbours'.
-    known = np.flatnonzero(rings.weight > 0)
-    if not len(known):
-        return np.zeros(len(rings) + 1)
-    distance = np.interp(np.arange(len(rings)), known, rings.distance[known])
-    out = np.zeros(len(distance) + 1)
-    slope = np.diff(distance)
-    for k in range(2, len(distance) - 1):
-        around = float(np.median(slope[max(0, k - 5) : k + 4]))
-        out[k] = 0.5 * (distance[k] + distance[k + 1] - distance[k - 1] - distance[k - 2]) - 2.0 * around
-    size = np.abs(out)
-    return np.asarray(np.sign(out) * (0.5 * np.minimum(size / 0.003, 1.0) + 0.5 * np.minimum(size / 0.020, 1.0)))
-
-
 def cloth_against_skin(
     distance: Float64[np.ndarray, " n"], spread: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:

@@ -17,7 +17,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.segment import label_by_body, read_labels, segment_scan
+from smplxpp.segment import UNSURE, label_by_body, read_labels, segment_scan
 from smplxpp.segment.by_body_outfit import NAT, RUNS, label_shares
 from smplxpp.segment.by_body_rings import cloth_against_skin
 
@@ -162,13 +162,72 @@ def test_calves_that_no_shape_of_the_body_has_are_no_trousers(body, calves):
 
 
 def test_who_wears_nothing_wears_no_shirt(body):
-    """Without colours the bare body was labelled shirt, shoes and hair."""
+    """Without colours the bare body was labelled shirt, shoes and hair; and tight clothes may look the same."""
     params = BodyParams.rest()
     mesh = body.mesh(body.forward(params).vertices[0])
-    labels = label_by_body(mesh, body, params).face_labels
+    result = label_by_body(mesh, body, params)
+    labels = result.face_labels
     below = mesh.face_centers[:, 1] < body.forward(params).joints[0, body.joint_names.index("neck"), 1]
     area = mesh.face_areas[below]
-    assert area @ (labels[below] == SKIN.id) > 0.85 * area.sum()
+    assert area @ (labels[below] == SKIN.id) > 0.99 * area.sum()
+    trunk = np.abs(mesh.face_centers[:, 1] - body.forward(params).joints[0, body.joint_names.index("spine1"), 1]) < 0.05
+    assert result.confidence[trunk].max() < UNSURE
+    assert any("no hem" in note for note in result.notes) and any("trunk as skin" in note for note in result.notes)
+
+
+def test_a_jacket_ends_at_its_hem_and_not_at_the_waist(body):
+    """A jacket's lower half was labelled trousers, although its hem stepped in by 2 cm at the hips."""
+    params = BodyParams.rest()
+    posed = body.forward(params)
+    mesh = body.mesh(posed.vertices[0])
+    joint = {name: posed.joints[0, k] for k, name in enumerate(body.joint_names)}
+    x, y, _ = mesh.vertices.T
+    hem, sleeve = joint["left_hip"][1] - 0.06, np.abs(x) < joint["left_wrist"][0] - 0.02
+    above = np.where((y > hem) & (y < joint["neck"][1] - 0.03) & sleeve, 0.03, 0.0)
+    above = np.where((y < hem) & sleeve, 0.01, above)
+    labels = label_by_body(mesh.with_vertices(mesh.vertices + above[:, None] * mesh.vertex_normals), body, params)
+    for low, high, label in ((hem + 0.03, hem + 0.2, UPPER), (hem - 0.3, hem - 0.03, LOWER)):
+        own = (y[mesh.faces] > low).all(axis=1) & (y[mesh.faces] < high).all(axis=1) & sleeve[mesh.faces].all(axis=1)
+        own &= (np.abs(x[mesh.faces]) < joint["left_shoulder"][0]).all(axis=1)
+        area = mesh.face_areas[own]
+        assert area @ (labels.face_labels[own] == label.id) > 0.9 * area.sum(), label.name
+
+
+def test_a_dress_without_a_hem_at_the_waist_is_one_garment(body):
+    """A dress was cut at the waist: what goes round both legs, with no hem above, is one garment, labelled upper."""
+    params = BodyParams.rest()
+    posed = body.forward(params)
+    mesh = body.mesh(posed.vertices[0])
+    joint = {name: posed.joints[0, k] for k, name in enumerate(body.joint_names)}
+    x, y, z = mesh.vertices.T
+    knee, waist, neck = joint["left_knee"][1], joint["spine1"][1], joint["neck"][1] - 0.04
+    inner = np.abs(x) < joint["left_elbow"][0] - 0.08
+    above = np.where((y > waist) & (y < neck) & inner, 0.012, 0.0)
+    dressed = mesh.with_vertices(mesh.vertices + above[:, None] * mesh.vertex_normals)
+    # The skirt, an elliptic frustum of 40 rings from the trunk's girth at the waist to the knees, hides the thighs.
+    kept = ((y < knee) | (y > waist) | ~inner)[mesh.faces].all(axis=1)
+    ring = (np.abs(y - waist) < 0.02) & inner
+    half = np.array([np.abs(x[ring]).max(), np.ptp(z[ring]) / 2]) + 0.012
+    turn, down = np.meshgrid(np.linspace(0, 2 * np.pi, 80, endpoint=False), np.linspace(0, 1, 40))
+    size = 1.0 + down
+    points = np.stack(
+        [half[0] * size * np.sin(turn), waist - down * (waist - knee), half[1] * size * np.cos(turn)], axis=2
+    )
+    points[:, :, 2] += 0.5 * (z[ring].max() + z[ring].min())
+    first = 80 * np.arange(39)[:, None] + np.arange(80)
+    right = 80 * np.arange(39)[:, None] + (np.arange(80) + 1) % 80
+    faces = np.concatenate(
+        [np.stack(t, axis=2).reshape(-1, 3) for t in ((first, first + 80, right + 80), (first, right + 80, right))]
+    )
+    skirt = TriangleMesh(points.reshape(-1, 3), faces)
+    scan = TriangleMesh(
+        np.concatenate([dressed.vertices, skirt.vertices]),
+        np.concatenate([dressed.faces[kept], skirt.faces + dressed.vertex_count]),
+    )
+    result = label_by_body(scan, body, params)
+    of_skirt = result.face_labels[kept.sum() :]
+    assert (of_skirt == UPPER.id).mean() > 0.9 and not (result.face_labels == LOWER.id).any()
+    assert any("no seam at the waist" in note for note in result.notes)
 
 
 def test_a_distance_on_the_body_is_skin_and_a_centimetre_above_it_cloth():
