@@ -95,5 +95,9 @@ def test_of_a_turn_a_student_is_fitted_without_a_teacher_and_options_still_count
     preset, own = recipe.preset, training_preset("cpu")
     assert preset.fit.iterations == 100 and preset.fit.sampling.sh_degree == 0
     assert preset.fit.sampling.count == own.fit.sampling.count
-    assert preset.bake.iterations == 7 and preset.bake.attributes == preset.compensate.attributes == 0.0
+    assert (
+        preset.bake.iterations == 7
+        and preset.bake.attributes == preset.compensate.attributes == 0.0
+        and preset.bake.lr < 1e-6
+    )
     assert TrainConfig().recipe("cpu").preset == own
