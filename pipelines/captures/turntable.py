@@ -46,6 +46,7 @@ CAMERA = "cam"
 """Name of the one camera."""
 # Of 20 frames and more every tenth is held out, so that a training can be measured; never the first, the reference.
 _HOLD_OUT_FROM, _HOLD_OUT_EVERY = 20, 10
+_TURN_SECONDS = 8.0  # in which players show a turn; photographs have no rate, and faster turns make a person spin
 
 
 @dataclass(frozen=True)
@@ -362,6 +363,7 @@ def _describe(root: Path, name: str, made: TurntableCapture) -> None:
         "name": name,
         "kind": TURNTABLE,
         "background": None,
+        "fps": made.frames / _TURN_SECONDS,
         "inputs": {"parameters": "tracked"},
         "train_frames": [[frame, frame] for frame in train],
         **({"novel_pose_frames": [[frame, frame] for frame in held_out]} if held_out else {}),

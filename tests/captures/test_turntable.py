@@ -62,6 +62,8 @@ def test_a_capture_with_camera_and_poses(made, taken):
     capture = open_capture(made.out)
     assert capture.kind == "turntable" and capture.frames == tuple(range(FRAMES)) and list(capture.cameras) == ["cam"]
     assert all(capture.params(frame) is not None and capture.mask("cam", frame) is not None for frame in capture.frames)
+    # Players show the turn in eight seconds, not in a sixth of one.
+    assert capture.fps == pytest.approx(FRAMES / 8)
     # Photographs keep their bytes; the joints of the poses lie where the keypoints are.
     first = taken[0] / "photos" / "IMG_103.png"
     assert capture.required_file("cam", 0).read_bytes() == first.read_bytes()
