@@ -19,10 +19,10 @@ from smplxpp.build.limits import (
 from smplxpp.capture.cameras import read_lenses
 from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
-from smplxpp.core import BACKGROUND, BodyParams, Camera, Check, InputError, SKIN, TriangleMesh
+from smplxpp.core import BACKGROUND, SKIN, BodyParams, Camera, Check, InputError, TriangleMesh
 from smplxpp.metrics import DirectedDistances, mirror_ratio, mirrored_by_views, point_to_surface
-from smplxpp.metrics.completeness import ENDS, TRUNK_AND_LIMBS, body_regions, far_patches, uncovered_body
 from smplxpp.metrics.comparison import MM
+from smplxpp.metrics.completeness import ENDS, TRUNK_AND_LIMBS, body_regions, far_patches, uncovered_body
 from smplxpp.template.template import Template
 
 EXPLAINED = 15e-3

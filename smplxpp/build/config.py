@@ -14,7 +14,7 @@ from smplxpp.body import Whose
 from smplxpp.capture import Capture
 from smplxpp.clean import BridgeConfig
 from smplxpp.clean.scan_frame import AUTO, check_height
-from smplxpp.core import BodyParams, InputError, LABELS, MeshLike, require_at_least, require_between, require_choice
+from smplxpp.core import LABELS, BodyParams, InputError, MeshLike, require_at_least, require_between, require_choice
 from smplxpp.core.errors import one_line
 
 STEPS = (

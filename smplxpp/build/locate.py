@@ -14,8 +14,8 @@ from jaxtyping import Int64, UInt8
 from smplxpp.body import BodyModel
 from smplxpp.build.data import LocatedInScan
 from smplxpp.build.scan import ScanFile
-from smplxpp.build.verdict import LEAST_CONFIDENCE
 from smplxpp.build.scan_keypoints import Landmarks, facing, keypoints_of_scan
+from smplxpp.build.verdict import LEAST_CONFIDENCE
 from smplxpp.clean import smooth_if_rough
 from smplxpp.core import BACKGROUND, BodyParams, Check, InputError, StageOutput, TriangleMesh
 from smplxpp.core.files.json_file import jsonable
@@ -172,9 +172,7 @@ def _best(search: Callable[..., LocatedBody], **known: Any) -> LocatedBody:
         return error.located
 
 
-def _confirmed(
-    found: LocatedBody, search: Callable[..., LocatedBody], landmarks: Landmarks
-) -> tuple[LocatedBody, str]:
+def _confirmed(found: LocatedBody, search: Callable[..., LocatedBody], landmarks: Landmarks) -> tuple[LocatedBody, str]:
     """Keep the body found if a detector's keypoints agree on its facing direction; else search again with them.
 
     Keypoints are centimetres off, geometry is not: they propose limb poses and decide the facing direction alone.

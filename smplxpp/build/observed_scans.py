@@ -13,7 +13,7 @@ from smplxpp.build.config import RegisterInputs
 from smplxpp.build.data import LocatedInScan
 from smplxpp.build.scan import ScanFile, read_scan, scan_file_labels
 from smplxpp.capture import Capture
-from smplxpp.core import BACKGROUND, GeometryWarning, InputError, LABELS, MeshLike, TriangleMesh
+from smplxpp.core import BACKGROUND, LABELS, GeometryWarning, InputError, MeshLike, TriangleMesh
 from smplxpp.register import ScanObservation, ViewMap
 from smplxpp.segment import vote_on_faces
 

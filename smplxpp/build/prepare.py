@@ -136,9 +136,7 @@ def pose_fit(scan: TriangleMesh, body: BodyModel, params: BodyParams) -> tuple[P
     return fit, StageOutput(checks, {"distance_median_mm": float(np.median(distance))})
 
 
-def _refuse_another_body(
-    points: Float[np.ndarray, "N 3"], body: BodyModel, params: BodyParams, overlap: float
-) -> None:
+def _refuse_another_body(points: Float[np.ndarray, "N 3"], body: BodyModel, params: BodyParams, overlap: float) -> None:
     """Refuse parameters that do not stand in the scan as the open body's and do so as a family's.
 
     Raises:

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from smplxpp.body import BodyModel, load_body
 from smplxpp.build.config import ReconstructInputs
 from smplxpp.build.limits import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
 from smplxpp.build.opened import opened
 from smplxpp.build.turning import turning_person
-from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.clean import sanitize
@@ -25,8 +25,8 @@ from smplxpp.core.files.json_file import as_number, as_numbers, as_object, read_
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
 from smplxpp.reconstruct import ReconstructConfig, Reconstruction, adopt_surface, reconstruct
 from smplxpp.reconstruct.carried import PosedPerson
-from smplxpp.reconstruct.turntable import reconstruct_turntable
 from smplxpp.reconstruct.neus2 import UnitCube, mesh_in_world
+from smplxpp.reconstruct.turntable import reconstruct_turntable
 from smplxpp.reconstruct.views import PhotoView, silhouette_agreement, usable_views
 
 Maker = Callable[..., Reconstruction]

@@ -17,12 +17,11 @@ from jaxtyping import Int64, UInt8
 from smplxpp.clean import PointSurface, Sanitized, sanitize, surface_from_points
 from smplxpp.clean.scan_frame import AUTO, check_human_scale, convert_points, find_scan_frame
 from smplxpp.core import GeometryWarning, InputError, MeshLike, as_mesh
+from smplxpp.core.errors import one_line
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes
 from smplxpp.segment import map_labels, read_labels
 from smplxpp.segment.label_files import check_element_count
-from smplxpp.core.errors import one_line
-
 
 # Formats whose files are in metres: by the format, or because their reader converts the unit that they state.
 _METRES = (".glb", ".gltf", ".fbx")
@@ -55,7 +54,6 @@ class ScanFile:
         """sRGB of the repaired scan's vertices: the mean of the file's vertices that became one; None without any."""
         return None if self.raw.vertex_colors is None else self.clean.mean_colors(self.raw.vertex_colors)
 
-
     def scaled(self, factor: float) -> ScanFile:
         """Return the scan with its repaired surface scaled about the origin; 1 is the scan itself."""
         if factor == 1.0:
@@ -66,9 +64,7 @@ class ScanFile:
         return replace(self, clean=clean, note=note)
 
 
-def read_scan(
-    scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", height: float | None = None
-) -> ScanFile:
+def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", height: float | None = None) -> ScanFile:
     """Read a scan: a mesh, or a point cloud, whose surface is reconstructed.
 
     Args:

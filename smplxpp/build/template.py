@@ -16,7 +16,6 @@ from smplxpp.build.assemble import assemble_parts
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.build.data import LocatedInScan, RestPart
 from smplxpp.build.inputs import check_inputs, given_motion, plan_build
-from smplxpp.build.request import BuildRequest
 from smplxpp.build.locate import locate_in_scan
 from smplxpp.build.observe import observe
 from smplxpp.build.opened import opened, with_params
@@ -34,6 +33,7 @@ from smplxpp.build.reconstruct import (
 )
 from smplxpp.build.register import Registration, register_observed
 from smplxpp.build.report import BuildReport, BuildResult
+from smplxpp.build.request import BuildRequest
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces
 from smplxpp.build.validate import validate_template

@@ -9,10 +9,10 @@ import numpy as np
 from smplxpp.body import BodyModel
 from smplxpp.capture import Capture
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
-from smplxpp.register.kinematics import BodyState
-from smplxpp.register.landmarks import visible_vertices
 from smplxpp.reconstruct import PhotoView
 from smplxpp.reconstruct.carried import PosedPerson
+from smplxpp.register.kinematics import BodyState
+from smplxpp.register.landmarks import visible_vertices
 
 _SPREAD_DEGREES = 12.0  # of each leg, which takes knees that touch some 20 cm apart
 _BODY_JOINTS = 22  # joints that carry the space around a body; fingers and face follow wrists and head
@@ -31,9 +31,7 @@ class TurningPerson:
     person: PosedPerson
 
 
-def turning_person(
-    capture: Capture, camera: str, frame: int, body: BodyModel
-) -> tuple[TurningPerson, list[str]]:
+def turning_person(capture: Capture, camera: str, frame: int, body: BodyModel) -> tuple[TurningPerson, list[str]]:
     """Read the frames of a turn that are trained on, and pose the body in them, with notes on those left out.
 
     Args:

@@ -10,21 +10,38 @@ from itertools import combinations
 
 import numpy as np
 
-from smplxpp.body.named_poses import STRESS_POSES, stress_poses
+from smplxpp.body.named_poses import STRESS_POSES, WORN_POSES, stress_poses, worn_poses
 from smplxpp.build.completeness import completeness_checks, photograph_checks
 from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PreparedScan
 from smplxpp.clean import loop_lengths, thickened
-from smplxpp.core import BACKGROUND, CLOTH_LABELS, LABELS, SKIN, BodyParams, Check, InputError, StageOutput, TriangleMesh, spread
+from smplxpp.core import (
+    BACKGROUND,
+    CLOTH_LABELS,
+    LABELS,
+    SKIN,
+    BodyParams,
+    Check,
+    InputError,
+    StageOutput,
+    TriangleMesh,
+    row_lengths,
+    spread,
+)
+from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.solids import closed_mesh
 from smplxpp.core.topology import border_loops
 from smplxpp.metrics import CompareConfig, DirectedDistances, directed_distances, point_to_surface, summarize
-from smplxpp.metrics.conventions import convention_named
 from smplxpp.metrics.comparison import MM
+from smplxpp.metrics.conventions import convention_named
 from smplxpp.metrics.intersection import interpenetration
 from smplxpp.metrics.quality import mesh_quality
 from smplxpp.metrics.stretch import stretch_report
+from smplxpp.skinning import skin
 from smplxpp.template.template import BODY_PART, Template
+from smplxpp.transfer import TransferConfig
+from smplxpp.transfer.checks import extent
+from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +97,12 @@ def validate_template(
     checks.append(Check("faces of the parts turned over against the cleaned scan", turned, "", 0, 0))
     # Stretch under poses that are rarely recorded, and under a dozen recorded frames.
     motion_frames = 12
-    poses = {"hard poses": stress_poses(params)}
+    poses = {"hard poses": stress_poses(params), "worn poses": worn_poses(params)}
     if motion is not None:
         poses["motion"] = motion.select(spread(range(len(motion)), motion_frames))
     for title, tried in poses.items():
-        names = list(STRESS_POSES) if title == "hard poses" else [f"frame {k}" for k in range(len(tried))]
+        known = {"hard poses": list(STRESS_POSES), "worn poses": list(WORN_POSES)}
+        names = known.get(title) or [f"frame {k}" for k in range(len(tried))]
         numbers[title], worst = _stretch(template, tried, names)
         checks.append(
             Check(
@@ -96,7 +114,65 @@ def validate_template(
                 explanation="the worst part and pose, over what the pose asks of the part's longest opening",
             )
         )
-    return found, StageOutput(checks, numbers)
+    worn, numbers["worn"] = worn_checks(template, params)
+    return found, StageOutput([*checks, *worn], numbers)
+
+
+def worn_checks(template: Template, params: BodyParams) -> tuple[list[Check], dict[str, dict[str, float]]]:
+    """Drive each part through `WORN_POSES`; check that its rings stay around their limbs, and count faces in the body.
+
+    A ring around one limb (`enclosed_by_one`) keeps its distance from the limb's axis, which moves with the skin around
+    it: wide trousers that stay behind a raised thigh are far from it. Cloth whose weights are right still meets the
+    body where limbs press on it, as a skirt does in front of a seated person, so that deep faces warn alone.
+
+    Args:
+        template: of the scan.
+        params: the person; only the first frame is used.
+    """
+    rest_body = template.part_mesh(BODY_PART)
+    weights, dense = template.body.weights, template.weights.dense()
+    settings = TransferConfig(joint_names=template.body.joint_names)
+    axes = limb_axes(rest_body, weights, extent(rest_body), settings)
+    tried = worn_poses(params)
+    transforms, posed = template.posed_from_rest(tried), template.pose(tried)
+    fields = [SignedDistanceField(rest_body.with_vertices(p[: template.body.vertex_count]), solid=True) for p in posed]
+    checks: list[Check] = []
+    numbers: dict[str, dict[str, float]] = {}
+    for part in template.part_names:
+        if part == BODY_PART:
+            continue
+        chosen = template.part_faces(part)
+        mesh, used = template.mesh.submesh(chosen)
+        # How much farther from the axis rings are than at rest, by pose.
+        row = {}
+        if axes:
+            rings = enclosed_by_one(mesh, axes, dense.shape[1])
+            kept = rings.share > 0.5
+            before = row_lengths(mesh.vertices - rings.centre)[kept]
+            for name, vertices, moved in zip(WORN_POSES, posed, transforms, strict=True):
+                after = row_lengths(vertices[used] - skin(rings.centre, _or_first(rings.weights), moved))[kept]
+                row[f"{name}: rings off their limb, mm"] = (
+                    float(np.percentile(after - before, 95) * MM) if kept.any() else 0.0
+                )
+        # Faces deeper than 1 cm within the body.
+        for name, vertices, field in zip(WORN_POSES, posed, fields, strict=True):
+            depth = field.query(vertices[template.faces[chosen]].mean(axis=1)).distance
+            row[f"{name}: faces in the body"] = float((depth < -0.01).mean())
+        numbers[part] = row
+        farthest = max((value for key, value in row.items() if key.endswith("mm")), default=0.0)
+        deep = max(value for key, value in row.items() if key.endswith("body"))
+        checks += [
+            Check(f"{part}: rings off their limb, worn poses, p95", farthest, "mm", 30.0, 60.0),
+            Check(f"{part}: share of faces in the body, worn poses", deep, "", 0.25, 1.0),
+        ]
+    return checks, numbers
+
+
+def _or_first(weights: np.ndarray) -> np.ndarray:
+    """Return weights with all weight on the first joint in rows that have none."""
+    out = weights.copy()
+    out[~weights.any(axis=1), 0] = 1.0
+    return out
 
 
 def _against_scan(

@@ -55,11 +55,13 @@ class Enclosure:
         share: 0 to 1, how far the vertex belongs to rings around one limb and nothing else.
         weights: of that limb's skin at the same place along it; zero where `share` is.
         limb: index of the limb, -1 where `share` is 0.
+        centre: the point of the limb's axis at its place, metres; zero where `share` is.
     """
 
     share: Float64[np.ndarray, " N"]
     weights: Float64[np.ndarray, "N J"]
     limb: np.ndarray
+    centre: Float64[np.ndarray, "N 3"]
 
 
 def limb_axes(
@@ -135,13 +137,14 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         share[better], limb[better] = own[better], k
         at[better] = place[k, better] / alone[k, better]
     _continue_to_hems(mesh, axes, share, at, limb, open_rows=(alone + other).sum(axis=0) == 0)
-    # The weights of each vertex's place along its limb.
-    weights = np.zeros((n, joint_count))
+    # The axis' point and the weights at each vertex's place along its limb.
+    weights, centre = np.zeros((n, joint_count)), np.zeros((n, 3))
     for k, axis in enumerate(axes[:-1]):
         rows = np.flatnonzero(limb == k)
         places = np.arange(len(axis.points))
-        weights[rows] = np.stack([np.interp(at[rows], places, column) for column in axis.weights.T], axis=1)
-    return Enclosure(share, weights, limb)
+        for out, values in ((weights, axis.weights), (centre, axis.points)):
+            out[rows] = np.stack([np.interp(at[rows], places, column) for column in values.T], axis=1)
+    return Enclosure(share, weights, limb, centre)
 
 
 def _continue_to_hems(
@@ -155,8 +158,17 @@ def _continue_to_hems(
 ) -> None:
     """Continue share, place and limb, in place, outwards to vertices that no closed ring reaches.
 
-    Near a slanted or jagged hem planes across the limb leave the cloth, so that they make no ring.
+    Near a slanted or jagged hem planes across the limb leave the cloth, so that they make no ring. Only vertices from
+    eight planes before the last ring on count, and none much farther off the axis than rings are: the side of an open
+    coat below the armpit makes no ring either.
     """
+    last, widest = np.zeros(len(axes)), np.zeros(len(axes))
+    for k, axis in enumerate(axes[:-1]):
+        rows = np.flatnonzero(limb == k)
+        if len(rows):
+            index = np.clip(at[rows].round().astype(int), 0, len(axis.points) - 1)
+            last[k] = at[rows].max()
+            widest[k] = 1.2 * row_lengths(mesh.vertices[rows] - axis.points[index]).max()
     ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
     # Hems are seldom more slanted than 16 vertices are high.
     for _ in range(16):
@@ -165,14 +177,20 @@ def _continue_to_hems(
             return
         origin, next_one = pairs.T
         index = np.clip(at[origin].astype(int), 0, None)
-        tangent, step = np.zeros((len(pairs), 3)), np.ones(len(pairs))
+        tangent, step, off = np.zeros((len(pairs), 3)), np.ones(len(pairs)), np.zeros(len(pairs))
         for k, axis in enumerate(axes[:-1]):
             rows = limb[origin] == k
-            tangent[rows] = axis.tangents[np.minimum(index[rows], len(axis.tangents) - 1)]
+            nearest = np.minimum(index[rows], len(axis.points) - 1)
+            tangent[rows] = axis.tangents[nearest]
+            offset = mesh.vertices[next_one[rows]] - axis.points[nearest]
+            # The part of the offset across the axis.
+            off[rows] = row_lengths(offset - np.einsum("ij,ij->i", offset, tangent[rows])[:, None] * tangent[rows])
             step[rows] = np.linalg.norm(axis.points[1] - axis.points[0])
         along = np.einsum("ij,ij->i", mesh.vertices[next_one] - mesh.vertices[origin], tangent)
         # Only outwards: upwards cloth that makes no ring is an open jacket's shoulder.
         outwards = along > -0.3 * row_lengths(mesh.vertices[next_one] - mesh.vertices[origin])
+        outwards &= at[origin] > last[limb[origin]] - 8.0
+        outwards &= off < widest[limb[origin]]
         origin, next_one, along, step = (values[outwards] for values in (origin, next_one, along, step))
         share[next_one], limb[next_one] = share[origin], limb[origin]
         at[next_one] = at[origin] + along / step

@@ -13,8 +13,8 @@ from smplxpp.body.smpl_params import from_smpl
 from smplxpp.build import locate
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.inputs import plan_build
-from smplxpp.build.request import BuildRequest
 from smplxpp.build.prepare import given_params, pose_fit, start_params
+from smplxpp.build.request import BuildRequest
 from smplxpp.core import BodyParams, GeometryWarning, InputError
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
