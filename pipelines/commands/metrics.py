@@ -293,27 +293,27 @@ def _print(report: dict[str, Any], console: Console) -> None:
         "A->B\np95": "pred_to_gt.p95",
         "B->A\nmean": "gt_to_pred.mean",
         "B->A\np95": "gt_to_pred.p95",
-        "Haus\n>=": "hausdorff",
-        "dorff\n<=": "hausdorff_upper",
+        "Hausd.\n>=": "hausdorff",
+        "Hausd.\n<=": "hausdorff_upper",
         "norm.\ndeg": "normal_angle_deg",
         "norm.\n|cos|": "normal_consistency",
         **{f"F\n{threshold:g} mm": f"fscore@{threshold:g}mm" for threshold in report["threshold_mm"]},
     }
-    table = Table(
-        title=f"{report['preset']}: {report['definition']}",
-        title_justify="left",
-        caption="A->B: from A to the surface of B, mm; Hausdorff >=: samples and vertices, <=: certified bound, mm; "
-        "norm.: angle of the normals and mean |cos|, both ways; F: F-score at the threshold",
-        caption_justify="left",
-        padding=(0, 1 if console.width > 100 else 0),
-    )
-    table.add_column("frame", no_wrap=True, min_width=9)
-    for column in columns:
-        table.add_column(column, justify="right", overflow="fold")  # a number cut short is another number
+    # A narrow terminal gets two tables, because numbers that are folded cannot be read.
+    names = list(columns)
+    groups = [names] if console.width > 100 else [names[:8], names[8:]]
+    tables = []
+    for group in groups:
+        table = Table(padding=(0, 1 if console.width > 100 else 0))
+        table.add_column("frame", no_wrap=True, min_width=9)
+        for name in group:
+            table.add_column(name, justify="right", overflow="fold")  # a number cut short is another number
+        tables.append(table)
 
     def add(name: str, values: dict[str, Any], *, style: str | None = None, end_section: bool = False) -> None:
-        cells = ["-" if values.get(key) is None else f"{values[key]:.4g}" for key in columns.values()]
-        table.add_row(name, *cells, style=style, end_section=end_section)
+        for table, group in zip(tables, groups, strict=True):
+            cells = ["-" if (value := values.get(columns[key])) is None else f"{value:.4g}" for key in group]
+            table.add_row(name, *cells, style=style, end_section=end_section)
 
     # A single pair also lists its labels; many frames list them under the mean.
     for frame in frames:
@@ -331,6 +331,12 @@ def _print(report: dict[str, Any], console: Console) -> None:
                 for label in labels:
                     start = f"{label}."
                     add(f"  {label}", {k.removeprefix(start): v for k, v in values.items() if k.startswith(start)})
-    console.print(table)
+    console.print(f"{report['preset']}: {report['definition']}", style="italic")
+    for table in tables:
+        console.print(table)
+    console.print(
+        "A->B: from A to the surface of B, mm; Hausdorff >=: samples and vertices, <=: certified bound, mm; "
+        "norm.: angle of the normals and mean |cos|, both ways; F: F-score at the threshold"
+    )
     for entry in report["skipped"]:
         console.print(f"[yellow]skipped[/] {escape(str(entry['frame']))}: {escape(entry['reason'])}", soft_wrap=True)
