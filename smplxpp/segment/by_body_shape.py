@@ -26,7 +26,7 @@ from smplxpp.core.labels import LABELS, LOWER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import WRIST
 from smplxpp.segment.by_body_hems import Hems
 from smplxpp.segment.by_body_outfit import NAT, Outfit
-from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, Rings, cloth_against_skin
+from smplxpp.segment.by_body_rings import ARM_START, Rings, cloth_against_skin
 
 _SHOE, _SHOD_LEGS, _LEGS, _LOWER, _MIDRIFF, _UPPER = range(6)
 _LABELS = (SHOE, SKIN, SKIN, LOWER, SKIN, UPPER)
@@ -120,10 +120,11 @@ def outfit_by_shape(seen: ShapeEvidence) -> Outfit:
     shares, margins, worn = _posterior(chain, place, borders)
     sleeved = np.exp(-sleeve - logsumexp(-sleeve))
     reach = seen.arm.places
-    best = int(sleeve.argmin()) if upper_start < COLUMN_END else 0
+    dressed = bool(states[-1] == _UPPER)
+    best = int(sleeve.argmin()) if dressed else 0
     # The odds of the sleeve's end, or of there being none where no upper garment is.
     near = worn * float(sleeved[np.abs(reach - reach[best]) <= _ELSEWHERE].sum())
-    near = float(np.clip(near if upper_start < COLUMN_END else near + 1.0 - worn, _NONE, 1.0 - _NONE))
+    near = float(np.clip(near if dressed else near + 1.0 - worn, _NONE, 1.0 - _NONE))
     margins["cuff"] = NAT * float(np.log(near) - np.log1p(-near))
     sleeve_share = worn * (1.0 - np.cumsum(sleeved)[:-1])
     return Outfit(shoe_top, lower_start, lower_end, upper_start, float(reach[best]), margins, shares, sleeve_share)

@@ -9,7 +9,8 @@ import pytest
 
 from smplxpp.core import TriangleMesh
 from smplxpp.segment.by_body_hems import Hems, roughness
-from smplxpp.segment.by_body_shape import Chain
+from smplxpp.segment.by_body_rings import ARM_START, Rings
+from smplxpp.segment.by_body_shape import Chain, ShapeEvidence, outfit_by_shape
 
 
 def tube(distance) -> Hems:
@@ -79,3 +80,18 @@ def test_sums_of_a_chain_are_those_over_all_its_sequences():
     np.testing.assert_allclose(np.exp(forward + backward), share, atol=1e-12)
     assert np.exp(forward[-1] - chain.end).sum() == pytest.approx(total)
     assert tuple(chain.cheapest()) == best[1]
+
+
+def test_who_wears_no_shirt_has_no_sleeves():
+    """Arms that keep a centimetre from the body, as they did of an unclothed man, were sleeves without a shirt."""
+
+    def rings(start: float, count: int, distance: float) -> Rings:
+        nothing = np.zeros((count, 2))
+        return Rings(start, np.ones(count), nothing, nothing, np.full(count, distance), np.zeros(count))
+
+    flat = [Hems(np.full(n + 1, -3.0), np.full(n + 1, -3.0)) for n in (88, 45)]
+    seen = ShapeEvidence(
+        rings(0.0, 88, 0.0), rings(ARM_START, 45, 0.012), flat[0], flat[1], -4.0, (0.15e-3, 0.12e-3), np.ones(88)
+    )
+    outfit = outfit_by_shape(seen)
+    assert outfit.unclothed and outfit.cuff == ARM_START
