@@ -1,21 +1,24 @@
-"""Define the base of the baselines: Gaussians on a skinned mesh, with residuals from a network."""
+"""Define the base of the baselines, Gaussians on a skinned mesh with residuals of a network, and its training."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
 from avatar.gaussians.binding import corner_weights
 from avatar.models.learned_gaussians import LearnedGaussians
-from avatar.models.networks.deformation_field import FrameCodes
+from avatar.models.networks.deformation_field import FrameCodes, show_null_code
 from avatar.models.networks.teacher import local_offsets
 from avatar.rig.rig import Pose, PosedAvatar, Rig
 from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
+from smplxpp.core.errors import require_between
 
 POSITION_SCALE = 0.05
 """Metres of displacement for an output of 1, as the teacher's."""
@@ -107,3 +110,47 @@ class ResidualBaseline(Baseline):
         """Return networks and codes as one group."""
         own = {name: p for name, p in self.named_parameters() if not name.startswith("gaussians.")}
         return [ParameterGroup("networks", own, lr, lr_final_factor)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotographConfig(PhotometricConfig):
+    """Options of a baseline's training on photographs.
+
+    Attributes:
+        null_share: share of the poses that are shown with the null code.
+    """
+
+    null_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_between("baseline: null_share", self.null_share, 0.0, 1.0)
+
+
+class PhotographTask(PhotometricTask):
+    """`L_rec` of a baseline's renderings against photographs."""
+
+    config: PhotographConfig
+
+    def __init__(
+        self, sequence: AvatarSequence, model: Baseline, config: PhotographConfig, context: TaskContext = ALONE
+    ) -> None:
+        groups = model.groups(config.lr, config.lr_final_factor)
+        super().__init__(sequence, model, config, groups, context)
+        if config.null_share:
+            show_null_code(model)
+        for group in groups:
+            # A configuration that leaves the attributes as they are freezes all of them, a texture's colours too.
+            for value in group.parameters.values():
+                value.requires_grad_(True)
+
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+        """Return the loss of one frame, and its terms as numbers."""
+        # With probability `null_share` a pose is shown with the null
+        # code, which thereby learns to stand for unseen frames.
+        views = self.views(item)
+        pose = self.sequence.pose(item.frame)
+        if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
+            pose = pose.without_code()
+        total, terms, _ = self.compared(self.model(pose, camera_centers_of(views)), views)
+        return total, {"loss": float(total.detach()), **terms}

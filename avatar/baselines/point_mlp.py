@@ -20,7 +20,7 @@ from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
 from avatar.gaussians.binding import BoundGaussians
 from avatar.models.networks.deformation_field import positional_encoding
 from avatar.rig.rig import THETA, Pose, Rig
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.errors import require_at_least
 
 
 @dataclass(frozen=True)

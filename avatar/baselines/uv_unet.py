@@ -23,7 +23,7 @@ from avatar.baselines.avatar_base import RESIDUALS, ResidualBaseline
 from avatar.gaussians.binding import BoundGaussians
 from avatar.models.networks.stylegan2_layers import ConvLayer
 from avatar.rig.rig import Pose, Rig
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.errors import require_at_least
 from smplxpp.template.template import Template
 
 BODY_JOINTS = 22

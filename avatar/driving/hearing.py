@@ -59,7 +59,7 @@ def hear(
     """
     # Curves of another engine move the face; the phonemes only time the gestures.
     if curves is not None:
-        from avatar.speech.curve_sources import read_curves
+        from avatar.speech.curves import read_curves
 
         read = read_curves(curves)
         silence = Sound(np.zeros(round(read.seconds * _SILENT_RATE), np.float32), _SILENT_RATE)
@@ -67,7 +67,7 @@ def hear(
         return Heard(sound, _lasting(read.speech(), sound.seconds), curves=read)
     model = None
     if face_model is not None:
-        from avatar.speech.curve_sources import FaceModel
+        from avatar.speech.curves import FaceModel
 
         model = FaceModel(face_model)
     # A recording: its words are aligned where they are known or can be recognised, else its sounds are classified.

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
-from avatar.evaluation.as_new import AsNew, new_pose
 from avatar.evaluation.gallery import Gallery, ShownSurface, ShownView
-from avatar.evaluation.protocol import ProtocolConfig, ViewSet, truth_frames, view_sets, with_people
+from avatar.evaluation.protocol import AsNew, ProtocolConfig, ViewSet, new_pose, truth_frames, view_sets, with_people
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
 from avatar.evaluation.summary import SPREAD_CONVENTION
 from avatar.gaussians.sampling import head_faces

@@ -6,6 +6,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from avatar.data.sequence import AvatarSequence
+from avatar.rig.rig import AvatarModel, Pose, PosedAvatar, Rig
 from smplxpp.capture import Capture, Splits
 from smplxpp.core import GeometryWarning, InputError, require_at_least, require_known, spread
 
@@ -199,3 +204,28 @@ def _require_views(capture: Capture, sets: Mapping[str, ViewSet]) -> None:
             f"held out, images of {int(capture.presence().any(axis=0).sum())} frames are there",
             remedy="hold some out with --hold-out and --hold-out-frames, choose other --sets, or check the masks",
         )
+
+
+class AsNew(nn.Module):
+    """An avatar that draws every frame as a new pose, without the frame's code, as it does live.
+
+    Args:
+        model: the avatar; its loose clothes are simulated as they are in new poses.
+    """
+
+    rig: Rig
+
+    def __init__(self, model: AvatarModel) -> None:
+        super().__init__()
+        self.model, self.rig = model, model.rig
+
+    def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
+        """Pose the avatar without the code of a frame."""
+        return self.model(pose.without_code(), camera_centers)
+
+
+def new_pose(sequence: AvatarSequence, frame: int) -> Pose:
+    """Return the pose of any frame as a live player has it: without a code, with simulated clothes."""
+    if frame not in sequence.train_frames:
+        return sequence.pose(frame)
+    return replace(sequence.as_new_pose(frame), known=None)

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from avatar.losses.image_similarity import psnr_from_mse, ssim
 from avatar.losses.perceptual import MIN_SIZE, PerceptualDistance
-from smplxpp.core.errors import one_line
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.errors import one_line, require_at_least
 
 if TYPE_CHECKING:
     from avatar.rendering.avatar_view import Rendering

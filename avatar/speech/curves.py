@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import csv
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from avatar.speech.phonemes import Phoneme, Speech
-from smplxpp.core.errors import InputError
+from avatar.speech.pronunciation import EXTRA
+from smplxpp.core import DEFAULT_FPS, InputError
+from smplxpp.core.files import as_list, as_number, as_numbers, as_object, as_text, read_arrays, read_json, read_text
+from smplxpp.core.files.onnx_file import OnnxModel
+from smplxpp.core.files.sound_file import Sound
 
 _SIDED = (
     *("eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide", "browDown"),
@@ -125,3 +134,194 @@ class Curves:
                 out.append(Phoneme("AH", float(start), float(min(end, self.seconds)), stress))
                 last = end
         return Speech(tuple(out), self.seconds)
+
+
+_MAX_ROWS = 200_000  # of a table: 55 minutes at 60 frames a second
+_INDEX_OF_NAME = {name.lower(): k for k, name in enumerate(ARKIT)}
+
+
+def read_curves(path: str | Path, *, fps: float | None = None) -> Curves:
+    """Read face curves in the format of the file's suffix.
+
+    - `.csv`: a row a frame, columns by ARKit's names in any case, with or without a prefix that ends in a point (Live
+      Link Face, Audio2Face-3D); other columns are left out. A column of times: seconds, or
+      hours:minutes:seconds:frames.
+    - `.json`: Audio2Face's export: `facsNames`, `weightMat`, `exportFps`.
+    - `.npz`: `blendshapes` (T, 52) with `names` of the columns, or `expression` (T, up to 50) and `jaw_pose` (T, 3) of
+      FLAME; `fps`.
+
+    Args:
+        path: the file.
+        fps: frames a second where the file does not state them; None: `DEFAULT_FPS`.
+
+    Raises:
+        InputError: another suffix, a file in none of these formats, or values that `Curves` refuses.
+    """
+    path = Path(path)
+    readers: dict[str, Callable[[Path, float], Curves]] = {".csv": _csv, ".json": _json, ".npz": _npz}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"curves {path}", expected=".csv, .json or .npz", received=path.suffix or "no suffix")
+    return reader(path, fps or DEFAULT_FPS)
+
+
+def _csv(path: Path, fps: float) -> Curves:
+    subject = f"curves {path}"
+    try:
+        rows = list(csv.reader(read_text(path, subject="curves", most=1 << 28).splitlines()))
+    except csv.Error as error:
+        raise InputError(subject, expected="comma-separated values", received=str(error)) from None
+    rows = [row for row in rows if row]
+    if not 2 <= len(rows) <= _MAX_ROWS:
+        expected = f"a row of names and up to {_MAX_ROWS} of numbers"
+        raise InputError(subject, expected=expected, received=f"{len(rows)} rows")
+    # Columns of ARKit's blendshapes, whatever else the program writes beside them.
+    names = [name.strip().rsplit(".", 1)[-1].lower() for name in rows[0]]
+    where = _columns(names, subject)
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(names):
+            raise InputError(f"{subject}, row {number}", expected=f"{len(names)} values", received=str(len(row)))
+    values = np.zeros((len(rows) - 1, len(ARKIT)))
+    for column, k in where:
+        values[:, k] = _floats([row[column] for row in rows[1:]], f"{subject}, column {rows[0][column]}")
+    # Times of the frames, or a constant rate where there is no such column.
+    time_columns = ("timecode", "time", "timestamp", "seconds")
+    clock = next((names.index(one) for one in time_columns if one in names), None)
+    if clock is None:
+        return Curves.evenly(values, fps)
+    times = _clock([row[clock] for row in rows[1:]], f"{subject}, column {rows[0][clock]}")
+    good = np.r_[True, np.diff(np.maximum.accumulate(times)) > 0.0]  # phones write some frames twice
+    return Curves(times[good] - times[0], values[good])
+
+
+def _columns(names: Sequence[str], subject: str) -> list[tuple[int, int]]:
+    """Return the columns of a table that are ARKit's, each with its index in `ARKIT`."""
+    where = [(column, _INDEX_OF_NAME[name]) for column, name in enumerate(names) if name in _INDEX_OF_NAME]
+    if "jawopen" not in names or len(where) < 10:
+        received = ", ".join(names[:6])[:120] or "none"
+        raise InputError(subject, expected="columns of ARKit's names, jawOpen among them", received=received)
+    if len({k for _, k in where}) < len(where):
+        raise InputError(subject, expected="every name once", received="one of ARKit's twice")
+    return where
+
+
+def _floats(texts: Sequence[str], subject: str) -> np.ndarray:
+    try:
+        return np.array([float(text or 0.0) for text in texts])
+    except ValueError as error:
+        raise InputError(subject, expected="numbers", received=str(error)[:120]) from None
+
+
+def _clock(texts: Sequence[str], subject: str) -> np.ndarray:
+    """Parse seconds, or timecodes hours:minutes:seconds:frames at 60 frames a second as Live Link Face writes them."""
+    if not any(":" in text for text in texts):
+        return _floats(texts, subject)
+    out = []
+    for text in texts:
+        found = re.fullmatch(r"\s*(\d{1,3}):(\d{1,2}):(\d{1,2})[:;.](\d{1,3}(?:\.\d{1,9})?)\s*", text)
+        if not found:
+            raise InputError(subject, expected="hours:minutes:seconds:frames", received=repr(text[:40]))
+        hours, minutes, seconds, frames = (float(one) for one in found.groups())
+        out.append(3600.0 * hours + 60.0 * minutes + seconds + frames / 60.0)
+    return np.array(out)
+
+
+def _json(path: Path, fps: float) -> Curves:
+    subject = f"curves {path}"
+    stored = as_object(read_json(path, subject="curves"), subject=subject)
+    names = [as_text(one, subject=f"{subject}: facsNames") for one in as_list(stored.get("facsNames"), subject=subject)]
+    where = _columns([name.lower() for name in names], subject)
+    # A row a frame; columns in the order of `facsNames`.
+    matrix = as_numbers(stored.get("weightMat"), (None, len(names)), subject=f"{subject}: weightMat")
+    if "exportFps" in stored:
+        fps = as_number(stored["exportFps"], subject=f"{subject}: exportFps")
+    return Curves.evenly(_reorder(matrix, where), fps)
+
+
+def _reorder(matrix: np.ndarray, where: Sequence[tuple[int, int]]) -> np.ndarray:
+    values = np.zeros((len(matrix), len(ARKIT)))
+    for column, k in where:
+        values[:, k] = matrix[:, column]
+    return values
+
+
+def _npz(path: Path, fps: float) -> Curves:
+    subject = f"curves {path}"
+    arrays = read_arrays(path, subject="curves")
+    if "fps" in arrays:
+        fps = float(as_numbers(arrays["fps"], (), subject=f"{subject}: fps"))
+
+    def take(wanted: Sequence[str]) -> Any:
+        return next((arrays[name] for name in wanted if name in arrays), None)
+
+    # Names under which common tools store the same arrays.
+    shapes = take(("arkit", "blendshapes", "blendshape", "bs", "weights"))
+    expression = take(("expression", "exp", "expr", "flame_expression"))
+    jaw = take(("jaw_pose", "jaw", "jaw_rot"))
+    if shapes is not None:
+        names = [str(one) for one in np.ravel(arrays["names"])] if "names" in arrays else []
+        where = _columns([name.lower() for name in names], subject) if names else [(k, k) for k in range(len(ARKIT))]
+        width = len(names) or len(ARKIT)
+        return Curves.evenly(_reorder(as_numbers(shapes, (None, width), subject=subject), where), fps)
+    if expression is None or jaw is None:
+        raise InputError(
+            subject,
+            expected="blendshapes (T, 52), or expression and jaw_pose of FLAME",
+            received=", ".join(sorted(arrays)[:8]) or "nothing",
+        )
+    values = as_numbers(expression, (None, None), subject=f"{subject}: expression")
+    return Curves.evenly(
+        values[:, :FLAME_EXPRESSIONS], fps, as_numbers(jaw, (len(values), 3), subject=f"{subject}: jaw_pose")
+    )
+
+
+class FaceModel:
+    """Any ONNX network from sound to ARKit's blendshapes.
+
+    Signature: one input of samples, float32 (1, N), mono; one output, float32 (1, T, 52) or (T, 52), T frames evenly
+    over the sound. The model's metadata may give `sample_rate` (Hz; 16000 by default) and `names` (of the 52, separated
+    by commas; alphabetical by default).
+
+    Args:
+        path: the ONNX file.
+        threads: of the runtime.
+
+    Raises:
+        MissingExtraError: onnxruntime is not installed.
+        InputError: a missing model, or another signature.
+    """
+
+    def __init__(self, path: Path, *, threads: int = 2) -> None:
+        self._model = OnnxModel(path, kind="face model", extra=EXTRA, threads=threads)
+        inputs, outputs, metadata = self._model.inputs, self._model.outputs, self._model.metadata
+        if len(inputs) != 1 or len(inputs[0].shape) != 2 or inputs[0].type != "tensor(float)" or len(outputs) != 1:
+            raise InputError(
+                self._model.subject,
+                expected="one input of samples, float32 (1, N), and one output",
+                received=f"{[(one.name, one.type, one.shape) for one in inputs]}, {len(outputs)} outputs",
+            )
+        try:
+            self.rate = int(metadata.get("sample_rate", 16_000))
+        except ValueError:
+            self.rate = 0
+        if not 4000 <= self.rate <= 192_000:
+            raise InputError(
+                f"{self._model.subject}: sample_rate", expected="4000 to 192000", received=repr(metadata["sample_rate"])
+            )
+        self._names = [one.strip() for one in metadata["names"].split(",")] if "names" in metadata else list(ARKIT)
+        if sorted(self._names) != list(ARKIT):
+            raise InputError(f"{self._model.subject}: names", expected="ARKit's 52, each once", received="others")
+
+    def __call__(self, sound: Sound) -> Curves:
+        """Return the face curves of a sound.
+
+        Raises:
+            InputError: a model that fails, or whose output has another shape.
+        """
+        samples = sound.at_rate(self.rate).samples.astype(np.float32)
+        output = np.asarray(self._model.run({self._model.inputs[0].name: samples[None]})[0])
+        values = output[0] if output.ndim == 3 and len(output) == 1 else output
+        if values.ndim != 2 or values.shape[1] != len(ARKIT) or not len(values):
+            raise InputError(self._model.subject, expected="an output (1, T, 52)", received=f"shape {output.shape}")
+        order = [self._names.index(name) for name in ARKIT]
+        return Curves.evenly(values[:, order].astype(np.float64), len(values) / max(sound.seconds, 1e-3))

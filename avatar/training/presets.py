@@ -17,7 +17,7 @@ from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
 from avatar.training.teacher.fit_teacher import FitTeacherConfig
 from avatar.training.tracking.config import Level, TrackConfig
-from smplxpp.core.validation import require_choice
+from smplxpp.core.errors import require_choice
 
 LOCAL_PARTS = 256
 # Of the fit to a turn, chosen among five settings by two held-out photographs of a real person and what they look like:

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.evaluation.as_new import AsNew
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
 from avatar.evaluation.input_protocol import InputProtocol
-from avatar.evaluation.protocol import SETS
+from avatar.evaluation.protocol import SETS, AsNew
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
 from avatar.evaluation.summary import REFINED_POSES, summary_figures
 from avatar.evaluation.tables import Column, FigureTable

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from avatar.baselines.photograph_task import PhotographConfig
+from avatar.baselines.avatar_base import PhotographConfig
 from avatar.baselines.point_mlp import PointMLPConfig
 from avatar.baselines.textured_mesh import TexturedMeshConfig
 from avatar.baselines.uv_unet import UVUNetConfig

@@ -11,9 +11,8 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from avatar.baselines.avatar_base import Baseline
+from avatar.baselines.avatar_base import Baseline, PhotographConfig, PhotographTask
 from avatar.baselines.build import BaselineConfig, make_baseline
-from avatar.baselines.photograph_task import PhotographConfig, PhotographTask
 from avatar.gaussians.tensor_file import open_tensor_file, require_finite, require_like
 from avatar.models.model_file import save_avatar
 from avatar.models.networks.deformation_field import show_null_code

@@ -18,7 +18,7 @@ from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText, 
 from pipelines.commands.terminal import print_paths, shared_progress, training_progress
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.stage import StageRecord, how_to_continue
-from smplxpp.core.validation import require_at_least, require_positive
+from smplxpp.core.errors import require_at_least, require_positive
 
 if TYPE_CHECKING:
     from avatar.training.fit.config import FitConfig

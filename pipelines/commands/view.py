@@ -13,7 +13,7 @@ from rich.console import Console
 
 from pipelines.commands.options import LARGEST_PORT, Lighting, OptionalPath, require_avatar
 from pipelines.commands.templates import load_run_template
-from smplxpp.core.validation import require_between
+from smplxpp.core.errors import require_between
 
 if TYPE_CHECKING:
     from pipelines.viewer.window import LabelWindow

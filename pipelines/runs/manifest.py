@@ -7,10 +7,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, require_choice
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, read_json, shown
 from smplxpp.core.files.paths import path_inside
-from smplxpp.core.validation import require_choice
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

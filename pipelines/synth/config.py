@@ -11,7 +11,7 @@ from pipelines.synth.simulate import SimulationConfig
 from pipelines.synth.talking import Talking
 from pipelines.synth.turntable import Turntable
 from smplxpp.capture.recording import TURNTABLE
-from smplxpp.core.validation import require_at_least, require_choice, require_positive
+from smplxpp.core.errors import require_at_least, require_choice, require_positive
 from smplxpp.people.fixture_person import CLOTHES
 from smplxpp.people.patterns import SKIRT_PATTERNS
 from smplxpp.raster.soft_light import LightConfig

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from smplxpp.cloth.fabric import Fabric, SolverConfig
-from smplxpp.cloth.model import build_model, shuffled
+from smplxpp.cloth.model import Fabric, SolverConfig, build_model, shuffled
 from smplxpp.cloth.solver import ClothSolver, ClothState, Collider
 from smplxpp.core.mesh import TriangleMesh
 

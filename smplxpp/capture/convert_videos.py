@@ -17,9 +17,8 @@ from smplxpp.capture.video_sync import Timeline, found_offsets, timeline
 from smplxpp.capture.writers.arrays import write_keypoints
 from smplxpp.capture.writers.metadata import camera_entry, lens_entry
 from smplxpp.core import Camera, Keypoints2D
-from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
+from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress, require_between, require_choice
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
-from smplxpp.core.validation import require_between, require_choice
 
 
 @dataclass(frozen=True)

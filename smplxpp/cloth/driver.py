@@ -10,8 +10,8 @@ from jaxtyping import Float32, Int64
 
 from smplxpp.body.model import PosedBody
 from smplxpp.cloth.carried import SkinnedRows
-from smplxpp.cloth.fabric import SolverConfig
 from smplxpp.cloth.garment import Garment
+from smplxpp.cloth.model import SolverConfig
 from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.cloth.thread import GarmentThread
 from smplxpp.core import BodyParams, InputError, require_at_least, require_choice, require_positive

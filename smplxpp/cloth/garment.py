@@ -21,8 +21,7 @@ from smplxpp.cloth.cloth_mesh import (
 )
 from smplxpp.cloth.collider import ColliderMesh, collider_of
 from smplxpp.cloth.embedding import Embedding, embed
-from smplxpp.cloth.fabric import Fabric
-from smplxpp.cloth.model import ClothModel, build_model
+from smplxpp.cloth.model import ClothModel, Fabric, build_model
 from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core import BodyParams, TriangleMesh, require_at_least, require_choice, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError, one_line

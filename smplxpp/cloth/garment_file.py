@@ -12,8 +12,8 @@ import numpy as np
 
 from smplxpp.cloth.collider import ColliderMesh
 from smplxpp.cloth.embedding import Embedding
-from smplxpp.cloth.fabric import Fabric
 from smplxpp.cloth.garment import Garment, GarmentConfig
+from smplxpp.cloth.model import Fabric
 from smplxpp.core import BodyParams, InputError, TriangleMesh, row_lengths
 from smplxpp.core.files import as_list, as_number, as_object, as_text, parse_json, read_arrays, write_arrays
 from smplxpp.template.template import Template

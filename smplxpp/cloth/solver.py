@@ -10,8 +10,7 @@ from math import ceil
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from smplxpp.cloth.fabric import Fabric, SolverConfig
-from smplxpp.cloth.model import ClothModel
+from smplxpp.cloth.model import ClothModel, Fabric, SolverConfig
 from smplxpp.core.errors import InputError
 from smplxpp.native import address, native_library
 

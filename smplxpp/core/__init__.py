@@ -5,7 +5,18 @@ Names that most rooms need are exported here; the modules of the room hold the r
 
 from smplxpp.core.camera import Camera
 from smplxpp.core.checks import Check, Gate, StageOutput
-from smplxpp.core.errors import GeometryWarning, InputError, MissingExtraError, ProgressCallback, ignore_progress
+from smplxpp.core.errors import (
+    GeometryWarning,
+    InputError,
+    MissingExtraError,
+    ProgressCallback,
+    ignore_progress,
+    require_at_least,
+    require_between,
+    require_choice,
+    require_known,
+    require_positive,
+)
 from smplxpp.core.foreign import METRES_PER_UNIT, MeshLike, PointsLike, as_array, as_mesh, as_points
 from smplxpp.core.keypoints import Keypoints2D
 from smplxpp.core.labels import (
@@ -28,13 +39,6 @@ from smplxpp.core.params import ARRAY_NAMES, DEFAULT_FPS, POSE_BLOCKS, BodyParam
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.skin_weights import SkinWeights, WeightsLike, dense_weights
 from smplxpp.core.spread import spread
-from smplxpp.core.validation import (
-    require_at_least,
-    require_between,
-    require_choice,
-    require_known,
-    require_positive,
-)
 
 __all__ = [
     "ARRAY_NAMES",

@@ -1,9 +1,10 @@
-"""What the library reports to its caller: errors about input, warnings, progress, and results in one line."""
+"""Report to the caller: errors about input with one wording, warnings, progress, and checks of numbers and choices."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeAlias
 
@@ -120,3 +121,36 @@ def _shown(value: Any) -> str:
 
 _SHORT, _LONG = 4, 80
 """Items of a tuple, and characters of any other value, that one line shows."""
+
+
+def require_at_least(subject: str, value: float, least: float) -> None:
+    """Raise `InputError` unless `value >= least` and finite; a NaN is refused too."""
+    require_between(subject, value, least, math.inf)
+
+
+def require_between(subject: str, value: float, least: float, most: float) -> None:
+    """Raise `InputError` unless `least <= value <= most` and finite; a NaN is refused too."""
+    if not (math.isfinite(value) and least <= value <= most):
+        limit = f" and at most {most:g}" if math.isfinite(most) else ""
+        raise InputError(subject, expected=f"a number, at least {least:g}{limit}", received=f"{value:g}")
+
+
+def require_positive(subject: str, value: float, *, finite: bool = True) -> None:
+    """Raise `InputError` unless `value > 0`; infinity passes with `finite=False`."""
+    if not value > 0 or (finite and not math.isfinite(value)):
+        raise InputError(subject, expected="a number above 0", received=f"{value:g}")
+
+
+def require_choice(subject: str, value: str, choices: Sequence[str]) -> None:
+    """Raise `InputError` unless `value` is one of `choices`."""
+    if value not in choices:
+        raise InputError(subject, expected=" or ".join(map(repr, choices)), received=repr(value))
+
+
+def require_known(subject: str, values: Iterable[object], known: Iterable[object]) -> None:
+    """Raise `InputError` that names those of `values` which are not among `known`."""
+    have = list(known)
+    unknown = [str(value) for value in values if value not in have]
+    if unknown:
+        shown = ", ".join(map(str, have[:40])) + (", ..." if len(have) > 40 else "")
+        raise InputError(subject, expected=f"among {shown}", received=", ".join(unknown))

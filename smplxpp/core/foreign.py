@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, require_choice
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.validation import require_choice
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 

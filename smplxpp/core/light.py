@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from smplxpp.core.colors import linear_from_srgb, srgb_from_linear
-from smplxpp.core.errors import InputError
-from smplxpp.core.validation import require_positive
+from smplxpp.core.errors import InputError, require_positive
 
 # Harmonics of the clamped cosine over pi, repeated for the orders of degrees 0, 1 and 2; higher degrees are dropped.
 _LOBE = np.repeat([1.0, 2.0 / 3.0, 0.25], [1, 3, 5])

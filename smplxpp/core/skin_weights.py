@@ -13,12 +13,11 @@ from jaxtyping import Bool, Float64, Int32
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, require_at_least, require_known
 from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_list, as_numbers, as_object, as_text, read_json
 from smplxpp.core.foreign import as_array
-from smplxpp.core.validation import require_at_least, require_known
 
 _MEASURED = ("matched", "distance", "angle", "component")
 _MOST_JOINTS = 10_000

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core.validation import require_choice
+from smplxpp.core.errors import require_choice
 
 
 @dataclass(frozen=True)

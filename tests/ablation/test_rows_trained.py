@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.evaluation.as_new import AsNew
 from avatar.evaluation.evaluate import EvaluationConfig
-from avatar.evaluation.protocol import ProtocolConfig
+from avatar.evaluation.protocol import AsNew, ProtocolConfig
 from avatar.evaluation.report import EvalReport
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.processes import Distributed

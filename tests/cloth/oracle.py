@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from smplxpp.cloth.fabric import Fabric
-from smplxpp.cloth.model import ClothModel
+from smplxpp.cloth.model import ClothModel, Fabric
 
 GRAVITY = 9.81
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from smplxpp.cloth.fabric import Fabric, SolverConfig
-from smplxpp.cloth.model import ClothModel, build_model
+from smplxpp.cloth.model import ClothModel, Fabric, SolverConfig, build_model
 from smplxpp.cloth.solver import ClothSolver, ClothState, Collider
 from smplxpp.core.mesh import TriangleMesh
 

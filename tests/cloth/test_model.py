@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.cloth.embedding import embed
-from smplxpp.cloth.fabric import Fabric
-from smplxpp.cloth.model import build_model, shuffled
+from smplxpp.cloth.model import Fabric, build_model, shuffled
 from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from tests.cloth.sheets import bent, hanging, held
 

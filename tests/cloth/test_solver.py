@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from smplxpp.cloth import solver as solver_module
-from smplxpp.cloth.fabric import Fabric, SolverConfig
-from smplxpp.cloth.model import build_model
+from smplxpp.cloth.model import Fabric, SolverConfig, build_model
 from smplxpp.cloth.solver import GRAVITY, ClothState, move_before_collider
 from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
 from tests.cloth.oracle import substep

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.speech.curve_sources import read_curves
+from avatar.speech.curves import read_curves
 from smplxpp.body import load_body
 from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.retarget import Skeleton

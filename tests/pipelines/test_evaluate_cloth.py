@@ -10,8 +10,8 @@ import pytest
 from avatar import EvaluationConfig
 from avatar.data.cloth_motion import ClothMotions
 from avatar.data.sequence import AvatarSequence
-from avatar.evaluation.as_new import AsNew
 from avatar.evaluation.evaluate import evaluate_models
+from avatar.evaluation.protocol import AsNew
 from pipelines.runs.layout import GARMENTS, REFINED_HELD_OUT_PARAMS
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.evaluate import load_model

@@ -14,7 +14,7 @@ from pipelines.cli import main
 from pipelines.figures import colormap
 from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend, read_strip, write_strip
 from pipelines.report import Curve, Report, write_report
-from pipelines.report.charts import curve_svg
+from pipelines.report.builder import curve_svg
 from pipelines.report.sections.build import rewrite_report
 from pipelines.report.sections.fit import fit_key_numbers, fit_section, head_box, standing_fit
 from pipelines.runs.code import sha256_file

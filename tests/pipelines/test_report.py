@@ -24,7 +24,7 @@ from pipelines.report import (
     worst_status,
     write_report,
 )
-from pipelines.report.charts import histogram_statistics, histogram_svg, timings_svg
+from pipelines.report.builder import histogram_statistics, histogram_svg, timings_svg
 from pipelines.report.sections.evaluation import talking_section
 from pipelines.runs.layout import TALKING_FILM
 from smplxpp.core import Check, InputError

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from avatar.speech import Face, talking_motion
-from avatar.speech.curve_sources import FaceModel, read_curves
-from avatar.speech.curves import ARKIT, Curves
+from avatar.speech.curves import ARKIT, Curves, FaceModel, read_curves
 from avatar.speech.face import JAW_ANGLE
 from pipelines.commands.talk import Talk
 from smplxpp.body import load_body

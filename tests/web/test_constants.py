@@ -16,7 +16,7 @@ from pipelines.chat.conversation import MOST_TYPED
 from pipelines.chat.hearing import RATE
 from pipelines.chat.server import REPLACED
 from smplxpp.cloth.driver import LONGEST_STEP, DriverConfig
-from smplxpp.cloth.fabric import SolverConfig
+from smplxpp.cloth.model import SolverConfig
 from smplxpp.core.params import DEFAULT_FPS
 
 WEB = Path(__file__).resolve().parents[2] / "web"

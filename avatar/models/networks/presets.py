@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.teacher import TeacherConfig
-from smplxpp.core.validation import require_choice
+from smplxpp.core.errors import require_choice
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from avatar.data.sequence import FrameSequence
 from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
 from avatar.training.engine.optimization_task import ParameterGroup
-from smplxpp.core.validation import require_positive
+from smplxpp.core.errors import require_positive
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from avatar.training.engine.learning_rates import LearningRates, attribute_group
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.unseen import hold_unseen
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.errors import require_at_least
 
 Preview = Callable[[Mapping[str, np.ndarray]], None]
 Surface = Callable[[View, int], View]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
-from smplxpp.core.validation import require_at_least
+from smplxpp.core.errors import require_at_least
 
 CACHE_BYTES = 1 << 30
 """Bound of the cache of inputs and known displacements, bytes: 1 GiB."""

@@ -9,7 +9,7 @@ from avatar.gaussians.sampling import SamplingConfig
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.training.engine.learning_rates import LearningRates
 from avatar.training.engine.photometric_task import PhotometricConfig
-from smplxpp.core.validation import require_between
+from smplxpp.core.errors import require_between
 
 
 @dataclass(frozen=True, kw_only=True)

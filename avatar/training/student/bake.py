@@ -30,7 +30,7 @@ from avatar.training.student.distillation import DistillationTargets
 from avatar.training.student.pretrain import PretrainFieldTask
 from avatar.training.student.regress_poses import regress_poses
 from avatar.training.tracking.surface_normals import with_surface_normals
-from smplxpp.core.validation import require_at_least, require_between, require_choice
+from smplxpp.core.errors import require_at_least, require_between, require_choice
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,11 +22,10 @@ from smplxpp.capture.calibrations.world import UNITS, metres_of, upright_from_wo
 from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.readers.common import pinhole
 from smplxpp.core import Camera
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, require_choice
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.markup_file import read_toml, read_xml
 from smplxpp.core.files.safe_pickle import safe_load
-from smplxpp.core.validation import require_choice
 
 
 @dataclass(frozen=True)

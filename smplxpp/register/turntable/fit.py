@@ -21,8 +21,7 @@ from jaxtyping import Float64
 
 from smplxpp.body import BodyModel
 from smplxpp.core import Camera, InputError, Keypoints2D, ProgressCallback, ignore_progress
-from smplxpp.core.errors import one_line
-from smplxpp.core.validation import require_at_least, require_between, require_positive
+from smplxpp.core.errors import one_line, require_at_least, require_between, require_positive
 from smplxpp.register.clothing import hand_vertices
 from smplxpp.register.keypoint_term import KeypointTerm, prepare_keypoints, projected
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics, Posture

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
-from avatar.training.engine.mean_of_steps import EVERY, MeanOfSteps
-from avatar.training.engine.optimization_task import OptimiserConfig
+from avatar.training.engine.optimization_task import EVERY, MeanOfSteps, OptimiserConfig
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy, copied, same_state
 

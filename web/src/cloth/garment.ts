@@ -2,7 +2,7 @@
 
 import type { Pose } from "../avatar/avatar.ts";
 
-/** What cloth is made of, in SI units (`smplxpp/cloth/fabric.py`). */
+/** What cloth is made of, in SI units (`smplxpp/cloth/model.py`). */
 export interface Fabric {
   density: number;
   stretch_stiffness: number;
