@@ -6,11 +6,11 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from smplxpp.assemble.build import CanonicalPart
 from smplxpp.assemble.patch import Patch, patch_loop
-from smplxpp.core import InputError, SkinWeights, TriangleMesh, require_at_least
+from smplxpp.core import InputError, SkinWeights, TriangleMesh, require_at_least, row_lengths
 from smplxpp.core.topology import border_loops
 
 
@@ -23,7 +23,7 @@ class FillHolesConfig:
             sail between a long sleeve and the side, is not made. 0 fills nothing.
     """
 
-    width: float = 0.08
+    width: float = 0.12
 
     def __post_init__(self) -> None:
         require_at_least("fill_holes: width", self.width, 0.0)
@@ -93,6 +93,7 @@ def cut_slits(
     *,
     taken: Bool[np.ndarray, " S"] | None = None,
     longest: float = 0.25,
+    closing: float = 0.4,
 ) -> list[Int[np.ndarray, " _"]]:
     """Return polygons that close what cuts have opened towards openings: a sleeve and the side that it was fused with.
 
@@ -108,7 +109,8 @@ def cut_slits(
         after: the part after the cut, in the T-pose.
         after_index: the scan's vertex of each of its vertices.
         taken: as for `cut_holes`.
-        longest: largest length of a straight edge, metres.
+        longest: distance of the ends of a segment, metres, from which it separates polygons.
+        closing: largest length of the straight edge that closes a polygon, metres: across the side of a hem.
     """
     at_openings = _at_openings(before, before_index, taken)
     linked = {(int(a), int(b)) for a, b in after.edges}
@@ -135,7 +137,7 @@ def cut_slits(
                 polygon += [segments[k] if len(segments[k]) <= _FEW else segments[k][[0, -1]], runs[k]]
                 k = (k + 1) % len(runs)
             out.append(np.concatenate([*polygon, segments[k][:1]]))
-            if not _closable(after.vertices, out[-1], linked, longest):
+            if not _closable(after.vertices, out[-1], linked, closing):
                 out.pop()
     return out
 
@@ -168,35 +170,61 @@ def fill_holes(
     """
     config = config or FillHolesConfig()
     # Close each loop, and keep patches that are narrow enough; loops that cannot be closed are skipped.
-    patches = []
-    for loop in holes:
+    report = FilledHoles(holes=len(holes))
+    for hole in holes:
         with suppress(InputError):
-            patch = patch_loop(part.mesh, loop)
-            if patch.width(part.mesh.vertices[loop]) <= config.width:
-                patches.append((loop, patch))
-    area = sum(patch.area(part.mesh.vertices[loop]) for loop, patch in patches)
-    report = FilledHoles(len(holes), len(patches), sum(len(patch.faces) for _, patch in patches), area)
-    for loop, patch in patches:
-        part = _with_patch(part, loop, patch)
+            dense, loop = _with_dense_edges(part, hole)
+            patch = patch_loop(dense.mesh, loop)
+            rim = dense.mesh.vertices[loop]
+            if patch.width(rim) <= config.width:
+                part = _with_patch(dense, loop, patch)
+                report += FilledHoles(closed=1, faces=len(patch.faces), area=patch.area(rim))
     return part, report
 
 
+def _with_dense_edges(part: CanonicalPart, loop: Int[np.ndarray, " L"]) -> tuple[CanonicalPart, Int[np.ndarray, " K"]]:
+    """Divide the straight edges of a polygon over openings to the length of the part's; a patch can then bend there.
+
+    Returns:
+        The part with the new vertices, linear between the ends of their edge, and the polygon through them.
+    """
+    following = np.roll(loop, -1)
+    length = row_lengths(part.mesh.vertices[following] - part.mesh.vertices[loop])
+    usual = float(np.median(row_lengths(np.diff(part.mesh.vertices[part.mesh.edges], axis=1)[:, 0])))
+    # Edges of the mesh stay whole, because a new vertex on one would be none of its face.
+    own = np.sort(np.stack([loop, following], axis=1)) @ np.array([part.mesh.vertex_count, 1])
+    straight = ~np.isin(own, part.mesh.edges @ np.array([part.mesh.vertex_count, 1]))
+    pieces = np.where(straight, np.maximum(np.round(length / usual).astype(int), 1), 1)
+    # Shares of both ends in each vertex of the new polygon; the first of each edge is the old vertex.
+    edge = np.repeat(np.arange(len(loop)), pieces)
+    step = np.arange(len(edge)) - (np.cumsum(pieces) - pieces)[edge]
+    share = step / pieces[edge]
+    coefficients = np.zeros((len(edge), len(loop)))
+    coefficients[np.arange(len(edge)), edge] = 1.0 - share
+    coefficients[np.arange(len(edge)), (edge + 1) % len(loop)] += share
+    out = loop[edge]
+    out[step > 0] = part.mesh.vertex_count + np.arange(int((step > 0).sum()))
+    return _with_vertices(part, loop, coefficients[step > 0]), out
+
+
 def _with_patch(part: CanonicalPart, loop: Int[np.ndarray, " L"], patch: Patch) -> CanonicalPart:
-    # The patch's vertices are the loop's, then new ones, whose attributes are linear in the loop's.
-    count, new = part.mesh.vertex_count, len(patch.from_rim)
-    at = np.concatenate([loop, np.arange(count, count + new)])
-    colors = patch.from_rim @ part.vertex_colors[loop]
+    # The patch's vertices are the loop's, then new ones.
+    at = np.concatenate([loop, part.mesh.vertex_count + np.arange(len(patch.from_rim))])
+    out = _with_vertices(part, loop, patch.from_rim)
+    return replace(out, mesh=TriangleMesh(out.mesh.vertices, np.concatenate([out.mesh.faces, at[patch.faces]])))
+
+
+def _with_vertices(
+    part: CanonicalPart, loop: Int[np.ndarray, " L"], from_loop: Float[np.ndarray, "K L"]
+) -> CanonicalPart:
+    """Append vertices whose attributes are linear in those of a loop."""
+    colors = from_loop @ part.vertex_colors[loop]
     return replace(
         part,
-        mesh=TriangleMesh(
-            np.concatenate([part.mesh.vertices, patch.from_rim @ part.mesh.vertices[loop]]),
-            np.concatenate([part.mesh.faces, at[patch.faces]]),
-        ),
-        weights=_with_rows(
-            part.weights, patch.from_rim @ part.weights.dense()[loop], int(part.weights.component[loop[0]])
-        ),
+        mesh=TriangleMesh(np.concatenate([part.mesh.vertices, from_loop @ part.mesh.vertices[loop]]), part.mesh.faces),
+        weights=_with_rows(part.weights, from_loop @ part.weights.dense()[loop], int(part.weights.component[loop[0]])),
         vertex_colors=np.concatenate([part.vertex_colors, colors.round().astype(np.uint8)]),
-        scan_index=np.concatenate([part.scan_index, np.full(new, -1)]),
+        scan_index=np.concatenate([part.scan_index, np.full(len(from_loop), -1)]),
     )
 
 

@@ -75,7 +75,7 @@ def patch_loop(mesh: TriangleMesh, loop: Int[np.ndarray, " L"]) -> Patch:
 
 def _chords(faces: Int[np.ndarray, "M 3"], loop: Int[np.ndarray, " L"]) -> set[tuple[int, int]]:
     """Return the pairs of positions in the loop, lower first, between which the mesh has an edge."""
-    at = np.full(int(faces.max()) + 1, -1)
+    at = np.full(int(max(faces.max(), loop.max())) + 1, -1)
     at[loop] = np.arange(len(loop))
     # Edges with both ends in the loop; -1 marks vertices outside of it.
     ends = np.sort(at[half_edges(faces)], axis=1)

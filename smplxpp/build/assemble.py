@@ -9,12 +9,16 @@ import numpy as np
 from jaxtyping import Bool, Integer
 
 from smplxpp.assemble import FilledHoles, FillHolesConfig, body_colors_from_scan, cut_holes, cut_slits, fill_holes
+from smplxpp.assemble.drape import drape_patches
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
-from smplxpp.core import OBJECT, SKIN, BodyParams, Check, InputError, StageOutput
+from smplxpp.clean.shreds import cut_borders
+from smplxpp.clean.smooth import smooth_cuts
+from smplxpp.core import OBJECT, SKIN, BodyParams, Check, InputError, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.metrics.comparison import MM
+from smplxpp.skinning import pose
 from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
 from smplxpp.template.template import Template
 
@@ -56,7 +60,7 @@ def assemble_parts(
             vertex_colors=part.colors,
             scan_index=_of_file(scan, part.source_vertex),
         )
-        canonical[name], filled[name] = _filled(made, before, part, taken, config.fill_holes)
+        canonical[name], filled[name] = _filled(made, before, part, fit, taken=taken, config=config.fill_holes)
     # The clearance is given in millimetres by the user; every length inside the package is in metres.
     settings = AssemblyConfig(clearance=config.clearance_mm / MM)
     template, report = assemble_template(body, params, canonical, config=settings)
@@ -100,25 +104,62 @@ def assemble_parts(
 
 
 def _filled(
-    made: CanonicalPart, before: Part, part: Part, taken: Bool[np.ndarray, " N"], config: FillHolesConfig
+    made: CanonicalPart,
+    before: Part,
+    part: Part,
+    fit: PosedFit,
+    *,
+    taken: Bool[np.ndarray, " N"],
+    config: FillHolesConfig,
 ) -> tuple[CanonicalPart, FilledHoles]:
     """Close the holes and slits that cut bridges left in a part; cuffs and hems were open before and stay open.
+
+    Their borders are smoothed first, and the patches draped over the body at last.
 
     Args:
         made: the part at rest.
         before: the cleaned part, before bridges were cut.
         part: the same without bridges.
+        fit: the body in the scan's pose and at rest.
         taken: the scan's vertices at which a thing was taken off.
         config: options.
     """
+    opened = before.source_vertex[np.unique(before.mesh.border_edges)]
+    cut = cut_borders(made.mesh, np.isin(part.source_vertex, opened))
+    if cut.any():
+        made = _with_smooth_cuts(made, cut, part.mesh, fit)
     borders = (before.mesh, before.source_vertex, made.mesh, part.source_vertex)
     holes = cut_holes(*borders, taken=taken)
     behind = [bool(taken[part.source_vertex[hole]].any()) for hole in holes]
     out, narrow = fill_holes(made, [hole for hole, wide in zip(holes, behind, strict=True) if not wide], config=config)
     # Slits have straight ends across a hem or a cuff, and a thing is as wide as it is: neither can become a sail.
     wide = [*(hole for hole, wide in zip(holes, behind, strict=True) if wide), *cut_slits(*borders, taken=taken)]
-    out, others = fill_holes(out, wide, config=replace(config, width=2.0 * config.width))
-    return out, narrow + others
+    out, others = fill_holes(out, wide, config=replace(config, width=1.5 * config.width))
+    patched = np.arange(out.mesh.vertex_count) >= made.mesh.vertex_count
+    return drape_patches(out, patched, fit.at_rest), narrow + others
+
+
+def _with_smooth_cuts(
+    part: CanonicalPart, cut: Bool[np.ndarray, " N"], scanned: TriangleMesh, fit: PosedFit
+) -> CanonicalPart:
+    """Return the part with smooth borders of cuts; its weights move along, so that it keeps its place in the scan.
+
+    Vertices of faces that would face another way than in the scan stay.
+    """
+    old, rows = part.weights, part.weights.dense()
+    kept = {name: getattr(old, name) for name in ("matched", "distance", "angle", "component", "policies")}
+    still = np.zeros(part.mesh.vertex_count, dtype=bool)
+    while True:
+        mesh, moved = smooth_cuts(part.mesh, cut & ~still, rows)
+        vertices = np.where(still[:, None], part.mesh.vertices, mesh.vertices)
+        moved = np.where(still[:, None], rows, moved)
+        weights = SkinWeights.from_dense(moved, max_influences=old.joint_indices.shape[1], **kept)
+        posed = scanned.with_vertices(pose(vertices, weights, fit.posed_from_rest))
+        turned = np.einsum("ij,ij->i", posed.face_cross, scanned.face_cross) < 0
+        corners = np.unique(scanned.faces[turned])
+        if still[corners].all():
+            return replace(part, mesh=part.mesh.with_vertices(vertices), weights=weights)
+        still[corners] = True
 
 
 def _of_file(scan: PreparedScan, vertices: Integer[np.ndarray, " n"]) -> Integer[np.ndarray, " n"]:

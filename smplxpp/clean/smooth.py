@@ -1,4 +1,4 @@
-"""Measure the noise of a scan's vertices, and smooth scans that are too rough to build from."""
+"""Measure the noise of a scan's vertices, smooth scans that are too rough to build from, and the borders of cuts."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix, csr_matrix
 
 from smplxpp.core import GeometryWarning, MeshLike, TriangleMesh, as_mesh, row_lengths
@@ -42,7 +43,7 @@ def roughness(mesh: MeshLike) -> float:
     of |h - W h|, which hair and folds, the smaller part of a person, do not disturb.
     """
     mesh = as_mesh(mesh, subject="mesh")
-    mean = _mean_of_neighbours(mesh)
+    mean = mean_of_neighbours(mesh)
     height = np.einsum("ij,ij->i", mean @ mesh.vertices - mesh.vertices, mesh.vertex_normals)
     i, j = mesh.edges.T
     edge = float(np.median(row_lengths(mesh.vertices[j] - mesh.vertices[i])))
@@ -64,7 +65,7 @@ def smooth_if_rough(mesh: MeshLike, *, rough: float = ROUGH) -> Smoothed:
     found = roughness(mesh)
     if found <= rough:
         return Smoothed(mesh, found, 0, 0.0)
-    mean, smooth, steps = _mean_of_neighbours(mesh), mesh, 0
+    mean, smooth, steps = mean_of_neighbours(mesh), mesh, 0
     # Each step shrinks by 0.5 and inflates by 0.53 of the Laplacian; at most 40 steps, until the roughness is 0.05.
     while steps < 40 and roughness(smooth) > 0.05:
         vertices = smooth.vertices
@@ -81,7 +82,44 @@ def smooth_if_rough(mesh: MeshLike, *, rough: float = ROUGH) -> Smoothed:
     return Smoothed(smooth, found, steps, moved)
 
 
-def _mean_of_neighbours(mesh: TriangleMesh) -> csr_matrix:
+def smooth_cuts(
+    part: TriangleMesh, cut: Bool[np.ndarray, " N"], carried: Float[np.ndarray, "N K"]
+) -> tuple[TriangleMesh, Float64[np.ndarray, "N K"]]:
+    """Smooth the borders of cuts: a border along faces is a saw, whose teeth stand off the patch that closes it.
+
+    The vertices of the cut, and those that share a face with it, move halfway to the mean of their neighbours, on the
+    border to that of its own, `_BORDER_STEPS` times. A move that would turn a face over is left out.
+
+    Args:
+        part: manifold.
+        cut: its vertices on such borders; other borders stay.
+        carried: values of the vertices that move with them, such as skin weights: where these stayed, a pose would bend
+            the border back.
+
+    Returns:
+        The part with smooth borders, and the carried values.
+    """
+    beside = np.zeros(part.vertex_count, dtype=bool)
+    beside[part.faces[cut[part.faces].any(axis=1)]] = True
+    beside[part.border_edges] = False
+    moving, mean, x = np.flatnonzero(cut | beside), mean_of_neighbours(part), np.hstack([part.vertices, carried])
+    for _ in range(_BORDER_STEPS):
+        moved = x.copy()
+        moved[moving] = 0.5 * (x[moving] + mean[moving] @ x)
+        # Put the corners of turned faces back, which may turn others.
+        for _ in range(3):
+            turned = np.einsum("ij,ij->i", part.face_cross, part.with_vertices(moved[:, :3]).face_cross) <= 0
+            back = np.unique(part.faces[turned])
+            moved[back] = x[back]
+        x = moved
+    return part.with_vertices(x[:, :3]), x[:, 3:]
+
+
+_BORDER_STEPS = 8
+"""Steps that smooth the border of a cut: teeth of one edge vanish, a curve of ten edges keeps its shape."""
+
+
+def mean_of_neighbours(mesh: TriangleMesh) -> csr_matrix:
     """Return (N, N) rows that average a vertex's neighbours; a border vertex has only neighbours along the border."""
     on_border = np.zeros(mesh.vertex_count, dtype=bool)
     on_border[mesh.border_edges] = True
