@@ -101,7 +101,7 @@ def cut_slits(
     the side from armpit to hem, the cut runs from the hem over the armpit to the cuff in front, round the rest of the
     cuff, and back behind the arm. A polygon joins such runs: it leaves out the segments between them, across whose ends
     it goes straight, and is closed straight, too, so that hem and cuff stay open. Segments with ends farther apart than
-    `longest` (the hem round the person) separate polygons.
+    `longest`, and nearly straight ones half as long (the hem round the person), separate polygons.
 
     Args:
         before: the part before the cut.
@@ -109,7 +109,7 @@ def cut_slits(
         after: the part after the cut, in the T-pose.
         after_index: the scan's vertex of each of its vertices.
         taken: as for `cut_holes`.
-        longest: distance of the ends of a segment, metres, from which it separates polygons.
+        longest: distance of the ends of a segment, metres, from which it separates polygons; half for a straight one.
         closing: largest length of the straight edge that closes a polygon, metres: across the side of a hem.
     """
     at_openings = _at_openings(before, before_index, taken)
@@ -127,7 +127,7 @@ def cut_slits(
             out.append(loop)
             continue
         # Segments that separate polygons: those with distant ends; where there is none, the longest.
-        apart = [_span(after.vertices, segment) > longest for segment in segments]
+        apart = [_separates(after.vertices, segment, longest) for segment in segments]
         if not any(apart):
             apart[int(np.argmax([len(segment) for segment in segments]))] = True
         for first in np.flatnonzero(apart):
@@ -148,6 +148,13 @@ _FEW = 3
 
 def _span(vertices: np.ndarray, segment: Int[np.ndarray, " S"]) -> float:
     return float(np.linalg.norm(vertices[segment[0]] - vertices[segment[-1]]))
+
+
+def _separates(vertices: np.ndarray, segment: Int[np.ndarray, " S"], longest: float) -> bool:
+    """Return whether a segment of an opening lies between two limbs: ends far apart, or nearly straight (the hem behind
+    two fused arms). That of a cuff goes round the limb."""
+    span, along = _span(vertices, segment), float(row_lengths(np.diff(vertices[segment], axis=0)).sum())
+    return span > longest or (span > 0.5 * longest and along < 1.5 * span)
 
 
 def _closable(vertices: np.ndarray, polygon: np.ndarray, linked: set[tuple[int, int]], longest: float) -> bool:
