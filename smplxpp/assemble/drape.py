@@ -20,9 +20,9 @@ from scipy.sparse import diags, identity
 from scipy.sparse.linalg import spsolve
 
 from smplxpp.assemble.build import CanonicalPart
-from smplxpp.clean.smooth import mean_of_neighbours
 from smplxpp.core import TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.core.topology import mean_of_neighbours
 
 STAND_OFF = (0.003, 0.04)
 """Bounds of the distance that a patch keeps from the skin, metres: cloth lies 2 to 5 mm off; the 4 cm of a wide sleeve
@@ -48,7 +48,7 @@ def drape_patches(part: CanonicalPart, new: Bool[np.ndarray, " N"], body: Triang
     if not new.any():
         return part
     field, free = SignedDistanceField(body, solid=True), np.flatnonzero(new)
-    mean = mean_of_neighbours(part.mesh)
+    mean = mean_of_neighbours(part.mesh.edges, part.mesh.border_edges, part.mesh.vertex_count)
     # The stand-off is harmonic between the rim's distances.
     wanted = np.zeros(part.mesh.vertex_count)
     rim = np.unique(part.mesh.faces[new[part.mesh.faces].any(axis=1)])

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
-from scipy.sparse import coo_matrix, csr_matrix
 
 from smplxpp.core import GeometryWarning, MeshLike, TriangleMesh, as_mesh, row_lengths
 from smplxpp.core.errors import one_line
+from smplxpp.core.topology import mean_of_neighbours
 
 ROUGH = 0.3
 """Roughness (`roughness`) from which a scan is smoothed: more noise flips faces. Available scans have 0.04 to 0.09."""
@@ -43,7 +43,7 @@ def roughness(mesh: MeshLike) -> float:
     of |h - W h|, which hair and folds, the smaller part of a person, do not disturb.
     """
     mesh = as_mesh(mesh, subject="mesh")
-    mean = mean_of_neighbours(mesh)
+    mean = mean_of_neighbours(mesh.edges, mesh.border_edges, mesh.vertex_count)
     height = np.einsum("ij,ij->i", mean @ mesh.vertices - mesh.vertices, mesh.vertex_normals)
     i, j = mesh.edges.T
     edge = float(np.median(row_lengths(mesh.vertices[j] - mesh.vertices[i])))
@@ -65,7 +65,7 @@ def smooth_if_rough(mesh: MeshLike, *, rough: float = ROUGH) -> Smoothed:
     found = roughness(mesh)
     if found <= rough:
         return Smoothed(mesh, found, 0, 0.0)
-    mean, smooth, steps = mean_of_neighbours(mesh), mesh, 0
+    mean, smooth, steps = mean_of_neighbours(mesh.edges, mesh.border_edges, mesh.vertex_count), mesh, 0
     # Each step shrinks by 0.5 and inflates by 0.53 of the Laplacian; at most 40 steps, until the roughness is 0.05.
     while steps < 40 and roughness(smooth) > 0.05:
         vertices = smooth.vertices
@@ -102,7 +102,8 @@ def smooth_cuts(
     beside = np.zeros(part.vertex_count, dtype=bool)
     beside[part.faces[cut[part.faces].any(axis=1)]] = True
     beside[part.border_edges] = False
-    moving, mean, x = np.flatnonzero(cut | beside), mean_of_neighbours(part), np.hstack([part.vertices, carried])
+    moving, x = np.flatnonzero(cut | beside), np.hstack([part.vertices, carried])
+    mean = mean_of_neighbours(part.edges, part.border_edges, part.vertex_count)
     for _ in range(_BORDER_STEPS):
         moved = x.copy()
         moved[moving] = 0.5 * (x[moving] + mean[moving] @ x)
@@ -117,15 +118,3 @@ def smooth_cuts(
 
 _BORDER_STEPS = 8
 """Steps that smooth the border of a cut: teeth of one edge vanish, a curve of ten edges keeps its shape."""
-
-
-def mean_of_neighbours(mesh: TriangleMesh) -> csr_matrix:
-    """Return (N, N) rows that average a vertex's neighbours; a border vertex has only neighbours along the border."""
-    on_border = np.zeros(mesh.vertex_count, dtype=bool)
-    on_border[mesh.border_edges] = True
-    ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
-    inner = ends[~on_border[ends[:, 0]]]
-    row, column = np.concatenate([inner, mesh.border_edges, mesh.border_edges[:, ::-1]]).T
-    count = np.bincount(row, minlength=mesh.vertex_count)
-    weights = 1.0 / count[row]
-    return coo_matrix((weights, (row, column)), shape=(mesh.vertex_count, mesh.vertex_count)).tocsr()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Int
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 
@@ -129,3 +129,14 @@ def border_loops(faces: Int[np.ndarray, "M 3"]) -> list[Int[np.ndarray, " _"]]:
     rank = np.where(steps > 0, length[loop] - steps, 0)
     ordered = nodes[np.lexsort((rank, loop))]
     return np.split(ordered, np.cumsum(length)[:-1])
+
+
+def mean_of_neighbours(edges: Int[np.ndarray, "E 2"], border_edges: Int[np.ndarray, "B 2"], count: int) -> csr_matrix:
+    """Return (N, N) rows that average a vertex's neighbours; a border vertex has only neighbours along the border."""
+    on_border = np.zeros(count, dtype=bool)
+    on_border[border_edges] = True
+    ends = np.concatenate([edges, edges[:, ::-1]])
+    inner = ends[~on_border[ends[:, 0]]]
+    row, column = np.concatenate([inner, border_edges, border_edges[:, ::-1]]).T
+    weights = 1.0 / np.bincount(row, minlength=count)[row]
+    return coo_matrix((weights, (row, column)), shape=(count, count)).tocsr()
