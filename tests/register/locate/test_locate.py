@@ -15,7 +15,14 @@ from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.landmarks import visible_vertices
 from smplxpp.register.locate import BodyNotFoundError, LocateConfig, locate_body
-from smplxpp.register.locate.decision import confidence_of, is_doubtful, no_person
+from smplxpp.register.locate.decision import (
+    closed_hands,
+    confidence_of,
+    is_doubtful,
+    missing_parts,
+    no_person,
+    notes_of,
+)
 from smplxpp.register.locate.dressed import PARTS, Misfit
 from smplxpp.register.locate.proxy import Region, regions
 from smplxpp.register.locate.search import Found
@@ -134,9 +141,7 @@ def test_a_body_that_no_standing_pose_explains_is_found_among_rare_poses(body, b
 def test_rare_poses_are_tried_only_where_standing_ones_leave_something_unexplained(located):
     rare = {name for name, _ in rare_poses(55)}
     assert not rare & {one.pose for one in located.candidates}
-    parts = dict.fromkeys(PARTS, 0.9)
-    state = BodyState(np.eye(3)[None, None], np.zeros((1, 3)), np.zeros(10), np.zeros((1, 10)))
-    plain = Found("standing", state, Misfit(0.004, 0.014, 0.95, 0.7, parts), 20.0, landmarks=0.0)
+    plain, parts = _found(), dict.fromkeys(PARTS, 0.9)
     assert not is_doubtful(plain)
     assert is_doubtful(replace(plain, misfit=replace(plain.misfit, covered=0.75)))
     assert is_doubtful(replace(plain, misfit=replace(plain.misfit, bare=0.05)))
@@ -203,8 +208,28 @@ def test_colours_of_another_mesh_are_refused(body, scan):
 
 def test_landmarks_that_are_centimetres_off_do_not_lower_the_confidence():
     """A hand places landmarks centimetres off; a surface that fits as well as before is believed as much."""
-    parts = dict.fromkeys(PARTS, 0.9)
-    state = BodyState(np.eye(3)[None, None], np.zeros((1, 3)), np.zeros(10), np.zeros((1, 10)))
-    best = Found("by hand", state, Misfit(0.005, 0.015, 0.95, 0.7, parts), 10.0, landmarks=0.0)
+    best = _found()
     assert best.cost < replace(best, landmarks=0.04).cost
     assert confidence_of(replace(best, landmarks=0.04), ()) == confidence_of(best, ()) > 0.7
+
+
+def _found(*, surface: float = 0.004, bare: float = 0.015, **parts: float) -> Found:
+    """Return a body with these distances to a surface, metres, and shares of parts shown; others are well shown."""
+    shown = dict.fromkeys(PARTS, 0.9) | {name.replace("_", " "): share for name, share in parts.items()}
+    state = BodyState(np.eye(3)[None, None], np.zeros((1, 3)), np.zeros(10), np.zeros((1, 10)))
+    return Found("made", state, Misfit(surface, bare, 0.95, 0.7, shown), 10.0, landmarks=0.0)
+
+
+def test_wide_clothes_do_not_lower_the_confidence_and_hands_and_face_elsewhere_do():
+    assert confidence_of(_found(surface=0.020), ()) == confidence_of(_found(surface=0.004), ()) > 0.8
+    assert confidence_of(_found(bare=0.030), ()) < 0.01
+
+
+def test_fists_are_no_missing_hands_but_a_hand_is_lost_with_its_forearm():
+    """A fist shows some of an open hand; an arm that lies elsewhere shows as much of the hand and no forearm."""
+    fist, elsewhere = _found(left_hand=0.3), _found(left_hand=0.3, left_forearm=0.05)
+    assert (missing_parts(fist), closed_hands(fist)) == ([], ["left hand"])
+    assert (missing_parts(elsewhere), closed_hands(elsewhere)) == (["left hand", "left forearm"], [])
+    assert "fist" in " ".join(notes_of(fist, ()))
+    assert "not found in the scan: left hand, left forearm" in " ".join(notes_of(elsewhere, ()))
+    assert confidence_of(elsewhere, ()) < 0.5 < confidence_of(fist, ())
