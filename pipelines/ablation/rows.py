@@ -18,10 +18,11 @@ from avatar.training.presets import LOCAL_PARTS, TrainingPreset, with_local_shap
 from avatar.training.student.bake import BakeConfig
 from pipelines.ablation.stages import BaselineStage, PruneConfig, PrunedStage
 from pipelines.runs.layout import ABLATION, BAKE_STAGE, CLOTH_STAGE, COMPENSATE_STAGE, FIT_STAGE, TEACHER_STAGE
+from pipelines.stages.bake import BakeStage
 from pipelines.stages.cloth import ClothStage
+from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.fit import FitStage
 from pipelines.stages.models import CLOTHED, NAKED, OUTER, ModelStage
-from pipelines.stages.student import BakeStage, CompensateStage
 from pipelines.stages.teacher import TeacherStage
 from smplxpp.core.errors import InputError
 

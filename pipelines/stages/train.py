@@ -18,13 +18,14 @@ from pipelines.runs import layout
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import PARAMS, TEMPLATE
 from pipelines.runs.stage import StageRecord, is_finished, read_manifest, require_stage
+from pipelines.stages.bake import BakeStage
 from pipelines.stages.cloth import ClothStage
+from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.fit import FitStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
 from pipelines.stages.refine import refine
 from pipelines.stages.scene import TrainInputs, open_scene
-from pipelines.stages.student import BakeStage, CompensateStage
 from pipelines.stages.teacher import TeacherStage
 
 log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""Stages 85 and 90: the student distilled from the teacher's maps, then its blend shapes compensated."""
+"""Stage 90: train blend shapes for the residual of the field, and write the compact file for players."""
 
 from __future__ import annotations
 
@@ -8,55 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from avatar.models.networks.blend_shapes import BlendShapeConfig
-from avatar.models.student import StudentConfig
-from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.session import Session
-from avatar.training.student.bake import BakeConfig, bake
 from avatar.training.student.compensate import CompensateConfig, compensate
 from avatar.training.student.write_student import write_student
 from pipelines.runs.layout import COMPACT_STUDENT
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.cloth import clothed_sequence
 from pipelines.stages.models import ModelStage, Trainer
-from pipelines.stages.train_results import training_output, write_model
-
-
-@dataclass(frozen=True, kw_only=True)
-class BakeStage(ModelStage):
-    """A student before its blend shapes: field and attributes from a teacher, or from photographs.
-
-    Attributes:
-        source: stage of a teacher, whose Gaussians are the start; or of a fit, to learn from photographs alone.
-        cloth: stage of the loose clothes, which are simulated in poses that count as new; None simulates none.
-        student: architecture of the student.
-        config: configuration of the training.
-    """
-
-    file = "student.safetensors"
-
-    source: ModelStage
-    cloth: ModelStage | None = None
-    student: StudentConfig
-    config: BakeConfig
-
-    @property
-    def needs(self) -> Mapping[str, ModelStage]:
-        return {"source": self.source, **({} if self.cloth is None else {"cloth": self.cloth})}
-
-    def settings(self, trainer: Trainer) -> Mapping[str, Any]:
-        return {
-            "training": self.config,
-            "student": self.student,
-            "perceptual": trainer.perceptual_name(self.config),
-        }
-
-    def work(self, trainer: Trainer, session: Session, folder: Path) -> StageOutput:
-        sequence = clothed_sequence(trainer, self.ground, self.cloth)
-        source = self.source.read(trainer.path(self.source), sequence.rig)
-        teacher = source if isinstance(source, TeacherAvatar) else None
-        gaussians = source if teacher is None else teacher.gaussians.snapshot()
-        model, done = bake(sequence, gaussians, self.student, self.config, session, teacher=teacher)
-        return training_output(trainer, session, folder, model, done, lambda: write_model(folder / self.file, model))
+from pipelines.stages.train_results import training_output
 
 
 @dataclass(frozen=True, kw_only=True)
