@@ -1,4 +1,7 @@
-"""Stage 85: distil the teacher's maps into a deformation field of the student's mesh."""
+"""Stage 85: distil the teacher's maps into a deformation field of the student's mesh.
+
+Apart from the compensation, whose code would otherwise be in this stage's key.
+"""
 
 from __future__ import annotations
 
