@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
+from smplxpp.assemble.feet import feet_in_shoes
 from smplxpp.assemble.layers import (
     Obstacle,
     Penetration,
@@ -23,6 +24,7 @@ from smplxpp.assemble.push_out import PushConfig, flipped_faces, push_out, stand
 from smplxpp.body.model import BodyModel
 from smplxpp.core import (
     OBJECT,
+    SHOE,
     SKIN,
     BodyParams,
     GeometryWarning,
@@ -154,10 +156,10 @@ def assemble_template(
 ) -> tuple[Template, AssemblyReport]:
     """Put the shaped body and its parts together, outer layers pushed out of inner ones.
 
-    Parts are processed from the skin outwards (`config.layer_order`); each is pushed out of the body and of every part
-    inside it, which were repaired before. Vertices that keep the clearance stay, but for those around a push. No part
-    is pushed farther than it stands off the body (`stand_off`). If that is not enough, the body does not fit the scan,
-    and the report names the place.
+    Parts are processed from the skin outwards (`config.layer_order`); each is pushed out of the body and of every
+    part inside it, which were repaired before; feet are drawn into their shoes (`feet_in_shoes`). Vertices that keep
+    the clearance stay, but for those around a push. No part is pushed farther than it stands off the body
+    (`stand_off`). If that is not enough, the body does not fit the scan, and the report names the place.
 
     Args:
         body: the body model; its betas are baked in, its bases stay.
@@ -183,6 +185,9 @@ def assemble_template(
     neutral = BodyParams.rest(betas=params.betas[0], expressions=0, v_shape=params.v_shape)
     # Without the mean hand, because its pose correctives are not part of the T-pose.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
+    # Feet give way to shoes, everything else to the body.
+    shoes = [part.mesh for part in parts.values() if part.label == SHOE.id]
+    rest, body = feet_in_shoes(body, rest, shoes)
     body_mesh = body.mesh(rest)
     meshes, report = _separate(body, body_mesh, parts, config)
     template = _template(body, params.betas[0], [body_mesh, *(meshes[name] for name in parts)], parts, config)

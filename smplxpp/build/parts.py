@@ -15,11 +15,11 @@ from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
 from smplxpp.clean.shreds import cut_borders, drawn_out, find_shreds
-from smplxpp.core import LABELS, OBJECT, Check, GeometryWarning, SkinWeights, StageOutput, TriangleMesh
+from smplxpp.core import LABELS, OBJECT, SHOE, Check, GeometryWarning, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
 from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import UnposeConfig, Unposed, invertible_weights, unpose
-from smplxpp.transfer import TransferConfig, rigid_weights, transfer_weights
+from smplxpp.transfer import TransferConfig, rigid_weights, shoe_weights, transfer_weights
 
 _FOLDED = 1e-6
 """Least determinant of a blended transform in trials of the T-pose: what is smaller has no inverse in float64."""
@@ -52,7 +52,7 @@ def transfer_to_parts(
 ) -> tuple[dict[str, Part], dict[str, SkinWeights], StageOutput]:
     """Transfer skin weights from the posed body to every part, and cut the bridges that the weights show.
 
-    Things in hands get no weights of the body's surface: each is rigid (`rigid_weights`).
+    Things in hands get no weights of the body's surface: each is rigid (`rigid_weights`); shoes are stiff (`shoe_weights`).
 
     Returns:
         The parts without bridges, their weights, checks and numbers.
@@ -69,6 +69,8 @@ def transfer_to_parts(
         else:
             settings = transfer_config(LABELS[part.label].name, body, config)
             mesh, source, found = _without_bridges(part.mesh, fit, body, settings, config.bridges)
+            if part.label == SHOE.id and config.method != "paper":
+                found = shoe_weights(found, mesh, fit.joints, joint_names=body.joint_names)
         parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
         # A few vertices whose blend folds flat in the scan's pose, as between thighs that touch, stop no build.
         found, folded = invertible_weights(found, fit.posed_from_rest)

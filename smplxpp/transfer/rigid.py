@@ -1,11 +1,13 @@
-"""Bind a rigid thing to one joint: a bag or a binder to the hand that holds it."""
+"""Bind what is stiff: a bag or a binder to the hand that holds it, a shoe to the ankle and the ball of the foot."""
 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from smplxpp.core import MeshLike, SkinWeights, WeightsLike, as_mesh, dense_weights
+from smplxpp.core import MeshLike, SkinWeights, TriangleMesh, WeightsLike, as_mesh, dense_weights
+from smplxpp.transfer.anchors import smooth_step
 from smplxpp.transfer.correspond import vertex_components
 
 _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
@@ -81,4 +83,68 @@ def rigid_weights(
         angle=np.full(len(joint), np.nan),
         component=component,
         policies=tuple(policies),
+    )
+
+
+_BALL = (-0.01, 0.03)
+"""Metres beyond the joint of the toes between which a shoe begins to follow them; a sole bends over such a length."""
+_SHAFT = (0.0, 0.05)
+"""Metres above the ankle between which a shoe begins to follow the leg, as the shaft of a boot does."""
+
+
+def shoe_weights(
+    weights: SkinWeights,
+    mesh: TriangleMesh,
+    joints: Float[np.ndarray, "J 3"],
+    *,
+    joint_names: tuple[str, ...],
+) -> SkinWeights:
+    """Return the weights of shoes that do not bend but at the ball of the foot, and above the ankle as they did.
+
+    A heel hangs centimetres below the skin that transferred weights come from, near to heel and toes alike, so that it
+    would bend with both. Below the ankle a vertex follows the toes by how far it lies before their joint, along the
+    foot, and the ankle with the rest:
+
+        w_toes = s(t; ball),  w_ankle = 1 - w_toes,  t = (x - ankle) . (toes - ankle) / |toes - ankle| - |toes - ankle|
+
+    with s a smooth step.
+
+    Args:
+        weights: as transferred, which tell the shoes of both feet apart.
+        mesh: the shoes in the pose of the joints.
+        joints: posed joints of the body.
+        joint_names: their names.
+
+    Example:
+        >>> from smplxpp.transfer import shoe_weights
+        >>> body = smplxpp.load_body()
+        >>> given = smplxpp.SkinWeights.from_dense(body.weights)
+        >>> joints = body.joint_regressor @ body.v_template
+        >>> stiff = shoe_weights(given, body.mesh(), joints, joint_names=body.joint_names)
+        >>> heel = body.v_template[:, 1].argmin()
+        >>> float(stiff.dense()[heel].max())
+        1.0
+    """
+    dense, names = weights.dense(), list(joint_names)
+    out = dense.copy()
+    legs = {side: [names.index(f"{side}_{joint}") for joint in ("knee", "ankle", "foot")] for side in ("left", "right")}
+    left = dense[:, legs["left"]].sum(axis=1) >= dense[:, legs["right"]].sum(axis=1)
+    for side, own in (("left", left), ("right", ~left)):
+        knee, ankle, toes = legs[side]
+        foot, shin = joints[toes] - joints[ankle], joints[knee] - joints[ankle]
+        offset = mesh.vertices[own] - joints[ankle]
+        length = float(np.linalg.norm(foot))
+        share = smooth_step(offset @ foot / length - length, *_BALL)
+        above = smooth_step(offset @ shin / np.linalg.norm(shin), *_SHAFT)[:, None]
+        stiff = np.zeros((int(own.sum()), len(names)))
+        stiff[:, ankle], stiff[:, toes] = 1.0 - share, share
+        out[own] = above * dense[own] + (1.0 - above) * stiff
+    return SkinWeights.from_dense(
+        out,
+        max_influences=weights.joint_indices.shape[1],
+        matched=weights.matched,
+        distance=weights.distance,
+        angle=weights.angle,
+        component=weights.component,
+        policies=weights.policies,
     )

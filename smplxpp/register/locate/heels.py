@@ -3,17 +3,28 @@
 Feet are fitted flat, so that a leg in a heeled shoe comes out too long and its foot ends below the sole. A local step
 cannot lift it, because knee, ankle and toes would have to bend together. A foot that is lower than the scan around it
 is therefore tried on heels of two heights: the ankle is raised along the leg (law of cosines for hip and knee), the
-foot is pitched down and the toes up, and the candidate of lowest cost is kept.
+foot is pitched down and the toes up, and the candidate of lowest cost is kept. A straight leg cannot be shortened by
+its knee, and the fit has made it too long: candidates with shorter legs are tried, too.
+
+At the end the feet are turned to where their shoes are (`settle_feet`), because the pose prior keeps toes straight
+and a step of the whole body moves them little: with the depth d of a point of the foot in the shoe (negative
+outside), and e the distance of a point of the shoe from the foot, pitch, toes, turn and tilt of each foot minimise
+
+    mean min(|d|, 5 cm)^2 [d < 0] + mean clip(d - 15 mm, 0, 3 cm)^2 [d > 0] + mean clip(e - 8 mm, 0, 4 cm)^2.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 
 from smplxpp.core.rotations import matrix_from_rotvec
+from smplxpp.core.surface_points import SurfacePoints
 from smplxpp.register.kinematics import BodyState
+from smplxpp.register.locate.proxy import BodyProxy
 from smplxpp.register.locate.search import Found, Search
 
 # A usual and a high heel: height in metres, pitch of the foot and of the toes in degrees.
@@ -48,7 +59,146 @@ def lift_heels(search: Search, found: Found, skin: np.ndarray | None = None) -> 
             found = best
             if len(sides) == 2:
                 break
+    # A foot that is still in the floor hangs on a leg that is too long.
+    if low and max(_below_floor(search, found.state, side) for side in low) >= _BELOW:
+        tried = []
+        for length in _SHORTER:
+            state = _on_their_shoes(search, _with_shorter_legs(search, found.state, length), low)
+            tried.append(search.polished(found.name, state, skin, steps=6))
+        best = min(tried, key=lambda one: one.cost)
+        found = best if best.cost < found.cost - 0.05 else found
     return found
+
+
+def settle_feet(search: Search, found: Found) -> Found:
+    """Return the body with its lifted feet turned into their shoes; flat feet stay.
+
+    The cost of the pose stays that before, because toes that a heel bends are no odd pose.
+    """
+    lifted = [side for side in ("left", "right") if _pitch(search, found.state, side) > _LIFTED]
+    if not lifted:
+        return found
+    state = _on_their_shoes(search, found.state, lifted)
+    now = search.polished(found.name, state, None, steps=0)
+    return replace(found, state=state, misfit=now.misfit)
+
+
+_SHORTER = (0.04, 0.06)
+"""Metres by which legs are shortened where the heels alone do not lift the feet out of the floor."""
+_KEPT = 0.004
+"""Weight of a standard deviation of shape against a metre of a bone's length, when legs are shortened."""
+_LIFTED = np.radians(15.0)
+"""Pitch of a foot from which it is lifted; flat on the floor it is less than 10 degrees."""
+_BETTER = 0.9
+"""Share of the cost of a foot in its shoe below which another pose of it is taken."""
+
+
+def _pitch(search: Search, state: BodyState, side: str) -> float:
+    """Return by how much a foot points farther down than in the T-pose, radians."""
+    names = search.kinematics.body.joint_names
+    ends = [names.index(f"{side}_{joint}") for joint in ("ankle", "foot")]
+    posed, rest = search.kinematics.posture(state, 0).joints[ends], search.kinematics.rest_joints[ends]
+    now, before = (np.arcsin((ankle[1] - foot[1]) / np.linalg.norm(ankle - foot)) for ankle, foot in (posed, rest))
+    return float(now - before)
+
+
+def _with_shorter_legs(search: Search, state: BodyState, length: float) -> BodyState:
+    """Return the body with a shape whose legs are shorter by a length, metres, and whose other bones stay.
+
+    With the derivatives D of the lengths of all bones by the shape, and the wanted changes r, the change of shape is
+    argmin |D x - r|^2 + (4 mm)^2 |x|^2. The pelvis stays in its place.
+    """
+    kinematics, count = search.kinematics, len(state.betas)
+    names, parents = list(kinematics.body.joint_names), kinematics.body.parents
+    rest = kinematics.rest_joints + kinematics.joint_dirs[:, :, :count] @ state.betas
+    leg = [f"{side}_{joint}" for side in ("left", "right") for joint in ("knee", "ankle")]
+    rows, wanted = [], []
+    for joint, name in enumerate(names):
+        bone = rest[joint] - rest[parents[joint]] if joint else np.zeros(3)
+        size = float(np.linalg.norm(bone))
+        # Eyes and fingers are too short to say anything about shape.
+        if size > 0.05 and not name.endswith("_hip"):
+            change = kinematics.joint_dirs[joint, :, :count] - kinematics.joint_dirs[parents[joint], :, :count]
+            rows.append(bone / size @ change)
+            wanted.append(-0.5 * length if name in leg else 0.0)
+    matrix = np.array(rows)
+    step = np.linalg.solve(matrix.T @ matrix + _KEPT**2 * np.eye(count), matrix.T @ np.array(wanted))
+    moved = kinematics.joint_dirs[0, :, :count] @ step
+    return replace(state, betas=state.betas + step, transl=state.transl - moved)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shoe:
+    """A lower leg and the surface around it.
+
+    Attributes:
+        side: left or right.
+        proxy: points of the body below the knee.
+        weight: of each of them; those of the foot count 1, of the shin, which trousers cover, less.
+        surface: points of the scan.
+    """
+
+    side: str
+    proxy: BodyProxy
+    weight: np.ndarray
+    surface: SurfacePoints
+
+    @staticmethod
+    def of(search: Search, state: BodyState, side: str) -> _Shoe:
+        """Gather the points about one ankle; those nearer to the other leg belong to the other shoe."""
+        kinematics, many, fine = search.kinematics, search.many, search.fine
+        names = list(kinematics.body.joint_names)
+        posture, ankle = kinematics.posture(state, 0), names.index(f"{side}_ankle")
+        proxy = many.select(np.flatnonzero(kinematics.descends_from[many.limb, names.index(f"{side}_knee")]))
+        hip = names.index("right_hip" if side == "left" else "left_hip")
+        nearest = cKDTree(many.posed(kinematics, posture)[0]).query(fine.points)[1]
+        near = np.linalg.norm(fine.points - posture.joints[ankle], axis=1) < _AROUND
+        own = near & ~kinematics.descends_from[many.limb[nearest], hip]
+        weight = np.where(kinematics.descends_from[proxy.limb, ankle], 1.0, 0.3)
+        return _Shoe(side, proxy, weight / weight.sum(), fine.select(np.flatnonzero(own)))
+
+    def cost(self, search: Search, state: BodyState) -> float:
+        """Return the cost of the module's docstring, square millimetres."""
+        places = self.proxy.posed(search.kinematics, search.kinematics.posture(state, 0))[0]
+        distance, nearest = cKDTree(self.surface.points).query(places)
+        offset = places - self.surface.points[nearest]
+        outside = np.einsum("ij,ij->i", self.surface.normals[nearest], offset) > 0
+        depth = np.where(outside, np.minimum(distance, 0.05), np.clip(distance - 0.015, 0.0, 0.03))
+        empty = np.clip(cKDTree(places).query(self.surface.points)[0] - 0.008, 0.0, 0.04)
+        return 1e6 * float(self.weight @ depth**2 + (empty**2).mean())
+
+
+def _on_their_shoes(search: Search, state: BodyState, sides: list[str]) -> BodyState:
+    """Return the body with pitch, toes, turn and tilt of feet as their shoes have them (Nelder-Mead, three starts)."""
+    for side in sides:
+        state = _on_shoe(search, state, _Shoe.of(search, state, side))
+    return state
+
+
+def _on_shoe(search: Search, state: BodyState, shoe: _Shoe) -> BodyState:
+    if not len(shoe.surface):
+        return state
+    ankle = search.kinematics.body.joint_names.index(f"{shoe.side}_ankle")
+
+    def turned(x: np.ndarray) -> BodyState:
+        pitched = on_heel(search, state, shoe.side, (0.0, float(x[0]), float(x[1])))
+        rotations = pitched.rotations.copy()
+        rotations[0, ankle] = rotations[0, ankle] @ matrix_from_rotvec(np.radians([0.0, x[2], x[3]]))
+        return replace(pitched, rotations=rotations)
+
+    def cost(x: np.ndarray) -> float:
+        # A degree of turn or tilt costs a little, because a round toe does not tell them.
+        return shoe.cost(search, turned(x)) + 0.05 * float(x[2:] @ x[2:])
+
+    best, least = None, _BETTER * shoe.cost(search, state)
+    for pitch, toes in ((0.0, 0.0), (25.0, -25.0), (45.0, -45.0)):
+        start = np.array([pitch, toes, 0.0, 0.0])
+        simplex = np.concatenate([start[None], start + np.diag([12.0, -12.0, 6.0, 6.0])])
+        options = {"initial_simplex": simplex, "maxfev": 150, "xatol": 0.5, "fatol": 0.5}
+        found = minimize(cost, start, method="Nelder-Mead", options=options)
+        if found.fun < least:
+            best, least = found.x, float(found.fun)
+    return state if best is None else turned(best)
 
 
 def _below_floor(search: Search, state: BodyState, side: str) -> float:

@@ -16,7 +16,7 @@ from smplxpp.core import SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.register.kinematics import Kinematics
 from smplxpp.register.locate.decision import confidence_of, findings_of, is_doubtful, no_person, notes_of
-from smplxpp.register.locate.heels import lift_heels
+from smplxpp.register.locate.heels import lift_heels, settle_feet
 from smplxpp.register.locate.icp import PinnedLandmarks
 from smplxpp.register.locate.located import BodyNotFoundError, Candidate, LocatedBody
 from smplxpp.register.locate.persons import convex_share
@@ -86,6 +86,8 @@ def locate_body(
         labels = labeller(best.state.to_params(body))
         if labels is not None:
             best = search.finished(best, np.asarray(labels)[search.fine.face] == SKIN.id)
+    if not reason:
+        best = settle_feet(search, best)
     others = tuple(found[1:])
     findings, trust = findings_of(mesh, search.fine, best)
     located = LocatedBody(

@@ -8,7 +8,7 @@ import pytest
 from smplxpp.body import load_body
 from smplxpp.core import BodyParams, ignore_progress
 from smplxpp.register.kinematics import BodyState, Kinematics
-from smplxpp.register.locate.heels import lift_heels, on_heel
+from smplxpp.register.locate.heels import _with_shorter_legs, lift_heels, on_heel, settle_feet
 from smplxpp.register.locate.search import LocateConfig, Search
 
 BODY = load_body()
@@ -16,10 +16,10 @@ FLAT = BodyState.of_params(BODY, BodyParams.rest(betas=np.zeros(BODY.num_betas),
 NAMES = list(BODY.joint_names)
 
 
-def _search(state: BodyState) -> Search:
+def _search(state: BodyState, *, points: int = 1500) -> Search:
     """A search in the surface of a body without clothes."""
     mesh = BODY.mesh(BODY.forward(state.to_params(BODY)).vertices[0])
-    config = LocateConfig(coarse_points=400, fine_points=1500)
+    config = LocateConfig(coarse_points=400, fine_points=points)
     return Search(Kinematics(BODY), mesh, config, None, ignore_progress)
 
 
@@ -56,6 +56,34 @@ def test_legs_that_came_out_too_long_are_lifted_on_their_heels(flat):
     found = lift_heels(search, lost)
     assert found.cost < lost.cost - 0.05
     assert _off(search, found.state, truth) < 0.5 * _off(search, lost.state, truth) < 0.08
+
+
+def test_toes_of_a_lifted_foot_are_bent_as_its_shoe_is(flat):
+    """The pose prior kept toes straight, so that they came out below the shoe's tip."""
+    truth = on_heel(flat, FLAT, "left", (0.08, 40.0, -45.0))
+    search = _search(truth, points=5000)
+    straight = search.polished("straight", on_heel(flat, FLAT, "left", (0.08, 30.0, 0.0)), None, steps=0)
+    settled = settle_feet(search, straight)
+    assert settled.misfit.total < straight.misfit.total and settled.pose_cost == straight.pose_cost
+    toes = settled.state.rotations[0, NAMES.index("left_foot")]
+    assert np.degrees(np.arctan2(-toes[1, 2], toes[2, 2])) == pytest.approx(-45.0, abs=15.0)
+    np.testing.assert_array_equal(
+        settled.state.rotations[0, NAMES.index("right_ankle")], straight.state.rotations[0, NAMES.index("right_ankle")]
+    )
+    assert settle_feet(flat, flat.polished("flat", FLAT, None, steps=0)).state is FLAT
+
+
+def test_straight_legs_that_are_too_long_get_shorter_and_the_rest_of_the_body_stays():
+    search = _search(FLAT)
+    short = _with_shorter_legs(search, FLAT, 0.04)
+    before, after = (search.kinematics.posture(one, 0).joints for one in (FLAT, short))
+    at = {
+        name: NAMES.index(name) for name in ("pelvis", "head", "left_hip", "left_ankle", "left_wrist", "left_shoulder")
+    }
+    legs = [np.linalg.norm(joints[at["left_hip"]] - joints[at["left_ankle"]]) for joints in (before, after)]
+    assert 0.015 < legs[0] - legs[1] < 0.045
+    np.testing.assert_allclose(after[0], before[0], atol=1e-9)
+    assert np.linalg.norm(after[at["head"]] - before[at["head"]]) < 0.012
 
 
 def _off(search: Search, state: BodyState, truth: BodyState) -> float:
