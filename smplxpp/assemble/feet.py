@@ -13,12 +13,13 @@ the smallest change relative to r.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.body import BodyModel
-from smplxpp.core import TriangleMesh
+from smplxpp.core import SkinWeights, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 
 _LEATHER = 0.002
@@ -30,14 +31,14 @@ _ROUNDS = 4
 
 
 def feet_in_shoes(
-    body: BodyModel, rest: Float64[np.ndarray, "V 3"], shoes: list[TriangleMesh]
+    body: BodyModel, rest: Float64[np.ndarray, "V 3"], shoes: list[tuple[TriangleMesh, SkinWeights]]
 ) -> tuple[Float64[np.ndarray, "V 3"], BodyModel]:
     """Return the body's vertices with its feet inside the shoes, and the model whose joints stay where they were.
 
     Args:
         body: the body model.
         rest: its vertices in the T-pose, metres.
-        shoes: open surfaces in the T-pose, outward.
+        shoes: open surfaces in the T-pose, outward, with their skin weights. Toes bend as far as the shoe around them.
 
     Example:
         >>> from smplxpp.assemble.feet import feet_in_shoes
@@ -46,15 +47,18 @@ def feet_in_shoes(
         >>> bool((same == body.v_template).all())
         True
     """
-    moved = rest.copy()
+    moved, weights = rest.copy(), body.weights.copy()
     middle = float(rest[:, 0].mean())
-    for side, shoe in [(side, shoe) for shoe in shoes for side in ("left", "right")]:
+    for side, (shoe, bound) in product(("left", "right"), shoes):
         # In the T-pose the left shoe lies on the side of the left foot, +x.
         own = (shoe.face_centers[:, 0] > middle) == (side == "left")
         if not (shoe.face_areas[own] > 0).any():
             continue
-        foot = [k for k, name in enumerate(body.joint_names) if name in (f"{side}_ankle", f"{side}_foot")]
+        foot = [body.joint_names.index(f"{side}_{joint}") for joint in ("ankle", "foot")]
         rows = np.flatnonzero(body.weights[:, foot].sum(axis=1) > 0.5)
+        # The largest weight of the toes' joint in the shoe is the share of their turn that it makes.
+        bends = float(bound.dense()[:, foot[1]].max())
+        weights[:, foot] += (1.0 - bends) * weights[:, foot[1:]] * [1.0, -1.0]
         field = SignedDistanceField(shoe.submesh(own)[0], solid=False)
         for _ in range(_ROUNDS):
             found = field.query(moved[rows])
@@ -64,7 +68,7 @@ def feet_in_shoes(
                 break
             moved[rows[out]] = found.closest[out] - 1.01 * _LEATHER * found.normal[out]
     changed = np.abs(moved - rest).max(axis=1) > 0
-    if not changed.any():
+    if not shoes:
         return rest, body
     # Rows of joints that depend on a moved vertex.
     regressor = body.joint_regressor.copy()
@@ -74,4 +78,4 @@ def feet_in_shoes(
         missing = np.append(row @ (rest[used] - moved[used]), 0.0)
         y = np.linalg.lstsq(places.T @ (row[:, None] * places), missing, rcond=None)[0]
         regressor[joint, used] = row * (1.0 + places @ y)
-    return moved, replace(body, joint_regressor=regressor)
+    return moved, replace(body, joint_regressor=regressor, weights=weights)

@@ -88,6 +88,8 @@ def rigid_weights(
 
 _BALL = (-0.01, 0.03)
 """Metres beyond the joint of the toes between which a shoe begins to follow them; a sole bends over such a length."""
+_TOES_IN_SHOES = 0.5
+"""Share of the toes' turn that a shoe makes; without it, a pump taken off its heel would be straightened like a foot."""
 _SHAFT = (0.0, 0.05)
 """Metres above the ankle between which a shoe begins to follow the leg, as the shaft of a boot does."""
 
@@ -105,7 +107,7 @@ def shoe_weights(
     would bend with both. Below the ankle a vertex follows the toes by how far it lies before their joint, along the
     foot, and the ankle with the rest:
 
-        w_toes = s(t; ball),  w_ankle = 1 - w_toes,  t = (x - ankle) . (toes - ankle) / |toes - ankle| - |toes - ankle|
+        w_toes = 0.5 s(t; ball),  w_ankle = 1 - w_toes,  t = (x - ankle) . (toes - ankle) / |toes - ankle| - |toes - ankle|
 
     with s a smooth step.
 
@@ -134,7 +136,7 @@ def shoe_weights(
         foot, shin = joints[toes] - joints[ankle], joints[knee] - joints[ankle]
         offset = mesh.vertices[own] - joints[ankle]
         length = float(np.linalg.norm(foot))
-        share = smooth_step(offset @ foot / length - length, *_BALL)
+        share = _TOES_IN_SHOES * smooth_step(offset @ foot / length - length, *_BALL)
         above = smooth_step(offset @ shin / np.linalg.norm(shin), *_SHAFT)[:, None]
         stiff = np.zeros((int(own.sum()), len(names)))
         stiff[:, ankle], stiff[:, toes] = 1.0 - share, share
