@@ -89,7 +89,7 @@ def rigid_weights(
 _BALL = (-0.01, 0.03)
 """Metres beyond the joint of the toes between which a shoe begins to follow them; a sole bends over such a length."""
 _TOES_IN_SHOES = 0.5
-"""Share of the toes' turn that a shoe makes; without it, a pump taken off its heel would be straightened like a foot."""
+"""Share of the toes' turn that a shoe makes; a pump taken off its heel would else be straightened like a foot."""
 _SHAFT = (0.0, 0.05)
 """Metres above the ankle between which a shoe begins to follow the leg, as the shaft of a boot does."""
 
@@ -107,7 +107,8 @@ def shoe_weights(
     would bend with both. Below the ankle a vertex follows the toes by how far it lies before their joint, along the
     foot, and the ankle with the rest:
 
-        w_toes = 0.5 s(t; ball),  w_ankle = 1 - w_toes,  t = (x - ankle) . (toes - ankle) / |toes - ankle| - |toes - ankle|
+        w_toes = 0.5 s(t; ball),  w_ankle = 1 - w_toes,
+        t = (x - ankle) . (toes - ankle) / |toes - ankle| - |toes - ankle|
 
     with s a smooth step.
 
