@@ -1,4 +1,4 @@
-"""Convert a bundle's skeleton to a body model, its surface to a template, and simulate its loose clothes."""
+"""Convert a bundle to a body model and a template, prepare motions for its player, and simulate its loose clothes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from jaxtyping import Int64
 
 from avatar.runtime.bundle import AvatarBundle
 from smplxpp.body.model import BodyModel
+from smplxpp.body.pose_range import PoseRange
 from smplxpp.cloth.driver import ClothDriver, ClothShape, DriverConfig
 from smplxpp.cloth.garment_file import garments_from_arrays
-from smplxpp.core import BodyParams, SkinWeights
+from smplxpp.cloth.poses import pose_between
+from smplxpp.core import BodyParams, SkinWeights, require_positive
 from smplxpp.template.template import Template
 
 
@@ -172,3 +174,37 @@ class LooseClothes:
 def _is_wide(name: str) -> bool:
     """Return whether an array of garments is float64 in its own file."""
     return ".params." in name or name.split(".")[-1] in ("rest_vertices", "lengths", "depth", "vertex_depth")
+
+
+def resampled(params: BodyParams, fps: float, *, source_fps: float | None = None) -> BodyParams:
+    """Resample a motion to another frame rate, with spherical linear interpolation (slerp) of every joint.
+
+    Different vectors of one rotation are the same pose, so that a joint never spins between them.
+
+    Args:
+        params: the motion.
+        fps: frames a second of the result.
+        source_fps: frames a second of `params`; None: their own.
+
+    Raises:
+        InputError: no positive rate.
+    """
+    rate = source_fps or params.fps or 0.0
+    for name, value in (("frames a second", fps), ("frames a second of the motion", rate)):
+        require_positive(name, value)
+    # Interpolate between the two neighbouring frames of each new time.
+    # The 1e-9 keeps the last frame where the duration is a whole number of new frames up to rounding.
+    last = len(params) - 1
+    frames = []
+    for k in range(int(np.floor(last / rate * fps + 1e-9)) + 1):
+        at = min(k * rate / fps, float(last))
+        low = min(int(at), max(last - 1, 0))
+        high = min(low + 1, last)
+        frames.append(pose_between(params.frame(low), params.frame(high), at - low))
+    return replace(BodyParams.concatenate([replace(one, fps=None) for one in frames]), fps=fps)
+
+
+def pose_range(bundle: AvatarBundle) -> PoseRange | None:
+    """Return the range of the training's poses in a bundle; None if it stores none."""
+    known = bundle.tensors.get("poses.known")
+    return None if known is None else PoseRange.of(known)

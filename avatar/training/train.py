@@ -35,8 +35,7 @@ from avatar.training.recipe import STEPS, Recipe, TrainConfig
 from avatar.training.refinement.refine_capture import refine_capture, with_refined_poses
 from avatar.training.scene import TrainScene, hold_out_cameras, prepare_scene
 from avatar.training.student.bake import bake
-from avatar.training.student.compensate import compensate
-from avatar.training.student.write_student import write_student
+from avatar.training.student.compensate import compensate, write_student
 from avatar.training.teacher.fit_teacher import fit_teacher
 from smplxpp.capture import Capture
 from smplxpp.capture.declared import has_estimated_params

@@ -128,8 +128,7 @@ class Animate:
     def _student_film(self) -> dict:
         """Draw the student frame by frame and write the film."""
         import avatar
-        from avatar.runtime.motion import resampled
-        from avatar.runtime.skeleton import skeleton_body
+        from avatar.runtime.skeleton import resampled, skeleton_body
 
         # The whole motion drives the clothes; `first` is the row of the first frame that is shown.
         bundle = avatar.open_bundle(self.run_folder)

@@ -71,7 +71,7 @@ def student_frames(
         notes: list to which remarks are added.
     """
     from avatar.runtime import AvatarPlayer
-    from avatar.runtime.motion import pose_range
+    from avatar.runtime.skeleton import pose_range
 
     # Compare the shown frames with the joint range of the training: outside it the field extrapolates.
     limits = pose_range(bundle)

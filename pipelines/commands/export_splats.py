@@ -69,7 +69,7 @@ def splat_writers(
 
 def _far_poses(bundle: AvatarBundle, shown: BodyParams) -> list[str]:
     """Return a note on the number of poses far from those of the training, if there are any."""
-    from avatar.runtime.motion import pose_range
+    from avatar.runtime.skeleton import pose_range
 
     limits = pose_range(bundle)
     outside = np.zeros(len(shown), bool) if limits is None else limits.outside(shown).any(axis=1)

@@ -9,8 +9,7 @@ from typing import Any
 
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.training.engine.session import Session
-from avatar.training.student.compensate import CompensateConfig, compensate
-from avatar.training.student.write_student import write_student
+from avatar.training.student.compensate import CompensateConfig, compensate, write_student
 from pipelines.runs.layout import COMPACT_STUDENT
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.cloth import clothed_sequence

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avatar.runtime import load_bundle
-from avatar.runtime.motion import pose_range, resampled
+from avatar.runtime.skeleton import pose_range, resampled
 from smplxpp.body.pose_range import MARGIN
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from tests.dolls.dancing import dance
