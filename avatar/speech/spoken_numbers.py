@@ -13,8 +13,6 @@ _IRREGULAR_ORDINALS = {
     **{"one": "first", "two": "second", "three": "third", "five": "fifth"},
     **{"eight": "eighth", "nine": "ninth", "twelve": "twelfth"},
 }
-_MOST = 10**15
-"""Numbers from here on are spelled digit by digit, because their names are words that few listeners know."""
 
 
 def spell_digits(digits: str) -> str:
@@ -37,8 +35,9 @@ def spell_cardinal(digits: str) -> str:
         >>> spell_cardinal("100245")
         'one hundred thousand two hundred forty five'
     """
-    # The count of digits comes first: Python refuses to parse very long ones.
-    if len(digits) >= len(str(_MOST)) or (len(digits) > 1 and digits[0] == "0"):
+    # Few listeners know the names of longer numbers, and Python refuses to parse very long ones.
+    most_digits = 15
+    if len(digits) > most_digits or (len(digits) > 1 and digits[0] == "0"):
         return spell_digits(digits)
     return " ".join(_words(int(digits)))
 

@@ -146,9 +146,9 @@ def _ffmpeg(program: str, video: Path, filters: str, *output: str) -> bytes:
     command = [program, "-nostdin", "-v", "error", "-i", str(video), "-vf", filters, "-fps_mode", "passthrough"]
     done = subprocess.run([*command, *output], capture_output=True, timeout=_FFMPEG_SECONDS, check=False)
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
+        message = done.stderr.decode(errors="replace").strip().splitlines()
         raise InputError(
-            f"video {video}", expected="a video that can be decoded", received=(said or ["nothing"])[0][:200]
+            f"video {video}", expected="a video that can be decoded", received=(message or ["nothing"])[0][:200]
         )
     return done.stdout
 

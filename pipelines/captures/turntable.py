@@ -340,7 +340,7 @@ def held_out_frames(count: int, chosen: tuple[int, ...] = ()) -> tuple[int, ...]
     """Return the frames that are held out of a turn of a number of frames: the chosen, else every tenth of 20 and more.
 
     Raises:
-        InputError: chosen frames that the turn does not have, the reference, or so many that too few are left.
+        InputError: chosen frames that the turn does not have, the reference, or a number that leaves too few.
     """
     if chosen:
         if not set(chosen) <= set(range(1, count)) or count - len(set(chosen)) < LEAST_FRAMES:

@@ -82,7 +82,7 @@ SYSTEM_PROMPT = (
     "You speak aloud through an avatar. Answer in one to three short sentences of plain spoken English, "
     "without lists, markup or emoji."
 )
-# Tokens that an answer may take. Thoughts count too and are longer than answers; what is said is bounded in characters
+# Tokens that an answer may take. Thoughts count too and are longer than answers; speech is bounded in characters
 # (`pipelines.chat.conversation`).
 _MOST_TOKENS = 2048
 _PATH = "/chat/completions"

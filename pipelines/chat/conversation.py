@@ -251,7 +251,7 @@ class Conversation:
                     self._note("The answer was too long and is cut here.")
                     return
         except InputError as error:
-            # What came before an answer broke off is said.
+            # What came before an answer broke off is spoken.
             if not count:
                 raise
             if not turn.cancelled:

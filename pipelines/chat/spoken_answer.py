@@ -1,4 +1,4 @@
-"""What of a language model's answer is said: no thoughts, and Markdown as a person would read it aloud."""
+"""What of a language model's answer is spoken: no thoughts, and Markdown as a person would read it aloud."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from smplxpp.core.errors import InputError
 _NAMES = r"(?:seed:)?(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection|analysis|scratchpad)"
 _OPENS = re.compile(rf"<{_NAMES}>|\[THINK\]|\u25c1think\u25b7|<\|channel\|>(?:analysis|commentary)\b", re.IGNORECASE)
 _CLOSES = re.compile(rf"</{_NAMES}>|\[/THINK\]|\u25c1/think\u25b7|<\|channel\|>final(?:<\|message\|>)?", re.IGNORECASE)
-# The longest mark, of which the end of a piece may hold the beginning.
-_LONGEST_MARK = 40
 _STARTS = re.compile(r"[<\[\u25c1][^\s>\]\u25b7]*(?:>?[a-z]*)$", re.IGNORECASE)
 
 
@@ -36,6 +34,7 @@ class ThoughtFilter:
         Raises:
             InputError: what `pieces` raises, after all that came before.
         """
+        longest_mark = 40  # characters, with a margin: the end of a piece may hold the beginning of a mark
         inside, held, heard = self.opened_before is True, "", ""
         waiting, failure = self.opened_before is None, None
         stream = iter(pieces)
@@ -57,7 +56,7 @@ class ThoughtFilter:
                     heard += held[: found.start()]
                 inside, held = not closes, held[found.end() :]
             # What may be the beginning of a mark waits for the next piece.
-            start = _STARTS.search(held, max(0, len(held) - _LONGEST_MARK))
+            start = _STARTS.search(held, max(0, len(held) - longest_mark))
             cut = len(held) if start is None else start.start()
             heard, held = heard if inside else heard + held[:cut], held[cut:]
             if heard and not waiting:
@@ -97,7 +96,7 @@ _MARKS = [
 
 
 class MarkdownReader:
-    """Turns the sentences of one answer into what is said, line by line; code in fences is shown and not said."""
+    """Turns the sentences of one answer into speech, line by line; code in fences is shown and not spoken."""
 
     def __init__(self) -> None:
         self._in_code = False

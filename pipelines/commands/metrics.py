@@ -120,9 +120,9 @@ class Metrics:
                 )
             meshes.append(mesh)
             labels.append(_labels(file, given, path))
-        doubt = doubtful_pair(*meshes)
-        if doubt:
-            warnings.warn(f"{path_a.name}, {path_b.name}: {doubt}", GeometryWarning, stacklevel=2)
+        warning = doubtful_pair(*meshes)
+        if warning:
+            warnings.warn(f"{path_a.name}, {path_b.name}: {warning}", GeometryWarning, stacklevel=2)
         return compare(
             *meshes,
             samples=self.samples,

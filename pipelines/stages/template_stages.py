@@ -148,13 +148,13 @@ def segment(folder: Path, build: BuildContext) -> StageOutput:
         labels_before_hand=before.face_labels,
         confidence_before_hand=before.confidence,
     )
-    # A coloured mesh for mesh viewers, pale where labels are not sure, with labels as face properties.
-    sure = np.ones(scan.mesh.vertex_count, dtype=bool)
-    sure[scan.mesh.faces[result.confidence < UNSURE]] = False
+    # A coloured mesh for mesh viewers, pale where labels are uncertain, with labels as face properties.
+    certain = np.ones(scan.mesh.vertex_count, dtype=bool)
+    certain[scan.mesh.faces[result.confidence < UNSURE]] = False
     write_ply(
         folder / "labels.ply",
         scan.mesh,
-        vertex_colors=display_colors(vertex_labels(scan.mesh, result.face_labels), sure),
+        vertex_colors=display_colors(vertex_labels(scan.mesh, result.face_labels), certain),
         face_properties={
             "label": result.face_labels,
             "confidence": result.confidence,

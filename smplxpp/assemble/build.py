@@ -185,7 +185,7 @@ def assemble_template(
     neutral = BodyParams.rest(betas=params.betas[0], expressions=0, v_shape=params.v_shape)
     # Without the mean hand, because its pose correctives are not part of the T-pose.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
-    # Feet give way to shoes, everything else to the body.
+    # Feet yield to shoes, everything else to the body.
     shoes = [(part.mesh, part.weights) for part in parts.values() if part.label == SHOE.id]
     rest, body = feet_in_shoes(body, rest, shoes)
     body_mesh = body.mesh(rest)

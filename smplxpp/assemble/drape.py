@@ -3,7 +3,7 @@
 A patch of least area goes straight from rim to rim; under a sleeve whose lower side was fused with the trunk it would
 go through the arm. Its new vertices x are moved in three steps:
 
-    1. bend    x minimises |L x|^2 (L: the uniform Laplacian), so that the patch goes on in the direction of its rim
+    1. bend    x minimises |L x|^2 (L: the uniform Laplacian), so that the patch continues in the direction of its rim
     2. blow    vertices that are still in the body move out along the patch's normal, and the others follow by 1
     3. settle  x falls to a membrane (Jacobi steps), but keeps signed distance(x) >= s from the body
 
@@ -26,7 +26,7 @@ from smplxpp.core.topology import mean_of_neighbours
 
 STAND_OFF = (0.003, 0.04)
 """Bounds of the distance that a patch keeps from the skin, metres: cloth lies 2 to 5 mm off; the 4 cm of a wide sleeve
-are not taken beyond it."""
+are not taken farther out."""
 _BLOW, _BLOW_STEP, _BLOW_PULL = 2, 0.02, 0.1
 """Steps of blowing up; the move that is asked of a vertex in the body, metres, less than a limb's radius; its weight
 beside the patch's bending. Two steps clear a sleeve of which a third is left; more crumple a coarse patch."""
@@ -56,8 +56,8 @@ def drape_patches(part: CanonicalPart, new: Bool[np.ndarray, " N"], body: Triang
     wanted[rim] = np.clip(field.query(part.mesh.vertices[rim]).distance, *STAND_OFF)
     laplacian = (identity(len(wanted)) - mean).tocsr()[free]
     off = spsolve(laplacian[:, free].tocsc(), -laplacian[:, rim] @ wanted[rim])
-    # The surface that goes on as its rim does has the least squared Laplacian over new and rim vertices: it bends round
-    # a limb where a membrane goes across.
+    # The surface that continues as its rim does has the least squared Laplacian over new and rim vertices: it bends
+    # round a limb where a membrane goes across.
     x, rows = part.mesh.vertices.copy(), (identity(len(wanted)) - mean).tocsr()[np.concatenate([free, rim])]
     bent, known = rows[:, free], rows @ np.where(new[:, None], 0.0, x)
     x[free] = spsolve((bent.T @ bent).tocsc(), -(bent.T @ known))

@@ -1,7 +1,7 @@
 """Draw the body's feet into its shoes.
 
 The shape of a body has one foot for everybody: it is longer than a small shoe, stands flat in a heel, and its toes
-come through the front. No one sees a foot in a shoe, and a shoe is stiff, so that the foot gives way: a vertex in
+come through the front. No one sees a foot in a shoe, and a shoe is stiff, so that the foot yields: a vertex in
 front of the shoe's surface goes to the nearest place behind it. The joints stay where they are. With the moved
 vertices v' and the row r of a joint's regressor, the new row is r' = r (1 + [v' 1] y) with the y that solves
 
@@ -25,7 +25,7 @@ from smplxpp.core.signed_distance import SignedDistanceField
 _LEATHER = 0.002
 """Metres behind the surface of a shoe at which the skin begins; soles are thicker, the uppers of pumps are as thin."""
 _FARTHEST = 0.08
-"""Metres by which a vertex may be drawn in; what lies farther from every shoe is not in one."""
+"""Largest length in metres that a vertex is drawn in; what lies farther from every shoe is not in one."""
 _ROUNDS = 4
 """Rounds of drawing in; after the first, a vertex may have come in front of another side of the shoe."""
 

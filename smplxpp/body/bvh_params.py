@@ -54,7 +54,7 @@ _FINGER_PATTERNS = ("Shand{finger}{bone}", "{finger}0{bone}S", "S{finger}{bone}"
 _SIDE_NAMES = {"left": ("left", "l"), "right": ("right", "r")}
 _FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
 _CHILD = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
-_STRETCH = 0.02  # share of a bone's length by which it may change: the rounding of files is below
+_STRETCH = 0.02  # largest change of a bone's length, as a share: the rounding of files is below
 _CHILD |= {f"{finger}{bone}": f"{finger}{bone + 1}" for finger in _FINGER_NAMES for bone in (1, 2)}
 
 

@@ -330,7 +330,7 @@ def _moved(params: BodyParams, root: Float64[np.ndarray, "T 3"], rotvec: np.ndar
 
 
 def _read_content(content: Any, layout: str, person: int | None, source: str) -> Frames | None:
-    # Readers get records that note what is looked at: what nobody looks at is named.
+    # Readers get records that note what is looked at: what no reader looks at is named.
     if isinstance(content, Mapping):
         content = NotedReads(content)
     elif isinstance(content, list):

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
 MARGIN = np.radians(10.0)
-"""Angle in radians by which a joint may exceed the training and still count as inside its range."""
+"""Largest angle in radians outside of the training that still counts as inside its range."""
 
 
 @dataclass(frozen=True, eq=False)

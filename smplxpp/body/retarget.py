@@ -19,7 +19,7 @@ from smplxpp.skinning.linear_blend import forward_kinematics
 
 _LEG = ("hip", "knee", "ankle")
 FEET = ("left_foot", "right_foot", "left_ankle", "right_ankle")
-"""Joints by which contact with the floor is recognised."""
+"""Joints that show contact with the floor."""
 
 
 @dataclass(frozen=True, eq=False)

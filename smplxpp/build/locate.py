@@ -186,13 +186,13 @@ def _confirmed(found: LocatedBody, search: Callable[..., LocatedBody], landmarks
     if np.sin(own) * front[0] + np.cos(own) * front[2] > 0:
         return found, "the detector's keypoints face the same way"
     again = _best(search, landmarks={name: point for name, (point, _) in landmarks.items() if name.startswith("coco_")})
-    return again, "the surface alone was taken for somebody who faces the other way than the detector's keypoints do"
+    return again, "the surface alone was taken for a person who faces away from where the detector's keypoints do"
 
 
 def certain_labels(
     mesh: TriangleMesh, body: BodyModel, colors: UInt8[np.ndarray, "N 3"] | None, params: BodyParams
 ) -> Int64[np.ndarray, " M"]:
-    """Return labels of a scan's faces by its colours and a body in it; -1 where it is not sure."""
+    """Return labels of a scan's faces by its colours and a body in it; -1 where they do not tell."""
     # A wrong label pulls the fit, a missing one only slows it.
     labelled = label_by_body(mesh, body, params, colors=colors)
     return np.where(labelled.confidence >= UNSURE, labelled.face_labels, BACKGROUND)

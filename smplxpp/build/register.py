@@ -102,7 +102,7 @@ def register_observed(
         raise InputError(
             "registration",
             expected="a body in at least one frame",
-            received=f"none in {len(observations.frames)} frames: {'; '.join(fit.notes) or 'nobody was seen'}",
+            received=f"none in {len(observations.frames)} frames: {'; '.join(fit.notes) or 'no person was seen'}",
             remedy="look at the inputs with `smplxpp capture check`",
         )
     notes = (*observed.all_notes(), *fit.notes, *lost)

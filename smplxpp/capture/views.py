@@ -61,20 +61,17 @@ def read_alpha(path: Path) -> Image:
     values = np.asarray(image)
     if values.dtype == bool:
         return image.convert("L")
-    largest = float(values.max(initial=0))
+    # Data sets of human parsing know 18 (ATR) to 28 (Sapiens) parts; the mattes of a person reach 255.
+    largest, largest_id = float(values.max(initial=0)), 63
     if values.dtype.kind == "f":
         values = values * (255.0 if largest <= 1.0 else 1.0)
-    elif 0 < largest <= _LARGEST_ID:
+    elif 0 < largest <= largest_id:
         _warn_of_ids(path, f"values of at most {largest:.0f}")
         values = np.where(values > 0, 255, 0)
     elif image.mode.startswith("I") and largest > 255:
         # 16-bit grey; Pillow's own conversion would clip.
         values = values / 257.0
     return image if image.mode == "L" and values.max(initial=0) == largest else _from_array(_as_bytes(values))
-
-
-# Data sets of human parsing know 18 (ATR) to 28 (Sapiens) parts; the mattes of a person reach 255.
-_LARGEST_ID = 63
 
 
 def _as_bytes(values: np.ndarray) -> UInt8[np.ndarray, "H W"]:

@@ -1,6 +1,6 @@
 """Find shreds: what cuts of bridges leave of the other limb's surface, which the T-pose carries off the body.
 
-Where a sleeve was fused with the side, the cut follows the edges that stretch most. What lies beyond it belongs to the
+Where a sleeve was fused with the side, the cut follows the edges that stretch most. What lies behind it belongs to the
 other limb, hangs on by a ribbon, and its smoothed weights mix both limbs: the T-pose draws it out and leaves it in
 the air. A scan in which no two limbs are fused has no cuts, and is not touched.
 """
@@ -17,7 +17,7 @@ from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.core.topology import border_loops, face_components
 
 STRETCH = 2.5
-"""Factor by which unposing lengthens an edge, from which a face beside a cut is drawn out."""
+"""Ratio of an edge's lengths after and before unposing, from which a face beside a cut is drawn out."""
 STANDS_OFF = 0.011
 """Growth of a face's distance from the body by unposing, as a share of the body's extent: 2 cm of a person."""
 NARROW = 0.008
@@ -76,7 +76,7 @@ def _distance(part: TriangleMesh, body: TriangleMesh) -> Float64[np.ndarray, " N
 
 
 def drawn_out(posed: TriangleMesh, rest: TriangleMesh, factor: float) -> Bool[np.ndarray, " M"]:
-    """Return the faces with an edge that grows more than so many times; edges below 2 mm count as 2 mm long."""
+    """Return the faces with an edge whose length grows by more than `factor`; edges below 2 mm count as 2 mm long."""
     before, after = (
         row_lengths((mesh.triangles - np.roll(mesh.triangles, 1, axis=1)).reshape(-1, 3)).reshape(-1, 3)
         for mesh in (posed, rest)

@@ -21,7 +21,7 @@ _COINCIDENT = 1e-2
 # them surfaces are off by the same within 3 % (body, scan and five garments at a quarter and a tenth of their faces),
 # so that what is in metres stays as it is; at 100 the budget is not reached.
 _FITTING, _DIAGONAL = (0.2, 5.0), 2.0
-# Exponents by which the library's threshold grows from pass to pass.
+# Exponents with which the library's threshold grows from pass to pass.
 _AGGRESSIVENESS = (3, 5, 7)
 
 

@@ -33,7 +33,7 @@ def find_opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
     """Find the faces of a template's clothes that close an opening, in the T-pose.
 
     A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, look along the
-    opening's axis, which cloth that goes on to the border does not, and have a hollow behind them. Small pieces that
+    opening's axis, which cloth that continues to the border does not, and have a hollow behind them. Small pieces that
     only such faces join to the rest are bridges, too. A body without an inside has none.
     """
     out = np.zeros(len(template.faces), dtype=bool)

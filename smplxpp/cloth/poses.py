@@ -75,7 +75,7 @@ def resampled(params: BodyParams, times: Float[np.ndarray, " T"], wanted: Float[
     """Return a motion's poses at other times: cubic Hermite curves through the poses, joints about themselves.
 
     Tangents are those of the parabola through a pose and its two neighbours (of Catmull and Rom, where times are even),
-    taken in the space of rotation vectors about each step's first pose; at the ends a motion goes on as it came.
+    taken in the space of rotation vectors about each step's first pose; at the ends a motion continues as it came.
 
     Args:
         params: T frames.

@@ -46,15 +46,15 @@ LABEL_BY_NAME: dict[str, Label] = {label.name: label for label in LABELS}
 
 
 def display_colors(
-    label_ids: Integer[np.ndarray, "*N"], sure: Bool[np.ndarray, "*N"] | None = None
+    label_ids: Integer[np.ndarray, "*N"], certain: Bool[np.ndarray, "*N"] | None = None
 ) -> UInt8[np.ndarray, "*N 3"]:
-    """Return the display colours of label ids, pale where a label is not sure; the background is black."""
+    """Return the display colours of label ids, pale where a label is uncertain; the background is black."""
     table = np.array([label.display_rgb for label in LABELS] + [(0, 0, 0)], dtype=np.uint8)
     colors = table[np.asarray(label_ids)]
-    if sure is None:
+    if certain is None:
         return colors
     # A third of the colour and two of white: still to be told apart.
-    return np.where(np.asarray(sure)[..., None], colors, 170 + colors // 3).astype(np.uint8)
+    return np.where(np.asarray(certain)[..., None], colors, 170 + colors // 3).astype(np.uint8)
 
 
 def semantic_colors(label_ids: Integer[np.ndarray, "*N"]) -> UInt8[np.ndarray, "*N 3"]:

@@ -34,7 +34,7 @@ class DetectedPerson:
 
     @property
     def total_confidence(self) -> float:
-        """The sum of the confidences, by which one of several people is chosen."""
+        """The sum of the confidences, which chooses among several people."""
         return float(self.confidence.sum())
 
     @property

@@ -37,7 +37,7 @@ class ModelCard:
         mean: of the normalisation, on the scale 0 to 255, in the order of `channels`.
         std: of the normalisation, likewise.
         channels: "rgb" or "bgr".
-        padding: factor by which the person's box is enlarged.
+        padding: factor that enlarges the person's box.
         simcc_split: bins of a simcc output a pixel of the input; None to derive it from the shapes.
         alignment: "corners" for heatmaps whose outermost cells lie on the outermost pixels (UDP: ViTPose, Sapiens,
             RTMO), "stride" for those whose cell k lies on pixel k times the stride.

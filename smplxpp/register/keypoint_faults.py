@@ -139,7 +139,7 @@ def find_other_people(table: Table, points: Float64[np.ndarray, "N 3"]) -> Bool[
     length = np.linalg.norm(s.residuals(points), axis=2)
     known = (s.weight > 0) & np.isfinite(points).all(axis=1)
     agree = known & (length < _BOUNDS.far * s.threshold[:, None])
-    # Counts by camera and frame: a detector that followed somebody else contradicts nearly all points of a view at
+    # Counts by camera and frame: a detector that followed another person contradicts nearly all points of a view at
     # once.
     known, agree = table.by_frame(known).sum(axis=2), table.by_frame(agree).sum(axis=2)
     return (known >= _BOUNDS.least_sightings) & (agree < _BOUNDS.other_person * known)

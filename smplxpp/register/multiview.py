@@ -221,7 +221,7 @@ class Resection:
     Attributes:
         pose: `x_cam = R x_world + t`.
         median: median of the remaining reprojection errors, as a share of the camera's threshold.
-        moved: median of the distances by which the projections moved, as a share of the threshold.
+        moved: median of the distances that the projections moved, as a share of the threshold.
     """
 
     pose: Float64[np.ndarray, "3 4"]

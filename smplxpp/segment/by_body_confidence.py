@@ -25,7 +25,7 @@ _BORDERS = {
 
 
 UNSURE = 0.6
-"""Confidence below which a label is not sure: it is told, drawn pale, and taken for no label by fits."""
+"""Confidence below which a label is uncertain: it is reported, drawn pale, and no label for fits."""
 
 
 def confidence_bound(

@@ -3,7 +3,7 @@
 A hem is where cloth ends over skin or over other cloth: within a centimetre or two the surface comes nearer to the
 body by the cloth's thickness and play, on all sides of the limb. Folds, pockets and muscles make such steps on one
 side alone, and the misfit of the body changes slowly along a limb. So the step is measured in sectors about the limb,
-beyond the slopes around it, and the median over the sectors counts.
+above the slopes around it, and the median over the sectors counts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from smplxpp.segment.by_body_rings import STEP
 
 _SECTORS = 12
 _UNEVEN = 1
-"""Rings by which a hem lies higher in one sector than in another."""
+"""Largest difference in rings between the heights of a hem in two sectors."""
 _LEAST_ROUGHNESS = 0.0008
 """Metres: the least step that counts as usual, so that a scan without any noise does not have hems everywhere."""
 # Log ratio of densities of a median step, in multiples of the scan's usual step, at a hem and elsewhere. From 200 hems
@@ -102,7 +102,7 @@ def _cells(
 
 
 def _steps(mean: np.ndarray, known: np.ndarray) -> Float64[np.ndarray, "R1 S"]:
-    """Return the steps between two rings on each side of each start of a ring, beyond the slopes 6 cm before and after.
+    """Return the steps between two rings on each side of each start of a ring, above the slopes 6 cm before and after.
 
     Where the slope changes, as where a skirt begins to flare, what either slope explains is no step. NaN where no ring
     beside it has faces.

@@ -9,7 +9,7 @@ minimises
     E(O) = - sum_(i in O) e_i a_i + sum_(cut edges) c_ij length_ij
 
 whose second term is low in concave folds and across edges of colour (`edge_weights`), as where a thing lies against
-clothes or an arm. A skirt beside a hand has such evidence, too; it goes on smoothly into cloth, so that cutting it
+clothes or an arm. A skirt beside a hand has such evidence, too; it continues smoothly into cloth, so that cutting it
 out is dear. A minimum cut gives O; its pieces are kept where they are large enough, touch the hand, leave its reach,
 and have a border that is short for their area, which a flap of cloth does not have.
 """
@@ -125,7 +125,7 @@ def find_objects(
 
 @dataclass(frozen=True, eq=False)
 class _Where:
-    """Measures of faces and edges by which pieces of a cut are judged.
+    """Measures of faces and edges that judge the pieces of a cut.
 
     Attributes:
         distance: of each face to the body, metres.
@@ -149,7 +149,7 @@ class _Where:
 _LEAST_AREA = 60.0
 """Square centimetres of a thing; less is a ring, a cuff or the error of a fitted hand."""
 _LEAST_REACH = 0.06
-"""Metres by which a thing leaves the body; fists and wrong fingers stay within."""
+"""Distance in metres of a thing from the body; fists and wrong fingers stay within."""
 _TOUCHES = 0.03
 """Metres from the hand within which a thing begins."""
 _LEFT_OF_HAND = 120.0

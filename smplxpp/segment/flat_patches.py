@@ -24,7 +24,7 @@ from smplxpp.core.surface_points import draw_on_surface
 _RADIUS, _OFF_PLANE = 0.05, 0.002
 """Radius of a disc, and how far a sample may lie off its plane, metres; twice the noise of a good scan."""
 _SAME_WAY = float(np.cos(np.radians(12.0)))
-"""Cosine of the angle by which normals of one plane may differ."""
+"""Cosine of the largest angle between normals of one plane."""
 _COVERED = 0.9
 """Share of a disc that has to be in its plane; samples are drawn at random, so that no disc has all of them."""
 _SPACING, _SMOOTHED = 0.01, 0.015

@@ -13,7 +13,7 @@ from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 
 MOUTH_COLOR = (72, 32, 30)
-"""sRGB of the inside of a mouth that nobody has seen: what lies in its shade."""
+"""sRGB of the inside of a mouth that no view shows: what lies in its shade."""
 
 _OPEN = (0.15, 0.3, 0.45)  # radians of the jaw
 _INSIDE = ("teeth", "tongue", "gum", "mouth")  # in names of a body's parts
@@ -52,7 +52,7 @@ def inside_of_mouth(template: Template) -> Bool[np.ndarray, " V"]:
 def shown_mouth(
     template: Template, inside: Bool[np.ndarray, " V"], posed: Float[np.ndarray, "V 3"]
 ) -> Bool[np.ndarray, " V"]:
-    """Mark what somebody ahead of a posed head could see of the inside of the mouth.
+    """Mark what a viewer ahead of a posed head could see of the inside of the mouth.
 
     Args:
         template: the person.

@@ -49,7 +49,7 @@ _OPTIONAL = {
     "expression_names": ("U", 1),
 }
 _WORDS = {"f": "floats", "i": "integers", "b": "bools", "U": "texts"}
-_ROW_SUM = 1e-6  # by which the weights of a vertex may miss 1
+_ROW_SUM = 1e-6  # largest difference of the sum of a vertex's weights from 1
 
 
 def check_arrays(arrays: Mapping[str, np.ndarray]) -> None:

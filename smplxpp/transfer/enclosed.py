@@ -19,7 +19,7 @@ from smplxpp.transfer.config import TransferConfig
 _SPACING = 0.01
 """Distance of the planes along a limb, as a share of the body's extent: less than a ring of a coarse garment."""
 _BEYOND = 0.1
-"""How far a limb's axis goes on past ankle and wrist, as a share of the body's extent: hems reach lower than these."""
+"""How far a limb's axis continues past ankle and wrist, as a share of the body's extent: hems reach lower."""
 _CLOSED = 0.99
 """Least share of a turn about the axis that a ring has to make: a plane that leaves through a hem makes no ring."""
 _LEAST_TUBE = 0.1
@@ -37,7 +37,7 @@ class LimbAxis:
         points: metres, from the trunk outwards, evenly spaced.
         tangents: unit length.
         weights: mean weights of the limb's skin at each point.
-        whole: points of the axis as it counts for the rings of other limbs: a leg's goes on to the floor.
+        whole: points of the axis as it counts for the rings of other limbs: a leg's continues to the floor.
     """
 
     joints: tuple[int, ...]
@@ -87,7 +87,7 @@ def limb_axes(
         if not all(share.any() for share in (*shares, weights[:, joints[0]], weights[:, joints[-1]])):
             return []
         knots = [_mean(source.vertices, share) for share in shares]
-        # A limb starts where it leaves the trunk and goes on straight past its last joint; the trunk ends in the head.
+        # A limb starts where it leaves the trunk and continues straight past its end; the trunk ends in the head.
         if chain[-1] == "head":
             ends = [_mean(source.vertices, weights[:, joints[k]]) for k in (0, -1)]
             line = [ends[0], *knots, ends[1]]

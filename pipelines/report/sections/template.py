@@ -70,7 +70,7 @@ def scan_section(
         source = as_text(record.manifest["numbers"].get("labels_from", "file"), subject="labels_from")
         notes = as_list(record.manifest["numbers"].get("notes", []), subject="notes")
     labels, confidence = read_named(run / SCAN_LABELS, "face_labels", "confidence")
-    sure = confidence >= UNSURE
+    certain = confidence >= UNSURE
     # A colour bar beside the last view serves all.
     heat = [
         render_heat(scan, camera, confidence, cmap="weight", limits=(0.0, 1.0), bar=camera is cameras[-1])
@@ -85,7 +85,7 @@ def scan_section(
         ),
         pictures=(
             Picture("scan", _sheet(scan, cameras, vertex_colors=colors)),
-            Picture("labels, pale where not sure", _sheet(scan, cameras, face_colors=display_colors(labels, sure))),
+            Picture("labels, pale where uncertain", _sheet(scan, cameras, face_colors=display_colors(labels, certain))),
             Picture("confidence of the labels", encode_jpeg(row(heat))),
         ),
         tables=(Table(("uncertain labels",), tuple((str(note),) for note in notes)),) if notes else (),

@@ -118,7 +118,7 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
         out.append(f"{piece.share:.0%} of the surface, in one piece of {piece}, is no part of the body found: {what}")
     if float(high - low) < 1.2:
         out.append(
-            f"only {high - low:.2f} m from the lowest to the highest point: a small child, or a part of somebody"
+            f"only {high - low:.2f} m from the lowest to the highest point: a small child, or a part of a person"
         )
     return tuple(out), trust
 

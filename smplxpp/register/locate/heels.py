@@ -84,7 +84,7 @@ def settle_feet(search: Search, found: Found) -> Found:
 
 
 _SHORTER = (0.04, 0.06)
-"""Metres by which legs are shortened where the heels alone do not lift the feet out of the floor."""
+"""Shortening of the legs in metres, where the heels alone do not lift the feet out of the floor."""
 _KEPT = 0.004
 """Weight of a standard deviation of shape against a metre of a bone's length, when legs are shortened."""
 _LIFTED = np.radians(15.0)

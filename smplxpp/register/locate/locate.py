@@ -26,7 +26,7 @@ from smplxpp.register.locate.second_look import look_again
 Labeller = Callable[[BodyParams], "Integer[np.ndarray, ' M'] | None"]
 """Labels every face of the surface, given the body in it, negative where unknown; None for no labels at all."""
 _RARER = 0.5
-"""Millimetres by which a body in a rare pose has to be the better one: such poses also bend into what is no person."""
+"""Margin in millimetres that a body in a rare pose needs to win: such poses also bend into what is no person."""
 
 _MOST_CONVEX = 0.9
 """Share of a surface on its convex hull from which it is no person; people have at most 0.3 (18 scans of 11 people)."""
