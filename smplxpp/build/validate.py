@@ -94,7 +94,9 @@ def validate_template(
     numbers["quality"] = {name: q.as_dict() for name, q in quality.items()}
     numbers["shared_volume"] = _shared_volumes(template)
     turned = _turned_faces(template, posed, parts)
-    checks.append(Check("faces of the parts turned over against the cleaned scan", turned, "", 0, 0))
+    # A sheet that folds over has hundreds of faces; real scans have up to nine slivers beside cuts that nothing shows.
+    most_slivers = 20
+    checks.append(Check("faces of the parts turned over against the cleaned scan", turned, "", 0, most_slivers))
     # Stretch under poses that are rarely recorded, and under a dozen recorded frames.
     motion_frames = 12
     poses = {"hard poses": stress_poses(params), "worn poses": worn_poses(params)}
