@@ -49,8 +49,8 @@ _PUBLISHED_LENGTH = 2.0**0.5
 VARIANTS = {
     "default": _DEFAULT,
     "published 0.35": replace(_DEFAULT, published=0.35),
-    "published 0.8": replace(_DEFAULT, published=0.8),
-    "published_length 0.02": replace(_DEFAULT, published_length=0.02),
+    "published 0.65": replace(_DEFAULT, published=0.65),
+    "published_length 0.008": replace(_DEFAULT, published_length=0.008),
 }
 FAMILIES = {
     "trousers": ("trousers", "shorts", "overalls", "jumpsuit", "hakama"),

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from smplxpp.core import MeshLike, SkinWeights, TriangleMesh, WeightsLike, as_mesh, dense_weights
+from smplxpp.core import MeshLike, SkinWeights, WeightsLike, as_mesh, dense_weights
 from smplxpp.transfer.anchors import smooth_step
 from smplxpp.transfer.correspond import vertex_components
 
@@ -96,7 +96,7 @@ _SHAFT = (0.0, 0.05)
 
 def shoe_weights(
     weights: SkinWeights,
-    mesh: TriangleMesh,
+    mesh: MeshLike,
     joints: Float[np.ndarray, "J 3"],
     *,
     joint_names: tuple[str, ...],
@@ -128,6 +128,7 @@ def shoe_weights(
         >>> float(stiff.dense()[heel].max())
         1.0
     """
+    mesh = as_mesh(mesh, subject="shoes")
     dense, names = weights.dense(), list(joint_names)
     out = dense.copy()
     legs = {side: [names.index(f"{side}_{joint}") for joint in ("knee", "ankle", "foot")] for side in ("left", "right")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import warnings
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from smplxpp.capture.calibrations import read_calibration
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color, read_normals
 from smplxpp.capture.views import read_labels as read_label_image
-from smplxpp.core import BodyParams, SkinWeights, TriangleMesh
+from smplxpp.core import BodyParams, GeometryWarning, SkinWeights, TriangleMesh
 from smplxpp.core.files.array_file import read_array, read_arrays, write_arrays
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
@@ -298,8 +299,10 @@ def _image_doors() -> list[Door]:
     noise = np.random.default_rng(3).integers(0, 255, (24, 20, 4)).astype(np.uint8)
 
     def read(folder: Path, suffix: str) -> None:
-        for reader in (read_color, read_alpha, read_normals):
-            reader(folder / f"x.{suffix}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GeometryWarning)  # of coloured noise that is read as a mask
+            for reader in (read_color, read_alpha, read_normals):
+                reader(folder / f"x.{suffix}")
 
     def write(folder: Path, suffix: str) -> None:
         pixels = noise[..., :3] if suffix in ("jpg", "bmp") else noise

@@ -1,4 +1,4 @@
-/* smplxpp player, Apache-2.0; web/ of the project has its sources ef3eaa014595e2e2f36187b33f906770e8dd068ad5c92dd137fde668dd688094 */
+/* smplxpp player, Apache-2.0; web/ of the project has its sources b3a5ece10b4cfa474a83879f4a22f1abb1170fb5a9a67190f790628745b30ab2 */
 "use strict";(()=>{var Ce=`:root {
   --ground: #121418;
   --raised: rgba(28, 31, 37, 0.86);
