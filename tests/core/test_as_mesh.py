@@ -171,14 +171,12 @@ def calls(mesh) -> dict[str, object]:
         "thickened": lambda: clean.thickened(mesh, inward=0.1).vertices,
         "wall_thickness": lambda: clean.wall_thickness(mesh)[:10],
         "rigid_weights": lambda: transfer.rigid_weights(mesh, ones, mesh, joint_names=("root",)).dense(),
-        "shoe_weights": lambda: (
-            transfer.shoe_weights(
-                SkinWeights.from_dense(np.full((count, len(LEGS)), 1.0 / len(LEGS))),
-                mesh,
-                np.arange(3.0 * len(LEGS)).reshape(-1, 3) ** 0.5,
-                joint_names=LEGS,
-            ).dense()
-        ),
+        "shoe_weights": lambda: transfer.shoe_weights(
+            SkinWeights.from_dense(np.full((count, len(LEGS)), 1.0 / len(LEGS))),
+            mesh,
+            np.arange(3.0 * len(LEGS)).reshape(-1, 3) ** 0.5,
+            joint_names=LEGS,
+        ).dense(),
         "transfer_weights": lambda: transfer.transfer_weights(mesh, ones, mesh).dense(),
         "label_by_body": None,  # needs a person: its first statement is `as_mesh`, as that of `segment_scan`
         "segment_scan": lambda: segment.segment_scan(mesh, face_labels=labels).face_labels,
