@@ -166,7 +166,7 @@ def test_a_folder_of_something_else_is_not_removed(folder, source, tmp_path):
 def test_the_page_is_what_the_stored_result_gives():
     text = (ROOT / "docs" / "real.md").read_text()
     assert ROOT / "docs" / "real.md" in PAGES and page(text) == text, "run `python -m benchmarks.support.page`"
-    assert text.split("\n## ")[1].startswith("What fails")
+    assert text.split("\n## ")[1].startswith("What fails a check")
     figures = json.loads((RESULTS / "real.json").read_text())["figures"]
     assert figures["summary"] == summary(figures["rows"])
     for row in figures["rows"]:

@@ -90,7 +90,7 @@ def test_interpolation():
 @pytest.mark.parametrize("which", ["darned", "holes"])
 def test_armpits(which):
     means = [person["T-pose"][f"at the patch, {which}"][0] for person in closed("darning")["people"].values()]
-    assert f"{min(means):.1f} to {max(means):.1f} mm" in section("Armpits that nobody saw")
+    assert f"{min(means):.1f} to {max(means):.1f} mm" in section("Armpits that no view shows")
 
 
 def test_icp():
