@@ -18,9 +18,9 @@ from scipy.ndimage import laplace
 
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.files import IMAGE_SUFFIXES
+from smplxpp.capture.video_files import ffmpeg_program
 from smplxpp.core import InputError, spread
 from smplxpp.core.files.image_file import open_image
-from smplxpp.core.lazy import import_extra
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 _DIAGONAL_MM = 43.27  # of a frame of 35 mm film, to which equivalent focal lengths refer
@@ -102,8 +102,7 @@ def decoded_frames(video: Path, folder: Path, most: int) -> list[TurnFrame]:
         MissingExtraError: imageio-ffmpeg is not installed.
         InputError: a file that is no video.
     """
-    package = import_extra("imageio_ffmpeg", extra="video", purpose="reading videos", named="imageio-ffmpeg")
-    program = package.get_ffmpeg_exe()
+    program = ffmpeg_program()
     # All frames, small and grey, show which of them are sharp; those that are chosen are decoded whole.
     side = _SHARPNESS_PIXELS
     small = _ffmpeg(program, video, f"scale={side}:{side},format=gray", "-f", "rawvideo", "-")

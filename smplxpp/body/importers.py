@@ -15,7 +15,8 @@ from jaxtyping import Float64
 from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, NotedReads, recognise, with_valid_frames
+from smplxpp.body.noted_reads import NotedReads, warn_of_unread
+from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, with_valid_frames
 from smplxpp.body.retarget import Skeleton
 from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.body.smpl_params import FAMILY_NAMES, from_smpl, rests_like_smpl, smpl_skeleton
@@ -349,20 +350,8 @@ def _read_content(content: Any, layout: str, person: int | None, source: str) ->
             remedy="see the layouts in `smplxpp params convert --help`",
         ) from error
     if frames is not None:
-        _warn_of_what_is_left([content] if isinstance(content, NotedReads) else content, layout, source)
+        warn_of_unread([content] if isinstance(content, NotedReads) else content, layout, source)
     return frames
-
-
-def _warn_of_what_is_left(records: Any, layout: str, source: str) -> None:
-    """Name the arrays of a file that are not zero and that its layout's reader does not read."""
-    left = sorted({key for one in records if isinstance(one, NotedReads) for key in one.keys_left()})
-    if left:
-        # Files of frames get one text, so that it is shown once.
-        warnings.warn(
-            f"{re.sub(r'[0-9]{4,}', '#', source)}: not read in the layout {layout}: {', '.join(left[:12])}",
-            GeometryWarning,
-            stacklevel=5,
-        )
 
 
 def _content(path: Path) -> Any:

@@ -35,11 +35,6 @@ _EASYMOCAP_FAMILIES: dict[int, Family] = {
     156: "smplh",
     165: "smplx",
 }
-# Parts of `poses` that AMASS writes a second time, under names of their own, and what fits write of the posed body,
-# which follows from the parameters.
-_COPIES = frozenset({"root_orient", "pose_body", "pose_hand", "pose_jaw", "pose_eye", "full_pose"}) | frozenset(
-    {"joints", "Jtr", "joints_3d", "vertices", "verts", "faces"}
-)
 _SMPL_SHAPE, _SMPL_PLACE = ("betas", "shape", "shapes", "beta"), ("trans", "transl", "translation")
 OPEN_BODY = "open_body"
 """What a file states as its `body` whose parameters are of the open body."""
@@ -85,40 +80,6 @@ def with_valid_frames(content: Any) -> tuple[Any, list[int]]:
     # Index of the last valid frame up to each frame; before the first valid one, the first.
     held = np.maximum.accumulate(np.where(valid, np.arange(count), np.argmax(valid)))
     return {**content, **{name: value[held] for name, value in arrays.items()}}, np.flatnonzero(~valid).tolist()
-
-
-class NotedReads(dict[str, Any]):
-    """A record of a file that notes which of its entries a reader looked at, so that the others can be named."""
-
-    def __init__(self, record: Mapping[str, Any]) -> None:
-        super().__init__({str(key): value for key, value in record.items()})
-        self._read: set[str] = set()
-
-    def __getitem__(self, key: str) -> Any:
-        self._read.add(key)
-        return super().__getitem__(key)
-
-    def get(self, key: str, default: Any = None) -> Any:
-        """Return an entry, as `dict.get` does."""
-        self._read.add(key)
-        return super().get(key, default)
-
-    def keys_left(self) -> list[str]:
-        """Return the names of arrays that no reader looked at and that are not zero, without copies of the poses."""
-        left: list[str] = []
-        # Of another person in the file only the id was looked at.
-        if not self._read - {"id"}:
-            return left
-        for key in self.keys() - self._read - _COPIES:
-            value = super().__getitem__(key)
-            try:
-                array = np.asarray(value)
-            except ValueError:  # a ragged list is no array
-                continue
-            # Single numbers describe the file (a count, a duration); arrays describe the person or the motion.
-            if array.dtype.kind in "iuf" and array.size > 1 and array.any():
-                left.append(key)
-        return sorted(left)
 
 
 @dataclass(frozen=True)

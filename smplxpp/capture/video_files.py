@@ -59,7 +59,7 @@ def probe_video(path: str | Path) -> Video:
     """
     path = regular_file(path, subject="video")
     # ffmpeg describes the file on stderr, and ends with an error because no output is named.
-    found = subprocess.run([_program(), "-hide_banner", "-i", str(path)], capture_output=True, check=False)
+    found = subprocess.run([ffmpeg_program(), "-hide_banner", "-i", str(path)], capture_output=True, check=False)
     text = found.stderr.decode(errors="replace")
     size, rate, duration = (pattern.search(text) for pattern in (_STREAM, _RATE, _DURATION))
     if size is None or rate is None or duration is None or float(rate[1]) <= 0:
@@ -94,7 +94,7 @@ def video_frames(
     wanted = sorted(set(numbers))
     if not wanted:
         return
-    command = [_program(), "-hide_banner", "-loglevel", "error", *(["-noautorotate"] if as_stored else [])]
+    command = [ffmpeg_program(), "-hide_banner", "-loglevel", "error", *(["-noautorotate"] if as_stored else [])]
     command += ["-i", str(video.path), "-map", "0:v:0", "-vf", f"scale={size[0]}:{size[1]}:flags=area"]
     command += [
         "-fps_mode",
@@ -137,11 +137,27 @@ def video_sound(video: Video, rate: int) -> Float64[np.ndarray, " S"]:
     """
     if not video.sound:
         return np.zeros(0)
-    command = [_program(), "-hide_banner", "-loglevel", "error", "-i", str(video.path), "-map", "0:a:0", "-ac", "1"]
+    command = [
+        ffmpeg_program(),
+        "-hide_banner",
+        "-loglevel",
+        "error",
+        "-i",
+        str(video.path),
+        "-map",
+        "0:a:0",
+        "-ac",
+        "1",
+    ]
     found = subprocess.run([*command, "-ar", str(rate), "-f", "f32le", "-"], capture_output=True, check=False)
     return np.frombuffer(found.stdout[: len(found.stdout) // 4 * 4], dtype="<f4").astype(np.float64)
 
 
-def _program() -> str:
+def ffmpeg_program() -> str:
+    """Return the path of the ffmpeg that reads videos.
+
+    Raises:
+        MissingExtraError: imageio-ffmpeg is not installed.
+    """
     package = import_extra("imageio_ffmpeg", extra="video", purpose="reading videos", named="imageio-ffmpeg")
     return str(package.get_ffmpeg_exe())
