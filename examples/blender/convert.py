@@ -1,7 +1,7 @@
-"""A template's GLB (or FBX) into Blender, looked at, and out again as .blend, .fbx or an .obj of one frame.
+"""A template's GLB or FBX into Blender, looked at, and out again as .blend or an .obj of one frame.
 
-    blender --background --python examples/blender/convert.py -- me.glb --out me.fbx --fps 20
-    python examples/blender/convert.py me.glb --out me.fbx --fps 20         # with PyPI's bpy (Python 3.11: bpy 5.0)
+    blender --background --python examples/blender/convert.py -- me.glb --out me.blend --fps 20
+    python examples/blender/convert.py me.glb --out me.blend --fps 20       # with PyPI's bpy (Python 3.11: bpy 5.0)
 
 Blender and bpy are under the GPL: this package neither needs nor imports them; this script does, a program of its own.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import bpy
 
-# Blender's own axes are z up; FBX, glTF and OBJ keep y up on the way out.
+# Blender's own axes are z up; OBJ keeps y up on the way out.
 AXES = {"forward_axis": "NEGATIVE_Z", "up_axis": "Y"}
 
 
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument(
         "source", type=Path, help="what `smplxpp export RUN --out me.glb --model template` wrote, or .fbx"
     )
-    parser.add_argument("--out", type=Path, required=True, help=".blend, .fbx or .obj")
+    parser.add_argument("--out", type=Path, required=True, help=".blend or .obj")
     parser.add_argument("--fps", type=int, default=20, help="frames a second of the motion: one frame of Blender each")
     parser.add_argument("--frame", type=int, default=0, help="of an .obj")
     options = parser.parse_args(given)
@@ -46,8 +46,6 @@ def main() -> None:
 
     if options.out.suffix == ".blend":
         bpy.ops.wm.save_as_mainfile(filepath=str(options.out.resolve()))
-    elif options.out.suffix == ".fbx":
-        bpy.ops.export_scene.fbx(filepath=str(options.out), add_leaf_bones=False, bake_anim=True)
     else:
         scene.frame_set(options.frame)
         for thing in bpy.data.objects:

@@ -15,6 +15,7 @@ from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt, Op
 from pipelines.commands.templates import export_bundle, load_params_for, load_run_template
 from smplxpp.clean import SolidConfig, solid_of_parts
 from smplxpp.core import InputError, TriangleMesh, require_positive
+from smplxpp.export.by_suffix import ExportOptions
 from smplxpp.export.printing import check_solid_path, write_solid
 from smplxpp.metrics import self_intersections
 from smplxpp.metrics.comparison import MM
@@ -115,11 +116,11 @@ class Export:
     """Folder that `smplxpp build` and `smplxpp train` wrote, or a bundle NAME.avatar of its student."""
     out: OptionalPath = None
     """Write a file there; its suffix says which: .avatar (the student for our players), .ply .spz .sog (its splats in a
-    pose), .glb and .usdc (see --model), .obj (the template), .onnx (pose to splats), .bvh and .npz (a motion). A
-    name without a suffix: a folder, a file a frame, with --format."""
-    format: Literal["auto", "avatar", "ply", "spz", "sog", "glb", "usd", "obj", "onnx", "bvh", "amass", "webavatar"] = (
-        "auto"
-    )
+    pose), .glb and .usdc (see --model), .fbx and .obj (the template), .onnx (pose to splats), .bvh and .npz (a
+    motion). A name without a suffix: a folder, a file a frame, with --format."""
+    format: Literal[
+        "auto", "avatar", "ply", "spz", "sog", "glb", "usd", "fbx", "obj", "onnx", "bvh", "amass", "webavatar"
+    ] = "auto"
     """Format where the suffix does not tell: of a folder, or of an .npz."""
     model: Literal["auto", "student", "template"] = "auto"
     """What a GLB or USD has: the student's splats in a pose, or the template with skeleton, expressions and motion.
@@ -142,6 +143,13 @@ class Export:
     """Fill a PLY up with zeros to harmonics of degree 3: some importers (Unity's) take no others."""
     up: Literal["y", "-y", "z"] = "y"
     """The axis that points up in a PLY, whose users disagree; other formats say it themselves."""
+    joint_names: Literal["smplx", "mixamo", "unity", "unreal", "vrm"] = "smplx"
+    """Whose names the joints of a rigged template or a BVH have; joints without a name there keep ours."""
+    max_influences: OptionalInt = None
+    """Most joints that move a vertex of a rigged template, such as the 4 or 8 of an engine; the largest weights stay.
+    By default as many as the format holds, 8 in a GLB."""
+    blender: OptionalPath = None
+    """Blender, or a Python with bpy, which writes FBX; by default $BLENDER, `blender` on the path, or bpy."""
     name: OptionalText = None
     """Name of the avatar in the bundle; by default that of the run's folder."""
     licence: str = ""
@@ -197,6 +205,9 @@ class Export:
             full_harmonics=self.full_harmonics,
             up=self.up,
             quiet=self.json,
+            rigged=ExportOptions(
+                joint_names=self.joint_names, max_influences=self.max_influences, blender=self.blender
+            ),
         )
         # The notes go to standard error, so that a script that reads the output sees the file alone.
         report = export_file(request)

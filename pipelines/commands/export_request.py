@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from pipelines.commands.options import ClothMode
 from pipelines.runs.layout import STUDENT
 from smplxpp.core import DEFAULT_FPS, BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_folder
+from smplxpp.export.by_suffix import ExportOptions
 
 SERIES = ""
 """Suffix of a folder with a file a frame."""
@@ -28,6 +29,7 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "sog": (".sog",),
     "glb": (".glb",),
     "usd": (".usdc", ".usda", ".usd"),
+    "fbx": (".fbx",),
     "obj": (".obj",),
     "onnx": (".onnx",),
     "bvh": (".bvh",),
@@ -53,6 +55,7 @@ class FileRequest:
         full_harmonics: whether a PLY has all harmonics.
         up: upward axis of a PLY.
         quiet: whether to hide the progress bar.
+        rigged: options of files with a skeleton.
     """
 
     source: Path
@@ -65,6 +68,7 @@ class FileRequest:
     full_harmonics: bool = False
     up: str = "y"
     quiet: bool = True
+    rigged: ExportOptions = field(default_factory=ExportOptions)
 
     @property
     def is_series(self) -> bool:
@@ -161,7 +165,7 @@ _SPLATS = ("pipelines.commands.export_splats", "splat_writers")
 _TEMPLATE = ("pipelines.commands.export_template", "template_writers")
 _BY_MODEL = {
     **{("student", name): _SPLATS for name in ("ply", "spz", "sog", "glb", "usd")},
-    **{("template", name): _TEMPLATE for name in ("glb", "usd", "obj")},
+    **{("template", name): _TEMPLATE for name in ("glb", "fbx", "usd", "obj")},
 }
 _STEP = ("pipelines.commands.export_splats", "step_writers")
 _MOTION = ("pipelines.commands.export_template", "motion_writers")
@@ -179,8 +183,8 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         InputError: options that do not go together, a source that lacks what is asked for, parameters of another body.
         MissingExtraError: a package of an extra that is not installed.
     """
-    # Find the module that writes this format; an OBJ always holds the template, splats are always the student's.
-    model = "template" if request.format == "obj" else request.model
+    # Find the module that writes this format; OBJ and FBX always hold the template, splats are always the student's.
+    model = "template" if request.format in ("obj", "fbx") else request.model
     if model == "auto":
         of_either = ("template", request.format) in _BY_MODEL
         trained = request.source.is_file() or (request.source / STUDENT).is_file()
@@ -197,6 +201,11 @@ def export_file(request: FileRequest) -> dict[str, Any]:
     for option, given in (("full-harmonics", request.full_harmonics), ("up", request.up != "y")):
         if given and request.format != "ply":
             raise InputError(f"option {option}", expected="a PLY", received=request.format)
+    if request.rigged != ExportOptions() and model == "student" and ("template", request.format) in _BY_MODEL:
+        raise InputError(
+            "options of the skeleton", expected="--model template", received=f"--model {model}, splats without bones"
+        )
+    request.rigged.check(request.out.suffix.lower() or "of a series")
     if request.is_series:
         check_series(request.out)
     # Import the writer only now: some of them need packages of an extra.

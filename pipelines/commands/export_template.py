@@ -1,4 +1,4 @@
-"""Export a template as rigged GLB or USD or as OBJ, a file a frame where it moves, and motions as BVH or AMASS."""
+"""Export a template as rigged GLB, FBX or USD or as OBJ, a file a frame where it moves, and motions as BVH or AMASS."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from smplxpp.cloth.play import play
 from smplxpp.core import BodyParams, InputError
 from smplxpp.export.amass import write_amass
 from smplxpp.export.bvh import write_bvh
+from smplxpp.export.by_suffix import export_template, pruning_error
+from smplxpp.export.joint_names import names_of_joints
 from smplxpp.template.template import Template
 
-Writers = tuple[float | None, Iterator[tuple[int, Callable[[Path], None]]], list[str]]
+Writers = tuple[float | None, Iterator[tuple[int, Callable[[Path], object]]], list[str]]
 
 
 def template_writers(request: FileRequest) -> Writers:
@@ -32,7 +34,7 @@ def template_writers(request: FileRequest) -> Writers:
     Raises:
         InputError: no template, parameters of another body, rows that are not there, a series without a motion.
     """
-    # An OBJ has no skeleton: its surfaces are posed here. GLB and USD store skeleton and motion.
+    # An OBJ has no skeleton: its surfaces are posed here. The others store skeleton and motion.
     template = load_run_template(request.source)
     params = None if request.params is None else load_params_for(template, request.params)
     # A motion places the person by itself; in the T-pose she stands on the floor.
@@ -49,11 +51,18 @@ def template_writers(request: FileRequest) -> Writers:
     if params is not None:
         rows = request.chosen(len(params), moves=True)
         chosen = replace(params.select(list(rows)), fps=request.rate(params))
-    from smplxpp.export.gltf import write_glb
-    from smplxpp.export.usd import write_usd
+    write = partial(export_template, template=template, animation=chosen, options=request.rigged)
+    notes = [] if request.rigged.max_influences is None else [_pruned(template, request.rigged.max_influences)]
+    return None if chosen is None else chosen.fps, iter([(1 if chosen is None else len(chosen), write)]), notes
 
-    write = partial(write_glb if request.format == "glb" else write_usd, template=template, animation=chosen)
-    return None if chosen is None else chosen.fps, iter([(1 if chosen is None else len(chosen), write)]), []
+
+def _pruned(template: Template, most: int) -> str:
+    """Say what fewer joints a vertex do to the template."""
+    error = pruning_error(template, most)
+    return (
+        f"weights of at most {most} joints move vertices in stress poses by up to {error.worst_mm:.1f} mm "
+        f"({error.part}, {error.pose}), 99 % of them by at most {error.p99_mm:.1f} mm"
+    )
 
 
 def _surfaces(request: FileRequest, template: Template, params: BodyParams | None) -> Writers:
@@ -122,7 +131,8 @@ def motion_writers(request: FileRequest) -> tuple[float, Iterator[tuple[int, Cal
     fps = request.rate(params)
     chosen = replace(params.select(list(rows)), fps=fps)
     if request.format == "bvh":
-        write: Callable[[Path], None] = partial(write_bvh, body=body, params=chosen, joints=joints)
+        named = replace(body, joint_names=names_of_joints(body.joint_names, request.rigged.joint_names))
+        write: Callable[[Path], None] = partial(write_bvh, body=named, params=chosen, joints=joints)
     else:
         write = partial(write_amass, body=body, params=chosen)
     return fps, iter([(len(chosen), write)]), []

@@ -2,32 +2,80 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from smplxpp.core import BodyParams, InputError
+import numpy as np
+
+from smplxpp.body.named_poses import STRESS_POSES, stress_poses
+from smplxpp.core import BodyParams, InputError, require_between, require_choice
+from smplxpp.export.fbx import ROOT, write_fbx
 from smplxpp.export.gltf import write_glb
+from smplxpp.export.gltf_skin import MAX_INFLUENCES
+from smplxpp.export.joint_names import OWN, SCHEMES, with_joint_names
 from smplxpp.export.obj import write_obj
 from smplxpp.export.usd import write_usd
 from smplxpp.template.template import Template
 
 _USD = (".usd", ".usda", ".usdc", ".usdz")
-SUFFIXES = (".glb", *_USD, ".obj", ".npz")
+RIGGED = (".glb", ".fbx", *_USD)
+"""Suffixes of files with a skeleton."""
+SUFFIXES = (*RIGGED, ".obj", ".npz")
+# Unreal's own skeletons begin with this bone.
+_UNREAL_ROOT = "root"
 
 
-def export_template(path: str | Path, template: Template, *, animation: BodyParams | None = None) -> Path:
-    """Write a template as GLB, USD, OBJ or npz, by the suffix of the path; see `Template.export`.
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What a rigged file may be asked for.
+
+    Attributes:
+        joint_names: whose names the joints have: one of `smplxpp.export.joint_names.SCHEMES`.
+        max_influences: most joints of a vertex, 1 to 8; None: as many as the format holds.
+        blender: Blender, or a Python with bpy, which writes FBX; None: as `smplxpp.export.fbx.blender_command` finds
+            it.
+
+    Raises:
+        InputError: a value that no format takes.
+    """
+
+    joint_names: str = OWN
+    max_influences: int | None = None
+    blender: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        require_choice("option joint_names", self.joint_names, SCHEMES)
+        if self.max_influences is not None:
+            require_between("option max_influences", self.max_influences, 1, MAX_INFLUENCES)
+
+    def check(self, suffix: str) -> None:
+        """Raise `InputError` for an option that has no effect on files of a suffix."""
+        effects = {"joint_names": (*RIGGED, ".bvh"), "max_influences": RIGGED, "blender": (".fbx",)}
+        for name, suffixes in effects.items():
+            if getattr(self, name) != getattr(ExportOptions, name) and suffix not in suffixes:
+                raise InputError(f"option {name}", expected=f"a file {', '.join(suffixes)}", received=suffix)
+
+
+def export_template(
+    path: str | Path,
+    template: Template,
+    *,
+    animation: BodyParams | None = None,
+    options: ExportOptions | None = None,
+) -> Path:
+    """Write a template as GLB, FBX, USD, OBJ or npz, by the suffix of the path; see `Template.export`.
 
     Args:
         path: of the file.
         template: body and parts in the T-pose.
         animation: T frames; OBJ takes one, npz none.
+        options: what a rigged file may be asked for.
 
     Returns:
         The path.
 
     Raises:
-        InputError: another suffix, or frames that the format cannot hold.
+        InputError: another suffix, frames or options that the format cannot hold, FBX without Blender.
         MissingExtraError: USD without usd-core.
     """
     path = Path(path)
@@ -43,11 +91,17 @@ def export_template(path: str | Path, template: Template, *, animation: BodyPara
             received=f"{frames} frames",
             remedy="export a motion as .glb or .usdc",
         )
+    options = options or ExportOptions()
+    options.check(suffix)
+    template = with_joint_names(with_influences(template, options.max_influences), options.joint_names)
     # A motion places the person by itself; in the T-pose she stands on the floor. Our own files keep the body's frame.
     if animation is None and suffix != ".npz":
         template = template.on_floor()
     if suffix == ".glb":
         write_glb(path, template, animation=animation)
+    elif suffix == ".fbx":
+        root = _UNREAL_ROOT if options.joint_names == "unreal" else ROOT
+        write_fbx(path, template, animation=animation, root=root, blender=options.blender)
     elif suffix in _USD:
         write_usd(path, template, animation=animation)
     elif suffix == ".obj":
@@ -57,3 +111,53 @@ def export_template(path: str | Path, template: Template, *, animation: BodyPara
     else:
         template.save(path)
     return path
+
+
+def with_influences(template: Template, max_influences: int | None) -> Template:
+    """Return the template with the strongest joints of each vertex alone, weights summing to 1; None changes nothing.
+
+    Raises:
+        InputError: fewer than 1 or more than 8 joints.
+    """
+    if max_influences is None:
+        return template
+    require_between("max_influences", max_influences, 1, MAX_INFLUENCES)
+    return replace(template, weights=template.weights.pruned(max_influences))
+
+
+@dataclass(frozen=True)
+class PruningError:
+    """What fewer joints a vertex do to a template in stress poses.
+
+    Attributes:
+        worst_mm: largest displacement of a vertex.
+        pose: pose of `STRESS_POSES` in which it occurs.
+        part: part that it belongs to.
+        p99_mm: 99th percentile of the displacements of all vertices in all poses.
+    """
+
+    worst_mm: float
+    pose: str
+    part: str
+    p99_mm: float
+
+
+def pruning_error(template: Template, max_influences: int) -> PruningError:
+    """Measure by how much a template with at most `max_influences` joints a vertex leaves its own stress poses.
+
+    Raises:
+        InputError: fewer than 1 or more than 8 joints.
+    """
+    poses = stress_poses(BodyParams.rest(betas=0, expressions=0))
+    pruned = with_influences(template, max_influences)
+    moved = 1000.0 * np.linalg.norm(pruned.pose(poses) - template.pose(poses), axis=2)
+    # Vertices without a face show nothing.
+    moved = moved[:, np.unique(template.faces)]
+    pose, column = np.unravel_index(int(moved.argmax()), moved.shape)
+    vertex = np.unique(template.faces)[column]
+    return PruningError(
+        worst_mm=float(moved[pose, column]),
+        pose=list(STRESS_POSES)[pose],
+        part=template.part_names[template.vertex_part[vertex]],
+        p99_mm=float(np.percentile(moved, 99.0)),
+    )

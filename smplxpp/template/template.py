@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64, UInt8
@@ -263,29 +264,32 @@ class Template:
         }
         write_arrays(path, template_arrays.in_file_order(arrays))
 
-    def export(self, path: str | Path, *, animation: BodyParams | None = None) -> Path:
+    def export(self, path: str | Path, *, animation: BodyParams | None = None, **options: Any) -> Path:
         """Write the template in a format of other programs, chosen by the path's suffix.
 
-        `.glb` (skin, expressions, colours, motion), `.usd`, `.usda`, `.usdc` or `.usdz` (the same, by usd-core), `.obj`
-        (the surface in the T-pose, or in the one pose of `animation`), `.npz` (as `save`, for `load`).
+        `.glb` (skin, expressions, colours, motion), `.fbx` (the same, by Blender), `.usd`, `.usda`, `.usdc` or `.usdz`
+        (the same, by usd-core), `.obj` (the surface in the T-pose, or in the one pose of `animation`), `.npz` (as
+        `save`, for `load`).
 
         Args:
             path: of the file.
             animation: T frames that the file plays; None: the template alone.
+            options: of rigged files, the fields of `smplxpp.export.by_suffix.ExportOptions`: `joint_names`,
+                `max_influences`, `blender`.
 
         Returns:
             The path.
 
         Raises:
-            InputError: another suffix, or frames that the format cannot hold.
+            InputError: another suffix, frames or options that the format cannot hold, FBX without Blender.
             MissingExtraError: USD without usd-core.
 
         Example:
-            >>> template.export("anna.glb")  # doctest: +SKIP
+            >>> template.export("anna.glb", joint_names="unity", max_influences=4)  # doctest: +SKIP
         """
         # Writers lie above this room; they are imported when they are called, by name.
-        export = import_module("smplxpp.export.by_suffix").export_template
-        return export(path, self, animation=animation)
+        writers = import_module("smplxpp.export.by_suffix")
+        return writers.export_template(path, self, animation=animation, options=writers.ExportOptions(**options))
 
     @staticmethod
     def load(path: str | Path) -> Template:

@@ -1,34 +1,34 @@
-"""Blender opens the rigged GLB: armature, shape keys, motion; and takes it on to FBX. Skips without Blender."""
+"""Blender opens the rigged GLB: armature, shape keys, motion; and writes it as FBX. Skips without Blender."""
 
 from __future__ import annotations
 
 import json
-import shutil
+import re
 import subprocess
 import sys
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from smplxpp.core import InputError
 from smplxpp.export import write_glb
-from tests.export.templates import open_body_template, random_motion
+from smplxpp.export.fbx import VARIABLE, blender_command, write_fbx
+from tests.export.templates import open_body_template, random_motion, random_template
 
 SCRIPT = Path(__file__).resolve().parents[2] / "examples" / "blender" / "convert.py"
 
 
 def blender(*arguments: object) -> dict:
     """Run the example by bpy or by Blender; what it found."""
-    if find_spec("bpy"):
-        command = [sys.executable, str(SCRIPT)]
-    elif program := shutil.which("blender"):
-        command = [program, "--background", "--python", str(SCRIPT), "--"]
-    else:
+    try:
+        command = blender_command()
+    except InputError:
         pytest.skip("neither bpy nor Blender is installed")
-    run = subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, timeout=900, check=True)
+    line = [*command, str(SCRIPT), "--", *map(str, arguments)]
+    run = subprocess.run(line, capture_output=True, text=True, timeout=900, check=True)
     return json.loads(next(line for line in run.stdout.splitlines() if line.startswith('{"bones"')))
 
 
@@ -42,11 +42,48 @@ def test_blender_moves_the_template_as_we_do_and_fbx_keeps_it(tmp_path):
     ours = template.pose(motion)[2]
     mesh = trimesh.load(tmp_path / "a.obj", process=False, force="mesh")
     np.testing.assert_allclose(mesh.vertices, ours, atol=2e-5)
-    blender(tmp_path / "a.glb", "--out", tmp_path / "a.fbx")
-    again = blender(tmp_path / "a.fbx", "--out", tmp_path / "b.obj", "--frame", 3)  # an FBX counts from 1
+    # The same by the command's own FBX, with another program's names; Blender counts its frames from 1.
+    template.export(tmp_path / "a.fbx", animation=motion, joint_names="unreal")
+    again = blender(tmp_path / "a.fbx", "--out", tmp_path / "b.obj", "--frame", 3)
     assert (again["bones"], again["shape_keys"]) == (55, {"body": 52})
     mesh = trimesh.load(tmp_path / "b.obj", process=False, force="mesh")
     np.testing.assert_allclose(mesh.vertices, ours, atol=2e-5)
+    # Unit and axes as the file states them: centimetres, +Y up, +Z front; no object is turned or scaled.
+    data = (tmp_path / "a.fbx").read_bytes()
+    assert stated(data, b"UnitScaleFactor") == 1.0
+    assert b"upperarm_l" in data and b"left_shoulder" not in data and b"root" in data
+
+
+def stated(data: bytes, name: bytes) -> float:
+    """The number of a property of a binary FBX: `D` and 8 bytes after its name and three texts."""
+    found = re.search(re.escape(name) + rb"S.{4}doubleS.{4}NumberS.{4}D(.{8})", data, re.DOTALL)
+    assert found is not None
+    return float(np.frombuffer(found[1], "<f8")[0])
+
+
+def test_without_blender_an_error_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr("smplxpp.export.fbx.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"expected Blender or bpy.*pip install bpy"):
+        random_template().export(tmp_path / "a.fbx")
+    monkeypatch.setenv(VARIABLE, "no-such-blender")
+    with pytest.raises(InputError, match="variable BLENDER: expected a program, received no-such-blender"):
+        blender_command()
+    with pytest.raises(InputError, match="option blender: expected a program"):
+        random_template().export(tmp_path / "a.fbx", blender="other")
+    with pytest.raises(InputError, match=r"option blender: expected a file \.fbx, received \.glb"):
+        random_template().export(tmp_path / "a.glb", blender="other")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_program_that_fails_is_quoted_and_leaves_no_file(tmp_path):
+    program = tmp_path / "blender"
+    program.write_text("#!/bin/sh\necho no display >&2\nexit 3\n")
+    program.chmod(0o755)
+    with pytest.raises(InputError, match="expected an FBX, received exit status 3: no display"):
+        write_fbx(tmp_path / "a.fbx", random_template(), blender=program)
+    assert list(tmp_path.iterdir()) == [program]
 
 
 ADDON = SCRIPT.with_name("transfer_addon.py")
