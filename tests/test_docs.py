@@ -6,6 +6,7 @@ import ast
 import importlib
 import re
 import textwrap
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -106,3 +107,13 @@ def test_the_checks_find_what_is_wrong(tmp_path):
     assert dotted_names(page) == {"smplxpp.no_such_room", "avatar.gaussians.binding"}
     assert not exists("smplxpp.no_such_room") and not exists("avatar.gaussians.binding.nothing")
     assert exists("avatar.gaussians.binding.BoundGaussians.face_index")
+
+
+def test_the_version_is_the_same_in_every_file():
+    """The package, the citation and the newest section of the changelog belong to one release."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    cited = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    released = [
+        name for name in re.findall(r"^## (.+)$", (ROOT / HISTORY).read_text(), re.MULTILINE) if name != "Unreleased"
+    ]
+    assert (cited[1], released[0]) == (project, project)

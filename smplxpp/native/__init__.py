@@ -163,6 +163,13 @@ def native_library(level: str | None = None) -> ctypes.CDLL:
     if level is not None and level not in LEVELS:
         raise ImportError(f"instruction set {level!r}: expected one of {', '.join(LEVELS)}")
     have = _cpu_features()
+    if level is not None and have and not _FEATURES[level] <= have:
+        # The kernels would end the process with an illegal instruction.
+        needed = ", ".join(sorted(_FEATURES[level]))
+        missing = ", ".join(sorted(_FEATURES[level] - have))
+        raise ImportError(
+            f"instruction set {level!r}: expected a CPU with {needed}, got one without {missing}; unset SMPLXPP_ISA"
+        )
     stale = ""
     for name in LEVELS if level is None else (level,):
         if level is None and not _FEATURES[name] <= have:

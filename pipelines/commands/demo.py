@@ -1,0 +1,113 @@
+"""`smplxpp demo`: the embedded person, from scan and photographs to a template, a student, a report, films, pages."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+import pipelines
+from pipelines.commands.animate import Animate
+from pipelines.commands.build import Build
+from pipelines.commands.evaluate import Evaluate
+from pipelines.commands.options import OptionalPath, require_avatar
+from pipelines.commands.talk import Talk
+from pipelines.commands.templates import BUNDLE_SUFFIX, export_bundle
+from pipelines.commands.train import Train
+from pipelines.commands.web import Web
+from pipelines.report.sections.build import rewrite_report
+from pipelines.runs.layout import REFINED_PARAMS, TALKING_FILM
+from smplxpp.capture.protocols import TRACKED
+from smplxpp.core.errors import InputError, MissingExtraError
+
+_LOG = logging.getLogger(__name__)
+# Below what the small scan has, so that simplification has something to do.
+BUDGETS = {"upper": 8_000, "lower": 8_000}
+NAME, LICENCE = "The embedded person", "CC0-1.0"
+SAID = (
+    "Hello! I was made from one scan and a few photographs. Nobody has ever filmed me talking: "
+    "my voice, my mouth and my hands all come from this text. Type one of your own, and I will say it."
+)
+# The wheel holds a copy of the person beside the package; a checkout holds the original.
+_IN_WHEEL = Path("pipelines", "person")
+_IN_CHECKOUT = Path("data", "fixtures", "person")
+
+
+def embedded_capture() -> Path:
+    """Return the folder of the embedded person: of the checkout, or the copy that the wheel installs.
+
+    Raises:
+        InputError: neither is there.
+    """
+    root = Path(pipelines.__file__).resolve().parents[1]
+    for folder in (root / _IN_CHECKOUT, root / _IN_WHEEL):
+        if (folder / "cameras.json").is_file():
+            return folder
+    raise InputError(
+        "the embedded person",
+        expected=f"its capture in {root / _IN_CHECKOUT} or {root / _IN_WHEEL}",
+        received="neither folder",
+        remedy="install the wheel again, or give a capture of your own with --capture",
+    )
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Options of `smplxpp demo`.
+
+    The body is registered to what a tracker and a detector saw of the embedded person, the template is built, the
+    poses are refined on the photographs, teacher and student are trained and measured, and the student is shown in a
+    film, a page and a speech.
+
+    Nothing exact goes in: its protocol is `tracked`. The truth is read for measuring alone.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = Path("runs/demo")
+    """Folder of the run."""
+    capture: OptionalPath = None
+    """Capture to build; by default the embedded person."""
+
+    def run(self) -> None:
+        """Build, train, evaluate, animate, write the pages and print where they are.
+
+        Raises:
+            InputError: the embedded person is not there and no capture is given.
+        """
+        require_avatar("training the student of the demo")
+        console = Console(stderr=True)
+        out, capture = self.run_folder, self.capture or embedded_capture()
+        started = perf_counter()
+        Build(run_folder=out, capture=capture, protocol=TRACKED, budgets=BUDGETS).run()
+        _LOG.info(
+            "demo: the template stands after %.0f s: open %s while the student is trained (a few minutes more)",
+            perf_counter() - started,
+            (out / "report.html").resolve(),
+        )
+        Train(run_folder=out, capture=capture, preset="demo").run()
+        Evaluate(run_folder=out, capture=capture).run()
+        film = out / "motion.mp4"
+        Animate(run_folder=out, params=out / REFINED_PARAMS, out=film, height=540).run()
+        page = out / "player.html"
+        Web(source=out, single_file=page, params=out / REFINED_PARAMS, name=NAME, licence=LICENCE).run()
+        where = {"report": out / "report.html", "film": film, "player": page, **self._talk(console)}
+        lines = [f"{name:7} {path.resolve()}" for name, path in where.items()]
+        console.print("\n" + "\n".join(lines), highlight=False, soft_wrap=True, markup=False)
+
+    def _talk(self, console: Console) -> dict[str, Path]:
+        """Let the student speak, in the report and in a page; where the extra is not installed, print how to get it."""
+        avatar = self.run_folder / f"me{BUNDLE_SUFFIX}"
+        params = self.run_folder / REFINED_PARAMS
+        export_bundle(self.run_folder, avatar, name=NAME, licence=LICENCE, params=params, exact=False)
+        page = self.run_folder / "talking.html"
+        try:
+            Talk(avatar, self.run_folder / TALKING_FILM, web=page, text=SAID, view="front", height=540).run()
+        except MissingExtraError as error:
+            console.print(f"she does not talk: {error}", markup=False, highlight=False)
+            return {"avatar": avatar}
+        rewrite_report(self.run_folder)
+        return {"avatar": avatar, "talking": page}
