@@ -161,6 +161,24 @@ def test_the_runtime_needs_no_torch():
     assert done.stdout.strip() == "[]"
 
 
+def test_commands_and_reports_start_without_torch():
+    """A plain install has no torch: `smplxpp build` there, and the report that it writes, must not import it."""
+    code = """
+import importlib, pkgutil, sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "safetensors", "threadpoolctl"):
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Missing())
+import pipelines.commands, pipelines.figures, pipelines.report, pipelines.stages.build
+for package in (pipelines.commands, pipelines.figures, pipelines.report):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(module.name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_every_public_name_resolves():
     assert set(smplxpp.__all__) <= set(dir(smplxpp))
     assert all(getattr(smplxpp, name) is not None for name in smplxpp.__all__)

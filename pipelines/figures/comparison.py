@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from avatar.data.views import read_view
 from pipelines.figures import body_cameras, caption, colormap, encode_png, heat_colors, render_heat, row
 from smplxpp.capture import Capture
 from smplxpp.core.files.atomic import atomic_write_bytes
@@ -55,6 +54,9 @@ def enlarge(image: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray,
 
 def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
     """Writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
+    # Here and not above: a report of a build draws with this module where torch is not installed.
+    from avatar.data.views import read_view
+
     background = capture.recording.background or (0.0, 0.0, 0.0)
 
     def write(images: Mapping[str, np.ndarray]) -> None:

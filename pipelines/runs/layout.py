@@ -5,6 +5,8 @@ The numbers of the stages give the order in which they run.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 RECONSTRUCT_STAGE = "02_reconstruct"
 LOCATE_STAGE = "03_locate"
 REGISTER_STAGE = "05_register"
@@ -96,3 +98,25 @@ REPORT_FILE = "report.html"
 def reconstructed_scan(frame: int) -> str:
     """The file of a frame's reconstructed surface: what a build takes as its scan."""
     return f"{RECONSTRUCT_STAGE}/scan_{frame:06d}.ply"
+
+
+MODEL_FILES: Mapping[str, str] = {
+    "fit": GAUSSIANS,
+    "teacher": TEACHER,
+    "baked": BAKED,
+    "student": STUDENT,
+    "compact": COMPACT_STUDENT,
+}
+"""Models of a run by the name that an evaluation gives them. `baked` is the student before its blend shapes."""
+MEASURED = ("fit", "teacher", "student")
+"""Models that are measured by default, as far as a run has them."""
+BEST_FIRST = ("student", "compact", "baked", "teacher")
+"""Preference for the model that the gates apply to: the first of these that was measured."""
+HELD_OUT_VIEWS = ("novel_view", "novel_pose")
+KINDS = {"novel_view": "held-out views", "novel_pose": "held-out poses"}
+"""Titles of the kinds of views that a training measures."""
+
+
+def kind_name(kind: str, *, held_out: bool) -> str:
+    """Return the words for a kind of views; without held-out cameras "novel" views are views that were trained on."""
+    return KINDS[kind] if held_out or kind != "novel_view" else "training views"

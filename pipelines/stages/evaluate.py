@@ -23,13 +23,10 @@ from pipelines.figures.comparison import surface_picture, write_tiles
 from pipelines.runs import gates
 from pipelines.runs.code import TRAINING, sha256_file
 from pipelines.runs.folders import own_run_folder
-from pipelines.runs.layout import EVALUATE_STAGE, GARMENTS
+from pipelines.runs.layout import BEST_FIRST, EVALUATE_STAGE, GARMENTS, MEASURED, MODEL_FILES
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_inputs import (
-    BEST_FIRST,
-    MEASURED,
-    MODEL_FILES,
     REPORT_FILE,
     input_protocol,
     surface_digest,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 
 from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
 from avatar.evaluation.protocol import ProtocolConfig, truth_frames, view_sets
 from avatar.training.scene import normal_maps
-from pipelines.runs.layout import BAKED, COMPACT_STUDENT, GAUSSIANS, REGISTERED_PARAMS, STUDENT, TEACHER, TRAIN_STAGES
+from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import MANIFEST, read_manifest
 from pipelines.stages.build_config import load_build
 from pipelines.stages.run_inputs import folder_of_maps, labels_of_build, parameters_in_run
@@ -19,19 +18,6 @@ from smplxpp.capture.declared import DeclaredInputs, path_of_params
 from smplxpp.core.files.json_file import as_integer, as_text
 
 REPORT_FILE = "metrics.json"
-MODEL_FILES: Mapping[str, str] = {
-    "fit": GAUSSIANS,
-    "teacher": TEACHER,
-    "baked": BAKED,
-    "student": STUDENT,
-    "compact": COMPACT_STUDENT,
-}
-"""Models of a run by the name that an evaluation gives them. `baked` is the student before its blend shapes."""
-MEASURED = ("fit", "teacher", "student")
-"""Models that are measured by default, as far as a run has them."""
-BEST_FIRST = ("student", "compact", "baked", "teacher")
-"""Preference for the model that the gates apply to: the first of these that was measured."""
-HELD_OUT_VIEWS = ("novel_view", "novel_pose")
 
 
 def input_protocol(run: Path, capture: Capture) -> InputProtocol:

@@ -19,20 +19,14 @@ from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.resources import peak_memory
 from avatar.training.engine.session import BACK, PRETRAIN, TRACK, Session
 from pipelines.runs import gates
+from pipelines.runs.layout import KINDS, kind_name
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import CLOTHED, Trainer
 from smplxpp.core.checks import Check
 
-KINDS = {"novel_view": "held-out views", "novel_pose": "held-out poses"}
-"""Titles of the kinds of views that a training measures."""
 TRACK_BACK = f"{TRACK}/{BACK}"
 BEFORE = {TRACK: "track_metrics.jsonl", TRACK_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
 """Log files of tracking and pretraining, by their folder within the session's."""
-
-
-def kind_name(kind: str, *, held_out: bool) -> str:
-    """Return the words for a kind of views; without held-out cameras "novel" views are views that were trained on."""
-    return KINDS[kind] if held_out or kind != "novel_view" else "training views"
 
 
 def keep_logs(work: Path, folder: Path) -> None:

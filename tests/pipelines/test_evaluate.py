@@ -32,9 +32,10 @@ from pipelines.report.sections.evaluation import (
     standing_evaluation,
 )
 from pipelines.runs.code import sha256_file
+from pipelines.runs.layout import MODEL_FILES
 from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
-from pipelines.stages.evaluate_inputs import MODEL_FILES, input_protocol
+from pipelines.stages.evaluate_inputs import input_protocol
 from smplxpp.capture import open_capture
 from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template

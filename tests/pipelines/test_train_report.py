@@ -10,9 +10,14 @@ import pytest
 
 from pipelines.report import Report, write_report
 from pipelines.report.builder import readable
-from pipelines.report.sections.training import cloth_section, standing_trainings, training_key_numbers, training_section
+from pipelines.report.sections.training import (
+    cloth_section,
+    kind_name,
+    standing_trainings,
+    training_key_numbers,
+    training_section,
+)
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.train_results import kind_name
 from smplxpp.core import GeometryWarning, spread
 from tests.dolls.dancing import write_dance, write_dance_run
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers

@@ -15,9 +15,17 @@ from pipelines.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, enlarge,
 from pipelines.report import CheckRow, Comparison, Film, KeyNumber, Picture, Section, Table
 from pipelines.report.sections.fit import HEAD_HEIGHT, head_box
 from pipelines.runs.code import sha256_file
-from pipelines.runs.layout import EVALUATE_STAGE, RELIGHT_STAGE, STUDENT, TALKING_FILM, TEMPLATE
+from pipelines.runs.layout import (
+    BEST_FIRST,
+    EVALUATE_STAGE,
+    HELD_OUT_VIEWS,
+    MODEL_FILES,
+    RELIGHT_STAGE,
+    STUDENT,
+    TALKING_FILM,
+    TEMPLATE,
+)
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.evaluate_inputs import BEST_FIRST, HELD_OUT_VIEWS, MODEL_FILES
 from smplxpp.core.files.paths import path_inside, read_bytes
 
 

@@ -12,9 +12,17 @@ from avatar.training.engine.metrics_log import read_metrics
 from pipelines.figures import encode_png, row
 from pipelines.figures.comparison import ERROR_LIMIT, error_legend, read_strip, read_tiles
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
-from pipelines.runs.layout import BAKE_STAGE, COMPENSATE_STAGE, REFINE_STAGE, TEACHER_STAGE, TEMPLATE, TRAIN_STAGES
+from pipelines.runs.layout import (
+    BAKE_STAGE,
+    COMPENSATE_STAGE,
+    KINDS,
+    REFINE_STAGE,
+    TEACHER_STAGE,
+    TEMPLATE,
+    TRAIN_STAGES,
+    kind_name,
+)
 from pipelines.runs.stage import StageRecord, read_manifest
-from pipelines.stages.train_results import KINDS, kind_name
 from smplxpp.core.files.paths import path_inside
 from smplxpp.core.spread import spread
 
