@@ -9,7 +9,7 @@ import numpy as np
 from avatar.runtime import AvatarBundle
 from avatar.runtime.skeleton import clothed_template, skeleton_body
 from avatar.speech import Face, StandingBody
-from avatar.speech.curves import ARKIT
+from smplxpp.body.blendshapes import ARKIT
 from smplxpp.body.retarget import Skeleton
 from smplxpp.core.params import BodyParams
 from smplxpp.template.template import Template

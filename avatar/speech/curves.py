@@ -14,23 +14,12 @@ from jaxtyping import Float64
 
 from avatar.speech.phonemes import Phoneme, Speech
 from avatar.speech.pronunciation import EXTRA
+from smplxpp.body.blendshapes import ARKIT
 from smplxpp.core import DEFAULT_FPS, InputError
 from smplxpp.core.files import as_list, as_number, as_numbers, as_object, as_text, read_arrays, read_json, read_text
 from smplxpp.core.files.onnx_file import OnnxModel
 from smplxpp.core.files.sound_file import Sound
 
-_SIDED = (
-    *("eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide", "browDown"),
-    *("browOuterUp", "cheekSquint", "noseSneer", "mouthSmile", "mouthFrown", "mouthDimple", "mouthStretch"),
-    *("mouthPress", "mouthLowerDown", "mouthUpperUp"),
-)
-_UNSIDED = (
-    *("jawForward", "jawLeft", "jawRight", "jawOpen", "mouthClose", "mouthFunnel", "mouthPucker", "mouthLeft"),
-    *("mouthRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper", "browInnerUp"),
-    *("cheekPuff", "tongueOut"),
-)
-ARKIT: tuple[str, ...] = tuple(sorted([*_UNSIDED, *(f"{name}{side}" for name in _SIDED for side in ("Left", "Right"))]))
-"""ARKit's 52 blendshapes by name, in alphabetical order."""
 BLINK = ("eyeBlinkLeft", "eyeBlinkRight")
 FLAME_EXPRESSIONS = 50
 """Largest number of FLAME's expressions in curves; SMPL-X's are the first ten, or hundred, of the same space."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from avatar.speech.blendshape_transfer import transfer_blendshapes
 from avatar.speech.coarticulation import ARTICULATORS
-from avatar.speech.curves import ARKIT, BLINK
+from avatar.speech.curves import BLINK
+from smplxpp.body.blendshapes import ARKIT, both_sides, transfer_blendshapes
 from smplxpp.body.model import BodyModel
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.errors import one_line
@@ -39,13 +39,9 @@ _ARKIT_OF_ARTICULATOR: dict[str, dict[str, float]] = {
 }
 
 
-def _both_sides(name: str) -> tuple[str, ...]:
-    return (name,) if name in ARKIT else (f"{name}Left", f"{name}Right")
-
-
 def _named_basis(names: list[str]) -> Float64[np.ndarray, "52 E"]:
     """Return the matrix that selects a body's expressions for ARKit's blendshapes, 0 for those that it lacks."""
-    wanted = {side for shape in _ARKIT_OF_ARTICULATOR.values() for one in shape for side in _both_sides(one)} | {*BLINK}
+    wanted = {side for shape in _ARKIT_OF_ARTICULATOR.values() for one in shape for side in both_sides(one)} | {*BLINK}
     missing = sorted(wanted - set(names))
     if missing:
         more = f" and {len(missing[3:])} more" if len(missing) > 3 else ""
@@ -117,7 +113,7 @@ class Face:
         weights = np.zeros((len(ARTICULATORS), len(ARKIT)))
         for row, articulator in enumerate(ARTICULATORS):
             for one, value in _ARKIT_OF_ARTICULATOR[articulator].items():
-                for side in _both_sides(one):
+                for side in both_sides(one):
                     weights[row, ARKIT.index(side)] = value
         has_jaw = "jaw" in joint_names
         if not has_jaw:

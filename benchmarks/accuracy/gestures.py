@@ -6,7 +6,7 @@ A Piper voice (extra `[talk]`) speaks for some minutes, and the embedded body, k
 it. Measured are the path length of the feet's joints, the distance of hands from the trunk's skin, the delay of beats
 after stressed vowels, the seconds of speech until a gesture is used again, and the similarity of any two pieces of
 the arms' angles; in addition the part of ARKit's expressions that numbered ones cannot make
-(`avatar.speech.blendshape_transfer`).
+(`smplxpp.body.blendshapes`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from avatar.speech import Face, Phoneme, Speech, SpeechAnimator, StandingBody, TalkConfig
-from avatar.speech.blendshape_transfer import transfer_blendshapes
-from avatar.speech.curves import ARKIT
 from avatar.speech.voice import PiperVoice
 from benchmarks.accuracy.talking import SENTENCES
 from benchmarks.support.results import store_results
 from smplxpp.body import load_body
+from smplxpp.body.blendshapes import ARKIT, transfer_blendshapes
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.model import BodyModel
 from smplxpp.body.retarget import FEET, Skeleton

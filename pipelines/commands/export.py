@@ -15,6 +15,7 @@ from pipelines.commands.options import ClothMode, OptionalFloat, OptionalInt, Op
 from pipelines.commands.templates import export_bundle, load_params_for, load_run_template
 from smplxpp.clean import SolidConfig, solid_of_parts
 from smplxpp.core import InputError, TriangleMesh, require_positive
+from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.export.by_suffix import ExportOptions
 from smplxpp.export.printing import check_solid_path, write_solid
 from smplxpp.metrics import self_intersections
@@ -116,10 +117,10 @@ class Export:
     """Folder that `smplxpp build` and `smplxpp train` wrote, or a bundle NAME.avatar of its student."""
     out: OptionalPath = None
     """Write a file there; its suffix says which: .avatar (the student for our players), .ply .spz .sog (its splats in a
-    pose), .glb and .usdc (see --model), .fbx and .obj (the template), .onnx (pose to splats), .bvh and .npz (a
-    motion). A name without a suffix: a folder, a file a frame, with --format."""
+    pose), .glb and .usdc (see --model), .fbx, .vrm and .obj (the template), .onnx (pose to splats), .bvh and
+    .npz (a motion). A name without a suffix: a folder, a file a frame, with --format."""
     format: Literal[
-        "auto", "avatar", "ply", "spz", "sog", "glb", "usd", "fbx", "obj", "onnx", "bvh", "amass", "webavatar"
+        "auto", "avatar", "ply", "spz", "sog", "glb", "usd", "fbx", "vrm", "obj", "onnx", "bvh", "amass", "webavatar"
     ] = "auto"
     """Format where the suffix does not tell: of a folder, or of an .npz."""
     model: Literal["auto", "student", "template"] = "auto"
@@ -151,9 +152,14 @@ class Export:
     blender: OptionalPath = None
     """Blender, or a Python with bpy, which writes FBX; by default $BLENDER, `blender` on the path, or bpy."""
     name: OptionalText = None
-    """Name of the avatar in the bundle; by default that of the run's folder."""
+    """Name of the avatar in the bundle or VRM; by default that of the run's folder, or of the file."""
     licence: str = ""
-    """Licence of the avatar, as the bundle is to say it."""
+    """Licence of the avatar, as the bundle is to say it; of a VRM its address, https://..."""
+    authors: tuple[str, ...] = ()
+    """Who made the avatar, as a VRM is to say it."""
+    meta: OptionalPath = None
+    """JSON file with more fields of VRM's `meta`, such as {"commercialUsage": "corporation"}; where it is silent the
+    file permits next to nothing."""
     exact: bool = False
     """Keep every number of the bundle in float32, at about four times the size."""
     height_mm: OptionalFloat = None
@@ -194,6 +200,8 @@ class Export:
         return report
 
     def _file(self, out: Path, name: str) -> dict[str, Any]:
+        if name != "vrm" and (self.authors or self.meta is not None):
+            raise InputError("options authors and meta", expected="a .vrm, whose terms they are", received=out.name)
         request = FileRequest(
             source=self.run_folder,
             out=out,
@@ -206,7 +214,10 @@ class Export:
             up=self.up,
             quiet=self.json,
             rigged=ExportOptions(
-                joint_names=self.joint_names, max_influences=self.max_influences, blender=self.blender
+                joint_names=self.joint_names,
+                max_influences=self.max_influences,
+                blender=self.blender,
+                meta=self._meta() if name == "vrm" else None,
             ),
         )
         # The notes go to standard error, so that a script that reads the output sees the file alone.
@@ -217,6 +228,16 @@ class Export:
             for sentence in report["notes"]:
                 Console(stderr=True).print(sentence, markup=False, soft_wrap=True)
         return report
+
+    def _meta(self) -> dict[str, Any] | None:
+        """Return what the options state for a VRM; None where they state nothing."""
+        stated = (
+            {} if self.meta is None else dict(as_object(read_json(self.meta, subject="VRM meta"), subject="VRM meta"))
+        )
+        stated |= {} if self.name is None else {"name": self.name}
+        stated |= {"authors": list(self.authors)} if self.authors else {}
+        stated |= {"licenseUrl": self.licence} if self.licence else {}
+        return stated or None
 
     def _solid(self, solid: Path) -> dict[str, Any]:
         report = export_solid(

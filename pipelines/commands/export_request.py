@@ -30,6 +30,7 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "glb": (".glb",),
     "usd": (".usdc", ".usda", ".usd"),
     "fbx": (".fbx",),
+    "vrm": (".vrm",),
     "obj": (".obj",),
     "onnx": (".onnx",),
     "bvh": (".bvh",),
@@ -165,7 +166,7 @@ _SPLATS = ("pipelines.commands.export_splats", "splat_writers")
 _TEMPLATE = ("pipelines.commands.export_template", "template_writers")
 _BY_MODEL = {
     **{("student", name): _SPLATS for name in ("ply", "spz", "sog", "glb", "usd")},
-    **{("template", name): _TEMPLATE for name in ("glb", "fbx", "usd", "obj")},
+    **{("template", name): _TEMPLATE for name in ("glb", "fbx", "vrm", "usd", "obj")},
 }
 _STEP = ("pipelines.commands.export_splats", "step_writers")
 _MOTION = ("pipelines.commands.export_template", "motion_writers")
@@ -183,8 +184,8 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         InputError: options that do not go together, a source that lacks what is asked for, parameters of another body.
         MissingExtraError: a package of an extra that is not installed.
     """
-    # Find the module that writes this format; OBJ and FBX always hold the template, splats are always the student's.
-    model = "template" if request.format in ("obj", "fbx") else request.model
+    # Find the module that writes this format; OBJ, FBX and VRM hold the template, splats are always the student's.
+    model = "template" if request.format in ("obj", "fbx", "vrm") else request.model
     if model == "auto":
         of_either = ("template", request.format) in _BY_MODEL
         trained = request.source.is_file() or (request.source / STUDENT).is_file()

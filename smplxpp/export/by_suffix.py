@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +17,11 @@ from smplxpp.export.gltf_skin import MAX_INFLUENCES
 from smplxpp.export.joint_names import OWN, SCHEMES, with_joint_names
 from smplxpp.export.obj import write_obj
 from smplxpp.export.usd import write_usd
+from smplxpp.export.vrm import checked_meta, write_vrm
 from smplxpp.template.template import Template
 
 _USD = (".usd", ".usda", ".usdc", ".usdz")
-RIGGED = (".glb", ".fbx", *_USD)
+RIGGED = (".glb", ".fbx", ".vrm", *_USD)
 """Suffixes of files with a skeleton."""
 SUFFIXES = (*RIGGED, ".obj", ".npz")
 # Unreal's own skeletons begin with this bone.
@@ -34,6 +37,7 @@ class ExportOptions:
         max_influences: most joints of a vertex, 1 to 8; None: as many as the format holds.
         blender: Blender, or a Python with bpy, which writes FBX; None: as `smplxpp.export.fbx.blender_command` finds
             it.
+        meta: of a VRM, name, authors, licence and terms by VRM's own names: `smplxpp.export.vrm.checked_meta`.
 
     Raises:
         InputError: a value that no format takes.
@@ -42,15 +46,17 @@ class ExportOptions:
     joint_names: str = OWN
     max_influences: int | None = None
     blender: str | Path | None = None
+    meta: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         require_choice("option joint_names", self.joint_names, SCHEMES)
         if self.max_influences is not None:
             require_between("option max_influences", self.max_influences, 1, MAX_INFLUENCES)
+        checked_meta(self.meta, name="me")
 
     def check(self, suffix: str) -> None:
         """Raise `InputError` for an option that has no effect on files of a suffix."""
-        effects = {"joint_names": (*RIGGED, ".bvh"), "max_influences": RIGGED, "blender": (".fbx",)}
+        effects = {"joint_names": (*RIGGED, ".bvh"), "max_influences": RIGGED, "blender": (".fbx",), "meta": (".vrm",)}
         for name, suffixes in effects.items():
             if getattr(self, name) != getattr(ExportOptions, name) and suffix not in suffixes:
                 raise InputError(f"option {name}", expected=f"a file {', '.join(suffixes)}", received=suffix)
@@ -63,12 +69,12 @@ def export_template(
     animation: BodyParams | None = None,
     options: ExportOptions | None = None,
 ) -> Path:
-    """Write a template as GLB, FBX, USD, OBJ or npz, by the suffix of the path; see `Template.export`.
+    """Write a template as GLB, FBX, VRM, USD, OBJ or npz, by the suffix of the path; see `Template.export`.
 
     Args:
         path: of the file.
         template: body and parts in the T-pose.
-        animation: T frames; OBJ takes one, npz none.
+        animation: T frames; OBJ takes one, VRM and npz none.
         options: what a rigged file may be asked for.
 
     Returns:
@@ -83,7 +89,7 @@ def export_template(
     if suffix not in SUFFIXES:
         raise InputError("export path", expected=f"a suffix of {', '.join(SUFFIXES)}", received=path.name)
     # A file without motion holds the T-pose (npz), or one pose (OBJ).
-    frames, most = 0 if animation is None else len(animation), {".npz": 0, ".obj": 1}.get(suffix)
+    frames, most = 0 if animation is None else len(animation), {".npz": 0, ".vrm": 0, ".obj": 1}.get(suffix)
     if most is not None and frames > most:
         raise InputError(
             "animation",
@@ -93,7 +99,10 @@ def export_template(
         )
     options = options or ExportOptions()
     options.check(suffix)
-    template = with_joint_names(with_influences(template, options.max_influences), options.joint_names)
+    template = with_influences(template, options.max_influences)
+    # A VRM's bones are found by our names, before they get others.
+    if suffix != ".vrm":
+        template = with_joint_names(template, options.joint_names)
     # A motion places the person by itself; in the T-pose she stands on the floor. Our own files keep the body's frame.
     if animation is None and suffix != ".npz":
         template = template.on_floor()
@@ -102,6 +111,8 @@ def export_template(
     elif suffix == ".fbx":
         root = _UNREAL_ROOT if options.joint_names == "unreal" else ROOT
         write_fbx(path, template, animation=animation, root=root, blender=options.blender)
+    elif suffix == ".vrm":
+        write_vrm(path, template, meta=options.meta, joint_names=options.joint_names)
     elif suffix in _USD:
         write_usd(path, template, animation=animation)
     elif suffix == ".obj":

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pygltflib
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Float64, Int, UInt8, UInt16
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from smplxpp.core.colors import decode_srgb
@@ -23,7 +24,18 @@ from smplxpp.template.template import BODY_PART, Template
 _STILL = 1e-6
 
 
-def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template, *, morph_targets: bool) -> list[int]:
+MorphTargets = Mapping[str, Float64[np.ndarray, "V 3"]]
+"""Displacements of a template's vertices by name, metres."""
+
+
+def add_parts(
+    gltf: pygltflib.GLTF2,
+    buffers: BufferBuilder,
+    template: Template,
+    *,
+    morph_targets: bool,
+    shapes: MorphTargets | None = None,
+) -> list[int]:
     """Add a mesh, a material and a node for every part that has faces; skin 0 moves them all.
 
     Vertices of a part keep their order; the body's are the body model's own.
@@ -62,6 +74,7 @@ def add_parts(gltf: pygltflib.GLTF2, buffers: BufferBuilder, template: Template,
         mesh = pygltflib.Mesh(name=name, primitives=[primitive])
         if morph_targets and name == BODY_PART and template.body.num_expressions:
             _add_expressions(buffers, template, mesh)
+        _add_shapes(buffers, mesh, {name: moved[rows] for name, moved in (shapes or {}).items()})
         nodes.append(len(gltf.nodes))
         gltf.nodes.append(pygltflib.Node(name=name, mesh=len(gltf.meshes), skin=0))
         gltf.meshes.append(mesh)
@@ -87,6 +100,20 @@ def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib
     ]
     mesh.weights = [0.0] * len(offsets)
     mesh.extras = {"targetNames": list(template.body.expression_names)}
+
+
+def _add_shapes(buffers: BufferBuilder, mesh: pygltflib.Mesh, shapes: MorphTargets) -> None:
+    """Add the displacements of a mesh's vertices that are not zero as further morph targets."""
+    moving = {name: moved.astype(np.float32) for name, moved in shapes.items() if moved.any()}
+    if not moving:
+        return
+    names = [*(mesh.extras or {}).get("targetNames", ()), *moving]
+    mesh.primitives[0].targets = [
+        *(mesh.primitives[0].targets or ()),
+        *({"POSITION": buffers.add_sparse(moved, np.flatnonzero(moved.any(axis=1)))} for moved in moving.values()),
+    ]
+    mesh.weights = [0.0] * len(names)
+    mesh.extras = {"targetNames": names}
 
 
 def _unit_normals(template: Template) -> np.ndarray:
@@ -134,17 +161,31 @@ def write_glb(
     Example:
         >>> smplxpp.write_glb("anna.glb", template, animation=params)  # doctest: +SKIP
     """
-    gltf = pygltflib.GLTF2(
-        asset=pygltflib.Asset(version="2.0", generator=f"smplxpp {metadata.version('smplxpp')}"), scene=0
-    )
-    buffers = BufferBuilder(gltf)
-    joint_nodes = add_skin(gltf, buffers, template)
-    part_nodes = add_parts(gltf, buffers, template, morph_targets=morph_targets)
-    # Skinned meshes stand at the root of the scene: nodes above them would not move them.
-    gltf.scenes = [pygltflib.Scene(name="template", nodes=[int(joint_nodes[0]) - 1, *part_nodes])]
+    gltf, buffers, joint_nodes, part_nodes = rigged_gltf(template, morph_targets=morph_targets)
     if animation is not None:
         morph_node = next(
             (n for n in part_nodes if gltf.nodes[n].name == BODY_PART and gltf.meshes[gltf.nodes[n].mesh].weights), None
         )
         add_animation(gltf, buffers, template, animation, joint_nodes=joint_nodes, morph_node=morph_node)
     atomic_write_bytes(path, buffers.glb())
+
+
+def rigged_gltf(
+    template: Template, *, morph_targets: bool, shapes: MorphTargets | None = None
+) -> tuple[pygltflib.GLTF2, BufferBuilder, Int[np.ndarray, " J"], list[int]]:
+    """Return a scene of the template: its document and buffer, the nodes of the joints, and those of the parts.
+
+    Args:
+        template: body and parts in the T-pose.
+        morph_targets: add the expressions as morph targets of the body.
+        shapes: further morph targets, of every part that they move.
+    """
+    gltf = pygltflib.GLTF2(
+        asset=pygltflib.Asset(version="2.0", generator=f"smplxpp {metadata.version('smplxpp')}"), scene=0
+    )
+    buffers = BufferBuilder(gltf)
+    joint_nodes = add_skin(gltf, buffers, template)
+    part_nodes = add_parts(gltf, buffers, template, morph_targets=morph_targets, shapes=shapes)
+    # Skinned meshes stand at the root of the scene: nodes above them would not move them.
+    gltf.scenes = [pygltflib.Scene(name="template", nodes=[int(joint_nodes[0]) - 1, *part_nodes])]
+    return gltf, buffers, joint_nodes, part_nodes

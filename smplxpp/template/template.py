@@ -268,14 +268,14 @@ class Template:
         """Write the template in a format of other programs, chosen by the path's suffix.
 
         `.glb` (skin, expressions, colours, motion), `.fbx` (the same, by Blender), `.usd`, `.usda`, `.usdc` or `.usdz`
-        (the same, by usd-core), `.obj` (the surface in the T-pose, or in the one pose of `animation`), `.npz` (as
-        `save`, for `load`).
+        (the same, by usd-core), `.vrm` (VRM 1.0, without motion), `.obj` (the surface in the T-pose, or in the one pose
+        of `animation`), `.npz` (as `save`, for `load`).
 
         Args:
             path: of the file.
             animation: T frames that the file plays; None: the template alone.
             options: of rigged files, the fields of `smplxpp.export.by_suffix.ExportOptions`: `joint_names`,
-                `max_influences`, `blender`.
+                `max_influences`, `blender`, `meta`.
 
         Returns:
             The path.

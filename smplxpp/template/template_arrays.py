@@ -216,6 +216,34 @@ def completed_body(
     )
 
 
+def fitted_regressor(
+    start: Float64[np.ndarray, "J V"],
+    vertices: Float64[np.ndarray, "V 3"],
+    bases: Float64[np.ndarray, "V 3 K"],
+    *,
+    joints: Float64[np.ndarray, "J 3"],
+    moved: Float64[np.ndarray, "J 3 K"],
+) -> Float64[np.ndarray, "J V"]:
+    """Return the joint regressor nearest to another one that puts the joints where they belong on a changed surface.
+
+    `min |R - S|^2` where `R v = J`, `R 1 = S 1` and `R e_k = d_k` for every base: rest joints, and how expressions
+    move them (jaw and eyes), stay what they were.
+
+    Args:
+        start: regressor S to stay near to.
+        vertices: v of the new surface, metres.
+        bases: displacements e_k of its vertices, metres a unit.
+        joints: J at rest, metres.
+        moved: displacements d_k of the joints, metres a unit.
+    """
+    count = len(vertices)
+    known = np.hstack([vertices, np.ones((count, 1)), bases.reshape(count, -1)])
+    wanted = np.hstack([joints, start.sum(axis=1, keepdims=True), moved.reshape(len(joints), -1)])
+    # Fewer conditions than vertices: of all solutions least squares returns the shortest.
+    change = np.linalg.lstsq(known.T, (wanted - start @ known).T, rcond=None)[0]
+    return start + change.T
+
+
 def weight_arrays(weights: SkinWeights) -> dict[str, np.ndarray]:
     """All of the weights and where they came from, as a file names them."""
     return {_WEIGHTS + f.name: plain_array(getattr(weights, f.name)) for f in fields(SkinWeights)}

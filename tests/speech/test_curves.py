@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from avatar.speech import Face, talking_motion
-from avatar.speech.curves import ARKIT, Curves, FaceModel, read_curves
+from avatar.speech.curves import Curves, FaceModel, read_curves
 from avatar.speech.face import JAW_ANGLE
 from pipelines.commands.talk import Talk
 from smplxpp.body import load_body
+from smplxpp.body.blendshapes import ARKIT
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.sound_file import Sound
 

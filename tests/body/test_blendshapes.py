@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from avatar.speech import ARTICULATORS, Face, Phoneme, Speech, talking_motion
-from avatar.speech.blendshape_transfer import FaceSurface, transfer_blendshapes
-from avatar.speech.curves import ARKIT
 from avatar.speech.face import MAX_UNOBSERVED_NUMBERED
 from smplxpp.body import load_body
+from smplxpp.body.blendshapes import ARKIT, FaceSurface, transfer_blendshapes
 from smplxpp.body.model import BodyModel
 from smplxpp.core import BodyParams, InputError
 

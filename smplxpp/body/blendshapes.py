@@ -1,4 +1,4 @@
-"""Transfer ARKit's blendshapes to a body with numbered expressions (SMPL-X, FLAME) by bounded least squares.
+"""ARKit's blendshapes, and their transfer to a body with numbered expressions (SMPL-X, FLAME) by least squares.
 
 The embedded body has ARKit's blendshapes by name. Its face is aligned with the other one by eyes and mouth, its
 displacements t are copied to the nearest vertices (upper lip to upper, lower to lower), and the coefficients c that
@@ -17,10 +17,22 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import lsq_linear
 from scipy.spatial import cKDTree
 
-from avatar.speech.curves import ARKIT
-from smplxpp.body import BodyModel, load_body
+from smplxpp.body.loader import load_body
+from smplxpp.body.model import BodyModel
 from smplxpp.core import BodyParams, InputError
 
+_SIDED = (
+    *("eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide", "browDown"),
+    *("browOuterUp", "cheekSquint", "noseSneer", "mouthSmile", "mouthFrown", "mouthDimple", "mouthStretch"),
+    *("mouthPress", "mouthLowerDown", "mouthUpperUp"),
+)
+_UNSIDED = (
+    *("jawForward", "jawLeft", "jawRight", "jawOpen", "mouthClose", "mouthFunnel", "mouthPucker", "mouthLeft"),
+    *("mouthRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper", "browInnerUp"),
+    *("cheekPuff", "tongueOut"),
+)
+ARKIT: tuple[str, ...] = tuple(sorted([*_UNSIDED, *(f"{name}{side}" for name in _SIDED for side in ("Left", "Right"))]))
+"""ARKit's 52 blendshapes by name, in alphabetical order."""
 _EYES = ("left_eye_smplhf", "right_eye_smplhf")
 
 
@@ -206,3 +218,14 @@ def _vertex_weights(face: FaceSurface) -> Float64[np.ndarray, " N"]:
         away = np.linalg.norm((face.vertices - place)[:, :2], axis=1) / (reach * face.eye_distance)
         out = np.maximum(out, np.exp(-0.5 * (away / 0.6) ** 2))
     return out
+
+
+def both_sides(name: str) -> tuple[str, ...]:
+    """Return the blendshapes of `ARKIT` that a name without its side stands for.
+
+    Example:
+        >>> from smplxpp.body.blendshapes import both_sides
+        >>> both_sides("mouthSmile")
+        ('mouthSmileLeft', 'mouthSmileRight')
+    """
+    return (name,) if name in ARKIT else (f"{name}Left", f"{name}Right")
