@@ -11,14 +11,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.report.model import CheckRow, count_statuses, worst_status
+from pipelines.report.model import CheckRow, Step, count_statuses, worst_status
+from pipelines.report.words import next_steps
 from pipelines.runs.layout import (
     ALL_STAGES,
     EVALUATE_STAGE,
     FIT_STAGE,
     REFINE_STAGE,
     RELIGHT_STAGE,
-    STUDENT,
     TEMPLATE_GLB,
     TEMPLATE_STAGES,
     TRAIN_STAGES,
@@ -101,17 +101,19 @@ def summarise_run(run: Path) -> tuple[dict[str, Any], list[CheckRow]]:
         "remedy": _remedy(run, unfinished[0]) if unfinished else None,
         "report": str(report) if report.is_file() else None,
         "glb": str(glb) if glb.is_file() else None,
-        "next": _next_command(run) if glb.is_file() and not unfinished else None,
+        "next": [step.__dict__ for step in _next_steps(run, checks)] if glb.is_file() and not unfinished else [],
         "checks": [check.__dict__ for check in checks],
     }
     return summary, checks
 
 
-def _next_command(run: Path) -> str:
+def _next_steps(run: Path, checks: list[CheckRow]) -> tuple[Step, ...]:
     """Return what a person with a finished template, and perhaps a student, is likely to do next."""
-    if (run / STUDENT).is_file():
-        return f"smplxpp web {run} --serve (the student in the browser), or smplxpp export {run} --out me.avatar"
-    return f"smplxpp animate {run} --params MOTION --out me.mp4, or with photographs smplxpp train {run} --capture DIR"
+    from pipelines.stages.build_config import load_build
+    from pipelines.stages.run_inputs import capture_of_build
+
+    build = load_build(run)
+    return next_steps(run, capture=None if build is None else capture_of_build(run, build[0]), checks=checks)
 
 
 def _remedy(run: Path, stage: str) -> str:
@@ -241,8 +243,8 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
         console.print(Text("report  ") + Text("none yet; a finished build writes it", style="dim"))
     if summary["glb"]:
         console.print(Text("rigged  ") + Text(summary["glb"]), soft_wrap=True)
-    if summary["next"]:
-        console.print(Text("next    ") + Text(summary["next"], style="dim"), soft_wrap=True)
+    for step in summary["next"]:
+        console.print(Text("next    ") + Text(step["command"]) + Text(f"   {step['purpose']}", "dim"), soft_wrap=True)
 
 
 def _check_table(checks: list[CheckRow]) -> Table:

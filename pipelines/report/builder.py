@@ -20,12 +20,15 @@ from pipelines.report.model import (
     Curve,
     Histogram,
     KeyNumber,
+    Picture,
     Report,
     Section,
     count_statuses,
     format_value,
     worst_status,
 )
+from pipelines.report.pictures import PAGE_BYTES, Embedded, embed_pictures
+from pipelines.report.words import glossary_of, verdict_of
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.stage import StageRecord
 from smplxpp.core.errors import GeometryWarning, InputError
@@ -214,11 +217,8 @@ def _ticks(low: float, high: float, count: int) -> list[float]:
     return [round(float(t), 12) for t in np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step]
 
 
-_VERDICTS = {
-    "pass": "Every check passes",
-    "warn": "Usable, with warnings",
-    "fail": "Some checks fail",
-}
+_WORDS_BYTES = 450_000
+"""Room for words, tables and charts in a page: twice what the embedded person's page has."""
 
 
 def write_report(path: str | Path, report: Report) -> Path:
@@ -233,7 +233,12 @@ def write_report(path: str | Path, report: Report) -> Path:
         lstrip_blocks=True,
         loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
     )
-    environment.filters |= {"value": format_value, "flat": _flatten, "worst": worst_status}
+    environment.filters |= {
+        "value": format_value,
+        "flat": _flatten,
+        "worst": worst_status,
+        "embedded": _embedded(report).__getitem__,
+    }
     environment.tests["number"] = _is_number
     # Charts are drawn as SVG within the page while the template is rendered.
     environment.globals |= {
@@ -247,7 +252,8 @@ def write_report(path: str | Path, report: Report) -> Path:
         report=report,
         counts=count_statuses(report.checks),
         worst=worst,
-        verdict=_VERDICTS[worst] if report.checks else "No checks were made",
+        verdict=verdict_of(report.kind, report.checks, report.uses),
+        glossary=glossary_of(report),
         # List the checks that failed or warned first; STATUSES is ordered from the worst on.
         attention=sorted(
             (check for check in report.checks if check.status != "pass"), key=lambda c: STATUSES.index(c.status)
@@ -257,6 +263,15 @@ def write_report(path: str | Path, report: Report) -> Path:
     )
     atomic_write_text(path, html)
     return Path(path)
+
+
+def _embedded(report: Report) -> dict[Picture, Embedded]:
+    """Encode all pictures of a report for the room that films leave."""
+    pictures = list(report.hero)
+    for section in report.sections:
+        pictures += [*section.pictures, *(one for pair in section.comparisons for one in (pair.before, pair.after))]
+    films = sum(len(film.uri) for section in report.sections for film in section.films)
+    return embed_pictures(pictures, room=PAGE_BYTES - _WORDS_BYTES - films)
 
 
 def _by_stage(checks: tuple[CheckRow, ...]) -> dict[str, list[CheckRow]]:

@@ -14,8 +14,6 @@ from jaxtyping import Num
 from pipelines.runs.manifest import STATUSES, require_check
 from smplxpp.core import Check, InputError
 
-_SIGNATURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
-
 
 @dataclass(frozen=True)
 class CheckRow:
@@ -62,19 +60,17 @@ class CheckRow:
 
 @dataclass(frozen=True)
 class Picture:
-    """An encoded picture (PNG or JPEG) with its caption; `alt` is read aloud (default: the caption)."""
+    """An encoded picture (PNG, JPEG or WebP) with its caption.
+
+    Attributes:
+        alt: text that is read aloud; by default the caption.
+        enlarged: side of the square, in pixels of the page, that shows a pixel of the picture.
+    """
 
     caption: str
     data: bytes
     alt: str = ""
-
-    @property
-    def uri(self) -> str:
-        """Return the picture as a data URI."""
-        kind = next((mime for start, mime in _SIGNATURES.items() if self.data.startswith(start)), None)
-        if kind is None:
-            raise InputError(f"picture {self.caption!r}", expected="PNG or JPEG bytes", received=repr(self.data[:4]))
-        return f"data:{kind};base64,{base64.b64encode(self.data).decode()}"
+    enlarged: int = 1
 
 
 @dataclass(frozen=True)
@@ -169,6 +165,29 @@ class KeyNumber:
 
 
 @dataclass(frozen=True)
+class Use:
+    """Something that a run can be used for, with the checks that decide it.
+
+    Attributes:
+        purpose: completes "can be used to".
+        status: `pass`, `warn` or `fail`, the worst of the checks.
+        words: what was found.
+    """
+
+    purpose: str
+    status: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command that is likely to come next, with what it is for."""
+
+    purpose: str
+    command: str
+
+
+@dataclass(frozen=True)
 class Section:
     """Section of the report on one stage or topic.
 
@@ -197,6 +216,8 @@ class Report:
     Attributes:
         subject: name of the run's person.
         summary: one or two sentences.
+        uses: what the run can be used for, and what stands against it; the first thing that a reader sees.
+        steps: what to do next.
         hero: pictures beside the title.
         checks: all checks of the run; the verdict counts them.
         seconds: wall-clock seconds by stage, in order.
@@ -206,6 +227,8 @@ class Report:
 
     subject: str
     summary: str = ""
+    uses: tuple[Use, ...] = ()
+    steps: tuple[Step, ...] = ()
     hero: tuple[Picture, ...] = ()
     key_numbers: tuple[KeyNumber, ...] = ()
     checks: tuple[CheckRow, ...] = ()

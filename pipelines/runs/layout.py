@@ -113,7 +113,7 @@ MEASURED = ("fit", "teacher", "student")
 BEST_FIRST = ("student", "compact", "baked", "teacher")
 """Preference for the model that the gates apply to: the first of these that was measured."""
 HELD_OUT_VIEWS = ("novel_view", "novel_pose")
-KINDS = {"novel_view": "held-out views", "novel_pose": "held-out poses"}
+KINDS = {"novel_view": "novel views", "novel_pose": "novel poses"}
 """Titles of the kinds of views that a training measures."""
 
 

@@ -301,11 +301,21 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
     if name is None:
         return checks
     best = report.models[name]
-    # Appearance: an absolute floor of PSNR, the gain over the fit, and the loss against the teacher.
-    for part, floor in gates.PSNR.items():
+    # Appearance: likeness to held-out photographs, the gain over the fit, and the loss against the teacher.
+    for part, likeness in gates.LIKENESS.items():
         if part in best.views:
-            psnr = best.mean(part)["psnr"]
-            checks.append(floor.check(f"{name}, {SETS[part]}: PSNR of the person", psnr))
+            mean = best.mean(part)
+            psnr, distance = mean["psnr"], mean.get("perceptual")
+            checks.append(
+                likeness.check(
+                    f"{name}, {SETS[part]}: PSNR of the person",
+                    psnr,
+                    explanation="decibels fall with fine patterns and small images, too: look at the pictures",
+                )
+            )
+            perceptual = gates.PERCEPTUAL.get(report.metric or "")
+            if distance is not None and perceptual is not None:
+                checks.append(perceptual.check(f"{name}, {SETS[part]}: {report.metric} of the image", distance))
             if "fit" in report.models:
                 checks.append(
                     gates.GAIN.check(

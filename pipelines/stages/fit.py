@@ -163,7 +163,7 @@ def _output(result: FitResult, held_out: list[str], train: list[str], *, overlap
         if names
     }
     figures = mean["held_out" if held_out else "train"]
-    which = "held-out" if held_out else "training"
+    which = "novel" if held_out else "training"
     # Check the inputs (silhouettes), the quality reached, the gain over the start, and the steps done.
     checks = [
         gates.SILHOUETTE.check(

@@ -10,7 +10,7 @@ from pipelines.runs.artefacts import load_stacked_params
 from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTERED_PARAMS, TEMPLATE
 from pipelines.runs.stage import is_finished, read_manifest
-from pipelines.stages.build_config import BuildInputs, load_build, load_register
+from pipelines.stages.build_config import BuildInputs, load_build, load_reconstruct, load_register
 from smplxpp.body import load_body
 from smplxpp.build.inputs import given_motion
 from smplxpp.build.segment import label_source
@@ -58,6 +58,14 @@ def motion_of_build(run: Path, inputs: BuildInputs) -> BodyParams | None:
     if given is not None:
         return given
     return load_stacked_params(run / REGISTERED_PARAMS)[1] if inputs.registers else None
+
+
+def capture_of_build(run: Path, inputs: BuildInputs) -> Path | None:
+    """Return the folder of the capture that a run was built from; None for a scan, or where it is gone."""
+    of_stages = load_register(run), load_reconstruct(run)
+    found = next((one.root for one in of_stages if one is not None and one.root is not None), None)
+    folder = found or (None if inputs.cameras is None else inputs.cameras.parent)
+    return folder if folder is not None and folder.is_dir() else None
 
 
 def run_protocol(run: Path) -> str | None:

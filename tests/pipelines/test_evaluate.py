@@ -177,8 +177,8 @@ def test_the_report_shows_figures_and_pictures(evaluated, tmp_path):
     assert any(caption.startswith("novel poses, Held1, frame 4, head, ") for caption in captions)
     assert len(pictures.comparisons) == 2
     assert [number.label for number in evaluation_key_numbers(record)] == [
-        "novel views",
-        "novel poses",
+        "student, novel views: PSNR of the person",
+        "student, novel poses: PSNR of the person",
         "pictures a second",
     ]
     html = write_report(tmp_path / "report.html", Report("doll", sections=(figures, pictures))).read_text()

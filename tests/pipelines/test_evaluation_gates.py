@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from avatar.evaluation.report import EvalReport, ModelFigures, Surfaces
 from avatar.metrics.surface_quality import SurfaceQuality
 from avatar.metrics.view_quality import ViewQuality
-from pipelines.runs import gates
 from pipelines.stages.evaluate import evaluation_checks
 from smplxpp.core.checks import Check
 
@@ -30,10 +31,18 @@ def checks(psnr: float, *, fit: float | None = None, upper: float = 1.0, pixel: 
     return {check.name: check for check in evaluation_checks(report, overlap=0.99, pixel=pixel)}
 
 
-@pytest.mark.parametrize(("above", "status"), [(0.1, "pass"), (-0.1, "warn"), (-2.1, "fail")])
-def test_psnr_has_a_floor(above, status):
-    floor = gates.PSNR["novel_view"].warn
-    assert checks(floor + above)["student, novel views: PSNR of the person"].status == status
+@pytest.mark.parametrize(("psnr", "status"), [(24.1, "pass"), (23.9, "warn"), (19.9, "fail")])
+def test_likeness_to_held_out_photographs_is_graded(psnr, status):
+    assert checks(psnr)["student, novel views: PSNR of the person"].status == status
+
+
+@pytest.mark.parametrize(("distance", "status"), [(0.011, "pass"), (0.02, "warn"), (0.031, "fail")])
+def test_a_perceptual_distance_is_graded_by_its_metric(distance, status):
+    views = {"novel_view": {"Cam0_0": replace(view(25.0), perceptual=distance)}}
+    for metric, expected in (("st-lpips", {status}), ("lpips", set())):  # no limit is known for the other metric
+        report = EvalReport("doll", metric, {"student": ModelFigures(views)})
+        found = [c for c in evaluation_checks(report, overlap=0.99, pixel=0.001) if "of the image" in c.name]
+        assert {check.status for check in found} == expected
 
 
 @pytest.mark.parametrize(("gain", "status"), [(1.0, "pass"), (-0.5, "warn"), (-1.5, "fail")])

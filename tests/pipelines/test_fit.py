@@ -87,8 +87,8 @@ def test_inspect_knows_the_stage_and_tells_when_its_template_changed(own):
     stage = next(s for s in summary["stages"] if s["stage"] == "70_fit")
     assert stage["state"] == "done" and stage["files"] == 8
     assert {c.name for c in checks if c.stage == "70_fit"} >= {
-        "held-out views: PSNR of the person",
-        "held-out views: gain of PSNR since the start",
+        "novel views: PSNR of the person",
+        "novel views: gain of PSNR since the start",
     }
     (own / "60_assemble" / "manifest.json").write_text(
         json.dumps({"schema": SCHEMA, "stage": "60_assemble", "seconds": 1.0, "files": {"smplxpp.npz": "other"}})

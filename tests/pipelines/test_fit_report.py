@@ -68,14 +68,16 @@ def test_curves_follow_the_evaluations(fitted):
     seconds, values = psnr.lines["person"]
     assert len(seconds) == len(values) == 5 and (np.diff(seconds) >= 0).all()
     assert values[-1] == pytest.approx(fitted.manifest["numbers"]["mean"]["held_out"]["psnr"])
-    assert "held-out" in psnr.title and "whole image" in ssim.lines
+    assert "novel" in psnr.title and "whole image" in ssim.lines
 
 
 def test_the_page_is_written_with_it(fitted, tmp_path):
     path = write_report(tmp_path / "report.html", Report("doll", sections=(fit_section(fitted),)))
     html = path.read_text()
-    assert "<h2>Gaussians" in html and html.count("<polyline") == 3
-    assert html.count("data:image/png") >= 9 and "http" not in html.replace("http://www.w3.org", "")
+    assert "<span>Gaussians" in html and html.count("<polyline") == 3
+    assert html.count("data:image/webp") + html.count("data:image/png") >= 9 and "http" not in html.replace(
+        "http://www.w3.org", ""
+    )
 
 
 def test_without_held_out_cameras_it_says_so(fitted):
@@ -86,7 +88,7 @@ def test_without_held_out_cameras_it_says_so(fitted):
     record = replace(fitted, manifest=manifest)
     assert "no camera is held out" in " ".join(fit_section(record).text)
     assert "training views (7)" in fit_key_numbers(record)[0].note
-    assert "held-out views (2)" in fit_key_numbers(fitted)[0].note
+    assert "novel views (2)" in fit_key_numbers(fitted)[0].note
 
 
 def test_a_fit_of_another_template_does_not_stand(fitted):
@@ -190,15 +192,15 @@ def test_the_report_of_a_build_gains_the_section_and_keeps_it(fitted, tmp_path):
         "--json",
     ]
     assert main(build) == 0
-    assert "<h2>Gaussians" not in (run / "report.html").read_text()
+    assert "<span>Gaussians" not in (run / "report.html").read_text()
     shutil.copytree(fitted.folder, run / "70_fit")
     manifest = json.loads((run / "70_fit" / "manifest.json").read_text())
     manifest["inputs"]["60_assemble/smplxpp.npz"] = sha256_file(run / "60_assemble" / "smplxpp.npz")
     (run / "70_fit" / "manifest.json").write_text(json.dumps(manifest))
     rewrite_report(run)
-    assert "<h2>Gaussians" in (run / "report.html").read_text()
+    assert "<span>Gaussians" in (run / "report.html").read_text()
     (run / "70_fit" / "manifest.json").touch()  # newer than the report: the next build writes it again
     (run / "report.html").write_text("old")
     (run / "70_fit" / "manifest.json").touch()
     assert main(build) == 0
-    assert "<h2>Gaussians" in (run / "report.html").read_text()
+    assert "<span>Gaussians" in (run / "report.html").read_text()

@@ -1,11 +1,14 @@
 """The report: complete, self-contained, and honest about what it was given."""
 
 import base64
+import io
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipelines.figures import encode_jpeg, encode_png
 from pipelines.report import (
@@ -25,7 +28,10 @@ from pipelines.report import (
     write_report,
 )
 from pipelines.report.builder import histogram_statistics, histogram_svg, timings_svg
+from pipelines.report.model import Step
+from pipelines.report.pictures import embed_pictures
 from pipelines.report.sections.evaluation import talking_section
+from pipelines.report.words import next_steps, uses_of, verdict_of
 from pipelines.runs.layout import TALKING_FILM
 from smplxpp.core import Check, InputError
 
@@ -92,7 +98,7 @@ def sample_report():
                 tables=(Table(("label", "mm", "faces"), (("upper", 0.4567, 20000), ("lower", None, 7)), "labels"),),
                 histograms=(Histogram("Scan to template", errors, gates=(("warn", 2.0),)),),
                 legend=(("hair", (255, 128, 0)),),
-                checks=checks()[:2],
+                checks=checks()[:3],
             ),
         ),
         provenance={"Configuration": {"seed": 0, "budgets": {"hair": 2000}}, "Inputs": {"scan": "ab" * 32}},
@@ -136,9 +142,65 @@ def test_the_page_holds_every_number_and_picture(page):
         "2,000 values",
     ):
         assert text in parsed.text, text
-    first = next(s for s in parsed.sources if "png" in s)
-    assert base64.b64decode(first.split(",", 1)[1]) == sample_report().hero[0].data
+    first = Image.open(io.BytesIO(base64.b64decode(parsed.sources[0].split(",", 1)[1])))
+    assert first.size == Image.open(io.BytesIO(sample_report().hero[0].data)).size
     assert parsed.tags.count("svg") == 2
+
+
+def test_pictures_are_compressed_until_the_page_can_be_mailed():
+    x, y = np.meshgrid(np.arange(600), np.arange(900))
+    waves = 127 * (1 + np.sin(np.stack([x / 3, y / 5, (x + y) / 7], -1)))
+    noise = np.random.default_rng(0).normal(0, 20, waves.shape)
+    photograph = Picture("photograph", encode_png(np.clip(waves + noise, 0, 255).astype(np.uint8)))
+    head = Picture("head", encode_png(waves[:40, :30].astype(np.uint8)), enlarged=8)
+    wide, tight = (embed_pictures([photograph, head], room=room) for room in (10_000_000, 60_000))
+    assert len(photograph.data) > 1_000_000 > len(wide[photograph].uri)
+    assert sum(len(one.uri) for one in tight.values()) <= 60_000
+    # The place on the page is that of the picture and not of its file.
+    assert (tight[photograph].width, tight[photograph].height) == (600, 900)
+    assert (tight[head].width, tight[head].height) == (240, 320)
+    pixels = Image.open(io.BytesIO(base64.b64decode(tight[head].uri.split(",")[1])))
+    np.testing.assert_array_equal(np.asarray(pixels.convert("RGB")), waves[:40, :30].astype(np.uint8))
+
+
+def test_the_page_says_first_what_the_run_can_be_used_for_and_what_to_type(tmp_path):
+    def row(name, status, stage, value=1.0):
+        return CheckRow(name, value, "dB", status, ">= 22 (fail beyond 17) dB", stage=stage)
+
+    shape = row("template to scan, upper: mean", "fail", "65_validate")
+    moves = row("edge stretch p99.9, hard poses", "pass", "65_validate")
+    trained = row("novel poses: PSNR of the person", "pass", "90_compensate", 18.8)
+    purposes = {use.purpose: use for use in uses_of([shape, moves, trained])}
+    assert [use.status for use in purposes.values()] == ["pass", "fail", "warn"]
+    assert "held-out views yet" in purposes["show its student in new poses"].words
+    measured = row("student, novel poses: PSNR of the person", "warn", "95_evaluate", 18.8)
+    uses = uses_of([shape, moves, trained, measured])
+    assert "PSNR of the person is 18.8 dB" in {use.purpose: use for use in uses}["show its student in new poses"].words
+    said = verdict_of("template", [shape, moves, trained, measured], uses)
+    assert said == (
+        "This template can be used to pose, animate and export it. With care also to show its student in new poses. "
+        "It cannot be relied on to measure the person on it. One check failed."
+    )
+    # Commands have the paths of the run and are safe to paste.
+    run = tmp_path / "a run"
+    (run / "05_register").mkdir(parents=True)
+    (run / "05_register" / "params.npz").touch()
+    steps = next_steps(run, capture=tmp_path / "capture", checks=[shape])
+    assert all(f"'{run}" in step.command for step in steps)
+    assert f"--params '{run}/05_register/params.npz'" in " ".join(step.command for step in steps)
+    assert f"smplxpp train '{run}' --capture {tmp_path}/capture" in [step.command for step in steps]
+    page = Page(write_report(tmp_path / "report.html", replace(sample_report(), uses=uses, steps=steps)).read_text())
+    assert page.text.index("This template can be used") < page.text.index("0.62 mm") < page.text.index("a click opens")
+    assert Step("look at the layers in the browser", f"smplxpp view '{run}'") in steps and "smplxpp view" in page.text
+
+
+def test_stages_are_folded_and_pictures_come_when_they_are_looked_at(page):
+    parsed, path = page
+    html = path.read_text()
+    assert html.count('<details class="stage"') == 3 + 4
+    assert re.findall(r'id="(s\d)" open>', html) == ["s3"]  # the stage with a failed check
+    assert html.count("<img ") == html.count('loading="lazy"') + 1  # the enlarged one has no source yet
+    assert "Chamfer" not in parsed.text and "99.9" not in parsed.text  # of the glossary what the page uses
 
 
 def test_markup_in_names_stays_text(tmp_path):
@@ -194,8 +256,8 @@ def test_check_rows_come_from_checks_and_from_manifests_alike():
 
 
 def test_pictures_and_tables_are_checked():
-    with pytest.raises(InputError, match="PNG or JPEG"):
-        _ = Picture("x", b"GIF89a").uri
+    with pytest.raises(InputError, match="PNG, JPEG or WebP"):
+        embed_pictures([Picture("x", b"GIF89a")], room=100)
     with pytest.raises(InputError, match="2 cells"):
         Table(("a", "b"), ((1,),))
 

@@ -81,8 +81,8 @@ def test_files_and_figures_of_every_stage(trained, stage):
     for kind in ("novel_view", "novel_pose"):
         assert 3 < numbers[kind]["psnr"] < 60 and 3 < numbers["start"][kind]["psnr"] < 60
     assert {c["name"] for c in manifest["checks"]} >= {
-        "held-out views: PSNR of the person",
-        "held-out poses: SSIM",
+        "novel views: PSNR of the person",
+        "novel poses: SSIM",
         "iterations done",
     }
     real, rendered, _ = read_strip(folder / "previews" / "Held0_000004.png")

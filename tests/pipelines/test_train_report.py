@@ -59,7 +59,7 @@ def test_every_training_has_a_section_with_its_figures(run):
         table = section.tables[0]
         states = ["start", "after 3 iterations", *(["the compact file"] if stage == "90_compensate" else [])]
         assert [row[:2] for row in table.rows] == [
-            (kind, state) for kind in ("held-out views", "held-out poses") for state in states
+            (kind, state) for kind in ("novel views", "novel poses") for state in states
         ]
         assert table.rows[1][2] == numbers["novel_view"]["psnr"]
         assert {check.stage for check in section.checks} == {stage}
@@ -75,8 +75,8 @@ def test_curves_follow_evaluations_and_steps(own):
     lines += [{"kind": "step", "iteration": k, "seconds": 0.1 * k, "loss": 1.0 / k} for k in range(1, 1001)]
     (own / "85_bake" / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     psnr, ssim, loss = training_section(standing(own)["85_bake"]).curves
-    np.testing.assert_array_equal(psnr.lines["held-out views"], ([0.0, 2.0, 4.0], [20.0, 21.0, 22.0]))
-    assert set(ssim.lines) == {"held-out views"}
+    np.testing.assert_array_equal(psnr.lines["novel views"], ([0.0, 2.0, 4.0], [20.0, 21.0, 22.0]))
+    assert set(ssim.lines) == {"novel views"}
     seconds, values = loss.lines["training"]
     assert len(seconds) == len(values) == 300 and (np.diff(seconds) > 0).all() and (np.diff(values) < 0).all()
 
@@ -101,7 +101,7 @@ def test_a_log_with_foreign_figures_is_told(own):
 def test_key_numbers_are_those_of_a_training(run):
     records = standing(run)
     names = [number.label for number in training_key_numbers(records["90_compensate"])]
-    assert names == ["student, held-out views", "student, held-out poses"]
+    assert names == [f"student, novel {kind}: PSNR of the person" for kind in ("views", "poses")]
     assert training_key_numbers(records["80_teacher"])[0].value == (
         f"{records['80_teacher'].manifest['numbers']['novel_view']['psnr']:.1f} dB"
     )
@@ -152,8 +152,8 @@ def test_the_page_is_written(run, tmp_path):
 
 
 def test_names_and_spread():
-    assert kind_name("novel_view", held_out=True) == "held-out views"
+    assert kind_name("novel_view", held_out=True) == "novel views"
     assert kind_name("novel_view", held_out=False) == "training views"
-    assert kind_name("novel_pose", held_out=False) == "held-out poses"
+    assert kind_name("novel_pose", held_out=False) == "novel poses"
     assert spread([], 3) == [] and spread([5], 3) == [5]
     assert spread(range(10), 3) == [0, 4, 9] and spread(range(2), 4) == [0, 1]

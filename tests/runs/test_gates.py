@@ -16,6 +16,8 @@ STAGES = Path(gates.__file__).parents[1] / "stages"
     [
         (gates.PSNR["novel_view"], 18.0, 17.9, 15.9),
         (gates.PSNR["novel_pose"], 17.0, 16.9, 14.9),
+        (gates.LIKENESS["novel_view"], 24.0, 23.9, 19.9),
+        (gates.LIKENESS["novel_pose"], 22.0, 21.9, 16.9),
         (gates.SSIM, 0.9, 0.89, 0.74),
         (gates.LOST_BY_COMPRESSION, 0.3, 0.31, 2.1),
         (gates.AGAINST_SKINNING, 1.0, 1.01, 1.6),

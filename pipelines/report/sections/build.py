@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from pipelines.figures import body_cameras, encode_jpeg, render_shaded
@@ -10,6 +11,7 @@ from pipelines.report import CheckRow, KeyNumber, Picture, Report, Section, writ
 from pipelines.report.builder import readable, readable_numbers
 from pipelines.report.sections.evaluation import (
     evaluation_figures,
+    evaluation_hero,
     evaluation_key_numbers,
     evaluation_views,
     relight_section,
@@ -37,6 +39,7 @@ from pipelines.report.sections.training import (
     training_key_numbers,
     training_section,
 )
+from pipelines.report.words import next_steps, uses_of
 from pipelines.runs import layout
 from pipelines.runs.artefacts import load_params_of_run, load_scan, values_of
 from pipelines.runs.code import versions
@@ -57,7 +60,9 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.stage import MANIFEST, StageRecord, require_stage
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, stages_of
+from pipelines.stages.run_inputs import capture_of_build
 from smplxpp.body import load_body
+from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.template.template import Template
@@ -149,13 +154,14 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         *readable_numbers(checked, lambda: _distances(checked)),
         KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
         KeyNumber(
-            "scan to template",
+            "time of the template",
             f"{sum(seconds[name] for name in TEMPLATE_STAGES):.1f} s",
             "all stages of the template, validation included",
         ),
         *_numbers(poses, refinement_key_numbers),
         *_numbers(fit, fit_key_numbers),
-        *_numbers(next(reversed(trainings.values()), None), training_key_numbers),
+        # An evaluation measures the same figure on more views than a training does.
+        *_numbers(next(reversed(trainings.values()), None) if evaluation is None else None, training_key_numbers),
         *_numbers(evaluation, evaluation_key_numbers),
     ]
     inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}
@@ -163,11 +169,14 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     report = Report(
         subject=inputs.subject,
         summary="A personalised clothed template (SMPLX++) from one scan, measured at every stage.",
+        uses=uses_of(checks),
+        steps=next_steps(run, capture=capture_of_build(run, inputs), checks=checks),
         hero=(
             Picture(
                 "the template in the reference pose",
                 encode_jpeg(render_shaded(posed, front, vertex_colors=template.vertex_colors)),
             ),
+            *(() if evaluation is None else _hero(evaluation)),
         ),
         key_numbers=tuple(key_numbers),
         checks=tuple(checks),
@@ -181,6 +190,13 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         },
     )
     return write_report(run / "report.html", report)
+
+
+def _hero(evaluation: StageRecord) -> tuple[Picture, ...]:
+    """The student beside a photograph; nothing where the evaluation cannot be read, which its sections say."""
+    with suppress(InputError), values_of(evaluation):
+        return evaluation_hero(evaluation)
+    return ()
 
 
 def _trained(record: StageRecord) -> Section:
@@ -202,7 +218,9 @@ def _distances(record: StageRecord) -> tuple[KeyNumber, ...]:
     clothes = record.manifest["numbers"]["template_vs_scan"]["labels"]
     return tuple(
         KeyNumber(
-            f"{label.name} to scan", f"{clothes[label.name]['pred_to_gt']['mean']:.2f} mm", "mean, visible surface"
+            f"template to scan, {label.name}: mean",
+            f"{clothes[label.name]['pred_to_gt']['mean']:.2f} mm",
+            "visible surface",
         )
         for label in CLOTH_LABELS
         if clothes.get(label.name, {}).get("pred_to_gt")

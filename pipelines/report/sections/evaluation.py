@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from avatar.evaluation.input_protocol import InputProtocol, counted
-from pipelines.figures import encode_jpeg, encode_png, row
-from pipelines.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, enlarge, error_colors, error_legend, read_tiles
+from pipelines.figures import encode_png, row
+from pipelines.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, error_colors, error_legend, read_tiles
 from pipelines.report import CheckRow, Comparison, Film, KeyNumber, Picture, Section, Table
 from pipelines.report.sections.fit import HEAD_HEIGHT, head_box
 from pipelines.runs.code import sha256_file
@@ -51,8 +51,8 @@ def evaluation_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
     figures, out = models[name], []
     for part, title in zip(HELD_OUT_VIEWS, ("novel views", "novel poses"), strict=True):
         if figures.get(f"{part}.psnr") is not None:
-            note = f"{name}, SSIM {figures[f'{part}.ssim']:.3f}, {_counted(record.manifest['numbers'], part)}"
-            out.append(KeyNumber(title, f"{figures[f'{part}.psnr']:.1f} dB", note))
+            note = f"SSIM {figures[f'{part}.ssim']:.3f}, {_counted(record.manifest['numbers'], part)}"
+            out.append(KeyNumber(f"{name}, {title}: PSNR of the person", f"{figures[f'{part}.psnr']:.1f} dB", note))
     if figures.get("fps") is not None:
         out.append(KeyNumber("pictures a second", f"{figures['fps']:.1f}", f"{name}, deform and render"))
     return tuple(out)
@@ -133,21 +133,33 @@ def _view_pictures(
     if shown["head"] is not None:
         x0, y0, x1, y1 = head_box(shown["head"], truth)
         factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
-        crops = [enlarge(image[y0:y1, x0:x1], factor) for image in (truth, *rendered)]
-        picture = encode_jpeg(_with_errors(crops[0], crops[1:]), quality=92)
-        out.append(Picture(f"{shown['title']}, head, {factor} times enlarged", picture))
+        crops = [image[y0:y1, x0:x1] for image in (truth, *rendered)]
+        picture = encode_png(_with_errors(crops[0], crops[1:], gap=1))
+        out.append(Picture(f"{shown['title']}, head, {factor} times enlarged", picture, enlarged=factor))
     return out
 
 
 def _with_errors(
-    truth: UInt8[np.ndarray, "H W 3"], rendered: list[UInt8[np.ndarray, "H W 3"]]
+    truth: UInt8[np.ndarray, "H W 3"], rendered: list[UInt8[np.ndarray, "H W 3"]], *, gap: int = 12
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Photograph and renderings in a row, errors under the renderings."""
+    """Photograph and renderings in a row, errors under the renderings, `gap` pixels between them."""
     blank = np.full_like(truth, 255)
-    errors = row([blank, *(error_colors(truth, image) for image in rendered)])
-    images = row([truth, *rendered])
-    gap = np.full((12, images.shape[1], 3), 255, np.uint8)
-    return np.concatenate([images, gap, errors])
+    errors = row([blank, *(error_colors(truth, image) for image in rendered)], gap=gap)
+    images = row([truth, *rendered], gap=gap)
+    return np.concatenate([images, np.full((gap, images.shape[1], 3), 255, np.uint8), errors])
+
+
+def evaluation_hero(record: StageRecord) -> tuple[Picture, ...]:
+    """The first view of new poses, else of new cameras, as photograph and as the last model draws it."""
+    numbers = record.manifest["numbers"]
+    sets = [shown["set"] for shown in numbers["views"]]
+    chosen = next((name for name in reversed(HELD_OUT_VIEWS) if name in sets), None)
+    if chosen is None:
+        return ()
+    models = list(numbers["models"])
+    shown = numbers["views"][sets.index(chosen)]
+    truth, rendered = read_tiles(_named(record, shown["file"]), len(models))
+    return (Picture(f"{shown['title']}: photograph, {models[-1]}", encode_png(row([truth, rendered[-1]]))),)
 
 
 def _listed(names: list[str]) -> str:
@@ -185,7 +197,8 @@ def relight_section(record: StageRecord) -> Section:
     )
 
 
-_MOST_BYTES = 3_000_000
+_MOST_BYTES = 1_000_000
+"""A film of more bytes is left out: base64 makes it a third of the page that `pipelines.report.pictures` allows."""
 
 
 def talking_section(run: Path) -> tuple[Section, ...]:

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from avatar.training.engine.metrics_log import read_metrics
 from pipelines.figures import encode_png, row
-from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_legend, read_strip
+from pipelines.figures.comparison import ERROR_LIMIT, error_legend, read_strip
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import FIT_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
@@ -36,8 +36,8 @@ def fit_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
     numbers = record.manifest["numbers"]
     which, names = _shown(numbers)
     figures = numbers["mean"][which]
-    note = f"{'held-out' if which == 'held_out' else 'training'} views ({len(names)}), SSIM {figures['ssim']:.3f}"
-    return (KeyNumber("Gaussians to photographs", f"{figures['psnr']:.1f} dB", note),)
+    note = f"{'novel' if which == 'held_out' else 'training'} views ({len(names)}), SSIM {figures['ssim']:.3f}"
+    return (KeyNumber("one frame's Gaussians: PSNR of the person", f"{figures['psnr']:.1f} dB", note),)
 
 
 def fit_section(record: StageRecord) -> Section:
@@ -94,8 +94,8 @@ def _head_picture(name: str, parts: tuple[UInt8[np.ndarray, "H W 3"], ...], box:
     x0, y0, x1, y1 = head_box(box, parts[0])
     # Enlarge by whole numbers, so that pixels stay sharp squares.
     factor = max(1, round(HEAD_HEIGHT / (y1 - y0)))
-    crops = [enlarge(part[y0:y1, x0:x1], factor) for part in parts]
-    return Picture(f"{name}, head, {factor} times enlarged: photograph, rendered, error", encode_png(row(crops)))
+    crops = encode_png(row([part[y0:y1, x0:x1] for part in parts], gap=1))
+    return Picture(f"{name}, head, {factor} times enlarged: photograph, rendered, error", crops, enlarged=factor)
 
 
 def head_box(value: Any, image: UInt8[np.ndarray, "H W 3"]) -> tuple[int, int, int, int]:
@@ -118,7 +118,7 @@ def _table(numbers: dict[str, Any]) -> Table:
             rows.append((name, label, *(figures[key] for key in _FIGURES)))
         if numbers[which]:
             rows.append(("mean", label, *(numbers["mean"][which].get(key) for key in _FIGURES)))
-    header = ("camera", "views", "PSNR person, dB", "PSNR image, dB", "SSIM", "PSNR head, dB")
+    header = ("camera", "views", "PSNR of the person, dB", "of the image", "SSIM", "PSNR of the head, dB")
     return Table(header, tuple(rows), "figures by camera")
 
 
@@ -135,7 +135,7 @@ def _curves(path: Path) -> tuple[Curve, ...]:
         if all(entry["mean"].get(key) is not None for entry in found)
     }
     # A capture that holds nothing out is evaluated on training views, and the title states it.
-    which = "held-out" if found[0]["held_out"] else "training"
+    which = "novel" if found[0]["held_out"] else "training"
     ssim = {"whole image": (seconds, np.array([entry["mean"]["ssim"] for entry in found]))}
     return (
         Curve(f"PSNR of the {which} views", lines, "seconds", "dB"),

@@ -210,7 +210,7 @@ def fidelity_section(
         values = errors["template_to_scan"]["distance_mm"][errors["template_to_scan"]["label"] == label.id]
         if len(values) and label.id:
             gates = (("mean gate", 1.0), ("p95 gate", 3.0)) if label in CLOTH_LABELS else ()
-            histograms.append(Histogram(f"{label.name}: template to scan", values, gates=gates))
+            histograms.append(Histogram(f"template to scan, {label.name}", values, gates=gates))
     back = errors["scan_to_template"]
     histograms.append(Histogram("scan to template, all labels", back["distance_mm"]))
     # Runs from before the check have none.

@@ -28,7 +28,7 @@ from smplxpp.core.spread import spread
 
 SHOWN_VIEWS = 4
 CURVE_POINTS = 300
-_FIGURES = {"psnr": "PSNR person, dB", "psnr_image": "PSNR image, dB", "ssim": "SSIM"}
+_FIGURES = {"psnr": "PSNR of the person, dB", "psnr_image": "of the image", "ssim": "SSIM"}
 _TITLES = {
     TEACHER_STAGE: ("Teacher", "Networks on maps of the posed mesh give every Gaussian its residuals in every pose."),
     BAKE_STAGE: (
@@ -75,7 +75,7 @@ def training_key_numbers(record: StageRecord) -> tuple[KeyNumber, ...]:
     who = "teacher" if record.folder.name == TEACHER_STAGE else "student"
     return tuple(
         KeyNumber(
-            f"{who}, {kind_name(kind, held_out=numbers['held_out_cameras'])}",
+            f"{who}, {kind_name(kind, held_out=numbers['held_out_cameras'])}: PSNR of the person",
             f"{numbers[kind]['psnr']:.1f} dB",
             f"SSIM {numbers[kind]['ssim']:.3f}",
         )
