@@ -32,6 +32,7 @@ class BvhMotion:
         fps: frames a second.
         positions: position relative to its parent of every other joint that has position channels, which replace its
             offset, by the joint's index.
+        tips: offset of the end site of every joint that has one, by the joint's index.
     """
 
     names: tuple[str, ...]
@@ -41,6 +42,7 @@ class BvhMotion:
     root: Float64[np.ndarray, "T 3"]
     fps: float
     positions: Mapping[int, Float64[np.ndarray, "T 3"]] = field(default_factory=dict)
+    tips: Mapping[int, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
 
     @property
     def rest(self) -> Float64[np.ndarray, "J 3"]:
@@ -74,6 +76,7 @@ class _Reader:
         self._parents: list[int] = []
         self._offsets: list[list[float]] = []
         self._channels: list[list[str]] = []
+        self._tips: dict[int, Float64[np.ndarray, " 3"]] = {}
         if self._words[:2] != ["HIERARCHY", "ROOT"] or not found:
             raise InputError(subject, expected=_EXPECTED, received=text[:40].strip() or "nothing")
 
@@ -102,7 +105,7 @@ class _Reader:
                     positions[joint] = place
         parents, offsets = np.array(self._parents, dtype=np.int64), np.array(self._offsets, dtype=np.float64)
         _add_offsets(positions, offsets)
-        return BvhMotion(tuple(self._names), parents, offsets, rotations, root, fps, positions)
+        return BvhMotion(tuple(self._names), parents, offsets, rotations, root, fps, positions, self._tips)
 
     def _skeleton(self) -> None:
         """Parse the hierarchy; `open_joints` is the stack of braces, None for end sites."""
@@ -134,6 +137,8 @@ class _Reader:
                 offset = [self._number(self._next()) for _ in range(3)]
                 if current is not None:
                     self._offsets[current] = offset
+                elif joints := [joint for joint in open_joints if joint is not None]:
+                    self._tips[joints[-1]] = np.array(offset)
             elif word == "CHANNELS" and current is not None:
                 count = self._next()
                 names = [self._next() for _ in range(int(count))] if count in "0123456" else [count]

@@ -2,80 +2,140 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from smplxpp.body.bvh import BvhMotion, read_bvh
 from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.body.rest_pose import (
+    CHILD,
+    FINGER_JOINTS,
+    OURS,
+    lies_along,
+    reference_pose,
+    rest_rotation,
+    sides_are_exchanged,
+    trunk_rotations,
+    turned_to,
+    up_axis,
+    upright_rotation,
+)
 from smplxpp.body.retarget import FEET, Skeleton, held_feet
+from smplxpp.body.skeleton_match import SIDES, Tree, match_joints, spine_of
 from smplxpp.core import BodyParams, GeometryWarning, InputError, rotvec_from_matrix
 from smplxpp.core.files.json_file import as_object, as_text, read_json
 
-_FINGERS = SMPLX_JOINTS[25:]
-OURS = (*SMPLX_JOINTS[:22], *_FINGERS)
-"""Joints that a motion can rotate: those of the body and of the fingers."""
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
 NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in _LIMBS))
-# Names that other programs use for our joints, in lower case without blanks, dashes and prefixes; `S` stands for left
-# or right, or l or r. The first name that a file has is taken.
-_MIDDLE = {
-    "pelvis": "hips hip pelvis root bip01 bip01pelvis",
-    "spine1": "spine lowerback spine01 abdomen bip01spine chest torso",
-    "spine2": "spine1 spine02 chest2 bip01spine1 chestlower",
-    "spine3": "spine2 spine03 chest3 upperchest bip01spine2 chestupper chest4",
-    "neck": "neck neck1 neck01 bip01neck",
-    "head": "head bip01head",
-}
-_SIDES = {
-    "hip": "Supleg Shipjoint Sthigh thighS Supperleg Ship",
-    "knee": "Sleg Sshin calfS Slowleg Slowerleg Sknee Scalf",
-    "ankle": "Sankle Sfoot footS",
-    "foot": "Stoebase Stoe ballS Stoes Stoe0 Sball Sfoot footS",
-    "collar": "Scollar clavicleS Sclavicle Sshoulder",
-    "shoulder": "Sarm Sshldr upperarmS Suparm Supperarm Sshoulder",
-    "elbow": "Sforearm lowerarmS Slowarm Slowerarm Selbow",
-    "wrist": "Swrist Shand handS",
-}
-# Bones of a finger are numbered from the hand: in the patterns of Mixamo and CMU, Unreal, Poser, and DAZ.
-_FINGER_NAMES = {
-    "index": ["index"],
-    "middle": ["middle", "mid"],
-    "pinky": ["pinky", "little"],
-    "ring": ["ring"],
-    "thumb": ["thumb"],
-}
-_FINGER_PATTERNS = ("Shand{finger}{bone}", "{finger}0{bone}S", "S{finger}{bone}", "{finger}{bone}S")
-_SIDE_NAMES = {"left": ("left", "l"), "right": ("right", "r")}
-_FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
-_CHILD = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
+# The joint of ours up to which a joint moves the file's bones.
+_NEXT = {**CHILD, "collar": "shoulder", "ankle": "foot", "neck": "head"}
 _STRETCH = 0.02  # largest change of a bone's length, as a share: the rounding of files is below
-_CHILD |= {f"{finger}{bone}": f"{finger}{bone + 1}" for finger in _FINGER_NAMES for bone in (1, 2)}
+_TURNS = np.radians(2.0)  # a joint that turns less in its parent's frame, over all frames, is still
+_NAMED = 12  # joints that a warning names
 
 
-def load_bvh(path: str | Path, body: Skeleton, *, joint_map: Mapping[str, str] | None = None) -> BodyParams:
+@dataclass(frozen=True)
+class MatchedSkeleton:
+    """What of a file's skeleton was understood.
+
+    Attributes:
+        joints: index of the file's joint for each of ours.
+        taken: names of the file's joints whose turns each of ours takes over; "spine" where its joints are shared out.
+        left_out: joints of the file that turn and that the body has not.
+        up: axis that points up, as "y" or "-z".
+        frame: the frame that stands for the rest pose; None: the rest pose does.
+        leg: length of a leg in the file's unit.
+    """
+
+    joints: dict[str, int]
+    taken: dict[str, tuple[str, ...]]
+    left_out: tuple[str, ...]
+    up: str
+    frame: int | None
+    leg: float
+
+
+def load_bvh(
+    path: str | Path,
+    body: Skeleton,
+    *,
+    joint_map: Mapping[str, str] | None = None,
+    up: str | None = None,
+    fps: float | None = None,
+) -> BodyParams:
     """Read a BVH motion for a body: limbs point where the file's do, and steps are scaled by the length of the legs.
 
     Args:
         path: of the file.
         body: skeleton that shall move.
-        joint_map: our name for each of the file's names; None for the known names.
+        joint_map: our name for each of the file's names; None: joints are found in the hierarchy.
+        up: axis that points up, as "y" or "-z"; None: that along which the skeleton stands.
+        fps: frames a second; None: as the file says.
 
     Raises:
         InputError: what `read_bvh` refuses, or required joints that are missing.
 
     Warns:
-        GeometryWarning: bones below the pelvis that change their length.
+        GeometryWarning: bones below the pelvis that change their length; joints that turn and that the body has not; a
+            skeleton whose frames stand along another axis than its rest pose.
     """
     motion = read_bvh(path)
-    found = named_joints(motion.names, joint_map, parents=motion.parents, subject=f"motion {path}")
-    _warn_of_stretching(motion, found, str(path))
-    return bvh_params(motion, found, body)
+    motion = motion if fps is None else replace(motion, fps=fps)
+    joints = named_joints(motion, joint_map, subject=f"motion {path}")
+    found = matched_skeleton(motion, joints, up=up)
+    _warn_of_stretching(motion, joints, str(path))
+    if found.left_out:
+        more = f" and {len(found.left_out) - _NAMED} more" if len(found.left_out) > _NAMED else ""
+        warnings.warn(
+            f"{path}: joints that turn and that the body has not are left out: "
+            f"{', '.join(found.left_out[:_NAMED])}{more}",
+            GeometryWarning,
+            stacklevel=2,
+        )
+    if up is None and (other := lies_along(reference_pose(motion, joints), joints)):
+        warnings.warn(
+            f"{path}: the skeleton stands along {found.up} at rest, and along {other} in its frames: if that is no "
+            f"person who lies, say up {other} (--up)",
+            GeometryWarning,
+            stacklevel=2,
+        )
+    return bvh_params(motion, joints, body, up=up)
+
+
+def matched_skeleton(motion: BvhMotion, joints: Mapping[str, int], *, up: str | None = None) -> MatchedSkeleton:
+    """Return which of a file's joints each of ours takes over, and what else was understood of its skeleton.
+
+    Args:
+        motion: the file's skeleton and motion.
+        joints: as `named_joints` returns them.
+        up: axis that points up; None: that along which the skeleton stands.
+    """
+    reference = reference_pose(motion, joints)
+    tree = Tree(motion.names, motion.parents, reference.rest)
+    taken = {name: tuple(motion.names[k] for k in _path(tree, joints, name)) for name in joints}
+    if not any(f"spine{k}" in joints for k in (1, 2, 3)):
+        taken["spine"] = tuple(motion.names[k] for k in spine_of(tree, joints))
+    # Turns of joints above those that are matched are composed into them; of all others those that move are left out.
+    carried = {above for joint in joints.values() for above in tree.above(joint)}
+    moved = Rotation.from_matrix(
+        (np.swapaxes(motion.rotations[:1], 2, 3) @ motion.rotations).reshape(-1, 3, 3)
+    ).magnitude()
+    turning = moved.reshape(len(motion.root), -1).max(axis=0) > _TURNS
+    left_out = tuple(name for k, name in enumerate(motion.names) if turning[k] and k not in carried)
+    return MatchedSkeleton(
+        joints=dict(joints),
+        taken=taken,
+        left_out=left_out,
+        up=up or up_axis(reference.rest, joints),
+        frame=reference.frame,
+        leg=_leg(reference.rest, joints),
+    )
 
 
 def _warn_of_stretching(motion: BvhMotion, joints: Mapping[str, int], source: str) -> None:
@@ -115,25 +175,23 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
 
 
 def named_joints(
-    names: tuple[str, ...],
-    joint_map: Mapping[str, str] | None,
-    *,
-    parents: Sequence[int] | Int64[np.ndarray, " J"] = (),
-    subject: str = "motion",
+    motion: BvhMotion, joint_map: Mapping[str, str] | None = None, *, subject: str = "motion"
 ) -> dict[str, int]:
     """Return the index of the file's joint for each of our joints that it has.
 
     Args:
-        names: the file's joints.
-        joint_map: our name for each of the file's names; None for the names that other programs use.
-        parents: index of each joint's parent, -1 for the root. With it the spine is read off the skeleton, because
-            programs count its joints from 0, from 1, or not at all. Empty: names decide.
+        motion: the file's skeleton and motion.
+        joint_map: our name for each of the file's names, which decides alone. None: our own names, which our writer
+            uses, else joints found in the hierarchy (`smplxpp.body.skeleton_match`).
         subject: the file, for messages.
 
     Raises:
         InputError: a required joint is missing.
+
+    Warns:
+        GeometryWarning: sides that the feet contradict, which are exchanged.
     """
-    # A map of the user decides alone; else our own names, which our writer uses; else the names of other programs.
+    names = motion.names
     if joint_map is not None:
         unknown = [name for name in joint_map if name not in names]
         if unknown:
@@ -144,8 +202,11 @@ def named_joints(
     elif all(name in names for name in NEEDED):
         found = {name: names.index(name) for name in OURS if name in names}
     else:
-        found = _known(names)
-        found |= _spine(found, parents)
+        found = match_joints(names, motion.parents, motion.rest)
+        if all(name in found for name in NEEDED):
+            # Where the rest pose is no person, what lies left and right is looked for in a frame that stands.
+            pose = reference_pose(motion, found)
+            found = found if pose.frame is None else match_joints(names, motion.parents, pose.rest)
     missing = [name for name in NEEDED if name not in found]
     if missing:
         raise InputError(
@@ -154,94 +215,154 @@ def named_joints(
             received=f"none for {', '.join(missing)}, among {', '.join(names)}"[:600],
             remedy='name them with --joint-map FILE, JSON as {"LeftUpLeg": "left_hip", ...}',
         )
+    if joint_map is None and sides_are_exchanged(reference_pose(motion, found), found):
+        warnings.warn(
+            f"{subject}: what is named left lies on the right of where the feet point: taken by place",
+            GeometryWarning,
+            stacklevel=3,
+        )
+        other = {"left": "right", "right": "left"}
+        found = {"_".join(other.get(word, word) for word in name.split("_")): k for name, k in found.items()}
     return found
 
 
-def _known(names: tuple[str, ...]) -> dict[str, int]:
-    """Match joints by the names that other programs use."""
-    # Names without name space ("mixamorig:"), separators and case.
-    plain = [re.sub(r"[\s_.\-]", "", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
-    found: dict[str, int] = {}
-
-    def take(ours: str, words: list[str]) -> None:
-        for word in words:
-            if word in plain and plain.index(word) not in found.values():
-                found[ours] = plain.index(word)
-                return
-
-    for ours, words in _MIDDLE.items():
-        take(ours, words.split())
-    for side, spoken in _SIDE_NAMES.items():
-        # The shoulder comes first: a joint of that name is a collar if the file also has an arm.
-        for part in ("shoulder", *(name for name in _SIDES if name != "shoulder")):
-            take(f"{side}_{part}", [word.replace("S", one) for one in spoken for word in _SIDES[part].split()])
-        for finger, called in _FINGER_NAMES.items():
-            for bone in (1, 2, 3):
-                patterns = [p.format(finger=one, bone=bone) for one in called for p in _FINGER_PATTERNS]
-                take(f"{side}_{finger}{bone}", [p.replace("S", one) for one in spoken for p in patterns])
-    return found
-
-
-def _spine(found: Mapping[str, int], parents: Sequence[int] | Int64[np.ndarray, " J"]) -> dict[str, int]:
-    """Return the first, a middle and the last of the three or more joints between pelvis and neck; else none."""
-    if not len(parents) or not {"pelvis", "neck"} <= found.keys():
-        return {}
-    chain, joint = [], int(parents[found["neck"]])
-    while joint >= 0 and joint != found["pelvis"]:
-        chain.append(joint)
-        joint = int(parents[joint])
-    if joint < 0 or len(chain) < 3:
-        return {}
-    chain.reverse()
-    return {"spine1": chain[0], "spine2": chain[len(chain) // 2], "spine3": chain[-1]}
-
-
-def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton) -> BodyParams:
+def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton, *, up: str | None = None) -> BodyParams:
     """Return the parameters of a body that moves as the skeleton does.
 
     A joint's rotation in world coordinates is the file's, times the rotation from our rest pose to the file's. For
     hips, knees, shoulders, elbows and fingers this is the smallest rotation between the directions of their bones; for
-    all others it is the rotation between the trunks. So arms that hang in the file's rest pose hang here too. Fingers
-    that the file lacks follow their hands or, if it has none at all, stay at rest. Translations are scaled by the ratio
-    of the legs' lengths, which also converts units. The lowest foot is put at the height of the feet at rest, and the
-    first frame above the origin.
+    all others it is the rotation between the trunks. So arms that hang in the file's rest pose hang here too. Turns of
+    joints that we have not (twists, more bones of spine and neck) are composed into those that we have: a bone of ours
+    takes the mean of the turns along the file's bones that it stands for, weighted by their lengths, and limbs then
+    point where the file's do. Fingers that the file lacks follow their hands or, if it has none at all, stay at rest.
+    Translations are scaled by the ratio of the legs' lengths, which also converts units. The lowest foot is put at the
+    height of the feet at rest, and the first frame above the origin.
     """
-    # Rotations of the file in world coordinates, and the rotations between both rest poses.
-    world = _in_world(motion)
-    rest = motion.rest
-    trunk = _trunk(rest, joints, body)
-    upright = _upright(rest, joints)
-    pose = np.zeros((len(world), len(SMPLX_JOINTS), 3))
+    # Turns of the file in the world, and the rotations between both rest poses.
+    reference = reference_pose(motion, joints)
+    rest, places = reference.rest, reference.places
+    trunks = trunk_rotations(reference, joints, body)
+    upright = upright_rotation(up or up_axis(rest, joints))
+    turns = _turns(reference.turns, Tree(motion.names, motion.parents, rest), joints, body)
+    pose = np.zeros((len(places), len(SMPLX_JOINTS), 3))
     away: dict[str, Float64[np.ndarray, "3 3"]] = {}
     whole: dict[str, Float64[np.ndarray, "T 3 3"]] = {}
     # Parents before children; without a face, and fingers only if the file has some.
-    fingers = any(name in joints and name in body.names for name in _FINGERS)
+    fingers = any(name in joints and name in body.names for name in FINGER_JOINTS)
     for name in OURS if fingers else OURS[:22]:
         k = body.at(name)[0]
         above = body.names[body.parents[k]] if body.parents[k] >= 0 else ""
-        parent = whole.get(above, np.broadcast_to(np.eye(3), (len(world), 3, 3)))
+        parent = whole.get(above, np.broadcast_to(np.eye(3), (len(places), 3, 3)))
         whole[name] = parent
-        if name in joints:
-            away[name] = _rest_rotation(name, rest, joints, body, away.get(above, trunk) if name in _FINGERS else trunk)
-            whole[name] = upright @ world[:, joints[name]] @ away[name]
+        if name in turns:
+            away[name] = rest_rotation(
+                name, rest, joints, body, away.get(above, trunks[name]) if name in FINGER_JOINTS else trunks[name]
+            )
+            whole[name] = upright @ turns[name] @ away[name]
+            # Bones between that bend, or that stretch, must not change where the limb points.
+            side, _, part = name.rpartition("_")
+            end = f"{side}_{CHILD.get(part)}"
+            if part in _LIMBS and end in joints:
+                own = body.places[body.at(end)[0]] - body.places[k]
+                theirs = (places[:, joints[end]] - places[:, joints[name]]) @ upright.T
+                whole[name] = turned_to(whole[name] @ own, theirs) @ whole[name]
         pose[:, SMPLX_JOINTS.index(name)] = rotvec_from_matrix(np.swapaxes(parent, 1, 2) @ whole[name])
     params = BodyParams.from_full_pose(
         pose, betas=np.zeros(0), expression=np.zeros(0), transl=np.zeros(3), flat_hand_mean=fingers
     )
-    return _placed(replace(params, fps=motion.fps), motion, joints, body, upright)
+    params = replace(params, fps=motion.fps)
+    return _placed(params, places @ upright.T, body.leg / _leg(rest, joints), joints, body)
+
+
+def _turns(
+    world: Float64[np.ndarray, "T J 3 3"],
+    tree: Tree,
+    joints: Mapping[str, int],
+    body: Skeleton,
+) -> dict[str, Float64[np.ndarray, "T 3 3"]]:
+    """Return the turn of the file, in the world, that each of our joints takes over."""
+    turns = {}
+    for name, joint in joints.items():
+        path = _path(tree, joints, name)
+        if len(path) < 2:
+            turns[name] = world[:, joint]
+            continue
+        ends = [*path[1:], joints[_next(name)]]
+        turns[name] = _mean_turn(world, path, [tree.length([a, b]) for a, b in zip(path, ends, strict=True)])
+    if not any(f"spine{k}" in joints for k in (1, 2, 3)):
+        turns |= _spine_turns(world, tree, joints, body)
+    # Without a collar the shoulder hangs on a joint whose turn the collar's is.
+    for side in SIDES:
+        if f"{side}_collar" not in joints:
+            turns[f"{side}_collar"] = world[:, tree.parents[joints[f"{side}_shoulder"]]]
+    return turns
+
+
+def _path(tree: Tree, joints: Mapping[str, int], name: str) -> list[int]:
+    """Return the file's joints from one of ours to the one before the next of ours."""
+    end = joints.get(_next(name))
+    return [joints[name], *tree.below(joints[name], end)[:-1]] if end is not None else [joints[name]]
+
+
+def _next(name: str) -> str:
+    """Return the joint of ours up to which a joint moves bones; empty without one."""
+    side, _, part = name.rpartition("_")
+    end = _NEXT.get(part, "")
+    return f"{side}_{end}" if side and end else end
+
+
+def _spine_turns(
+    world: Float64[np.ndarray, "T J 3 3"], tree: Tree, joints: Mapping[str, int], body: Skeleton
+) -> dict[str, Float64[np.ndarray, "T 3 3"]]:
+    """Return the turns of our three joints of the spine from a spine of any number of joints.
+
+    Along the trunk, from the pelvis (0) to the neck (1), the file's turn is constant from each of its joints to the
+    next. Each of ours takes the mean over the part of the trunk that it moves.
+    """
+    spine = [joints["pelvis"], *spine_of(tree, joints)]
+    ours = ["pelvis", "spine1", "spine2", "spine3"]
+    # Where the trunk ends: at the neck or, without one, between the shoulders.
+    ends = ["neck"] if "neck" in joints else ["left_shoulder", "right_shoulder"]
+    theirs = np.vstack([tree.places[spine], tree.places[[joints[name] for name in ends]].mean(axis=0)])
+    own = np.vstack([body.places[body.at(*ours)], body.places[body.at(*ends)].mean(axis=0)])
+    shares = [_shares(places) for places in (theirs, own)]
+    turns = {}
+    for k, name in enumerate(ours[1:], start=1):
+        low, high = np.maximum(shares[0][:-1], shares[1][k]), np.minimum(shares[0][1:], shares[1][k + 1])
+        turns[name] = _mean_turn(world, spine, np.maximum(high - low, 0.0))
+    return turns
+
+
+def _shares(places: Float64[np.ndarray, "K 3"]) -> Float64[np.ndarray, " K"]:
+    """Return how far along a line of points each of them is, from 0 to 1."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+    return along / along[-1] if along[-1] > 0.0 else np.linspace(0.0, 1.0, len(along))
+
+
+def _mean_turn(
+    world: Float64[np.ndarray, "T J 3 3"], joints: Sequence[int], weights: Sequence[float] | Float64[np.ndarray, " K"]
+) -> Float64[np.ndarray, "T 3 3"]:
+    """Return the rotation nearest to the weighted sum of joints' rotations (the chordal mean), of each frame."""
+    weight = np.asarray(weights, np.float64)
+    # Weights by rounding alone must not blur turns that are one joint's.
+    heavy = [k for k in range(len(weight)) if weight[k] > 1e-4 * weight.sum()]
+    if len(heavy) < 2:
+        return world[:, joints[heavy[0] if heavy else 0]]
+    total = np.einsum("k,tkab->tab", weight[heavy], world[:, [joints[k] for k in heavy]])
+    u, _, vt = np.linalg.svd(total)
+    u[..., 2] *= np.linalg.det(u @ vt)[:, None]
+    return np.asarray(u @ vt)
 
 
 def _placed(
     params: BodyParams,
-    motion: BvhMotion,
+    places: Float64[np.ndarray, "T J 3"],
+    scale: float,
     joints: Mapping[str, int],
     body: Skeleton,
-    upright: Float64[np.ndarray, "3 3"],
 ) -> BodyParams:
     """Return the parameters with their translation, with planted feet held as `retarget` holds them."""
     # Scale the pelvis' path, remove the sliding of planted feet, then put the lowest foot on the floor.
-    places = _places(motion) @ upright.T
-    scale = body.leg / _leg(motion.rest, joints)
     root = places[:, joints["pelvis"]]
     params = replace(params, transl=scale * (root - root[0]) - body.places[0] * [1.0, 0.0, 1.0])
     feet = [name for name in FEET if name in joints]
@@ -261,75 +382,3 @@ def _leg(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> float:
     if not total > 0.0:
         raise InputError("legs of the motion", expected="bones of some length", received="none")
     return total
-
-
-def _in_world(motion: BvhMotion) -> Float64[np.ndarray, "T J 3 3"]:
-    """Return the rotations of all joints in world coordinates."""
-    out = motion.rotations.copy()
-    for joint, parent in enumerate(motion.parents):
-        if parent >= 0:
-            out[:, joint] = out[:, parent] @ motion.rotations[:, joint]
-    return out
-
-
-def _places(motion: BvhMotion) -> Float64[np.ndarray, "T J 3"]:
-    """Return the positions of all joints by forward kinematics, with the positions that the file states."""
-    world = _in_world(motion)
-    out = np.empty((len(motion.root), len(motion.names), 3))
-    for joint, parent in enumerate(motion.parents):
-        if parent < 0:
-            out[:, joint] = motion.root
-            continue
-        # (T, 3, 3) times (T, 3, 1): a joint with position channels is elsewhere in every frame.
-        step = np.atleast_2d(motion.positions.get(joint, motion.offsets[joint]))
-        out[:, joint] = out[:, parent] + (world[:, parent] @ step[..., None])[..., 0]
-    return out
-
-
-def _upright(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation that takes the axis along which the skeleton stands at rest to +Y."""
-    up = rest[joints["pelvis"]] - 0.5 * (rest[joints["left_ankle"]] + rest[joints["right_ankle"]])
-    axis = int(np.argmax(np.abs(up)))
-    direction = np.zeros(3)
-    direction[axis] = np.sign(up[axis]) or 1.0
-    return _between(direction, np.array([0.0, 1.0, 0.0]))
-
-
-def _trunk(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int], body: Skeleton) -> Float64[np.ndarray, "3 3"]:
-    """Return the least-squares rotation (Kabsch) of our trunk at rest onto the file's: hips, shoulders and neck."""
-    shared = [name for name in _FRAME if name in joints]
-    ours, theirs = body.places[body.at(*shared)], rest[[joints[name] for name in shared]]
-    ours, theirs = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
-    u, _, vt = np.linalg.svd(theirs.T @ ours)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-
-
-def _rest_rotation(
-    name: str,
-    rest: Float64[np.ndarray, "J 3"],
-    joints: Mapping[str, int],
-    body: Skeleton,
-    above: Float64[np.ndarray, "3 3"],
-) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation of a joint from our rest pose to the file's: `above`, then the smallest one for its bone."""
-    side, _, part = name.rpartition("_")
-    # A hand continues the direction of its forearm.
-    bone = (f"{side}_elbow", name) if part == "wrist" else (name, f"{side}_{_CHILD.get(part)}")
-    if any(end not in joints for end in bone):
-        return above
-    begin, end = body.places[body.at(*bone)]
-    return _between(above @ (end - begin), rest[joints[bone[1]]] - rest[joints[bone[0]]]) @ above
-
-
-def _between(a: Float64[np.ndarray, " 3"], b: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return the smallest rotation that takes one direction to another; the identity if one has no length."""
-    lengths = np.linalg.norm(a) * np.linalg.norm(b)
-    if not lengths > 0.0:
-        return np.eye(3)
-    axis, cosine = np.cross(a, b) / lengths, float(a @ b / lengths)
-    if cosine < -1.0 + 1e-9:  # half a turn, about any axis across
-        across = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        across /= np.linalg.norm(across)
-        return 2.0 * np.outer(across, across) - np.eye(3)
-    K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    return np.eye(3) + K + K @ K / (1.0 + cosine)
