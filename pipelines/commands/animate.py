@@ -95,7 +95,9 @@ class Animate:
         if self._of_student:
             return self._student_film()
         template = load_run_template(self.run_folder)
-        params, fps, before = self._chosen(self.driving.load(self.params, unshaped(template.body)))
+        params, fps, before = self._chosen(
+            self.driving.load(self.params, unshaped(template.body), fps=self._given_rate)
+        )
         garments = [] if self.cloth == "skin" or suffix == ".glb" else self._garments(template)
         if suffix == ".glb":
             from smplxpp.export import write_glb
@@ -122,6 +124,11 @@ class Animate:
         return not of_template and (self.run_folder / STUDENT).is_file()
 
     @property
+    def _given_rate(self) -> float | None:
+        """Return the motion's rate: that of the film times the frames of a step."""
+        return None if self.fps is None else self.fps * self.step
+
+    @property
     def _drawn(self) -> str:
         return "student" if self._of_student else "template"
 
@@ -132,7 +139,7 @@ class Animate:
 
         # The whole motion drives the clothes; `first` is the row of the first frame that is shown.
         bundle = avatar.open_bundle(self.run_folder)
-        given = self.driving.load(self.params, skeleton_body(bundle))
+        given = self.driving.load(self.params, skeleton_body(bundle), fps=self._given_rate)
         chosen, fps, whole = self._chosen(given)
         motion = replace(whole, fps=fps * self.step)
         first = len(whole) - 1 - (len(chosen) - 1) * self.step

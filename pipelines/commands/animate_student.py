@@ -51,11 +51,11 @@ class StudentFilm:
     below: float | None = None
 
 
-def motion_for(bundle: AvatarBundle, path: Path) -> BodyParams:
-    """Read a motion, in any layout or a .bvh, for a bundle's body."""
+def motion_for(bundle: AvatarBundle, path: Path, *, fps: float | None = None) -> BodyParams:
+    """Read a motion, in any layout or a .bvh, for a bundle's body, at its own or a stated rate."""
     from avatar.runtime.skeleton import skeleton_body
 
-    return Driving().load(path, skeleton_body(bundle))
+    return Driving().load(path, skeleton_body(bundle), fps=fps)
 
 
 def student_frames(

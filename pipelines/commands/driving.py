@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,12 +12,15 @@ import numpy as np
 from pipelines.commands.options import OptionalPath
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.body import BodyModel, UpAxis, Whose, load_body, load_motion
-from smplxpp.body.bvh_params import load_bvh, read_joint_map
+from smplxpp.body.bvh import read_bvh
+from smplxpp.body.bvh_params import MatchedSkeleton, load_bvh, matched_skeleton, named_joints, read_joint_map
 from smplxpp.body.retarget import Skeleton, retarget
 from smplxpp.body.smpl_params import FAMILY_NAMES, retarget_smpl
 from smplxpp.cloth.poses import resampled
-from smplxpp.core import BodyParams, GeometryWarning, InputError
+from smplxpp.core import BodyParams, GeometryWarning, InputError, require_positive
 from smplxpp.template.template import Template
+
+log = logging.getLogger(__name__)
 
 BVH = ".bvh"
 OPEN = "open"
@@ -34,35 +38,55 @@ class Driving:
     """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
     up: UpAxis | None = None
     """Axis that points up in the motion; by default the one that the file states, or z for AMASS, -y for TalkBody4D
-    and y for others. A .bvh tells it by its skeleton."""
+    and y for others, and for a .bvh that along which its skeleton stands at rest."""
     whose: Whose = "auto"
     """Whose parameters they are. auto: as the file tells; turns of SMPL, SMPL-H and SMPL-X are brought to an avatar of
     the open body. body: the avatar's own, whatever they look like."""
 
-    def load(self, path: Path, body: BodyModel) -> BodyParams:
+    def load(self, path: Path, body: BodyModel, *, fps: float | None = None) -> BodyParams:
         """Read a motion for a body; frames with NaN get poses interpolated between their neighbours.
+
+        Args:
+            path: of the motion.
+            body: body that shall move.
+            fps: frames a second; None: as the file states, or `DEFAULT_FPS` with a warning.
 
         Raises:
             InputError: no motion, one of another body, joints without a name that is known.
 
         Warns:
-            GeometryWarning: frames that hold NaN or infinity.
+            GeometryWarning: frames that hold NaN or infinity; a motion that states no rate.
         """
-        # A .bvh contains a skeleton and an upward axis, so that options for them are refused instead of ignored.
+        if fps is not None:
+            require_positive("option fps", fps)
+        # A .bvh contains a skeleton, so that options for it are refused instead of ignored.
         if path.suffix.lower() == BVH:
             self._refuse("retarget-from", self.retarget_from, f"{path}, which has a skeleton of its own")
-            self._refuse("up", self.up, f"{path}, which tells it by its skeleton")
             self._refuse("whose", None if self.whose == "auto" else self.whose, f"{path}, which has a skeleton")
             names = None if self.joint_map is None else read_joint_map(self.joint_map)
-            return load_bvh(path, Skeleton.of(body), joint_map=names)
+            return load_bvh(path, Skeleton.of(body), joint_map=names, up=self.up, fps=fps)
         self._refuse("joint-map", self.joint_map, f"{path}, whose joints have SMPL's names")
         if self.retarget_from is None:
-            return _whole(path, body, self.up, self.whose)
+            return _whole(path, body, self.up, self.whose, fps)
         # Read the motion for its own body, then transfer it to the person's skeleton. `open` says whose it is.
         source, shaped = self._source()
-        params = _whole(path, source, self.up, "body" if self.whose == "auto" else self.whose)
+        params = _whole(path, source, self.up, "body" if self.whose == "auto" else self.whose, fps)
         betas = params.betas[0] if shaped else None
         return retarget(params, Skeleton.of(source, betas), Skeleton.of(body))
+
+    def skeleton(self, path: Path) -> MatchedSkeleton:
+        """Return which joints of a .bvh stand for the body's, and log them.
+
+        Raises:
+            InputError: what `load` refuses.
+        """
+        names = None if self.joint_map is None else read_joint_map(self.joint_map)
+        motion = read_bvh(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GeometryWarning)  # given when the file is read for use
+            found = matched_skeleton(motion, named_joints(motion, names, subject=f"motion {path}"), up=self.up)
+        log.info("%s: %s", path, ", ".join(f"{ours} = {' + '.join(own)}" for ours, own in found.taken.items()))
+        return found
 
     def _source(self) -> tuple[BodyModel, bool]:
         """Return the body of the motion, and whether the motion's betas give it its shape."""
@@ -84,10 +108,10 @@ class Driving:
             raise InputError(f"option {name}", expected="a motion that needs it", received=received)
 
 
-def _whole(path: Path, body: BodyModel, up: UpAxis | None, whose: Whose) -> BodyParams:
+def _whole(path: Path, body: BodyModel, up: UpAxis | None, whose: Whose, fps: float | None) -> BodyParams:
     """Read a motion for a body; frames without a pose get one between their neighbours."""
     params, family, invalid = load_motion(path, body, up=up, whose=whose)
-    params = _interpolated(params, invalid, path)
+    params = _interpolated(params.with_rate(fps, source=str(path)), invalid, path)
     if family is None:
         return params
     if whose == "auto":

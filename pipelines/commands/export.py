@@ -137,6 +137,8 @@ class Export:
     """Of what moves: the row after the last one."""
     step: int = 1
     """Of what moves: take every step-th row."""
+    fps: OptionalFloat = None
+    """Frames a second of --params, for a file that states none or a wrong rate (None: as it says)."""
     cloth: ClothMode = "simulate"
     """What moves loose clothes in splats and OBJ files of --params: a simulation, the joints alone, or (splats) the
     student's own field."""
@@ -189,7 +191,13 @@ class Export:
 
     def _bundle(self, out: Path) -> dict[str, Any]:
         report = export_bundle(
-            self.run_folder, out, name=self.name, licence=self.licence, params=self.params, exact=self.exact
+            self.run_folder,
+            out,
+            name=self.name,
+            licence=self.licence,
+            params=self.params,
+            exact=self.exact,
+            fps=self.fps,
         )
         if not self.json:
             console = Console()
@@ -209,6 +217,7 @@ class Export:
             model=self.model,
             params=self.params,
             rows=(self.frame, self.stop, self.step),
+            fps=self.fps,
             cloth=self.cloth,
             full_harmonics=self.full_harmonics,
             up=self.up,

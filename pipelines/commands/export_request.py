@@ -52,6 +52,7 @@ class FileRequest:
         model: "student" or "template", for formats that hold either; "auto": the student where the source has one.
         params: parameters of the pose or the motion; None takes those of the source.
         rows: rows of the parameters: the first, the one after the last (None for the end), and the step.
+        fps: frames a second of the parameters; None: as they state.
         cloth: what moves loose clothes along the parameters.
         full_harmonics: whether a PLY has all harmonics.
         up: upward axis of a PLY.
@@ -65,6 +66,7 @@ class FileRequest:
     model: str = "auto"
     params: Path | None = None
     rows: tuple[int, int | None, int] = (0, None, 1)
+    fps: float | None = None
     cloth: ClothMode = "simulate"
     full_harmonics: bool = False
     up: str = "y"

@@ -40,7 +40,7 @@ def splat_writers(
     bundle = avatar.open_bundle(request.source, exact=True)
     player = AvatarPlayer(bundle)
     # Without parameters: the motion of the bundle, or the rest pose of a bundle without one.
-    motion = player.motion if request.params is None else motion_for(bundle, request.params)
+    motion = player.motion if request.params is None else motion_for(bundle, request.params, fps=request.fps)
     motion = BodyParams.rest(betas=0, expressions=0) if motion is None else motion
     # A folder or a USD with parameters holds a motion; all other files hold one pose.
     moves = request.is_series or (request.format == "usd" and request.params is not None)

@@ -36,7 +36,7 @@ def template_writers(request: FileRequest) -> Writers:
     """
     # An OBJ has no skeleton: its surfaces are posed here. The others store skeleton and motion.
     template = load_run_template(request.source)
-    params = None if request.params is None else load_params_for(template, request.params)
+    params = None if request.params is None else load_params_for(template, request.params, fps=request.fps)
     # A motion places the person by itself; in the T-pose she stands on the floor.
     template = template.on_floor() if params is None else template
     if request.format == "obj":
@@ -122,10 +122,14 @@ def motion_writers(request: FileRequest) -> tuple[float, Iterator[tuple[int, Cal
 
         bundle = avatar.open_bundle(request.source)
         body = skeleton_body(bundle)
-        joints, params = body.v_template, motion_for(bundle, request.params)
+        joints, params = body.v_template, motion_for(bundle, request.params, fps=request.fps)
     else:
         template = load_run_template(request.source)
-        body, joints, params = template.body, template.joints, load_params_for(template, request.params)
+        body, joints, params = (
+            template.body,
+            template.joints,
+            load_params_for(template, request.params, fps=request.fps),
+        )
     # The frame rate shrinks with the step, so that the motion keeps its speed.
     rows = request.chosen(len(params), moves=True)
     fps = request.rate(params)

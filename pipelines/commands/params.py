@@ -40,7 +40,9 @@ class ParamsConvert:
     """Id of the person, for files with several."""
     up: UpAxis | None = None
     """Axis that points up in the input; the output has y up. None: as the input states, z for AMASS, -y for TalkBody4D,
-    else y."""
+    for a .bvh that along which its skeleton stands at rest, else y."""
+    joint_map: OptionalPath = None
+    """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
     whose: Whose = "auto"
     """Whose parameters the input has. auto: as its counts and keys tell. body: those of --body. Parameters of SMPL,
     SMPL-H or SMPL-X are brought to the open body without their shape, as a start for a registration."""
@@ -63,10 +65,12 @@ class ParamsConvert:
         if self.fps is not None:
             require_positive("option fps", self.fps)
         # A .bvh is retargeted to the body; all other layouts are read as they are.
-        kept = _parse_frames(self.frames)
+        kept, skeleton = _parse_frames(self.frames), None
         if self.input.suffix.lower() == BVH:
             layout = "bvh"
-            params = Driving(up=self.up).load(self.input, load_body(self.body))
+            driving = Driving(up=self.up, joint_map=self.joint_map)
+            params = driving.load(self.input, load_body(self.body), fps=self.fps)
+            skeleton = driving.skeleton(self.input)
         else:
             layout = detect_layout(self.input) if self.layout == "auto" else self.layout
             params = load_params(
@@ -87,7 +91,7 @@ class ParamsConvert:
         if self.joints is not None:
             write_arrays(self.joints, {"joints": self._joints(params), "joint_names": np.array(BODY_JOINTS)})
         log.info("%s (%s, %d frames) -> %s", self.input, layout, len(params), self.out)
-        return _summary(self, layout, params)
+        return _summary(self, layout, params) | ({} if skeleton is None else {"skeleton": skeleton.as_dict()})
 
     def _joints(self, params: BodyParams) -> Float64[np.ndarray, "T 22 3"]:
         """Return SMPL's joints of the posed body, which are a model's own in its family."""

@@ -32,13 +32,13 @@ def load_run_template(run: Path) -> Template:
     return Template.load(path)
 
 
-def load_params_for(template: Template, path: Path) -> BodyParams:
-    """Read a motion, in any layout or as .bvh, for the body of a template.
+def load_params_for(template: Template, path: Path, *, fps: float | None = None) -> BodyParams:
+    """Read a motion, in any layout or as .bvh, for the body of a template, at its own or a stated rate.
 
     Raises:
         InputError: no file of parameters, or of another body.
     """
-    return Driving().load(path, unshaped(template.body))
+    return Driving().load(path, unshaped(template.body), fps=fps)
 
 
 def person_of_run(run: Path) -> tuple[Face, StandingBody]:
@@ -54,7 +54,14 @@ BUNDLE_SUFFIX = ".avatar"
 
 
 def export_bundle(
-    run: Path, out: Path, *, name: str | None, licence: str, params: Path | None, exact: bool
+    run: Path,
+    out: Path,
+    *,
+    name: str | None,
+    licence: str,
+    params: Path | None,
+    exact: bool,
+    fps: float | None = None,
 ) -> dict[str, Any]:
     """Write the student of a run as a bundle, whole or not at all.
 
@@ -65,6 +72,7 @@ def export_bundle(
         licence: licence of the avatar.
         params: parameters of the motion to play; None takes the poses of the training.
         exact: whether to keep float32.
+        fps: frames a second of the motion; None: as its file states.
 
     Returns:
         The file, bytes of its pieces, and how many frames it plays.
@@ -76,5 +84,5 @@ def export_bundle(
     import avatar
 
     student = avatar.load(run)
-    motion = None if params is None else load_params_for(student.rig.template, params)
+    motion = None if params is None else load_params_for(student.rig.template, params, fps=fps)
     return avatar.export_student(student, out, params=motion, name=name, licence=licence, exact=exact)

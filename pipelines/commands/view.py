@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
-from pipelines.commands.options import LARGEST_PORT, Lighting, OptionalPath, require_avatar
+from pipelines.commands.options import LARGEST_PORT, Lighting, OptionalFloat, OptionalPath, require_avatar
 from pipelines.commands.templates import load_run_template
 from smplxpp.core.errors import require_between
 
@@ -81,6 +81,8 @@ class View:
     """Capture whose photographs and frames are shown; by default the one that the run was made from."""
     params: OptionalPath = None
     """Motion to go through, in any layout that `smplxpp params convert` reads; by default the capture's frames."""
+    fps: OptionalFloat = None
+    """Frames a second of --params, for a file that states none or a wrong rate (None: as it says)."""
     lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
     """The light that the Gaussians are shown in."""
     port: int = 8080
@@ -104,6 +106,7 @@ class View:
             template,
             capture=self.capture,
             params=self.params,
+            fps=self.fps,
             relighting=self.lighting.relighting(),
         )
         window = open_run_window(session, port=self.port)

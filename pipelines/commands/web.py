@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, Lighting, OptionalPath, OptionalText
+from pipelines.commands.options import (
+    LARGEST_PORT,
+    MOST_AVATAR_BYTES,
+    Lighting,
+    OptionalFloat,
+    OptionalPath,
+    OptionalText,
+)
 from pipelines.commands.talking_page import PAGES, live_lips
 from pipelines.commands.templates import BUNDLE_SUFFIX, export_bundle
 from smplxpp.core import InputError, require_between
@@ -39,6 +46,8 @@ class Web:
     """Open no browser, print the address alone."""
     params: OptionalPath = None
     """Motion of a run's avatar, any layout that `smplxpp params convert` reads; without it what training saw."""
+    fps: OptionalFloat = None
+    """Frames a second of --params, for a file that states none or a wrong rate (None: as it says)."""
     name: OptionalText = None
     """Name of a run's avatar; by default that of the run's folder."""
     licence: str = ""
@@ -108,11 +117,19 @@ class Web:
         if self.source.is_dir():
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / f"me{BUNDLE_SUFFIX}"
-                export_bundle(self.source, path, name=self.name, licence=self.licence, params=self.params, exact=False)
+                export_bundle(
+                    self.source,
+                    path,
+                    name=self.name,
+                    licence=self.licence,
+                    params=self.params,
+                    exact=False,
+                    fps=self.fps,
+                )
                 name = self.name or self.source.resolve().name
                 return read_bytes(path, subject="avatar"), name, live_lips(load_bundle(path))
         # Name and licence are part of a finished bundle.
-        given = [option for option in ("params", "name", "licence") if getattr(self, option)]
+        given = [option for option in ("params", "fps", "name", "licence") if getattr(self, option)]
         if given:
             raise InputError(
                 f"option {given[0]}",

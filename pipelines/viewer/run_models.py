@@ -310,7 +310,9 @@ def _remembered(run: Path) -> list[Path]:
     return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
 
 
-def motion_of_run(run: Path, template: Template, capture: Capture | None, given: Path | None) -> ShownMotion:
+def motion_of_run(
+    run: Path, template: Template, capture: Capture | None, given: Path | None, *, fps: float | None = None
+) -> ShownMotion:
     """Return the motion that is given, else the capture's frames, else the run's reference pose, else the T-pose.
 
     Raises:
@@ -318,11 +320,11 @@ def motion_of_run(run: Path, template: Template, capture: Capture | None, given:
     """
     if given is not None:
         if given.suffix.lower() == ".bvh":
-            params = load_bvh(given, Skeleton.of(template.body))
+            params = load_bvh(given, Skeleton.of(template.body), fps=fps)
         else:
             # The template has the identity: betas must not move the root's joint a second time.
             body = replace(template.body, shapedirs=np.zeros_like(template.body.shapedirs))
-            params = load_params(given, body=body).without_shape()
+            params = load_params(given, body=body).without_shape().with_rate(fps, source=str(given))
         return ShownMotion(params, tuple(range(len(params))), params.fps or DEFAULT_FPS, given.name)
     if capture is not None:
         found = {frame: own for frame in capture.frames if (own := capture.params(frame)) is not None}

@@ -237,19 +237,21 @@ def open_run(
     *,
     capture: Path | None = None,
     params: Path | None = None,
+    fps: float | None = None,
     relighting: Relighting | None = None,
 ) -> RunSession:
     """Open what a run has to show.
 
     Args:
         template: of the run. capture, params: in the place of those that the run remembers.
+        fps: frames a second of the parameters; None: as they state.
         relighting: another light for the Gaussians.
 
     Raises:
         InputError: a capture or parameters that cannot be read, models of another template.
     """
     shown = capture_of_run(run, capture)
-    motion = motion_of_run(run, template, shown, params)
+    motion = motion_of_run(run, template, shown, params, fps=fps)
     session = RunSession(run, template, motion, shown, tracked=tracked_surface(run, template), relighting=relighting)
     session.refresh()
     # Frames of the training have codes that know their clothes; a new motion has none.

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -59,6 +60,17 @@ class MatchedSkeleton:
     up: str
     frame: int | None
     leg: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what was understood as JSON values."""
+        return {
+            "joints": {ours: list(theirs) for ours, theirs in self.taken.items()},
+            "missing": [name for name in OURS[:22] if name not in self.taken and not name.startswith("spine")],
+            "left_out": list(self.left_out),
+            "up": self.up,
+            "rest": "rest pose" if self.frame is None else f"frame {self.frame}",
+            "leg": self.leg,
+        }
 
 
 def load_bvh(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.atomic import atomic_path
 
 # Pose blocks in SMPL-X joint order, with their number of joints.
@@ -146,6 +147,25 @@ class BodyParams:
         found = self._with_arrays({name: getattr(self, name)[indices] for name in ARRAY_NAMES}, offsets)
         step = abs(indices.step or 1) if isinstance(indices, slice) else 1
         return found if found.fps is None or step == 1 else replace(found, fps=found.fps / step)
+
+    def with_rate(self, fps: float | None = None, *, source: str = "motion") -> BodyParams:
+        """Return the frames at a stated rate, else at their own; a motion without any gets `DEFAULT_FPS`.
+
+        Args:
+            fps: frames a second; None: as the source states.
+            source: in the warning.
+
+        Warns:
+            GeometryWarning: several frames that state no rate.
+        """
+        if fps is None and self.fps is None and len(self) > 1:
+            warnings.warn(
+                f"{source} states no frame rate: {DEFAULT_FPS:g} frames a second are taken; --fps states others",
+                GeometryWarning,
+                stacklevel=3,
+            )
+            fps = DEFAULT_FPS
+        return self if fps is None else replace(self, fps=fps)
 
     def without_shape(self) -> BodyParams:
         """Return the poses without betas and `v_shape`, for a body that already has the person's shape."""

@@ -73,7 +73,6 @@ def test_the_viewer_takes_a_bvh(run, folder, tmp_path):  # noqa: F811
     ("options", "file", "words"),
     [
         ({"retarget_from": Path("open")}, "walk.bvh", "retarget-from"),
-        ({"up": "z"}, "walk.bvh", "option up"),
         ({"joint_map": Path("map.json")}, "walk.npz", "joint-map"),
         ({"retarget_from": Path("/nowhere.npz")}, "walk.npz", "nowhere"),
     ],
