@@ -27,7 +27,7 @@ The terms are found one after the other:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64, Num
@@ -55,6 +55,7 @@ from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.by_body_rings import ARM_END, ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 from smplxpp.segment.by_body_shape import ShapeEvidence, outfit_by_shape
+from smplxpp.segment.by_body_waist import find_waist
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
 from smplxpp.segment.segment import SegmentedScan
 from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors, likeness
@@ -186,7 +187,7 @@ def weigh_evidence(
     """Return the unary costs of all labels at all faces with their ingredients; `lab` is (M, 3) colours in OKLab."""
     # The misfit of the body is the robust spread (1.4826 MAD) of the distances of face and hands.
     chart = chart_of_scan(mesh, body, params)
-    pairs, _ = face_adjacency(mesh.faces)
+    pairs, ends = face_adjacency(mesh.faces)
     # What the person holds says nothing about her clothes, so that it has no area in the steps that follow. A body that
     # is not even at the face, where nothing is held, would make a thing of her own arm.
     elsewhere = chart.face_core.any() and _spread(chart.distance[chart.face_core]) > BODY_ELSEWHERE
@@ -231,7 +232,17 @@ def weigh_evidence(
         outfit = outfit_by_shape(_shape_evidence(mesh, chart, column, arm, area=used, chest=chest))
     else:
         outfit = find_outfit(column, arm, config.outfit, misfit=misplaced, chest=chest)
-    prior = place_prior(chart, outfit, layers, softness=config.softness, body_softness=config.body_softness)
+    # The border between upper and lower garment where the surface shows it.
+    worn = ~(layers.hair | layers.coat | objects.faces)
+    waist = find_waist(mesh, chart, outfit, pairs, ends, used=worn, smoothing=config.smoothing)
+    if waist is not None and layers.bib:
+        # A front that ends over the trousers is a waistcoat's.
+        layers = replace(layers, bib=False)
+    elif lab is not None:
+        waist = None
+    prior = place_prior(
+        chart, outfit, layers, softness=config.softness, body_softness=config.body_softness, waist=waist
+    )
     # Costs of colour are averaged over faces of like colour, and the distance to the body is added.
     blend = Blend.of(
         pairs,

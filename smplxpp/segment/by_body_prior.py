@@ -10,6 +10,7 @@ from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HEAD, LEG, NECK, NECK
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import Outfit
 from smplxpp.segment.by_body_rings import COLUMN_END
+from smplxpp.segment.by_body_waist import Waist
 
 # Probability of each label in a region independent of the outline: the frequency of exceptions (a bag, a rolled
 # sleeve).
@@ -21,11 +22,19 @@ _ELSE: dict[int, dict[int, float]] = {
     FOOT: {SKIN.id: 0.03, SHOE.id: 0.06, LOWER.id: 0.02, UPPER.id: 0.001},
 }
 _NEVER = 1e-6  # probability of labels that do not occur in a region; keeps logarithms finite
+_BEYOND = 1e-3  # probability that a garment goes on beyond a border that the surface shows
+_SHARP = 0.4  # softness of such a border, as a share of a ring's
 _UNLAYERED = 0.2  # probability that a layer that was found is none
 
 
 def place_prior(
-    chart: BodyChart, outfit: Outfit, layers: Layers, *, softness: float, body_softness: float
+    chart: BodyChart,
+    outfit: Outfit,
+    layers: Layers,
+    *,
+    softness: float,
+    body_softness: float,
+    waist: Waist | None = None,
 ) -> Float64[np.ndarray, "M L"]:
     """Return P(label) at each face's place, before its colour is used; rows sum to 1.
 
@@ -35,6 +44,7 @@ def place_prior(
         layers: layers over other clothes.
         softness: standard deviation of a hem about its ring, metres.
         body_softness: standard deviation of the body's place at head and hands, metres.
+        waist: border of upper and lower garment that the surface shows, which goes before the outline's.
     """
     # Exceptions first; the outline shares out the rest.
     out = np.full((len(chart.region), len(LABELS)), _NEVER)
@@ -45,8 +55,12 @@ def place_prior(
     column, arm = np.isin(chart.region, (TRUNK, LEG, FOOT)), chart.region == ARM
     rest = 1.0 - out.sum(axis=1)
     out[column] += rest[column, None] * _column(chart.height[column], outfit, softness)
-    # Necklines: where the trunk meets the neck, skin replaces up to 45 % of the shirt.
     top = chart.region == TRUNK
+    if waist is not None:
+        _cut_at(waist, out, softness)
+        # Nor does the lower garment go on above it, whatever its colour.
+        out[top & (chart.height > waist.top), LOWER.id] *= _BEYOND
+    # Necklines: where the trunk meets the neck, skin replaces up to 45 % of the shirt.
     bare = 0.45 * _above(chart.height[top], NECK_BASE - 0.05, 0.03)
     out[top, SKIN.id], out[top, UPPER.id] = out[top, SKIN.id] + bare, out[top, UPPER.id] * (1 - bare)
     # Arms and hands: sleeve up to the cuff, then skin.
@@ -72,6 +86,15 @@ def place_prior(
     for mask, worn in ((layers.hair, HAIR), (layers.coat, OUTER)):
         out[mask] = _UNLAYERED * out[mask] + (1.0 - _UNLAYERED) * _only(worn.id)
     return out / out.sum(axis=1, keepdims=True)
+
+
+def _cut_at(waist: Waist, out: np.ndarray, softness: float) -> None:
+    """Share the probability of upper and lower garment on each side of a border, by the distance to it."""
+    at = waist.faces
+    both = out[at, UPPER.id] + out[at, LOWER.id]
+    upper = _above(np.where(waist.upper[at], 1.0, -1.0) * waist.away[at], 0.0, _SHARP * softness)
+    upper = _BEYOND + (1.0 - 2.0 * _BEYOND) * upper
+    out[at, UPPER.id], out[at, LOWER.id] = both * upper, both * (1.0 - upper)
 
 
 def _only(label: int) -> np.ndarray:
