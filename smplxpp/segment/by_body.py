@@ -48,7 +48,7 @@ from smplxpp.raster import outer_visible_points
 from smplxpp.segment.by_body_chart import FOOT, LEG, TRUNK, BodyChart, chart_of_scan, in_arm, in_column
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
-from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_shoes, roughness
+from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_shoes, on_heels, roughness
 from smplxpp.segment.by_body_layers import Layers, find_layers
 from smplxpp.segment.by_body_objects import FoundObjects, find_objects
 from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
@@ -227,11 +227,15 @@ def weigh_evidence(
     arm = rings(in_arm(chart), layers.hair, chart.reach, ARM_START, ARM_END)
     top = (chart.region == TRUNK) & (chart.height > 1.05)
     chest = bool(area[top].sum() > 0.01 * area.sum())
+    heels = on_heels(mesh, body, params)
     if lab is None:
         used = np.where(layers.hair | layers.coat, 0.0, area)
-        outfit = outfit_by_shape(_shape_evidence(mesh, chart, column, arm, area=used, chest=chest))
+        outfit = outfit_by_shape(_shape_evidence(mesh, chart, column, arm, area=used, chest=chest, heels=heels))
     else:
-        outfit = find_outfit(column, arm, config.outfit, misfit=misplaced, chest=chest)
+        outfit = find_outfit(column, arm, config.outfit, misfit=misplaced, chest=chest, heels=heels)
+        if heels:
+            # In shoes the colour of skin is none.
+            skin_like = np.where(np.isin(chart.region, (FOOT, LEG)) & (chart.height < outfit.shoe_top), 0.01, skin_like)
     # The border between upper and lower garment where the surface shows it.
     worn = ~(layers.hair | layers.coat | objects.faces)
     waist = find_waist(mesh, chart, outfit, pairs, ends, used=worn, smoothing=config.smoothing)
@@ -273,7 +277,14 @@ def weigh_evidence(
 
 
 def _shape_evidence(
-    mesh: TriangleMesh, chart: BodyChart, column: Rings, arm: Rings, *, area: Float64[np.ndarray, " M"], chest: bool
+    mesh: TriangleMesh,
+    chart: BodyChart,
+    column: Rings,
+    arm: Rings,
+    *,
+    area: Float64[np.ndarray, " M"],
+    chest: bool,
+    heels: bool,
 ) -> ShapeEvidence:
     """Measure hems along both legs and the trunk and along both arms, folds, feet, and how far the legs are apart."""
     legs, arms = np.isin(chart.region, (LEG, FOOT)), in_arm(chart)
@@ -295,7 +306,7 @@ def _shape_evidence(
         arm,
         hems(chart.height, (legs & left, legs & ~left, chart.region == TRUNK), column),
         hems(chart.reach, (arms & left, arms & ~left), arm),
-        nats_for_shoes(chart, area),
+        _HEELED if heels else nats_for_shoes(chart, area),
         (
             roughness(mesh, (chart.region == TRUNK) & (chart.height > 1.0) & (chart.height < 1.3) & (area > 0)),
             roughness(mesh, (chart.region == LEG) & (chart.height > 0.55) & (chart.height < 0.75) & (area > 0)),
@@ -305,6 +316,8 @@ def _shape_evidence(
     )
 
 
+_HEELED = 4.0
+"""Nats for shoes under raised heels, the most that the distance of the feet can say."""
 _CERTAIN = 12.0
 """Nats, the largest cost of a label at a face."""
 

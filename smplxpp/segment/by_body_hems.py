@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from smplxpp.core import TriangleMesh
-from smplxpp.segment.by_body_chart import FOOT, LEG, BodyChart
+from smplxpp.body import BodyModel
+from smplxpp.core import BodyParams, TriangleMesh
+from smplxpp.segment.by_body_chart import FOOT, LEG, BodyChart, chart_of_body
 from smplxpp.segment.by_body_rings import STEP
 
 _SECTORS = 12
@@ -177,6 +178,34 @@ def nats_for_shoes(chart: BodyChart, area: Float64[np.ndarray, " M"]) -> float:
         bare, shod = np.hypot(0.0025, turned), np.hypot(0.004, turned)
         nats.append(0.5 * ((middle + 0.0015) / bare) ** 2 - 0.5 * ((middle - 0.009) / shod) ** 2 + np.log(bare / shod))
     return float(np.clip(np.mean(nats), -4.0, 4.0)) if nats else 0.0
+
+
+def on_heels(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> bool:
+    """Return whether the scan reaches down to the floor under a raised heel of the body, as only a shoe does.
+
+    Args:
+        mesh: the scan, metres, +Y up.
+        body: the body model.
+        params: one frame, in the pose of the scan.
+    """
+    posed = body.forward(params)
+    vertices, rest, chart = posed.vertices[0], posed.rest_vertices[0], chart_of_body(body, params)
+    for side in (-1, 1):
+        foot = np.flatnonzero((chart.region == FOOT) & (chart.side == side))
+        # The hindmost twentieth of the foot is its heel; the foot stands on the lowest of it.
+        heel = vertices[foot[np.argsort(rest[foot, 2])[: max(1, len(foot) // 20)]]]
+        floor, above = vertices[foot, 1].min(), heel[:, 1].min()
+        if above - floor < _RAISED:
+            continue
+        beside = np.linalg.norm(mesh.face_centers[:, [0, 2]] - heel.mean(axis=0)[[0, 2]], axis=1) < _UNDER_HEEL
+        if (beside & (mesh.face_centers[:, 1] < floor + 0.3 * (above - floor))).any():
+            return True
+    return False
+
+
+_RAISED, _UNDER_HEEL = 0.03, 0.04
+"""Metres that a heel is raised by, and how far beside it the heel of its shoe may be: more than bent toes of flat shoes
+and errors of a fit, less than the distance to the ball of the foot."""
 
 
 def legs_apart(chart: BodyChart, area: Float64[np.ndarray, " M"], count: int) -> Float64[np.ndarray, " R"]:

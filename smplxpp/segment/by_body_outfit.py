@@ -30,6 +30,7 @@ NAT = 8.0
 """Nats of an outline's cost for one nat of its probability, because rings are not independent and clothes vary (6 to 8
 for 36 of 38 people)."""
 RUNS = (SHOE, SKIN, LOWER, SKIN, UPPER)
+_NO_SHOE = 200.0  # nats of no shoe under a heel, more than colours can bring
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,9 @@ class Outfit:
         return not self.has_lower and self.upper_start < HIP - 0.1
 
 
-def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: float, chest: bool = True) -> Outfit:
+def find_outfit(
+    column: Rings, arm: Rings, config: OutfitConfig, *, misfit: float, chest: bool = True, heels: bool = False
+) -> Outfit:
     """Find the cheapest borders of a column (from the soles up) and an arm (from the shoulder out).
 
     Args:
@@ -113,8 +116,9 @@ def find_outfit(column: Rings, arm: Rings, config: OutfitConfig, *, misfit: floa
         config: costs.
         misfit: typical distance between body and bare skin, metres.
         chest: whether the scan reaches the chest.
+        heels: whether the feet stand on heels, so that there are shoes, even in the colour of skin.
     """
-    order = _column_costs(column, config, misfit, chest=chest)
+    order = _column_costs(column, config, misfit, chest=chest, heels=heels)
     borders, margins = _cut_column(column.places, order)
     shoe_top, lower_start, lower_end, upper_start = borders
     of_arm = _arm_costs(arm, config, misfit, skin_colored=column.looks_like_skin(upper_start, COLUMN_END))
@@ -136,6 +140,8 @@ class _RunCosts:
     top: np.ndarray
     cloth: np.ndarray
     skin: np.ndarray
+    worn: np.ndarray
+    """Cloth for certain, whatever its colour."""
 
     @staticmethod
     def of(rings: Rings, config: OutfitConfig, misfit: float) -> _RunCosts:
@@ -148,7 +154,7 @@ class _RunCosts:
         cloth = cross + _between(cloth_far)
         skin = cross + _between(config.other_in_skin * n * rings.skin[:, 1] + skin_far)
         most = (config.skin_colored_shoe, config.skin_colored_top, config.skin_colored)
-        runs = (*(cloth + np.minimum(like_skin, one) for one in most), skin)
+        runs = (*(cloth + np.minimum(like_skin, one) for one in most), skin, cloth)
         there = np.triu(np.ones(cross.shape, dtype=bool))
         return _RunCosts(*(np.where(there, run, np.inf) for run in runs))
 
@@ -187,7 +193,9 @@ def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[
     return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
 
 
-def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: bool) -> list[np.ndarray]:
+def _column_costs(
+    rings: Rings, config: OutfitConfig, misfit: float, *, chest: bool, heels: bool
+) -> list[np.ndarray]:
     """Return the costs of each of the column's `RUNS`, (R + 1, R + 1): at [i, j] those of rings i..j-1."""
     place = rings.places
     runs = _RunCosts.of(rings, config, misfit)
@@ -202,7 +210,8 @@ def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: b
     skin = runs.skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
     # Priors on the place and length of each run: linear penalties outside of the usual range, and a waist at its
     # height.
-    shoe = runs.shoe + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
+    bare_feet = _NO_SHOE if heels else 2.0
+    shoe = (runs.worn if heels else runs.shoe) + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, bare_feet, 0.0)
     usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
     usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
     at_waist = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0)
