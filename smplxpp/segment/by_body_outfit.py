@@ -193,9 +193,7 @@ def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[
     return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
 
 
-def _column_costs(
-    rings: Rings, config: OutfitConfig, misfit: float, *, chest: bool, heels: bool
-) -> list[np.ndarray]:
+def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: bool, heels: bool) -> list[np.ndarray]:
     """Return the costs of each of the column's `RUNS`, (R + 1, R + 1): at [i, j] those of rings i..j-1."""
     place = rings.places
     runs = _RunCosts.of(rings, config, misfit)

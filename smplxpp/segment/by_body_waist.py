@@ -81,7 +81,9 @@ def find_waist(
     own, edge = index[pairs[within]], ends[within]
     weights = edge_weights(mesh, pairs, ends, smoothing)[within]
     cost = np.stack([np.where(place < low, _FIXED, 0.0), np.where(place > high, _FIXED, 0.0)], axis=1)
-    upper, _ = minimize_potts(PottsProblem.from_costs(cost, own, weights), labels=(place <= outfit.lower_end).astype(np.int64))
+    upper, _ = minimize_potts(
+        PottsProblem.from_costs(cost, own, weights), labels=(place <= outfit.lower_end).astype(np.int64)
+    )
     upper = upper == 0
     crossed = upper[own[:, 0]] != upper[own[:, 1]]
     if not crossed.any():
