@@ -52,6 +52,8 @@ class TransferConfig:
             of the body nearby.
         around: fractions of the source's extent. Between these distances from the skin a vertex whose ring goes around
             one arm or leg alone (`enclosed_by_one`) gradually takes the mean weights of that limb's skin at its place.
+        hanging: widths of a skirt, as distance off the legs by height below the waist, between which the pelvis starts
+            to keep a share of what hangs before both legs (`leg_bound`). None: it keeps none.
         anchor_length: `l` of the energy that inpaints the anchor weights, as a fraction of the source's extent. With a
             short length a skirt keeps a share of what its waist follows, a longer one continues the trend.
         published: share of the published method's weights in those of cloth off the skin. The errors of both differ, so
@@ -85,6 +87,7 @@ class TransferConfig:
     confident: float | None = 0.015
     far: tuple[float, float] = (0.045, 0.08)
     around: tuple[float, float] = (0.015, 0.04)
+    hanging: tuple[float, float] | None = (0.2, 0.34)
     anchor_length: float = 0.06
     published: float = 0.5
     published_length: float = 0.02
@@ -116,8 +119,10 @@ class TransferConfig:
         for name in ("normal_widening", "turned", "averaging_steps"):
             require_at_least(f"config {name}", getattr(self, name), 0)
         require_between("config published", self.published, 0.0, 1.0)
-        for name in ("far", "around"):
+        for name in ("far", "around", "hanging"):
             value = getattr(self, name)
+            if value is None and name == "hanging":
+                continue
             if len(value) != 2 or not 0 <= value[0] < value[1]:
                 raise InputError(
                     f"config {name}", expected="two fractions, none negative, growing", received=str(value)

@@ -36,6 +36,7 @@ from smplxpp.transfer.correspond import (
 )
 from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes, unworn_arms
 from smplxpp.transfer.extend import extend_weights, sample_weights
+from smplxpp.transfer.hanging import bounded_legs, leg_bound
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 
 _LEAST_SUM = 1e-3
@@ -107,7 +108,7 @@ def transfer_weights(
     found = closest_points(source, target)
     check_placement(source, target, found.distance)
     # Find the rings that go around one limb, and leave out arms that are not in the sleeves.
-    limbs = None
+    axes, limbs = [], None
     if config.confident is not None and found.distance.max() > config.around[0] * size:
         axes = limb_axes(source, weights, size, config)
         if axes:
@@ -153,6 +154,12 @@ def transfer_weights(
             share[total <= _LEAST_SUM] = 0.0
             answer /= np.maximum(total, _LEAST_SUM)[:, None]
         dense += share[:, None] * (answer - dense)
+    if limbs is not None and config.hanging is not None:
+        # Leave the pelvis its share of cloth that hangs free before both legs.
+        arms = weights[:, [joint for axis in axes[2:4] for joint in axis.joints]].sum(axis=1, keepdims=True)
+        off = np.where(found.interpolate(source, arms)[:, 0] > 0.5, np.inf, found.distance)
+        bound = leg_bound(target, component, off, axes, limbs, size=size, cone=config.hanging)
+        dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
     return SkinWeights.from_dense(
         dense[copies],
         max_influences=config.max_influences,

@@ -62,6 +62,24 @@ def test_wide_trousers_sit_down(mannequin, worn, name):
     assert np.percentile(error, 95) < 80
 
 
+def test_a_wide_skirt_leaves_the_pelvis_its_share_and_trousers_and_close_skirts_stay_as_they_are(mannequin, worn):
+    """All weight of a skirt that stood 8 cm off the thighs was theirs, so that its back came along when she sat."""
+
+    def transferred(name: str, config: TransferConfig) -> tuple[Case, np.ndarray]:
+        case = worn(name)
+        config = TransferConfig.for_label("lower", base=config)
+        return case, transfer_weights(case.source, mannequin.body.weights, case.mesh, config=config).dense()
+
+    without = TransferConfig(hanging=None)
+    case, dense = transferred("flared skirt", TransferConfig())
+    assert dense.min() >= 0 and np.abs(dense.sum(axis=1) - 1).max() < 1e-12
+    before = sitting_error(mannequin, case, transferred("flared skirt", without)[1])
+    assert sitting_error(mannequin, case, dense).mean() < 0.6 * before.mean()
+    for name in ("hakama", "mini skirt"):
+        changed = np.abs(transferred(name, TransferConfig())[1] - transferred(name, without)[1]).sum(axis=1)
+        assert np.percentile(changed, 99) < 0.02, name
+
+
 def test_each_leg_of_trousers_goes_around_its_own_leg_and_the_hips_around_none(mannequin, worn):
     case = worn("hakama")
     found = enclosure(mannequin, case)
