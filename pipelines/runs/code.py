@@ -25,13 +25,15 @@ GEOMETRY = ("numpy", "scipy", "libigl", "fast-simplification")
 """Libraries whose versions decide the result of a geometric stage."""
 TRAINING = (*GEOMETRY, "torch")
 """Libraries whose versions decide the result of a training."""
+_BLOCKS = ("body", "orelse", "handlers", "finalbody", "cases")
+"""Fields of the syntax tree that hold statements."""
 _COMMENTS = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _EXPORT = re.compile(r"SMPLXPP_EXPORT[^;{(]*?(\w+)\(")
 
 
 @dataclass(frozen=True)
 class _Module:
-    """Digest of a source file's statements, the modules that it imports, and the attribute names that it uses."""
+    """Digest of a source file's statements, the modules that it imports, and the native functions that it names."""
 
     digest: str
     imports: tuple[str, ...]
@@ -70,23 +72,30 @@ def _module(name: str) -> _Module:
         raise ModuleNotFoundError(f"no source of module {name}")
     tree = ast.parse(path.read_text(encoding="utf-8"))
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-    names = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     imports = dict.fromkeys(part for module in _imported(tree, package) for part in _with_packages(module))
-    text = ast.dump(_Statements().visit(tree), annotate_fields=False)
-    return _Module(hashlib.sha256(text.encode()).hexdigest()[:16], tuple(imports), frozenset(names))
+    # Write the tree out once and look for names in the text, because a walk over all nodes costs as much again.
+    _drop_strings(tree)
+    text = ast.dump(tree, annotate_fields=False)
+    names = frozenset(symbol for symbol in _exports() if f", '{symbol}', Load())" in text)
+    return _Module(hashlib.sha256(text.encode()).hexdigest()[:16], tuple(imports), names)
 
 
-class _Statements(ast.NodeTransformer):
+def _drop_strings(tree: ast.Module) -> None:
     """Drop string statements, which include docstrings, because they do nothing."""
+    for node in _statements(tree):
+        for field in _BLOCKS:
+            block = getattr(node, field, None)
+            if isinstance(block, list):
+                block[:] = [one for one in block if not _is_string(one)]
 
-    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
-        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return None if alone else self.generic_visit(node)
+
+def _is_string(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _imported(tree: ast.AST, package: str) -> Iterable[str]:
+def _imported(tree: ast.Module, package: str) -> Iterable[str]:
     """Yield the modules of `PACKAGES` that a file imports."""
-    for node in _executed(tree):
+    for node in _statements(tree, executed=True):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.split(".")[0] in PACKAGES)
         elif isinstance(node, ast.ImportFrom):
@@ -97,16 +106,15 @@ def _imported(tree: ast.AST, package: str) -> Iterable[str]:
                 yield from (f"{base}.{a.name}" for a in node.names if _source(f"{base}.{a.name}") is not None)
 
 
-def _executed(tree: ast.AST) -> Iterable[ast.AST]:
-    """Yield all nodes except those under `if TYPE_CHECKING`."""
-    waiting = [tree]
+def _statements(tree: ast.Module, *, executed: bool = False) -> Iterable[ast.AST]:
+    """Yield a module and all statements in it, or only those that are executed: not those under `if TYPE_CHECKING`."""
+    waiting: list[ast.AST] = [tree]
     while waiting:
         node = waiting.pop()
         yield node
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            waiting += node.orelse
-        else:
-            waiting += ast.iter_child_nodes(node)
+        skipped = executed and isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+        for field in ("orelse",) if skipped else _BLOCKS:
+            waiting += getattr(node, field, ())
 
 
 def _with_packages(module: str) -> list[str]:
