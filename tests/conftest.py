@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,8 @@ import hypothesis
 import pytest
 
 from tests import shape_contracts
+
+gc.disable()  # until all is collected: nothing that is imported goes away
 
 shape_contracts.install()  # before anything of the packages is imported
 
@@ -26,6 +29,13 @@ hypothesis.settings.load_profile("any machine")
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
+
+
+def pytest_collection_finish() -> None:
+    """Take what was imported and collected out of the garbage collector's rounds: it stays until the end."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

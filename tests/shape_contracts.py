@@ -49,6 +49,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     if open_ended := shaped.keys() & set(code.co_varnames[code.co_argcount + code.co_kwonlyargcount :]):
         raise TypeError(f"{function.__qualname__}: shapes of *{', '.join(open_ended)} cannot be checked")
     hints: dict[str, Any] = {}
+    held: set[Any] = set()
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -63,7 +64,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
                 pairs[name] = (hint, kwargs[name])
             elif places.get(name, len(args)) < len(args):
                 pairs[name] = (hint, args[places[name]])
-        _hold(function.__qualname__, pairs)
+        _hold(function.__qualname__, pairs, held)
         return result
 
     return call
@@ -74,14 +75,14 @@ def _checked_dataclass(cls: type) -> None:
     shaped = {f.name: str(f.type) for f in dataclasses.fields(cls) if _SHAPED.search(str(f.type))}
     if not shaped or "__init__" not in vars(cls):
         return
-    made, hints = cls.__init__, {}
+    made, hints, held = cls.__init__, {}, set()
 
     @functools.wraps(made)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
         made(self, *args, **kwargs)
         if not hints:
             hints.update({name: _resolved(text, _declaring(cls, name)) for name, text in shaped.items()})
-        _hold(cls.__qualname__, {name: (hint, getattr(self, name)) for name, hint in hints.items()})
+        _hold(cls.__qualname__, {name: (hint, getattr(self, name)) for name, hint in hints.items()}, held)
 
     cls.__init__ = init
 
@@ -105,11 +106,26 @@ def _resolved(text: str, owner: Any) -> Any:
             names[error.name] = Any  # a class that only type checkers see: not a shape
 
 
-def _hold(where: str, pairs: dict[str, tuple[Any, Any]]) -> None:
+def _hold(where: str, pairs: dict[str, tuple[Any, Any]], held: set[Any]) -> None:
+    """Raise where a value does not fit its hint; kinds of values that were `held` before fit as they did then."""
+    kinds = tuple((name, _kind(value)) for name, (_, value) in pairs.items())
+    if kinds in held:
+        return
     with jaxtyping.jaxtyped("context"):
         for name, (hint, value) in pairs.items():
             if not _fits(value, hint):
                 raise ContractError(f"{where}: {name} should be {hint}, is {_described(value)}")
+    held.add(kinds)
+
+
+def _kind(value: Any) -> Any:
+    """All of a value that decides whether it fits: its type, and the dtype and shape of arrays."""
+    shape = getattr(value, "shape", None)
+    if shape is not None:
+        return type(value), getattr(value, "dtype", None), tuple(shape)
+    if isinstance(value, list | tuple):
+        return type(value), *map(_kind, value)
+    return (dict, *map(_kind, value.values())) if isinstance(value, dict) else type(value)
 
 
 def _fits(value: Any, hint: Any) -> bool:
