@@ -27,6 +27,7 @@ _EXPORTS: dict[str, str] = {
     "Capture": "smplxpp.capture",
     "GeometryWarning": "smplxpp.core",
     "InputError": "smplxpp.core",
+    "LabelSet": "smplxpp.segment",
     "SkinWeights": "smplxpp.core",
     "Template": "smplxpp.template",
     "TransferConfig": "smplxpp.transfer",

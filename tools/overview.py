@@ -16,11 +16,11 @@ from PIL import Image
 
 from pipelines.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
 from pipelines.figures.comparison import read_tiles
-from pipelines.runs.artefacts import load_params_of_run, load_scan
+from pipelines.runs.artefacts import load_labels, load_params_of_run, load_scan
 from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core import InputError, TriangleMesh, display_colors
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.template.template import Template
 
@@ -41,7 +41,7 @@ class Overview:
         template = Template.load(self.run_folder / "60_assemble" / "smplxpp.npz")
         scan, colors, _ = load_scan(self.run_folder)
         with np.load(self.run_folder / "20_segment" / "labels.npz") as labels:
-            label_colors = display_colors(labels["face_labels"])
+            label_colors = load_labels(self.run_folder).display_colors(labels["face_labels"])
         poses = dict(zip(STRESS_POSES, template.pose(stress_poses(load_params_of_run(self.run_folder))), strict=True))
         step = template.mesh.with_vertices(poses["high_step"])
         looks = template.vertex_colors

@@ -252,6 +252,7 @@ class _Run:
             head=self._faces_of_head(rig),
             samples=self.config.samples,
             seed=self.config.seed,
+            labels=rig.template.labels,
         )
 
     def _by_set(self, frames: Mapping[int, SurfaceQuality]) -> dict[str, Surfaces]:

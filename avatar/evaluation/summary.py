@@ -9,7 +9,7 @@ from avatar.evaluation.protocol import SETS
 from avatar.evaluation.report import SKINNING_ALONE, SURFACE_SETS, EvalReport, ModelFigures, Surfaces
 from avatar.evaluation.tables import Column, FigureTable
 from avatar.metrics.surface_quality import HEAD
-from smplxpp.core.labels import CLOTH_LABELS, SKIN
+from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 
 MEGABYTE = 1e6
 REFINED_POSES = ", poses refined on training cameras"
@@ -57,6 +57,15 @@ def surface_figures(surfaces: Mapping[str, Surfaces]) -> dict[str, float | None]
                     out[f"surface.{name}.{prefix}{key}{end}"] = getattr(part, key)
         out[f"surface.{name}.frames"] = len(one.frames)
     return out
+
+
+def garments(report: EvalReport) -> tuple[str, ...]:
+    """Return the clothes that surfaces may have figures of: the built-in ones, and a user's own labels."""
+    surfaces = [report.skinning_alone, *(model.surfaces for model in report.models.values())]
+    every = [one for by_set in surfaces for one in by_set.values()]
+    found = dict.fromkeys(name for one in every for name in one.mean.labels)
+    own = (name for name in found if name not in (HEAD, *LABELS.names))
+    return (*(label.name for label in CLOTH_LABELS), *own)
 
 
 def summary_table(report: EvalReport) -> FigureTable:
@@ -136,7 +145,7 @@ def surface_table(report: EvalReport) -> FigureTable:
         ]
         columns += [
             Column(f"surface.{name}.{part}.p2s", f"P2S {part}", group, 2, "lower")
-            for part in (HEAD, SKIN.name, *(label.name for label in CLOTH_LABELS))
+            for part in (HEAD, SKIN.name, *garments(report))
         ]
     # Skinning alone is the reference that every deformation has to improve upon.
     rows = {SKINNING_ALONE: surface_figures(report.skinning_alone)} if report.skinning_alone else {}

@@ -185,7 +185,8 @@ def _surface(template: Template, cut: _Cut, config: BundleConfig) -> Tensors:
         "vertices": template.vertices[at].astype(np.float32),
         "faces": cut.faces.astype(np.uint16 if len(at) <= 1 << 16 else np.uint32),
         "parts": template.vertex_part[at].astype(np.uint8),
-        "labels": template.vertex_labels[at].astype(np.uint8),
+        # Players know the built-in labels alone.
+        "labels": template.labels.kind_ids(template.vertex_labels[at]).astype(np.uint8),
         "colors": template.vertex_colors[at],
         "joint_indices": index.astype(np.uint8),
     }

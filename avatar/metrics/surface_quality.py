@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
-from smplxpp.core import LABELS, InputError, TriangleMesh
+from smplxpp.core import LABELS, InputError, Labels, TriangleMesh
 from smplxpp.metrics import CompareConfig, DirectedDistances, MeshComparison, directed_distances, summarize
 from smplxpp.metrics.conventions import DEFAULT, convention_named
 
@@ -52,16 +52,18 @@ def surface_quality(
     head: Bool[np.ndarray, " F"] | None = None,
     samples: int = SAMPLES,
     seed: int = 0,
+    labels: Labels = LABELS,
 ) -> SurfaceQuality:
     """Compare a posed mesh with the truth over the surfaces that can be seen; see `CONVENTION`.
 
     Args:
         mesh: posed, metres.
-        vertex_labels: ids of `smplxpp.core.labels` on the mesh.
+        vertex_labels: ids of `labels` on the mesh.
         truth: the surface that the images show, metres.
         head: mask of the head's faces on the mesh; None: no head.
         samples: points on each surface, before the choice of visible ones.
         seed: of the samples.
+        labels: the template's.
 
     Raises:
         InputError: a mesh without area, or none of it to be seen.
@@ -70,22 +72,22 @@ def surface_quality(
     config = CompareConfig(visible_only=True)
     forth = directed_distances(mesh, truth, samples=samples, seed=seed, source_labels=vertex_labels, config=config)
     back = directed_distances(truth, mesh, samples=samples, seed=seed, target_labels=vertex_labels, config=config)
-    quality = _quality(_summary(forth, back))
+    quality = _quality(_summary(forth, back, labels))
     if head is None or not head.any():
         return quality
     # The head is a region across labels: relabel faces as head or rest, and summarise the same distances again.
-    region, rest = LABELS[-1].id + 1, LABELS[-1].id + 2
+    region, rest = len(labels), len(labels) + 1
     parts = (
         replace(forth, label=np.where(head[forth.samples.face], region, rest)),
         replace(back, label=np.where(head[back.face], region, rest)),
     )
-    found = _quality(_summary(*parts)).labels.get(str(region))
+    found = _quality(_summary(*parts, labels)).labels.get(str(region))
     return quality if found is None else replace(quality, labels={**quality.labels, HEAD: found})
 
 
-def _summary(forth: DirectedDistances, back: DirectedDistances) -> MeshComparison:
+def _summary(forth: DirectedDistances, back: DirectedDistances, labels: Labels) -> MeshComparison:
     config = CompareConfig()
-    return summarize(forth, back, convention=convention_named(DEFAULT), threshold_mm=config.threshold_mm)
+    return summarize(forth, back, convention=convention_named(DEFAULT), threshold_mm=config.threshold_mm, names=labels)
 
 
 def mean_surface(frames: Sequence[SurfaceQuality]) -> SurfaceQuality:

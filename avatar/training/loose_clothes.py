@@ -13,7 +13,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.models.tracked_surface import Track
 from smplxpp.cloth import Garment, GarmentConfig, cut_garment
 from smplxpp.cloth.calibrate import Calibration, CalibrationConfig, Followed, calibrate
-from smplxpp.core import CLOTH_LABELS, BodyParams, InputError, TriangleMesh, require_known, spread
+from smplxpp.core import BodyParams, InputError, TriangleMesh, require_known, spread
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import BODY_PART, Template
 
@@ -157,10 +157,10 @@ def loose_names(template: Template) -> list[str]:
 
 
 def _wanted(template: Template, config: ClothConfig) -> list[str]:
-    """Return the parts to look at: those named, or all clothes."""
+    """Return the parts to look at: those named, or all clothes that are neither tight nor rigid."""
     if config.parts is not None:
         return list(config.parts)
-    return [label.name for label in CLOTH_LABELS if label.name in template.part_names]
+    return list(template.loose_parts)
 
 
 def measure_outlines(

@@ -12,7 +12,7 @@ from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_mo
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.protocol import SETS, AsNew
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
-from avatar.evaluation.summary import REFINED_POSES, summary_figures
+from avatar.evaluation.summary import REFINED_POSES, garments, summary_figures
 from avatar.evaluation.tables import Column, FigureTable
 from avatar.rig.rig import AvatarModel
 from pipelines.ablation.rows import Row
@@ -26,7 +26,7 @@ from pipelines.stages.evaluate_inputs import surface_digest
 from pipelines.stages.evaluate_poses import of_held_out_poses, refined_digest, refined_poses
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.capture import Capture
-from smplxpp.core import CLOTH_LABELS, ProgressCallback, ignore_progress
+from smplxpp.core import ProgressCallback, ignore_progress
 from smplxpp.core.files import as_integer, as_number, atomic_write_bytes
 
 ROWS_FOLDER = f"{ABLATION}/rows"
@@ -205,6 +205,7 @@ def ablation_table(result: AblationResult) -> FigureTable:
         for name in SETS
         if any(name in one.views for r in result.rows.values() for one in r.report.models.values())
     ]
+    parts = garments(result.report) if result.rows else ()
     columns = []
     for name in shown:
         columns += [
@@ -224,9 +225,7 @@ def ablation_table(result: AblationResult) -> FigureTable:
             Column(f"surface.{name}.p2s", "P2S", group, 2, "lower"),
             Column(f"surface.{name}.chamfer", "Chamfer", group, 2, "lower"),
         ]
-        columns += [
-            Column(f"surface.{name}.{label.name}.p2s", f"P2S {label.name}", group, 2, "lower") for label in CLOTH_LABELS
-        ]
+        columns += [Column(f"surface.{name}.{part}.p2s", f"P2S {part}", group, 2, "lower") for part in parts]
     columns += [Column("megabytes", "MB", "", 1, "lower"), Column("minutes", "min", "training", 1)]
     rows = {one.row.title: row_figures(one) for one in result.rows.values()}
     return FigureTable(tuple(columns), rows, _caption(result, capture), row_title="")

@@ -25,7 +25,7 @@ from pipelines.runs.layout import GARMENTS, STUDENT
 from smplxpp.cloth import Garment, cut_garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
-from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, display_colors, require_at_least, require_positive, spread
+from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, require_at_least, require_positive, spread
 from smplxpp.core.camera import Camera
 from smplxpp.raster.shading import ShadeStyle
 from smplxpp.template.template import Template
@@ -298,7 +298,7 @@ class Animate:
         """Draw the pictures one after the other."""
         colors = {
             "scan": lambda: template.vertex_colors,
-            "labels": lambda: display_colors(template.vertex_labels),
+            "labels": lambda: template.labels.display_colors(template.vertex_labels),
             "semantic": lambda: template.semantic_colors,
             "weights": lambda: blend_joint_colors(template.weights),
             "none": lambda: None,

@@ -55,7 +55,8 @@ class Build:
     """Labels corrected by hand, as `smplxpp label` writes them. Kept in the run as labels_corrections.json, which is
     read whenever it lies there."""
     label_set: str = "auto"
-    """Label set of the labels: 4ddress, capture, lip, cihp, atr, sapiens, or a JSON file that maps ids to names.
+    """Label set of the labels: 4ddress, capture, lip, cihp, atr, pascal, sapiens, or a file: a labels.yaml of your own
+    classes (coat over shirt, socks, glasses, a bag), or a JSON object that maps ids to names.
     auto: `capture` with --capture, else 4ddress."""
     label_source: Literal["auto", "scan", "views", "body"] = "auto"
     """Labels that come with the scan, votes of its views' label maps, or what the body in the scan and its colours say.
@@ -93,6 +94,11 @@ class Build:
         dict[str, int], tyro.conf.arg(metavar="PART FACES [PART FACES ...]", help_behavior_hint="(optional)")
     ] = field(default_factory=dict)
     """Faces kept by part, for instance `--budgets upper 10000 hair 4000`; others keep their default."""
+    rules: Annotated[
+        dict[str, str], tyro.conf.arg(metavar="PART RULE [PART RULE ...]", help_behavior_hint="(optional)")
+    ] = field(default_factory=dict)
+    """How parts follow the skeleton: `--rules upper/1 rigid:spine3 outer chain:spine3,neck`. rigid:JOINT, chain:JOINTS,
+    isolate (each piece rigid by the joint nearest to it) or auto; upper/1 is the second largest piece of upper."""
     remesh: Literal["quadric", "isotropic"] = "quadric"
     """Remeshing of the parts: quadric edge collapse, or isotropic remeshing to faces of one size by pymeshlab (extra
     remesh; GPL-3)."""
@@ -181,8 +187,10 @@ class Build:
             InputError: a budget for an unknown part, or numbers out of range.
         """
         default = BuildConfig()
+        # A file is found from every folder.
+        own = Path(self.label_set)
         changed: dict[str, Any] = {
-            "budgets": default.budgets | self.budgets,
+            "label_set": str(own.absolute()) if own.is_file() else self.label_set,
             "bridges": replace(default.bridges, rounds=0) if self.keep_bridges else default.bridges,
             "fill_holes": replace(default.fill_holes, width=0.0) if self.keep_holes else default.fill_holes,
             # Landmarks and corrections lie in the run, where every stage finds them.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
@@ -12,6 +13,7 @@ import numpy as np
 
 from pipelines.runs.layout import (
     CANONICAL,
+    LABEL_TABLE,
     LOCATE_STAGE,
     PARAMS,
     PARTS,
@@ -24,8 +26,17 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import MANIFEST, StageRecord
 from smplxpp.body import BodyModel, load_params
 from smplxpp.build.data import LocatedInScan, Part, PosedFit, PreparedScan
-from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, SkinWeights, TriangleMesh, require_positive
-from smplxpp.core.files import as_integer, as_numbers, read_arrays
+from smplxpp.core import (
+    ARRAY_NAMES,
+    LABELS,
+    BodyParams,
+    InputError,
+    Labels,
+    SkinWeights,
+    TriangleMesh,
+    require_positive,
+)
+from smplxpp.core.files import as_integer, as_numbers, atomic_write_text, read_arrays, read_json
 from smplxpp.core.files.safe_pickle import safe_npz
 from smplxpp.skinning import Unposed
 
@@ -97,6 +108,18 @@ def load_scan_labels(run: Path, faces: int) -> np.ndarray:
     with values_of(run / SCAN_LABELS):
         _check("face_labels", labels, "iu", (faces,))
         return labels
+
+
+def save_labels(folder: Path, labels: Labels) -> None:
+    """Write what the ids of labels stand for, unless they are the built-in ones."""
+    if labels != LABELS:
+        atomic_write_text(folder / Path(LABEL_TABLE).name, json.dumps(labels.as_list(), indent=1) + "\n")
+
+
+def load_labels(run: Path) -> Labels:
+    """Read what the ids of a run's labels stand for: what `save_labels` wrote, or the built-in labels."""
+    path = run / LABEL_TABLE
+    return Labels.from_list(read_json(path), subject=f"file {path}") if path.is_file() else LABELS
 
 
 def save_fit(folder: Path, fit: PosedFit) -> None:

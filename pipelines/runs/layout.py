@@ -61,6 +61,7 @@ SCAN = f"{CAPTURE_STAGE}/scan.npz"
 PARAMS = f"{CAPTURE_STAGE}/params.npz"
 POSED_BODY = f"{POSE_BODY_STAGE}/body.npz"
 SCAN_LABELS = f"{SEGMENT_STAGE}/labels.npz"
+LABEL_TABLE = f"{SEGMENT_STAGE}/label_table.json"  # where labels are not the built-in ones alone
 PARTS = f"{CLEAN_STAGE}/parts.npz"
 WEIGHTS = f"{TRANSFER_STAGE}/weights.npz"
 PARTS_WITHOUT_BRIDGES = f"{TRANSFER_STAGE}/parts.npz"

@@ -33,11 +33,6 @@ Progress = Callable[[str, bool], None]
 """Called with a stage's name before (False) and after (True) it."""
 Report = Callable[[Path, BuildInputs, BuildConfig, dict[str, StageRecord]], object]
 """Writes the page of a run from its inputs, choices and the records of its stages."""
-_READERS: dict[str, Callable[[Path], object]] = {
-    layout.LANDMARKS_FILE: read_landmarks,
-    layout.CORRECTIONS_FILE: Corrections.load,
-}
-"""Readers of the files that a user places in a run; they refuse a wrong file before anything is replaced."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +97,8 @@ PARTS: dict[str, _Part] = {
     layout.TRANSFER_STAGE: _Part(
         template_stages.transfer,
         "parts",
-        (layout.POSE_BODY_STAGE, layout.CLEAN_STAGE),
-        settings=("max_influences", "method", "bridges"),
+        (layout.POSE_BODY_STAGE, layout.SEGMENT_STAGE, layout.CLEAN_STAGE),
+        settings=("max_influences", "method", "bridges", "rules"),
         files=("body",),
         writers=("pipelines.figures.colors",),
     ),
@@ -173,9 +168,14 @@ def build(
         BodyNotFoundError: no person was found in the scan, or none with enough confidence; a picture lies in the run.
         InputError: unusable input; every finished stage is kept.
     """
-    # Keep the user's files in the run first, so that they remain there if the build fails.
+    # Keep the user's files in the run first, so that they remain there if the build fails. Readers refuse wrong ones
+    # before anything is replaced.
+    readers: dict[str, Callable[[Path], object]] = {
+        layout.LANDMARKS_FILE: read_landmarks,
+        layout.CORRECTIONS_FILE: partial(Corrections.load, labels=inputs.labels_used),
+    }
     for name, source in (by_hand or {}).items():
-        take_file(run, name, source, read=_READERS[name])
+        take_file(run, name, source, read=readers[name])
     # Check the range of stages and the inputs before the run folder is touched.
     for name in (first, last):
         require_choice("stage", name, BUILD_STAGES)
@@ -184,7 +184,7 @@ def build(
     assert inputs.registers == (registration is not None), "what to register to"
     assert inputs.reconstructs == (reconstruction is not None), "what to reconstruct from"
     config = resolved(config, inputs)
-    check_inputs(inputs)
+    check_inputs(inputs, config=config)
     # The lock keeps a second process from writing into the run while stages change. `build.json` is written first,
     # because stages and the report of an interrupted build read it.
     with own_run_folder(run, (*BUILD_STAGES, "build", "metrics", "report")):
@@ -249,6 +249,9 @@ def _stage(name: str, context: BuildContext, records: dict[str, StageRecord]) ->
         # The path of a model does not identify its content.
         identity = load_detector(config.detector).identity
         digests["detector"] = hashlib.sha256(identity.encode()).hexdigest()
+    label_set = Path(str(inputs.label_set))
+    if "label_set" in part.settings and label_set.is_file():
+        digests["label_set"] = sha256_file(label_set)
     digests |= {file: sha256_file(context.run / file) for file in part.by_hand if (context.run / file).exists()}
     for other in (name for name in part.needs if name in records):
         digests |= {f"{other}/{file}": digest for file, digest in records[other].manifest["files"].items()}

@@ -12,7 +12,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
 from avatar.evaluation.protocol import SETS, measured_splits, view_sets, with_people
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, ModelFigures, view_key
-from avatar.evaluation.summary import evaluation_tables, summary_figures
+from avatar.evaluation.summary import evaluation_tables, garments, summary_figures
 from avatar.gaussians.bound_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student, StudentConfig
@@ -42,7 +42,7 @@ from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
-from smplxpp.core import CLOTH_LABELS, Check, InputError, ProgressCallback, ignore_progress, require_known
+from smplxpp.core import Check, InputError, ProgressCallback, ignore_progress, require_known
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.metrics.comparison import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
@@ -333,8 +333,8 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
         if part not in best.surfaces or name == "teacher":
             continue
         own, alone = best.surfaces[part].mean.labels, report.skinning_alone[part].mean.labels
-        for label in CLOTH_LABELS:
-            ours, skinned = (found[label.name].p2s if label.name in found else None for found in (own, alone))
+        for garment in garments(report):
+            ours, skinned = (found[garment].p2s if garment in found else None for found in (own, alone))
             if ours and skinned:
                 pixel_mm = pixel * MM
                 # Relax the gate where skinning is within a pixel of the truth, see `MATCHING_ERROR_PIXELS`.
@@ -343,7 +343,7 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
                 gate = replace(gate, warn=gate.warn + slack, fail=max(gate.fail, gate.warn + slack))
                 checks.append(
                     gate.check(
-                        f"P2S of {label.name} against skinning alone, {title}",
+                        f"P2S of {garment} against skinning alone, {title}",
                         ours / skinned,
                         explanation="below 1: the mesh that the field moves is nearer to the truth"
                         + (

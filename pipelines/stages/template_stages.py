@@ -18,6 +18,7 @@ from pipelines.runs.artefacts import (
     load_canonical,
     load_cleaned_parts,
     load_fit,
+    load_labels,
     load_params_of_run,
     load_parts,
     load_prepared_scan,
@@ -28,6 +29,7 @@ from pipelines.runs.artefacts import (
     save_arrays,
     save_canonical,
     save_fit,
+    save_labels,
     save_located,
     save_parts,
     save_scan,
@@ -54,7 +56,7 @@ from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces, vertex_labels
 from smplxpp.build.validate import validate_template
 from smplxpp.build.verdict import LEAST_CONFIDENCE, require_found
-from smplxpp.core import BodyParams, StageOutput, display_colors, write_ply
+from smplxpp.core import BodyParams, StageOutput, write_ply
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export import write_glb, write_obj
 from smplxpp.metrics.comparison import MM
@@ -129,13 +131,15 @@ def pose_body(folder: Path, build: BuildContext) -> StageOutput:
 def segment(folder: Path, build: BuildContext) -> StageOutput:
     """Write a label, a confidence and a seen flag for every face."""
     scan, path = load_prepared_scan(build.run), build.run / CORRECTIONS_FILE
+    labels = build.inputs.labels_used
     labelled, output = label_faces(
         scan,
         build.inputs,
         load_body(build.inputs.body),
         load_params_of_run(build.run),
-        corrections=Corrections.load(path) if path.exists() else None,
+        corrections=Corrections.load(path, labels=labels) if path.exists() else None,
     )
+    save_labels(folder, labels)
     # Keep the labels before corrections too: the report shows what was changed by hand.
     result, before = labelled.result, labelled.before
     assert result.corrected is not None
@@ -154,7 +158,7 @@ def segment(folder: Path, build: BuildContext) -> StageOutput:
     write_ply(
         folder / "labels.ply",
         scan.mesh,
-        vertex_colors=display_colors(vertex_labels(scan.mesh, result.face_labels), certain),
+        vertex_colors=labels.display_colors(vertex_labels(scan.mesh, result.face_labels), certain),
         face_properties={
             "label": result.face_labels,
             "confidence": result.confidence,
@@ -167,7 +171,8 @@ def segment(folder: Path, build: BuildContext) -> StageOutput:
 def clean(folder: Path, build: BuildContext) -> StageOutput:
     """Write one clean mesh within its face budget for every part that is not skin."""
     scan = load_prepared_scan(build.run)
-    parts, output = clean_scan(scan, load_scan_labels(build.run, scan.mesh.face_count), build.config)
+    face_labels = load_scan_labels(build.run, scan.mesh.face_count)
+    parts, output = clean_scan(scan, face_labels, build.config, load_labels(build.run))
     save_parts(folder, parts)
     return output
 
@@ -176,7 +181,7 @@ def transfer(folder: Path, build: BuildContext) -> StageOutput:
     """Write skin weights of every part from the posed body, and the parts without the bridges that the weights show."""
     body = load_body(build.inputs.body)
     cleaned, fit = load_cleaned_parts(build.run), load_fit(build.run, body)
-    parts, weights, output = transfer_to_parts(cleaned, fit, body, build.config)
+    parts, weights, output = transfer_to_parts(cleaned, fit, body, build.config, load_labels(build.run))
     save_weights(folder, weights)
     save_parts(folder, parts)
     for name, part in parts.items():
@@ -213,6 +218,7 @@ def assemble(folder: Path, build: BuildContext) -> StageOutput:
         load_cleaned_parts(build.run),
         {name: RestPart(part, weights[name], at_rest[name].vertices) for name, part in posed.items()},
         build.config,
+        labels=load_labels(build.run),
     )
     template.save(folder / "smplxpp.npz")
     # Other programs expect a figure that stands on the floor.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.runs.artefacts import load_scan, load_scan_labels, read_named, take, values_of
+from pipelines.runs.artefacts import load_labels, load_scan, load_scan_labels, read_named, take, values_of
 from pipelines.runs.layout import (
     CORRECTIONS_FILE,
     LANDMARKS_FILE,
@@ -41,7 +41,7 @@ def open_session(run: Path) -> LabelSession:
     corrections, landmarks = run / CORRECTIONS_FILE, run / LANDMARKS_FILE
     return LabelSession(
         _labelled_scan(run),
-        Corrections.load(corrections) if corrections.exists() else None,
+        Corrections.load(corrections, labels=load_labels(run)) if corrections.exists() else None,
         read_landmarks(landmarks) if landmarks.exists() else None,
     )
 
@@ -65,7 +65,7 @@ def _labelled_scan(run: Path) -> LabelledScan:
                 found["confidence_before_hand"], (mesh.face_count,), subject="confidence_before_hand"
             )
             labels = _before_hand(found["labels_before_hand"], mesh.face_count)
-    return LabelledScan(mesh, colors, labels.astype(np.int64), confidence)
+    return LabelledScan(mesh, colors, labels.astype(np.int64), confidence, load_labels(run))
 
 
 def _before_hand(labels: np.ndarray, faces: int) -> np.ndarray:

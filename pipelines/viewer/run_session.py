@@ -26,7 +26,7 @@ from pipelines.viewer.run_models import (
 )
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import Capture
-from smplxpp.core import POSE_BLOCKS, BodyParams, display_colors, matrix_from_rotvec, require_choice, rotvec_from_matrix
+from smplxpp.core import POSE_BLOCKS, BodyParams, matrix_from_rotvec, require_choice, rotvec_from_matrix
 from smplxpp.core.light import Relighting
 from smplxpp.template.template import Template
 
@@ -178,7 +178,7 @@ class RunSession:
         if coloring == "photograph":
             return self.template.vertex_colors
         if coloring == "labels":
-            return display_colors(self.template.vertex_labels)
+            return self.template.labels.display_colors(self.template.vertex_labels)
         if coloring == "weights":
             return blend_joint_colors(self.template.weights)
         names = self.template.body.joint_names

@@ -6,12 +6,12 @@ from typing import Any, Literal
 
 import numpy as np
 import pygltflib
-from jaxtyping import Float, Float64, Int, Int64, UInt8
+from jaxtyping import Float, Float64, Int64, UInt8
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from pipelines.figures.colors import heat_colors
 from pipelines.viewer.session import LabelSession, UncertainRegion, lies_within
-from smplxpp.core import LABELS, TriangleMesh, display_colors
+from smplxpp.core import LABELS, Labels, TriangleMesh
 from smplxpp.export.gltf import linear_rgba16
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
 
@@ -19,11 +19,6 @@ MOST_SPLIT_FACES = 250_000
 """Scans with more faces are drawn with vertex colours, because separate corners for every face would take too long."""
 _LIFT = 0.0007
 """Distance of painted faces above the scan, metres, against flickering depth."""
-
-
-def label_colors(labels: Int[np.ndarray, " M"]) -> UInt8[np.ndarray, "M 3"]:
-    """Return the display colours of labels."""
-    return display_colors(labels)
 
 
 def confidence_colors(confidence: Float64[np.ndarray, " M"]) -> UInt8[np.ndarray, "M 3"]:
@@ -73,14 +68,14 @@ def _glb(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, faces: n
     return buffers.glb()
 
 
-def legend(labels: Int64[np.ndarray, " M"], areas: Float64[np.ndarray, " M"]) -> str:
+def legend(labels: Int64[np.ndarray, " M"], areas: Float64[np.ndarray, " M"], known: Labels = LABELS) -> str:
     """The labels, their colours and shares of the surface, as HTML."""
-    share = np.bincount(labels, areas, minlength=len(LABELS)) / areas.sum()
+    share = np.bincount(labels, areas, minlength=len(known)) / areas.sum()
     rows = (
         f'<div style="display:flex;gap:.5em;align-items:center"><span style="width:1em;height:1em;border-radius:.2em;'
         f'background:rgb{label.display_rgb}"></span><span style="flex:1">{label.name}</span>'
         f"<span>{100 * share[label.id]:.1f} %</span></div>"
-        for label in LABELS
+        for label in known
     )
     return f'<div style="padding:0 .8em .4em .8em;font-size:.85em">{"".join(rows)}</div>'
 
@@ -123,7 +118,8 @@ class ScanScene:
         elif mode == "photograph" or not session.has_labels:
             node = self._server.scene.add_glb(_BASE, colored_glb(mesh, vertex_colors=session.scan.colors))
         else:
-            of_faces = label_colors(session.labels()) if mode == "labels" else confidence_colors(session.confidence())
+            colors = session.scan.known.display_colors
+            of_faces = colors(session.labels()) if mode == "labels" else confidence_colors(session.confidence())
             node = self._server.scene.add_glb(_BASE, colored_glb(mesh, face_colors=of_faces))
         return node
 
@@ -196,7 +192,7 @@ class ScanScene:
         self, group: str, session: LabelSession, faces: Int64[np.ndarray, " n"], labels: Int64[np.ndarray, " n"]
     ) -> None:
         nodes = self._nodes.setdefault(group, [])
-        glb = painted_glb(session.scan.mesh, faces, label_colors(labels))
+        glb = painted_glb(session.scan.mesh, faces, session.scan.known.display_colors(labels))
         nodes.append(self._server.scene.add_glb(f"{group}/{len(nodes)}", glb))
 
     def _clear(self, group: str) -> None:

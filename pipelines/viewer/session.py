@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64, UInt8
 
 from pipelines.runs.layout import CORRECTIONS_FILE, LANDMARKS_FILE
-from smplxpp.core import LABELS, InputError, TriangleMesh, normalize_rows
+from smplxpp.core import LABELS, InputError, Labels, TriangleMesh, normalize_rows
 from smplxpp.core.topology import component_labels
 from smplxpp.register import write_landmarks
 from smplxpp.segment import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
@@ -115,12 +115,14 @@ class LabelledScan:
     Attributes:
         mesh: metres, +Y up. colors: of its vertices.
         labels, confidence: of its faces; None: the run has none yet.
+        known: what ids of labels stand for.
     """
 
     mesh: TriangleMesh
     colors: UInt8[np.ndarray, "N 3"]
     labels: Int64[np.ndarray, " M"] | None
     confidence: Float64[np.ndarray, " M"] | None
+    known: Labels = LABELS
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +169,7 @@ class LabelSession:
     @property
     def corrections(self) -> Corrections:
         """Return all corrections of the session."""
-        return Corrections(self._state.items)
+        return Corrections(self._state.items, self.scan.known)
 
     @property
     def landmarks(self) -> Mapping[str, Float64[np.ndarray, " 3"]]:
@@ -212,7 +214,7 @@ class LabelSession:
     def brush(self, label: int, lines: list[Line], radius: float) -> int:
         """Paint along lines on the surface; returns the number of faces under them."""
         items = [StrokeCorrection(label, points, radius, normals) for points, normals in lines]
-        return self._add(items, f"{LABELS[label].name} painted")
+        return self._add(items, f"{self.scan.known[label].name} painted")
 
     def patch(self, label: int, face: int) -> int:
         """Give the whole patch that has this face's label, as far as it reaches, another label."""
@@ -220,7 +222,8 @@ class LabelSession:
         same = labels[pairs[:, 0]] == labels[pairs[:, 1]]
         patch = component_labels(pairs[same], len(labels))
         faces = np.flatnonzero(patch == patch[face])
-        words = f"a patch of {LABELS[labels[face]].name} to {LABELS[label].name}"
+        known = self.scan.known
+        words = f"a patch of {known[int(labels[face])].name} to {known[label].name}"
         return self._add([FaceCorrection.of(self.scan.mesh, label, faces)], words)
 
     def box(
@@ -233,13 +236,13 @@ class LabelSession:
         """Give everything in a box a label; returns the number of faces in it, 0 changes nothing."""
         item = BoxCorrection(label, *(np.asarray(value, dtype=np.float64) for value in (center, size, rotation)))
         inside = np.abs((self.surface.centers - item.center) @ item.rotation) <= 0.5 * item.size
-        return self._add([item], f"a box of {LABELS[label].name}") if inside.all(axis=1).any() else 0
+        return self._add([item], f"a box of {self.scan.known[label].name}") if inside.all(axis=1).any() else 0
 
     def remove(self, number: int) -> None:
         """Take back one correction, by its place among them."""
         state = self._state
         items, faces = list(state.items), list(state.faces)
-        name = LABELS[items.pop(number).label].name
+        name = self.scan.known[items.pop(number).label].name
         faces.pop(number)
         self._now(_State(tuple(items), tuple(faces), state.landmarks, f"correction {number + 1} ({name}) removed"))
 
@@ -264,7 +267,7 @@ class LabelSession:
         """Write both files of a run whole; returns the names of those that were written."""
         out, state = [], self._state
         if state.items or (run / CORRECTIONS_FILE).exists():
-            Corrections(state.items).save(run / CORRECTIONS_FILE)
+            Corrections(state.items, self.scan.known).save(run / CORRECTIONS_FILE)
             out.append(CORRECTIONS_FILE)
         if state.landmarks or (run / LANDMARKS_FILE).exists():
             write_landmarks(run / LANDMARKS_FILE, state.landmarks)

@@ -16,7 +16,7 @@ from pipelines.viewer.run_scan import label_again
 from pipelines.viewer.scene import MODES, ScanScene, legend
 from pipelines.viewer.server import address_of, one_at_a_time, plain_markdown, start_server, stop_server
 from pipelines.viewer.session import CHOICE, LabelSession, UncertainRegion, lies_within, uncertain_regions
-from smplxpp.core.labels import LABEL_BY_NAME, LABELS, UPPER
+from smplxpp.core.labels import UPPER, Labels
 from smplxpp.segment.corrected_faces import stroked_faces
 
 log = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ class LabelWindow:
             tools = (BRUSH, PATCH, BOX, LANDMARK) if self.session.has_labels else (LANDMARK,)
             self._tool = gui.add_dropdown("Tool", tools)
             self._help = gui.add_markdown(_HELP[tools[0]])
-            self._label = gui.add_dropdown("Label", tuple(LABEL_BY_NAME), initial_value=UPPER.name)
+            self._label = gui.add_dropdown("Label", self._known.names, initial_value=UPPER.name)
             self._radius = gui.add_slider("Brush (mm)", min=3, max=120, step=1, initial_value=20)
             self._size = gui.add_vector3("Box (m)", (0.2, 0.2, 0.2), min=(0.01,) * 3, max=(3.0,) * 3, step=0.01)
             self._fill = gui.add_button("Label what is in the box")
@@ -190,8 +190,12 @@ class LabelWindow:
     # -- what the controls do
 
     @property
+    def _known(self) -> Labels:
+        return self.session.scan.known
+
+    @property
     def _label_id(self) -> int:
-        return LABEL_BY_NAME[self._label.value].id
+        return self._known.named(self._label.value).id
 
     @property
     def _meters(self) -> float:
@@ -200,13 +204,13 @@ class LabelWindow:
     def _draw_box(self, center: Float[np.ndarray, " 3"]) -> None:
         if self._box is not None:
             self._box[0].remove()
-        self._box = self.scene.draw_box(center, np.array(self._size.value), LABELS[self._label_id].display_rgb)
+        self._box = self.scene.draw_box(center, np.array(self._size.value), self._known[self._label_id].display_rgb)
 
     @one_at_a_time
     def _resize_box(self) -> None:
         if self._box is not None:
             gizmo, shape = self._box
-            shape.dimensions, shape.color = tuple(self._size.value), LABELS[self._label_id].display_rgb
+            shape.dimensions, shape.color = tuple(self._size.value), self._known[self._label_id].display_rgb
             self._box = gizmo, shape
 
     @one_at_a_time
@@ -297,9 +301,9 @@ class LabelWindow:
         self._remark()
         if session.has_labels:
             labels, mesh = session.labels(), session.scan.mesh
-            self._legend.content = legend(labels, mesh.face_areas)
+            self._legend.content = legend(labels, mesh.face_areas, session.scan.known)
             self._regions = uncertain_regions(session.surface, labels, session.confidence(), session.corrected())
-        names = [f"{k + 1}: {LABELS[item.label].name}" for k, item in enumerate(session.corrections.items)]
+        names = [f"{k + 1}: {session.scan.known[item.label].name}" for k, item in enumerate(session.corrections.items)]
         self._list.options = tuple(names[::-1]) or (_NONE,)
         self._at = min(self._at, len(self._regions) - 1)
         self._show_regions()
@@ -316,5 +320,5 @@ class LabelWindow:
             one = self._regions[max(self._at, 0)]
             place = f"{max(self._at, 0) + 1} of {len(self._regions)}"
             self._doubt.content = (
-                f"{place}: {LABELS[one.label].name}, {1e4 * one.area:.0f} cm², confidence {one.confidence:.2f}"
+                f"{place}: {self._known[one.label].name}, {1e4 * one.area:.0f} cm², confidence {one.confidence:.2f}"
             )

@@ -23,18 +23,20 @@ from smplxpp.assemble.layers import (
 from smplxpp.assemble.push_out import PushConfig, flipped_faces, push_out, stand_off
 from smplxpp.body.model import BodyModel
 from smplxpp.core import (
+    LABELS,
     OBJECT,
     SHOE,
     SKIN,
     BodyParams,
     GeometryWarning,
     InputError,
+    Label,
+    Labels,
     SkinWeights,
     TriangleMesh,
     concatenate_meshes,
 )
 from smplxpp.core.errors import one_line
-from smplxpp.core.labels import LAYER_ORDER
 from smplxpp.template.template import BODY_PART, Template
 
 
@@ -66,13 +68,14 @@ class AssemblyConfig:
     Attributes:
         clearance: distance between layers after the repair, metres.
         push: the other options of the repair.
-        layer_order: label ids from the skin outwards; things (`object`) are no layers and stay where they are.
+        labels: what the parts' labels stand for; their layers are the order from the skin outwards. Things (kind
+            `object`) are no layers and stay where they are.
         skin_color: sRGB of the body's vertices.
     """
 
     clearance: float = 1e-3
     push: PushConfig = field(default_factory=PushConfig)
-    layer_order: tuple[int, ...] = LAYER_ORDER
+    labels: Labels = LABELS
     skin_color: tuple[int, int, int] = (205, 170, 150)
 
 
@@ -156,7 +159,7 @@ def assemble_template(
 ) -> tuple[Template, AssemblyReport]:
     """Put the shaped body and its parts together, outer layers pushed out of inner ones.
 
-    Parts are processed from the skin outwards (`config.layer_order`); each is pushed out of the body and of every
+    Parts are processed from the skin outwards (`Labels.layer_order`); each is pushed out of the body and of every
     part inside it, which were repaired before; feet are drawn into their shoes (`feet_in_shoes`). Vertices that keep
     the clearance stay, but for those around a push. No part is pushed farther than it stands off the body
     (`stand_off`). If that is not enough, the body does not fit the scan, and the report names the place.
@@ -186,7 +189,7 @@ def assemble_template(
     # Without the mean hand, because its pose correctives are not part of the T-pose.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
     # Feet yield to shoes, everything else to the body.
-    shoes = [(part.mesh, part.weights) for part in parts.values() if part.label == SHOE.id]
+    shoes = [(part.mesh, part.weights) for part in parts.values() if is_shoe(config.labels[part.label])]
     rest, body = feet_in_shoes(body, rest, shoes)
     body_mesh = body.mesh(rest)
     meshes, report = _separate(body, body_mesh, parts, config)
@@ -194,14 +197,20 @@ def assemble_template(
     return template, report
 
 
+def is_shoe(label: Label) -> bool:
+    """Whether a part of this label is stiff below the ankle, as shoes are and socks (tight) are not."""
+    return label.kind == SHOE.name and not label.tight and label.rule == "auto"
+
+
 def _check_part(name: str, part: CanonicalPart, body: BodyModel, config: AssemblyConfig) -> None:
     # Each row: the condition, what was expected, and what was received.
     count = part.mesh.vertex_count
+    allowed = [label.id for label in config.labels if label.kind != SKIN.name]
     checks = [
         (name != BODY_PART, "another name than the body's", repr(name)),
         (
-            part.label in (*config.layer_order, OBJECT.id),
-            f"a label of {(*config.layer_order, OBJECT.id)}",
+            part.label in allowed,
+            f"a label of {tuple(allowed)}",
             str(part.label),
         ),
         (part.mesh.face_count > 0, "a mesh with faces", "none"),
@@ -222,10 +231,11 @@ def _separate(
     push = replace(config.push, clearance=config.clearance)
     obstacles = [Obstacle(BODY_PART, body_mesh, solid=True, max_depth=push.max_depth)]
     # Fingers close round a thing in a hand, so that it is no layer, and pushing it out would bend it.
-    meshes = {name: part.mesh for name, part in parts.items() if part.label == OBJECT.id}
+    labels = config.labels
+    meshes = {name: part.mesh for name, part in parts.items() if labels[part.label].kind == OBJECT.name}
     reports = {}
     # Parts of one label lie side by side and are no obstacles to each other.
-    for label in config.layer_order:
+    for label in labels.layer_order:
         layer = [name for name, part in parts.items() if part.label == label]
         for name in layer:
             mesh = parts[name].mesh
@@ -298,6 +308,7 @@ def _template(
         body_index=np.concatenate([np.arange(count), nearest]),
         scan_index=np.concatenate(scan_index),
         metadata={"body": body.name, "smplxpp": metadata.version("smplxpp")},
+        labels=config.labels,
     )
 
 

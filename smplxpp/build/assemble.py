@@ -16,7 +16,18 @@ from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
 from smplxpp.clean.shreds import cut_borders
 from smplxpp.clean.smooth import smooth_cuts
-from smplxpp.core import OBJECT, SKIN, BodyParams, Check, InputError, SkinWeights, StageOutput, TriangleMesh
+from smplxpp.core import (
+    LABELS,
+    OBJECT,
+    SKIN,
+    BodyParams,
+    Check,
+    InputError,
+    Labels,
+    SkinWeights,
+    StageOutput,
+    TriangleMesh,
+)
 from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import pose
 from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
@@ -32,6 +43,8 @@ def assemble_parts(
     cleaned: Mapping[str, Part],
     parts: Mapping[str, RestPart],
     config: BuildConfig,
+    *,
+    labels: Labels = LABELS,
 ) -> tuple[Template, StageOutput]:
     """Put body and parts together as one `Template`, with its layers apart.
 
@@ -44,11 +57,13 @@ def assemble_parts(
         cleaned: the parts before bridges were cut, which tell the holes of a cut from openings.
         parts: the same parts without bridges, in the T-pose.
         config: choices of the build.
+        labels: what the ids of labels stand for.
     """
+    kinds = labels.kind_ids(face_labels)
     canonical, filled = {}, {}
     # Where a thing was taken off, the scan lacks the cloth behind it, and the thing's own back.
     taken = np.zeros(scan.mesh.vertex_count, dtype=bool)
-    taken[scan.mesh.faces[face_labels == OBJECT.id]] = True
+    taken[scan.mesh.faces[kinds == OBJECT.id]] = True
     for name, before in cleaned.items():
         # A part's vertices at rest come from the inverse skinning of its posed mesh. The faces are the same in both
         # poses.
@@ -62,11 +77,11 @@ def assemble_parts(
         )
         canonical[name], filled[name] = _filled(made, before, part, fit, taken=taken, config=config.fill_holes)
     # The clearance is given in millimetres by the user; every length inside the package is in metres.
-    settings = AssemblyConfig(clearance=config.clearance_mm / MM)
+    settings = AssemblyConfig(clearance=config.clearance_mm / MM, labels=labels)
     template, report = assemble_template(body, params, canonical, config=settings)
     # A body vertex takes the colour of the scan's skin where that is close; elsewhere the median of the skin that is
     # seen.
-    template = _with_scan_colors(template, scan, face_labels == SKIN.id, fit, body)
+    template = _with_scan_colors(template, scan, kinds == SKIN.id, fit, body)
     # A layer that penetrates another shows through it, so that the first check allows no such vertex (limits 0). What
     # the repair leaves inside is zero unless the fit is wrong, since no part may be pushed farther than it stands off
     # the body.

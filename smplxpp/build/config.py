@@ -14,8 +14,19 @@ from smplxpp.body import Whose
 from smplxpp.capture import Capture
 from smplxpp.clean import BridgeConfig
 from smplxpp.clean.scan_frame import AUTO, check_height
-from smplxpp.core import LABELS, BodyParams, InputError, MeshLike, require_at_least, require_between, require_choice
+from smplxpp.core import (
+    BodyParams,
+    InputError,
+    Labels,
+    MeshLike,
+    require_at_least,
+    require_between,
+    require_choice,
+    require_known,
+)
 from smplxpp.core.errors import one_line
+from smplxpp.core.labels import PartRule
+from smplxpp.segment import LABEL_SETS, LabelSet, find_label_set
 
 STEPS = (
     *("reconstruct", "locate", "register"),
@@ -27,10 +38,6 @@ UNITS = (AUTO, "m", "cm", "mm", "inch")
 UP_AXES = (AUTO, "y", "z", "x", "-y", "-z", "-x")
 WHOSE: tuple[str, ...] = get_args(Whose)
 LABEL_SOURCES = (AUTO, "scan", "views", "body")
-
-
-def _default_budgets() -> dict[str, int]:
-    return {label.name: label.face_budget for label in LABELS if label.face_budget}
 
 
 @dataclass(frozen=True)
@@ -51,15 +58,19 @@ class BuildConfig:
         masks: folder of masks that replaces the capture's own.
         landmarks: points placed by hand on the scan, a file or points by name. They tell where the body is.
         corrections: file of labels corrected by hand, as `smplxpp label` writes it.
-        label_set: name of the label set that labels and label maps use, or a JSON mapping file. "auto": "capture" with
-            a capture, else "4ddress".
+        label_set: label set that labels and label maps use: a name, a file (labels.yaml, or a JSON mapping) or a
+            `LabelSet`. One of one's own has more classes than the built-in ones. "auto": "capture" with a capture, else
+            "4ddress".
         label_source: "scan" takes labels that come with the scan, "views" lets label maps vote, "body" asks the fitted
             body and the colours. "auto": the first of views, scan and body that there is.
         register: whether the body is registered to the capture (or to the scan), "on", "off" or "auto". "auto": where
             the capture states that its parameters are tracked, and where it has none.
         detector: keypoint model that tells front and limbs of a scan without parameters: "mediapipe" or an ONNX
             file. None: the surface alone decides.
-        budgets: number of faces kept by part name.
+        budgets: number of faces kept by part name; others keep what their label says.
+        rules: how a part follows the skeleton by its name, or a piece of it by name and number ("upper/1"; 0 is the
+            largest in area): "auto", "rigid:JOINT", "chain:JOINT,JOINT,..." or "isolate", see `TransferConfig`. They come
+            before the rules of the labels.
         remesh: method that makes the parts' faces, "quadric" or "isotropic".
         clearance_mm: distance kept between layers, millimetres, 0.1 to 10.
         max_influences: joints that a vertex may follow.
@@ -86,11 +97,12 @@ class BuildConfig:
     masks: Path | None = None
     landmarks: Path | Mapping[str, Any] | None = None
     corrections: Path | None = None
-    label_set: str = AUTO
+    label_set: str | LabelSet = AUTO
     label_source: str = AUTO
     register: Literal["auto", "on", "off"] = "auto"
     detector: str | None = None
-    budgets: dict[str, int] = field(default_factory=_default_budgets)
+    budgets: dict[str, int] = field(default_factory=dict)
+    rules: dict[str, str] = field(default_factory=dict)
     remesh: str = "quadric"
     clearance_mm: float = 1.0
     max_influences: int = 8
@@ -111,10 +123,11 @@ class BuildConfig:
         require_choice("option whose", self.whose, WHOSE)
         require_choice("option register", self.register, (AUTO, "on", "off"))
         require_choice("option method", self.method, ("ours", "paper"))
-        parts = _default_budgets()
-        unknown = sorted(set(self.budgets) - set(parts))
-        if unknown:
-            raise InputError("option budgets", expected=f"parts among {', '.join(parts)}", received=", ".join(unknown))
+        # The labels of a file are known when it is read, before the first step.
+        if isinstance(self.label_set, LabelSet) or self.label_set in (AUTO, *LABEL_SETS):
+            self.check_parts(find_label_set("4ddress" if self.label_set == AUTO else self.label_set).labels)
+        for name, rule in self.rules.items():
+            PartRule.parse(rule, subject=f"option rules: {name}")
         # Millimetres; a value outside this range is most likely in another unit.
         require_between("option clearance-mm", self.clearance_mm, 0.1, 10.0)
         # The 95th percentile of 1000 samples rests on 50 of them; fewer would make the limits of `validate` a matter
@@ -127,6 +140,21 @@ class BuildConfig:
             ("budgets", min(self.budgets.values(), default=100), 100),
         ):
             require_at_least(f"option {name}", value, least)
+
+    def check_parts(self, labels: Labels) -> None:
+        """Refuse budgets and rules of parts that no label has.
+
+        Raises:
+            InputError: it names the part.
+        """
+        parts = [label.name for label in labels if label.face_budget]
+        require_known("option budgets", self.budgets, parts)
+        require_known("option rules", (name.partition("/")[0] for name in self.rules), parts)
+        for name in self.rules:
+            if "/" in name and not name.partition("/")[2].isdigit():
+                raise InputError(
+                    "option rules", expected="PART, or PART/NUMBER of a piece, as upper/1", received=repr(name)
+                )
 
 
 @dataclass(frozen=True)
@@ -143,7 +171,7 @@ class BuildInputs:
         label_maps: label image by camera name.
         photographs: image of the frame by camera name. They tell whether the scan is mirrored.
         cameras: camera file of label maps and photographs.
-        label_set: name of the label set that labels and label maps use, or a JSON mapping file.
+        label_set: label set that labels and label maps use: a name, a file or a `LabelSet`.
         label_source: "auto" takes the labels that there are; "body" ignores them.
         reconstructs: whether the scan is reconstructed from photographs.
         locates: whether the body has to be found in the scan.
@@ -164,7 +192,7 @@ class BuildInputs:
     label_maps: dict[str, Path] = field(default_factory=dict)
     photographs: dict[str, Path] = field(default_factory=dict)
     cameras: Path | None = None
-    label_set: str = "4ddress"
+    label_set: str | LabelSet = "4ddress"
     label_source: str = "auto"
     reconstructs: bool = False
     locates: bool = False
@@ -176,6 +204,11 @@ class BuildInputs:
     protocol: str | None = None
 
     __repr__ = one_line
+
+    @property
+    def labels_used(self) -> Labels:
+        """The labels that the label set's ids stand for."""
+        return find_label_set(self.label_set).labels
 
     @property
     def scan_file(self) -> Path:
@@ -238,7 +271,7 @@ class RegisterInputs:
     scan: Path | MeshLike | None = None
     frame: int = 0
     labels: Path | np.ndarray | None = None
-    label_set: str = "capture"
+    label_set: str | LabelSet = "capture"
     units: str = "m"
     up: str = "y"
     seed: int = 0

@@ -6,6 +6,8 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from smplxpp.body import BodyModel, family_of_params, load_body, load_params
 from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs, resolved
@@ -16,9 +18,11 @@ from smplxpp.capture.declared import DeclaredInputs
 from smplxpp.capture.protocols import TRACKED, choose_protocol, read_description
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.clean.scan_frame import AUTO
-from smplxpp.core import BodyParams, InputError, spread
+from smplxpp.core import BodyParams, InputError, require_choice, spread
 from smplxpp.core.files.paths import same_place
-from smplxpp.segment import find_label_set
+from smplxpp.core.labels import PartRule
+from smplxpp.segment import find_label_set, map_labels, read_label_map
+from smplxpp.segment.label_files import check_label_ids
 
 log = logging.getLogger(__name__)
 
@@ -328,12 +332,13 @@ def _scan_labels(request: BuildRequest, found: ReferenceFrame) -> Path | None:
     return found.scan_labels
 
 
-def check_inputs(inputs: BuildInputs, body: BodyModel | None = None) -> BodyModel:
+def check_inputs(inputs: BuildInputs, body: BodyModel | None = None, *, config: BuildConfig | None = None) -> BodyModel:
     """Refuse what can be known before the first step: missing files, and files that only the last steps read.
 
     Args:
         inputs: of the build.
         body: the model, where it is in memory.
+        config: choices of the build, whose parts and joints are looked up; None: they are not.
 
     Returns:
         The body model.
@@ -354,11 +359,37 @@ def check_inputs(inputs: BuildInputs, body: BodyModel | None = None) -> BodyMode
             received="none",
             remedy="put cameras.json or calibration.csv into the capture",
         )
-    # Look up the label set and the motion for their errors: both are read by the last steps only.
-    find_label_set(inputs.label_set)
+    # Look up labels and the motion for their errors: both are read by the last steps only.
+    _check_label_ids(inputs)
     model = load_body(inputs.body) if body is None else body
     given_motion(inputs, model)
+    if config is not None:
+        labels = inputs.labels_used
+        config.check_parts(labels)
+        rules = {f"rule of label {label.name!r}": label.rule for label in labels}
+        rules |= {f"option rules: {name}": rule for name, rule in config.rules.items()}
+        for subject, rule in rules.items():
+            for joint in PartRule.parse(rule, subject=subject).joints:
+                require_choice(f"{subject}: joint", joint, model.joint_names)
     return model
+
+
+def _check_label_ids(inputs: BuildInputs) -> None:
+    """Refuse a label set that is none, and ids in label maps and arrays of labels that it does not have."""
+    label_set, labels = find_label_set(inputs.label_set), inputs.labels
+    if isinstance(labels, Path) and labels.suffix.lower() in (".yaml", ".yml"):
+        raise InputError(
+            "option labels",
+            expected="labels of the scan's vertices or faces",
+            received=labels.name,
+            remedy="a labels.yaml describes a label set: name it with --label-set",
+        )
+    if isinstance(labels, np.ndarray):
+        map_labels(np.unique(labels), label_set)
+    elif labels is not None:
+        check_label_ids(labels, label_set)
+    for path in inputs.label_maps.values():
+        read_label_map(path, label_set=label_set)
 
 
 def given_motion(inputs: BuildInputs, body: BodyModel) -> BodyParams | None:

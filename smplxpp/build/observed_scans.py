@@ -15,7 +15,7 @@ from smplxpp.build.scan import ScanFile, read_scan, scan_file_labels
 from smplxpp.capture import Capture
 from smplxpp.core import BACKGROUND, LABELS, GeometryWarning, InputError, MeshLike, TriangleMesh
 from smplxpp.register import ScanObservation, ViewMap
-from smplxpp.segment import vote_on_faces
+from smplxpp.segment import LabelSet, find_label_set, vote_on_faces
 
 
 def observed_scans(
@@ -71,9 +71,10 @@ def observed_scans(
     return scans, notes
 
 
-def _given_labels(given: Path | np.ndarray, scan: ScanFile, label_set: str) -> Int64[np.ndarray, " V"]:
-    """The labels of a file or an array, one a vertex of the repaired scan."""
+def _given_labels(given: Path | np.ndarray, scan: ScanFile, label_set: str | LabelSet) -> Int64[np.ndarray, " V"]:
+    """The labels of a file or an array, one a vertex of the repaired scan, as the built-in ones that they behave like."""
     labels, of_faces = scan_file_labels(given, scan.raw, label_set=label_set)
+    labels = find_label_set(label_set).labels.kind_ids(labels)
     clean = scan.clean
     if not of_faces:
         return labels[clean.source_vertex]

@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Bool, Integer
 
+from smplxpp.assemble.build import is_shoe
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
 from smplxpp.clean.shreds import cut_borders, drawn_out, find_shreds
-from smplxpp.core import LABELS, OBJECT, SHOE, Check, GeometryWarning, SkinWeights, StageOutput, TriangleMesh
+from smplxpp.core import LABELS, Check, GeometryWarning, InputError, Labels, SkinWeights, StageOutput, TriangleMesh
+from smplxpp.core.labels import PartRule
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
 from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import UnposeConfig, Unposed, invertible_weights, unpose
 from smplxpp.transfer import TransferConfig, rigid_weights, shoe_weights, transfer_weights
+from smplxpp.transfer.checks import surface_components
 
 _FOLDED = 1e-6
 """Least determinant of a blended transform in trials of the T-pose: what is smaller has no inverse in float64."""
 
 
 def clean_scan(
-    scan: PreparedScan, face_labels: Integer[np.ndarray, " M"], config: BuildConfig
+    scan: PreparedScan, face_labels: Integer[np.ndarray, " M"], config: BuildConfig, labels: Labels = LABELS
 ) -> tuple[dict[str, Part], StageOutput]:
     """Make one clean mesh within its face budget for every part that is not skin."""
-    settings = PartsConfig(face_budgets=config.budgets, method=config.remesh)
+    settings = PartsConfig(face_budgets=config.budgets, method=config.remesh, labels=labels)
     cleaned = clean_parts(scan.mesh, face_labels, config=settings, vertex_colors=scan.colors)
     parts, checks, numbers = {}, [], {}
     for name, part in cleaned.items():
@@ -48,11 +51,12 @@ def clean_scan(
 
 
 def transfer_to_parts(
-    cleaned: Mapping[str, Part], fit: PosedFit, body: BodyModel, config: BuildConfig
+    cleaned: Mapping[str, Part], fit: PosedFit, body: BodyModel, config: BuildConfig, labels: Labels = LABELS
 ) -> tuple[dict[str, Part], dict[str, SkinWeights], StageOutput]:
     """Transfer skin weights from the posed body to every part, and cut the bridges that the weights show.
 
-    Things in hands get no weights of the body's surface: each is rigid (`rigid_weights`); shoes are stiff (`shoe_weights`).
+    Rules of parts and of their pieces come first (`BuildConfig.rules`, then those of the labels): things get no weights
+    of the body's surface, each is rigid (`rigid_weights`). Shoes are stiff (`shoe_weights`).
 
     Returns:
         The parts without bridges, their weights, checks and numbers.
@@ -62,14 +66,18 @@ def transfer_to_parts(
     checks: list[Check] = []
     numbers: dict[str, Any] = {}
     for name, part in cleaned.items():
-        if part.label == OBJECT.id:
+        label = labels[part.label]
+        rule = PartRule.parse(config.rules.get(name, label.rule))
+        pieces = rules_of_pieces(name, part.mesh, config.rules)
+        if rule.kind in ("rigid", "isolate") and not pieces:
             # A thing is rigid: it has no bridges, and follows one joint.
             mesh, source = part.mesh, np.arange(part.mesh.vertex_count)
-            found = rigid_weights(fit.mesh, body.weights, mesh, joint_names=body.joint_names)
+            joint = next(iter(rule.joints), None)
+            found = rigid_weights(fit.mesh, body.weights, mesh, joint_names=body.joint_names, joint=joint)
         else:
-            settings = transfer_config(LABELS[part.label].name, body, config)
-            mesh, source, found = _without_bridges(part.mesh, fit, body, settings, config.bridges)
-            if part.label == SHOE.id and config.method != "paper":
+            settings = replace(transfer_config(label.kind, body, config), rule=config.rules.get(name, label.rule))
+            mesh, source, found = _without_bridges(part.mesh, fit, body, _Ruled(settings, pieces), config.bridges)
+            if is_shoe(replace(label, rule=settings.rule)) and not pieces and config.method != "paper":
                 found = shoe_weights(found, mesh, fit.joints, joint_names=body.joint_names)
         parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
         # A few vertices whose blend folds flat in the scan's pose, as between thighs that touch, stop no build.
@@ -84,6 +92,7 @@ def transfer_to_parts(
             "matched_share": float(found.matched.mean()),
             "components": len(found.policies),
             "policies": sorted(set(found.policies)),
+            "rule": config.rules.get(name, label.rule),
             "report": report.as_dict(),
             "folded_vertices": int(folded.sum()),
             "web_faces": part.mesh.face_count - mesh.face_count,
@@ -105,6 +114,51 @@ def transfer_to_parts(
     return parts, weights, StageOutput(checks, numbers)
 
 
+@dataclass(frozen=True)
+class _Ruled:
+    """Settings of a part's transfer, and the rules of some of its vertices by the cleaned part's numbers."""
+
+    settings: TransferConfig
+    rules: Mapping[int, str]
+
+    def weights(self, fit: PosedFit, body: BodyModel, part: TriangleMesh, source: np.ndarray) -> SkinWeights:
+        """Transfer to what is left of the part; a component has the rule of its vertices."""
+        config = self.settings
+        if self.rules:
+            component = surface_components(part)
+            found = {int(c): self.rules[int(v)] for c, v in zip(component, source, strict=True) if int(v) in self.rules}
+            config = replace(config, component_rules=found)
+        return transfer_weights(fit.mesh, body.weights, part, config=config)
+
+    def stiff(self, part: TriangleMesh, source: np.ndarray) -> Bool[np.ndarray, " M"]:
+        """Which faces are of rigid pieces, in which there is no bridge."""
+        texts = (self.rules.get(int(v), self.settings.rule) for v in source)
+        rigid = np.array([PartRule.parse(text).kind in ("rigid", "isolate") for text in texts], dtype=bool)
+        return rigid[part.faces[:, 0]]
+
+
+def rules_of_pieces(name: str, part: TriangleMesh, rules: Mapping[str, str]) -> dict[int, str]:
+    """Return the rule of each vertex of the pieces that rules name, `NAME/NUMBER`, 0 the largest in area.
+
+    Raises:
+        InputError: a number that the part has no piece of.
+    """
+    start = f"{name}/"
+    named = {int(key.removeprefix(start)): rule for key, rule in rules.items() if key.startswith(start)}
+    if not named:
+        return {}
+    component = surface_components(part)
+    order = np.argsort(-np.bincount(component[part.faces[:, 0]], part.face_areas), kind="stable")
+    out: dict[int, str] = {}
+    for number, rule in named.items():
+        if number >= len(order):
+            raise InputError(
+                f"option rules: {name}/{number}", expected=f"pieces 0 to {len(order) - 1}", received=str(number)
+            )
+        out |= dict.fromkeys(np.flatnonzero(component == order[number]).tolist(), rule)
+    return out
+
+
 def transfer_config(label: str, body: BodyModel, config: BuildConfig) -> TransferConfig:
     """Return the settings of the transfer for a part of this label, by the build's method."""
     base = TransferConfig.paper() if config.method == "paper" else TransferConfig.for_label(label)
@@ -112,7 +166,7 @@ def transfer_config(label: str, body: BodyModel, config: BuildConfig) -> Transfe
 
 
 def _without_bridges(
-    part: TriangleMesh, fit: PosedFit, body: BodyModel, settings: TransferConfig, config: BridgeConfig
+    part: TriangleMesh, fit: PosedFit, body: BodyModel, ruled: _Ruled, config: BridgeConfig
 ) -> tuple[TriangleMesh, np.ndarray, SkinWeights]:
     """Return a part without its bridges, the vertex of `part` for each of its vertices, and its skin weights.
 
@@ -121,7 +175,7 @@ def _without_bridges(
     """
     source = np.arange(part.vertex_count)
     opened = np.unique(part.border_edges)
-    weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
+    weights = ruled.weights(fit, body, part, source)
     # Folded vertices lose their fold for the trial alone: those that are left with the part are counted later.
     limits = UnposeConfig(warn_below=0.0, fail_below=_FOLDED)
     # Bridges in folds first, because these are cut where the scan lacks the gap; then what still tears.
@@ -129,22 +183,24 @@ def _without_bridges(
         tried = invertible_weights(weights, fit.posed_from_rest, least=_FOLDED)[0]
         rest = unpose(part.vertices, tried, fit.posed_from_rest, config=limits)
         bridge = find(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
+        bridge &= ~ruled.stiff(part, source)
         if not bridge.any():
             continue
         part, kept = cut_bridges(part, bridge, config=config)
         source = source[kept]
-        weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
+        weights = ruled.weights(fit, body, part, source)
     # What cuts leave of the other limb hangs in the air at rest; without it the weights get better, which shows more.
     for _ in range(config.rounds):
         tried = invertible_weights(weights, fit.posed_from_rest, least=_FOLDED)[0]
         rest = unpose(part.vertices, tried, fit.posed_from_rest, config=limits)
         cut = cut_borders(part, np.isin(source, opened))
         shred = find_shreds(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, cut)
+        shred &= ~ruled.stiff(part, source)
         if not shred.any():
             break
         part, kept = cut_bridges(part, shred, config=config)
         source = source[kept]
-        weights = transfer_weights(fit.mesh, body.weights, part, config=settings)
+        weights = ruled.weights(fit, body, part, source)
     return part, source, weights
 
 

@@ -20,7 +20,7 @@ from smplxpp.core import GeometryWarning, InputError, MeshLike, as_mesh
 from smplxpp.core.errors import one_line
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes
-from smplxpp.segment import map_labels, read_labels
+from smplxpp.segment import LabelSet, map_labels, read_labels
 from smplxpp.segment.label_files import check_element_count
 
 # Formats whose files are in metres: by the format, or because their reader converts the unit that they state.
@@ -134,14 +134,14 @@ def _stated_units(path: Path | None, raw: RawMesh) -> str:
 
 
 def scan_file_labels(
-    labels: str | Path | np.ndarray, raw: RawMesh, *, label_set: str
+    labels: str | Path | np.ndarray, raw: RawMesh, *, label_set: str | LabelSet
 ) -> tuple[Int64[np.ndarray, " n"], bool]:
     """Read labels of a scan's vertices or faces, in the order of its file.
 
     Args:
         labels: a label file, the scan's own file, or an array of ids.
         raw: the scan as its file has it.
-        label_set: name of the set that the ids are of.
+        label_set: the set that the ids are of.
 
     Returns:
         Labels in our ids, one a vertex or one a face, and whether they are of faces.

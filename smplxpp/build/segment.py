@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +14,18 @@ from smplxpp.build.config import BuildInputs
 from smplxpp.build.data import PreparedScan
 from smplxpp.build.scan import ScanFile, scan_file_labels
 from smplxpp.capture import read_cameras
-from smplxpp.core import LABELS, SKIN, BodyParams, Check, GeometryWarning, InputError, StageOutput, TriangleMesh
+from smplxpp.core import SKIN, BodyParams, Check, GeometryWarning, InputError, Labels, StageOutput, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.core.mesh_files.raw_mesh import RawMesh
-from smplxpp.segment import SegmentedScan, holds_labels, label_by_body, read_label_map, segment_scan, vote_in_agreement
+from smplxpp.segment import (
+    SegmentedScan,
+    find_label_set,
+    holds_labels,
+    label_by_body,
+    read_label_map,
+    segment_scan,
+    vote_in_agreement,
+)
 from smplxpp.segment.corrections import Corrections
 
 
@@ -48,7 +56,10 @@ def label_source(inputs: BuildInputs) -> str:
         return "views"
     if inputs.labels is not None:
         return "file"
-    of_scan = isinstance(inputs.scan, Path) and not inputs.reconstructs and holds_labels(inputs.scan)
+    scan = inputs.scan
+    of_scan = (
+        isinstance(scan, Path) and not inputs.reconstructs and holds_labels(scan, labels=inputs.labels_used)
+    )
     return "file" if of_scan else "body"
 
 
@@ -78,16 +89,23 @@ def label_faces(
     if source == "views":
         before = _by_views(scan, inputs, body, params)
     elif source == "body":
-        before = label_by_body(scan.mesh, body, params, colors=scan.own_colors)
+        before = _by_body(scan, inputs, body, params)
     else:
         before = _by_file(scan, inputs, file)
     # Corrections by hand come last: they overrule every source of labels.
     result = (corrections or Corrections()).apply(scan.mesh, before)
     labelled = LabelledFaces(result, before)
-    return labelled, _measured(scan.mesh, labelled, source)
+    return labelled, _measured(scan.mesh, labelled, source, inputs.labels_used)
 
 
-def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str) -> StageOutput:
+def _by_body(scan: PreparedScan, inputs: BuildInputs, body: BodyModel, params: BodyParams) -> SegmentedScan:
+    """Ask body and colours, which know the built-in labels; what behaves like one of these has it."""
+    found = label_by_body(scan.mesh, body, params, colors=scan.own_colors)
+    label_set = find_label_set(inputs.label_set)
+    return found if not label_set.labels.own else replace(found, face_labels=label_set.of_body(found.face_labels))
+
+
+def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str, labels: Labels) -> StageOutput:
     """Check the confidence, and the share of the surface that nothing saw or that is uncertain, by area."""
     result, uncertain = labelled.result, 0.5  # confidence below which a label should be looked at
     # Normalised by area, so that `areas @ x` is the mean over the surface, whatever the density of faces.
@@ -127,8 +145,10 @@ def _measured(mesh: TriangleMesh, labelled: LabelledFaces, source: str) -> Stage
         "labels_from": source,
         "notes": list(labelled.before.notes),
         "corrected_by_hand": float(areas @ result.corrected),
-        "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(len(LABELS))},
+        "area_share": {str(k): float(areas[result.face_labels == k].sum()) for k in range(len(labels))},
     }
+    if labels.own:
+        numbers["labels"] = [asdict(label) for label in labels]
     return StageOutput([confidence, coverage], numbers)
 
 
@@ -159,7 +179,8 @@ def _by_views(scan: PreparedScan, inputs: BuildInputs, body: BodyModel, params: 
         (cameras[name], read_label_map(path, label_set=inputs.label_set)) for name, path in inputs.label_maps.items()
     ]
     # Each map is compared with the votes of the others; see `vote_in_agreement`.
-    agreed = vote_in_agreement(scan.mesh, views)
+    labels = inputs.labels_used
+    agreed = vote_in_agreement(scan.mesh, views, labels=labels)
     # A map that the others contradict is left out: an estimator's mistake would otherwise reach the template.
     notes = tuple(
         f"label map of {name} left out: the other views agree with {share:.0%} of it"
@@ -169,8 +190,8 @@ def _by_views(scan: PreparedScan, inputs: BuildInputs, body: BodyModel, params: 
         warnings.warn(note, GeometryWarning, stacklevel=2)
     colors = scan.own_colors
     # A prior for faces with few votes: which label the body's region and the scan's colours make likely.
-    prior = label_by_body(scan.mesh, body, params, colors=colors)
-    result = segment_scan(scan.mesh, votes=agreed.votes, colors=colors, prior=prior)
+    prior = _by_body(scan, inputs, body, params)
+    result = segment_scan(scan.mesh, votes=agreed.votes, colors=colors, prior=prior, labels=labels)
     return replace(result, notes=(*notes, *result.notes))
 
 
@@ -188,9 +209,10 @@ def _by_file(scan: PreparedScan, inputs: BuildInputs, file: ScanFile | None) -> 
     # Labels are in the file's order. The repair of the scan dropped and split elements, so that they are gathered by
     # source.
     labels, of_faces = scan_file_labels(source, raw, label_set=inputs.label_set)
+    used = inputs.labels_used
     if of_faces:
-        return segment_scan(scan.mesh, face_labels=_taken(labels, scan.source_face, "source_face"))
-    return segment_scan(scan.mesh, vertex_labels=_taken(labels, scan.source_vertex, "source_vertex"))
+        return segment_scan(scan.mesh, face_labels=_taken(labels, scan.source_face, "source_face"), labels=used)
+    return segment_scan(scan.mesh, vertex_labels=_taken(labels, scan.source_vertex, "source_vertex"), labels=used)
 
 
 def _taken(labels: np.ndarray, source: np.ndarray, name: str) -> np.ndarray:

@@ -72,8 +72,8 @@ def build_template(
         body: SMPL-X-layout body, a file or a model; None: the open body.
         params: body parameters of the scan, a file or `BodyParams`. None: those of the capture, or they are registered
             or located.
-        labels: labels of the scan's vertices or faces, a file or an array of ids of `config.label_set`. None: the
-            scan's own, votes of label maps, or the body and the colours.
+        labels: labels of the scan's vertices or faces, a file or an array of ids of `config.label_set`, which may be a
+            `LabelSet` of one's own. None: the scan's own, votes of label maps, or the body and the colours.
         capture: folder of a capture, or an open one. Either this or a scan is given.
         config: choices; None: the defaults.
         on_stage: called with the name of a step before (False) and after (True) it; names are those of `STEPS`.
@@ -115,7 +115,8 @@ class _Build:
         self.request, self.on_stage = request, on_stage
         self.plan = plan_build(request)
         # Refuse what only the last steps would find, before work starts.
-        self.body = check_inputs(self.plan.inputs, request.body if isinstance(request.body, BodyModel) else None)
+        given = request.body if isinstance(request.body, BodyModel) else None
+        self.body = check_inputs(self.plan.inputs, given, config=self.plan.config)
         self.outputs: dict[str, StageOutput] = {}
         self.seconds: dict[str, float] = {}
 
@@ -134,7 +135,7 @@ class _Build:
         require_remesher(config.remesh)
         if config.detector is not None:
             load_detector(config.detector)
-        corrections = None if config.corrections is None else Corrections.load(config.corrections)
+        corrections = None if config.corrections is None else Corrections.load(config.corrections, labels=inputs.labels_used)
 
         # Make what is not given: the scan, the body in it, the parameters of the capture's frames.
         if self.plan.reconstruction is not None:
@@ -174,18 +175,20 @@ class _Build:
             fit, step.output = pose_fit(scan.mesh, body, params)
         with self._step("segment") as step:
             labelled, step.output = label_faces(scan, inputs, body, params, file=file, corrections=corrections)
-        face_labels = labelled.face_labels
+        face_labels, labels = labelled.face_labels, inputs.labels_used
 
         # Cut the scan into parts, give them weights, bring them to the T-pose and put them onto the body.
         with self._step("clean") as step:
-            cleaned, step.output = clean_scan(scan, face_labels, config)
+            cleaned, step.output = clean_scan(scan, face_labels, config, labels)
         with self._step("transfer") as step:
-            posed, weights, step.output = transfer_to_parts(cleaned, fit, body, config)
+            posed, weights, step.output = transfer_to_parts(cleaned, fit, body, config, labels)
         with self._step("unpose") as step:
             at_rest, step.output = unpose_parts(posed, weights, fit)
         parts = {name: RestPart(part, weights[name], at_rest[name].vertices) for name, part in posed.items()}
         with self._step("assemble") as step:
-            template, step.output = assemble_parts(body, params, scan, face_labels, fit, cleaned, parts, config)
+            template, step.output = assemble_parts(
+                body, params, scan, face_labels, fit, cleaned, parts, config, labels=labels
+            )
         with self._step("validate") as step:
             # The motion that the template is tried with: the registered one, else the given one; None without either.
             motion = registration.fit.params if registration is not None else given_motion(inputs, body)

@@ -17,12 +17,11 @@ from smplxpp.build.data import Part, PreparedScan
 from smplxpp.clean import loop_lengths, thickened
 from smplxpp.core import (
     BACKGROUND,
-    CLOTH_LABELS,
-    LABELS,
     SKIN,
     BodyParams,
     Check,
     InputError,
+    Labels,
     StageOutput,
     TriangleMesh,
     row_lengths,
@@ -84,7 +83,7 @@ def validate_template(
     # Patches over the holes of cuts are guesses where the scan shows nothing, so that they count for no label.
     guessed = (template.scan_index < 0) & (template.vertex_part != template.part_names.index(BODY_PART))
     labels = np.where(guessed, BACKGROUND, template.vertex_labels)
-    found, checks, numbers = _against_scan(posed, labels, scan.mesh, face_labels, config)
+    found, checks, numbers = _against_scan(posed, labels, scan.mesh, face_labels, config, template.labels)
     whole, numbers["completeness"] = completeness_checks(template, params, scan.mesh, face_labels, found.to_template)
     checks += whole
     seen, numbers["photographs"] = photograph_checks(template, params, scan.mesh, scan.colors, inputs)
@@ -183,6 +182,7 @@ def _against_scan(
     scan: TriangleMesh,
     face_labels: np.ndarray,
     config: BuildConfig,
+    names: Labels,
 ) -> tuple[Validation, list[Check], dict]:
     """Distances between the posed template and the scan, both ways, by label."""
     # Scanners do not see pockets, armpits and inner layers: only points visible from outside are compared.
@@ -192,16 +192,16 @@ def _against_scan(
     # Both directions with one seed: template to scan finds invented surface, scan to template finds lost surface.
     forth = measured(posed, scan, source_labels=vertex_labels, target_labels=face_labels)
     back = measured(scan, posed, source_labels=face_labels, target_labels=vertex_labels)
-    result = summarize(forth, back, convention=convention_named("smplxpp"), threshold_mm=5.0)
+    result = summarize(forth, back, convention=convention_named("smplxpp"), threshold_mm=5.0, names=names)
     checks = []
-    for label in LABELS:
+    for label in names:
         found = result.labels.get(label.name)
         # Skin is checked below, since its distance measures the fit and not the template.
         if found is None or found.pred_to_gt is None or label == SKIN:
             continue
         # Millimetres, (warn, fail) of the mean and of the p95. Hair and shoes get wider limits, because
         # simplification costs their fine shapes more.
-        warn, fail = ((1.0, 3.0), (2.0, 6.0)) if label in CLOTH_LABELS else ((2.0, 6.0), (5.0, 15.0))
+        warn, fail = ((1.0, 3.0), (2.0, 6.0)) if label in names.cloth else ((2.0, 6.0), (5.0, 15.0))
         checks += [
             Check(f"template to scan, {label.name}: mean", found.pred_to_gt.mean, "mm", warn[0], fail[0]),
             Check(f"template to scan, {label.name}: p95", found.pred_to_gt.p95, "mm", warn[1], fail[1]),

@@ -13,15 +13,16 @@ from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
 from smplxpp.clean.remesh import METHODS, remesh, require_remesher
 from smplxpp.clean.simplify import simplify
 from smplxpp.core import (
-    LABEL_BY_NAME,
     LABELS,
     SKIN,
     InputError,
+    Labels,
     MeshLike,
     TriangleMesh,
     as_array,
     as_mesh,
     require_choice,
+    require_known,
 )
 from smplxpp.core.errors import one_line
 from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
@@ -36,18 +37,18 @@ class PartsConfig:
         speck_area: area fraction of the part below which components are removed.
         pinhole_length: perimeter, metres, below which border loops are closed.
         method: "quadric" edge collapse (`simplify`) or "isotropic" remeshing (`remesh`).
+        labels: what the ids of labels stand for.
     """
 
     face_budgets: Mapping[str, int] = field(default_factory=dict)
     speck_area: float = 1e-3
     pinhole_length: float = 0.04
     method: str = "quadric"
+    labels: Labels = LABELS
 
     def __post_init__(self) -> None:
         require_choice("method", self.method, METHODS)
-        unknown = sorted(set(self.face_budgets) - set(LABEL_BY_NAME))
-        if unknown:
-            raise InputError("face budgets", expected=f"names among {sorted(LABEL_BY_NAME)}", received=str(unknown))
+        require_known("face budgets", sorted(self.face_budgets), self.labels.names)
 
 
 @dataclass(frozen=True)
@@ -133,13 +134,14 @@ def clean_parts(
     if vertex_colors is not None and len(vertex_colors) != mesh.vertex_count:
         raise InputError("vertex colours", expected=f"{mesh.vertex_count} rows", received=f"{len(vertex_colors)}")
     # Labels must be known; -1 is the background.
-    unknown = np.setdiff1d(face_labels, [-1] + [label.id for label in LABELS])
+    labels = config.labels
+    unknown = np.setdiff1d(face_labels, [-1] + [label.id for label in labels])
     if len(unknown):
-        raise InputError("face labels", expected=f"label ids -1 to {LABELS[-1].id}", received=f"{unknown.tolist()}")
+        raise InputError("face labels", expected=f"label ids -1 to {labels[-1].id}", received=f"{unknown.tolist()}")
     parts = {}
-    for label in LABELS:
+    for label in labels:
         selected = face_labels == label.id
-        if label is SKIN or not selected.any():
+        if label.kind == SKIN.name or not selected.any():
             continue
         # Clean the part; its vertices keep the colours of the scan's vertices that they stand for.
         budget = config.face_budgets.get(label.name, label.face_budget)
@@ -149,7 +151,7 @@ def clean_parts(
     if not parts:
         raise InputError(
             "face labels",
-            expected="at least one of hair, shoe, upper, lower, outer, object",
+            expected=f"at least one of {', '.join(label.name for label in labels if label.kind != SKIN.name)}",
             received="only skin and background",
             remedy="check that the label set is the right one",
         )

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.cloth.cloth_mesh import coarsen
 from smplxpp.cloth.solver import Collider
-from smplxpp.core.labels import HAIR, LABEL_BY_NAME, LAYER_ORDER, OBJECT
+from smplxpp.core.labels import HAIR
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.template.template import BODY_PART, Template
 
@@ -58,7 +58,7 @@ def collider_of(template: Template, part: str, posed: TriangleMesh, config: Garm
     own = posed.vertices[np.unique(template.faces[template.part_faces(part)])]
     near = cKDTree(own).query(posed.vertices, distance_upper_bound=NEAR)[0] < NEAR
     # Fingers and the face are too fine for the collider's spacing; only hair collides with the head.
-    hair = part == HAIR.name
+    hair = template.label_of(part).kind == HAIR.name
     usable = near & ~_small_skin(template, head=hair)
     vertices, faces, margin, deepest, start = [], [], [], [], 0
     for name in (BODY_PART, *_layers_under(template, part)):
@@ -91,14 +91,16 @@ def collider_of(template: Template, part: str, posed: TriangleMesh, config: Garm
 
 def _layers_under(template: Template, part: str) -> list[str]:
     """The parts that lie under a part, the innermost first."""
-    order = {label: place for place, label in enumerate(LAYER_ORDER)}
+    order = {label: place for place, label in enumerate(template.labels.layer_order)}
+    names = {label.name: label for label in template.labels}
 
     def place(name: str) -> int:
-        label = LABEL_BY_NAME.get(name)
+        label = names.get(name)
         return order.get(label.id, 0) if label else 0
 
     # A thing in a hand is no layer: it may lie against cloth on either side.
-    others = [name for name in template.part_names if name not in (BODY_PART, OBJECT.name, part)]
+    things = [label.name for label in template.labels if label.layer is None]
+    others = [name for name in template.part_names if name not in (BODY_PART, *things, part)]
     return sorted((name for name in others if place(name) < place(part)), key=place)
 
 

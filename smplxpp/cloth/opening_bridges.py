@@ -13,7 +13,7 @@ from smplxpp.cloth.cloth_mesh import (
     opening_axis,
     turned_over,
 )
-from smplxpp.core import CLOTH_LABELS, InputError, TriangleMesh
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.topology import border_loops, face_adjacency, face_components
 from smplxpp.template.template import BODY_PART, Template
@@ -37,7 +37,7 @@ def find_opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
     only such faces join to the rest are bridges, too. A body without an inside has none.
     """
     out = np.zeros(len(template.faces), dtype=bool)
-    parts = [label.name for label in CLOTH_LABELS if label.name in template.part_names]
+    parts = template.cloth_parts
     if not parts:
         return out
     skin = template.part_mesh(BODY_PART)

@@ -31,6 +31,8 @@ from smplxpp.core.labels import (
     SHOE,
     SKIN,
     UPPER,
+    Label,
+    Labels,
     display_colors,
 )
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes, normalize_rows, row_lengths
@@ -56,6 +58,8 @@ __all__ = [
     "LABELS",
     "LABEL_BY_NAME",
     "LOWER",
+    "Label",
+    "Labels",
     "METRES_PER_UNIT",
     "MeshLike",
     "MissingExtraError",

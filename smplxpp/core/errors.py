@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
 from typing import Any, TypeAlias
 
 ProgressCallback: TypeAlias = Callable[[str, float], None]
@@ -36,7 +37,8 @@ class InputError(ValueError):
     def __init__(self, subject: str, *, expected: str, received: str, remedy: str = "") -> None:
         self.subject, self.expected, self.received, self.remedy = subject, expected, received, remedy
         message = f"{subject}: expected {expected}, received {received}."
-        super().__init__(f"{message} {remedy[:1].upper()}{remedy[1:]}." if remedy else message)
+        end = "" if remedy.endswith("?") else "."
+        super().__init__(f"{message} {remedy[:1].upper()}{remedy[1:]}{end}" if remedy else message)
 
 
 class GeometryWarning(UserWarning):
@@ -144,7 +146,15 @@ def require_positive(subject: str, value: float, *, finite: bool = True) -> None
 def require_choice(subject: str, value: str, choices: Sequence[str]) -> None:
     """Raise `InputError` unless `value` is one of `choices`."""
     if value not in choices:
-        raise InputError(subject, expected=" or ".join(map(repr, choices)), received=repr(value))
+        raise InputError(
+            subject, expected=" or ".join(map(repr, choices)), received=repr(value), remedy=did_you_mean(value, choices)
+        )
+
+
+def did_you_mean(value: object, known: Iterable[object]) -> str:
+    """Return a remedy for a misspelt name, the known one that is most like it as a question; "" if none is like it."""
+    like = get_close_matches(str(value).lower(), [str(one) for one in known], n=1)
+    return f"did you mean {like[0]!r}?" if like else ""
 
 
 def require_known(subject: str, values: Iterable[object], known: Iterable[object]) -> None:
@@ -153,4 +163,5 @@ def require_known(subject: str, values: Iterable[object], known: Iterable[object
     unknown = [str(value) for value in values if value not in have]
     if unknown:
         shown = ", ".join(map(str, have[:40])) + (", ..." if len(have) > 40 else "")
-        raise InputError(subject, expected=f"among {shown}", received=", ".join(unknown))
+        like = did_you_mean(unknown[0], have)
+        raise InputError(subject, expected=f"among {shown}", received=", ".join(unknown), remedy=like)

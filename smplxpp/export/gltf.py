@@ -13,7 +13,6 @@ from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
 from smplxpp.core.colors import decode_srgb
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.labels import LABELS
 from smplxpp.core.params import BodyParams
 from smplxpp.export.gltf_animation import add_animation
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
@@ -124,7 +123,7 @@ def _unit_normals(template: Template) -> np.ndarray:
 
 
 def _material(template: Template, name: str, rows: np.ndarray) -> pygltflib.Material:
-    label = LABELS[int(np.bincount(template.vertex_labels[rows]).argmax())]
+    label = template.labels[int(np.bincount(template.vertex_labels[rows]).argmax())]
     return pygltflib.Material(
         name=label.name,
         pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.9),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smplxpp.core import DEFAULT_FPS, LABELS, BodyParams, GeometryWarning, require_positive
+from smplxpp.core import DEFAULT_FPS, BodyParams, GeometryWarning, require_positive
 from smplxpp.core.colors import decode_srgb
 from smplxpp.export.gltf_animation import joint_motion
 from smplxpp.export.gltf_skin import rest_offsets
@@ -126,7 +126,7 @@ def _add_expressions(pxr: SimpleNamespace, stage: Any, template: Template, mesh:
 
 def _add_material(pxr: SimpleNamespace, stage: Any, template: Template, mesh: Any, rows: np.ndarray) -> None:
     """Add a preview surface in the colours of the vertices, named by the part's commonest label."""
-    label = LABELS[int(np.bincount(template.vertex_labels[rows]).argmax())]
+    label = template.labels[int(np.bincount(template.vertex_labels[rows]).argmax())]
     path = mesh.GetPath().AppendChild(f"{_identifier(label.name)}_material")
     types = pxr.Sdf.ValueTypeNames
     material = pxr.UsdShade.Material.Define(stage, path)

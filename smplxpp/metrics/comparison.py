@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from smplxpp.core import LABELS
+from smplxpp.core import LABELS, Labels
 from smplxpp.core.errors import one_line
 from smplxpp.metrics.conventions import Convention
 from smplxpp.metrics.sampling import SurfaceSamples
@@ -140,16 +140,17 @@ def summarize(
     *,
     convention: Convention,
     threshold_mm: float | tuple[float, ...],
+    names: Labels = LABELS,
 ) -> MeshComparison:
-    """The comparison that two sets of distances give, with one a label where they carry labels."""
+    """The comparison that two sets of distances give, with one a label where they carry labels, by the label's name."""
     thresholds = CompareConfig(threshold_mm=threshold_mm).thresholds_mm
     every = [np.ones(len(d.distance), dtype=bool) for d in (pred_to_gt, gt_to_pred)]
     labels = {}
     if pred_to_gt.label is not None and gt_to_pred.label is not None:
-        names = {label.id: label.name for label in LABELS}
+        called = {label.id: label.name for label in names}
         for k in np.union1d(pred_to_gt.label, gt_to_pred.label).tolist():
             masks = [pred_to_gt.label == k, gt_to_pred.label == k]
-            labels[names.get(k, str(k))] = _summary(pred_to_gt, gt_to_pred, masks, convention, thresholds, {})
+            labels[called.get(k, str(k))] = _summary(pred_to_gt, gt_to_pred, masks, convention, thresholds, {})
     return _summary(pred_to_gt, gt_to_pred, every, convention, thresholds, labels)
 
 

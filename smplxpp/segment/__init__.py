@@ -4,7 +4,8 @@ from smplxpp.segment.by_body import ByBodyConfig, label_by_body
 from smplxpp.segment.by_body_confidence import UNSURE
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import holds_labels, labels_from_colors, read_label_map, read_labels
-from smplxpp.segment.labels import LABEL_SETS, LabelSet, find_label_set, map_labels
+from smplxpp.segment.label_sets import LABEL_SETS, LabelSet
+from smplxpp.segment.labels import find_label_set, map_labels
 from smplxpp.segment.segment import SegmentConfig, SegmentedScan, segment_scan
 from smplxpp.segment.votes import AgreedVotes, vote_in_agreement, vote_on_faces
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64, Int64, Integer
 
-from smplxpp.core import LABEL_BY_NAME, LABELS, TriangleMesh, matrix_from_rotvec, require_choice, rotvec_from_matrix
+from smplxpp.core import LABELS, Labels, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.errors import GeometryWarning, InputError, one_line
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_numbers, as_object, as_text, read_json
@@ -104,22 +104,27 @@ class Corrections:
 
     They are applied to finished labels, after the graph cut, so that nothing smooths them away.
 
+    Attributes:
+        items: the corrections.
+        labels: what their ids stand for; files hold the names.
+
     Example:
         >>> corrections = Corrections.load("runs/me/labels_corrections.json")
         >>> corrected = corrections.apply(mesh, segment_scan(mesh, votes=votes))
     """
 
     items: tuple[Correction, ...] = ()
+    labels: Labels = LABELS
 
     def __len__(self) -> int:
         return len(self.items)
 
     def with_added(self, correction: Correction) -> Corrections:
         """Return these corrections with one more at the end."""
-        return Corrections((*self.items, correction))
+        return Corrections((*self.items, correction), self.labels)
 
     @staticmethod
-    def load(path: str | Path) -> Corrections:
+    def load(path: str | Path, *, labels: Labels = LABELS) -> Corrections:
         """Read and check the corrections in `labels_corrections.json` (docs/corrections.md).
 
         Raises:
@@ -134,11 +139,12 @@ class Corrections:
         rows = as_list(content.get("corrections"), subject=f"{subject}: corrections")
         if len(rows) > most:
             raise InputError(subject, expected=f"at most {most} corrections", received=f"{len(rows)}")
-        return Corrections(tuple(_read(row, f"{subject}: correction {k + 1}") for k, row in enumerate(rows)))
+        items = (_read(row, f"{subject}: correction {k + 1}", labels) for k, row in enumerate(rows))
+        return Corrections(tuple(items), labels)
 
     def save(self, path: str | Path) -> None:
         """Write the file that `load` reads: one line for each correction, rounded to 0.1 mm, written atomically."""
-        rows = ",\n  ".join(json.dumps(_written(item), separators=(",", ":")) for item in self.items)
+        rows = ",\n  ".join(json.dumps(_written(item, self.labels), separators=(",", ":")) for item in self.items)
         inner = f"[\n  {rows}\n ]" if rows else "[]"
         atomic_write_text(path, f'{{\n "version": {FORMAT_VERSION},\n "corrections": {inner}\n}}\n')
 
@@ -161,7 +167,7 @@ class Corrections:
         surface, out = surface or ScanSurface(mesh), np.array(labels, dtype=np.int64)
         by = np.full(mesh.face_count, -1, dtype=np.int64)
         for k, item in enumerate(self.items):
-            faces = faces_of(item, surface, subject=f"correction {k + 1} ({LABELS[item.label].name})")
+            faces = faces_of(item, surface, subject=f"correction {k + 1} ({self.labels[item.label].name})")
             out[faces], by[faces] = item.label, k
         return out, by
 
@@ -231,11 +237,10 @@ def _indexed_faces(item: FaceCorrection, surface: ScanSurface, subject: str) -> 
 # -- the file
 
 
-def _read(row: Any, subject: str) -> Correction:
+def _read(row: Any, subject: str, labels: Labels) -> Correction:
     values = as_object(row, subject=subject)
     name = as_text(values.get("label"), subject=f"{subject}: label")
-    require_choice(f"{subject}: label", name, list(LABEL_BY_NAME))
-    label, kinds = LABEL_BY_NAME[name].id, sorted(_KINDS & set(values))
+    label, kinds = labels.named(name, subject=f"{subject}: label").id, sorted(_KINDS & set(values))
     if len(kinds) != 1:
         raise InputError(subject, expected=f"one of {', '.join(sorted(_KINDS))}", received=", ".join(kinds) or "none")
     if kinds == ["faces"]:
@@ -309,12 +314,12 @@ def _require_near(values: Float[np.ndarray, "*n"], subject: str) -> None:
         raise InputError(subject, expected="metres, as the run's scan has them", received=f"{np.abs(values).max():.3g}")
 
 
-def _written(item: Correction) -> dict[str, Any]:
+def _written(item: Correction, labels: Labels) -> dict[str, Any]:
     # Each kind of correction has a field of its own, which `_read` tells it by; metres have four digits or more.
     def rounded(values: Any, digits: int = 4) -> list:
         return np.round(values, digits).tolist()
 
-    out: dict[str, Any] = {"label": LABELS[item.label].name}
+    out: dict[str, Any] = {"label": labels[item.label].name}
     if isinstance(item, StrokeCorrection):
         out |= {"stroke": rounded(item.points), "radius": round(float(item.radius), 5)}
         return out if item.normals is None else out | {"normals": rounded(item.normals, 3)}

@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Int64, Num, Shaped
 from scipy.spatial import cKDTree
 
-from smplxpp.core import BACKGROUND, LABELS, InputError
+from smplxpp.core import BACKGROUND, LABELS, InputError, Labels
 from smplxpp.core.files import as_numbers, read_arrays, regular_file
 from smplxpp.core.files.array_file import array_names, read_array
 from smplxpp.core.files.image_file import open_image
 from smplxpp.core.files.safe_pickle import safe_load
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
-from smplxpp.segment.labels import LabelSet, map_labels
+from smplxpp.segment.label_sets import LabelSet
+from smplxpp.segment.labels import find_label_set, map_labels
 
 _KEYS = (
     "label",
@@ -56,19 +57,9 @@ def read_labels(
     Raises:
         InputError: no labels in the file, a length that is neither count, or that is both, or unknown ids.
     """
-    # Read the array by the suffix of the file; whatever is no array file is a mesh.
     path = regular_file(path, subject="label file")
-    suffix = path.suffix.lower()
-    if suffix == ".npy":
-        values = read_array(path, subject="label file")
-    elif suffix == ".npz":
-        names = array_names(path, subject="label file")
-        values = _pick(read_arrays(path, subject="label file", keys=_KEYS), path, names)
-    elif suffix in (".pkl", ".pickle"):
-        loaded = safe_load(path)
-        is_table = isinstance(loaded, Mapping)
-        values = _pick(loaded, path, list(loaded)) if is_table else _as_array(loaded, path)
-    else:
+    values = _read_array(path)
+    if values is None:
         return _read_from_mesh(path, vertex_count, face_count, label_set, color_tolerance)
     if values.ndim == 2 and 1 in values.shape:
         values = values.ravel()
@@ -77,9 +68,28 @@ def read_labels(
     of = check_element_count(
         values, vertex_count=vertex_count, face_count=face_count, polygon_count=polygons, subject=f"label file {path}"
     )
+    labels = _mapped(values, label_set, path)
+    return labels if source_faces is None or of != "polygon" else labels[source_faces]
+
+
+def _read_array(path: Path) -> np.ndarray | None:
+    """Read the array by the suffix of the file; None for whatever is no array file, which is a mesh."""
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return read_array(path, subject="label file")
+    if suffix == ".npz":
+        names = array_names(path, subject="label file")
+        return _pick(read_arrays(path, subject="label file", keys=_KEYS), path, names)
+    if suffix in (".pkl", ".pickle"):
+        loaded = safe_load(path)
+        is_table = isinstance(loaded, Mapping)
+        return _pick(loaded, path, list(loaded)) if is_table else _as_array(loaded, path)
+    return None
+
+
+def _mapped(values: np.ndarray, label_set: str | Path | LabelSet, path: Path) -> np.ndarray:
     try:
-        labels = map_labels(values, label_set)
-        return labels if source_faces is None or of != "polygon" else labels[source_faces]
+        return map_labels(values, label_set)
     except InputError as error:
         raise InputError(
             f"label file {path}: {error.subject}",
@@ -87,6 +97,18 @@ def read_labels(
             received=error.received,
             remedy=error.remedy,
         ) from None
+
+
+def check_label_ids(path: str | Path, label_set: str | Path | LabelSet) -> None:
+    """Refuse a label file with ids that a set does not have; meshes are looked at when they are read.
+
+    Raises:
+        InputError: it names the ids, and the sets that have all of them.
+    """
+    path = regular_file(path, subject="label file")
+    values = _read_array(path)
+    if values is not None:
+        _mapped(np.unique(values), label_set, path)
 
 
 def check_element_count(
@@ -164,8 +186,8 @@ def _as_array(values: Any, path: Path) -> np.ndarray:
     return as_numbers(values, subject=f"label file {path}")
 
 
-def holds_labels(path: str | Path) -> bool:
-    """Return whether a mesh file holds labels: a property with a name of labels, or display colours of labels.
+def holds_labels(path: str | Path, *, labels: Labels = LABELS) -> bool:
+    """Return whether a mesh file holds labels: a property with a name of labels, or display colours of these labels.
 
     Raises:
         InputError: it is no mesh file.
@@ -176,8 +198,8 @@ def holds_labels(path: str | Path) -> bool:
     if raw.vertex_colors is None:
         return False
     # One colour throughout is a material without a texture; the grey of many tools is the colour of skin.
-    labels = labels_from_colors(raw.vertex_colors)
-    return _of_the_table(labels) and len(np.unique(labels[labels != BACKGROUND])) > 1
+    found = labels_from_colors(raw.vertex_colors, labels=labels)
+    return _of_the_table(found) and len(np.unique(found[found != BACKGROUND])) > 1
 
 
 def _of_the_table(labels: np.ndarray) -> bool:
@@ -207,7 +229,7 @@ def _read_from_mesh(
             expected=f"a property named one of {', '.join(_KEYS)}, or vertex colours",
             received="neither",
         )
-    labels = labels_from_colors(file.vertex_colors, tolerance=color_tolerance)
+    labels = labels_from_colors(file.vertex_colors, tolerance=color_tolerance, labels=find_label_set(label_set).labels)
     if not _of_the_table(labels):
         raise InputError(
             f"label file {path}",
@@ -218,11 +240,13 @@ def _read_from_mesh(
     return labels
 
 
-def labels_from_colors(colors: Num[np.ndarray, "N 3"], *, tolerance: float = 24.0) -> Int64[np.ndarray, " N"]:
+def labels_from_colors(
+    colors: Num[np.ndarray, "N 3"], *, tolerance: float = 24.0, labels: Labels = LABELS
+) -> Int64[np.ndarray, " N"]:
     """Return the label ids of display colours; -1 farther than `tolerance` from every colour of the table."""
-    table = cKDTree(np.array([label.display_rgb for label in LABELS], dtype=np.float64))
+    table = cKDTree(np.array([label.display_rgb for label in labels], dtype=np.float64))
     distance, nearest = table.query(np.asarray(colors, dtype=np.float64), distance_upper_bound=tolerance + 1e-9)
-    ids = np.array([label.id for label in LABELS] + [BACKGROUND])
+    ids = np.array([label.id for label in labels] + [BACKGROUND])
     return np.where(np.isfinite(distance), ids[nearest], BACKGROUND)
 
 

@@ -1,182 +1,56 @@
-"""Map label sets of other data sets and parsers onto ours.
-
-Some of their classes are finer than ours, or differ from them:
-
-| theirs | ours | why |
-|---|---|---|
-| socks, shoes | shoe | worn over the foot, move with it |
-| hat | hair | rigid on the head, as hair is |
-| gloves, face, limbs, feet, hands, mouth | skin | lie on the body, which the body model represents |
-| scarf, apparel | outer | worn over the upper clothes |
-| coat | outer | |
-| dress, jumpsuit | upper | one garment from the shoulders; it stays whole |
-| pants, skirt, belt | lower | |
-| bag, sunglasses | object | rigid, follow one joint |
-| undefined background, ignored (255) | background | |
-"""
+"""Find label sets by name or file, and map the ids of their files onto our labels."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64, Num
 
-from smplxpp.core import BACKGROUND, LABEL_BY_NAME, LABELS, InputError
-from smplxpp.core.files.json_file import read_json
-
-_OURS = {name: label.id for name, label in LABEL_BY_NAME.items()} | {"background": BACKGROUND}
-
-
-@dataclass(frozen=True)
-class LabelSet:
-    """The numbering of semantic classes in one data set or parser.
-
-    Attributes:
-        name: name in options and messages.
-        classes: (their id, their name, our name) of every class.
-    """
-
-    name: str
-    classes: tuple[tuple[int, str, str], ...]
-
-    @property
-    def ours(self) -> dict[int, int]:
-        """Return the mapping from their ids to ours."""
-        return {number: _OURS[ours] for number, _, ours in self.classes}
-
-
-def _numbered(name: str, *classes: tuple[str, str]) -> LabelSet:
-    return LabelSet(name, tuple((k, theirs, ours) for k, (theirs, ours) in enumerate(classes)))
-
-
-def _parser(name: str, *classes: tuple[str, str]) -> LabelSet:
-    """Return a parser's label set: classes from 0, and 255 for pixels to be ignored, which do not vote."""
-    return LabelSet(name, (*_numbered(name, *classes).classes, (255, "ignored", "background")))
-
-
-_LIP = (
-    ("background", "background"),
-    ("hat", "hair"),
-    ("hair", "hair"),
-    ("glove", "skin"),
-    ("sunglasses", "object"),
-    ("upper clothes", "upper"),
-    ("dress", "upper"),
-    ("coat", "outer"),
-    ("socks", "shoe"),
-    ("pants", "lower"),
-    ("jumpsuits", "upper"),
-    ("scarf", "outer"),
-    ("skirt", "lower"),
-    ("face", "skin"),
-    ("left arm", "skin"),
-    ("right arm", "skin"),
-    ("left leg", "skin"),
-    ("right leg", "skin"),
-    ("left shoe", "shoe"),
-    ("right shoe", "shoe"),
-)
-_SAPIENS_SIDE = (
-    ("foot", "skin"),
-    ("hand", "skin"),
-    ("lower arm", "skin"),
-    ("lower leg", "skin"),
-    ("shoe", "shoe"),
-    ("sock", "shoe"),
-    ("upper arm", "skin"),
-    ("upper leg", "skin"),
-)
-
-LABEL_SETS: dict[str, LabelSet] = {
-    label_set.name: label_set
-    for label_set in (
-        LabelSet(
-            "4ddress",
-            ((BACKGROUND, "background", "background"), *((label.id, label.name, label.name) for label in LABELS)),
-        ),
-        _numbered(
-            "capture",
-            ("background", "background"),
-            ("skin", "skin"),
-            ("hair", "hair"),
-            ("shoes", "shoe"),
-            ("upper", "upper"),
-            ("lower", "lower"),
-            ("other body", "skin"),
-        ),
-        _parser("lip", *_LIP),
-        _parser("cihp", *_LIP[:10], ("torso skin", "skin"), *_LIP[11:]),
-        _parser(
-            "atr",
-            ("background", "background"),
-            ("hat", "hair"),
-            ("hair", "hair"),
-            ("sunglasses", "object"),
-            ("upper clothes", "upper"),
-            ("skirt", "lower"),
-            ("pants", "lower"),
-            ("dress", "upper"),
-            ("belt", "lower"),
-            ("left shoe", "shoe"),
-            ("right shoe", "shoe"),
-            ("face", "skin"),
-            ("left leg", "skin"),
-            ("right leg", "skin"),
-            ("left arm", "skin"),
-            ("right arm", "skin"),
-            ("bag", "object"),
-            ("scarf", "outer"),
-        ),
-        _parser(
-            "sapiens",
-            ("background", "background"),
-            ("apparel", "outer"),
-            ("face and neck", "skin"),
-            ("hair", "hair"),
-            *((f"left {theirs}", ours) for theirs, ours in _SAPIENS_SIDE),
-            ("lower clothing", "lower"),
-            *((f"right {theirs}", ours) for theirs, ours in _SAPIENS_SIDE),
-            ("torso", "skin"),
-            ("upper clothing", "upper"),
-            ("lower lip", "skin"),
-            ("upper lip", "skin"),
-            ("lower teeth", "skin"),
-            ("upper teeth", "skin"),
-            ("tongue", "skin"),
-        ),
-    )
-}
+from smplxpp.core import LABELS, InputError
+from smplxpp.core.errors import did_you_mean
+from smplxpp.core.files.json_file import as_object, read_json
+from smplxpp.core.files.yaml_file import read_yaml
+from smplxpp.segment.label_set_file import label_set_of
+from smplxpp.segment.label_sets import LABEL_SETS, LabelSet
 
 
 def find_label_set(name: str | Path | LabelSet) -> LabelSet:
-    """Return a label set by its name, or from a JSON file `{"<their id>": "<our name>", ...}`.
+    """Return a label set by its name, or from a file.
 
-    Our names: skin, hair, shoe, upper, lower, outer, object, background.
+    A file is YAML or JSON: a set of one's own, `{"classes": [...]}` (docs/labels.md), or as JSON a mapping
+    `{"<their id>": "<our name>", ...}` to skin, hair, shoe, upper, lower, outer, object and background.
 
     Raises:
-        InputError: an unknown name, or a file that is not such a mapping.
+        InputError: an unknown name, or a file that is neither.
     """
     if isinstance(name, LabelSet):
         return name
     if str(name) in LABEL_SETS:
         return LABEL_SETS[str(name)]
     path = Path(name)
-    if path.suffix.lower() != ".json" or not path.is_file():
+    suffix = path.suffix.lower()
+    if suffix not in (".json", ".yaml", ".yml") or not path.is_file():
         raise InputError(
-            "label set", expected=f"one of {', '.join(LABEL_SETS)}, or an existing JSON file", received=repr(str(name))
+            "label set",
+            expected=f"one of {', '.join(LABEL_SETS)}, or an existing YAML or JSON file",
+            received=repr(str(name)),
+            remedy=did_you_mean(name, LABEL_SETS),
         )
-    expected = f"a mapping of integers to names among {', '.join(_OURS)}"
+    subject = f"label set {path}"
+    content = read_json(path, subject="label set") if suffix == ".json" else read_yaml(path, subject="label set")
+    if suffix != ".json" or (isinstance(content, dict) and "classes" in content):
+        return label_set_of(as_object(content, subject=subject), subject=subject, name=path.stem)
+    ours = (*LABELS.names, "background")
+    expected = f"a mapping of integers to names among {', '.join(ours)}"
     try:
-        mapping = read_json(path)
-        classes = tuple(sorted((int(number), str(ours), ours) for number, ours in mapping.items()))
+        classes = tuple(sorted((int(number), str(ours), ours) for number, ours in content.items()))
     except (ValueError, AttributeError) as error:
-        raise InputError(f"label set {path}", expected=expected, received=str(error)) from None
-    unknown = sorted({str(ours) for _, _, ours in classes if not isinstance(ours, str) or ours not in _OURS})
+        raise InputError(subject, expected=expected, received=str(error)) from None
+    unknown = sorted({str(name) for _, _, name in classes if not isinstance(name, str) or name not in ours})
     if unknown or not classes:
-        raise InputError(f"label set {path}", expected=expected, received=f"{', '.join(unknown) or 'nothing'}")
+        raise InputError(subject, expected=expected, received=f"{', '.join(unknown) or 'nothing'}")
     return LabelSet(path.stem, classes)
 
 
@@ -190,7 +64,7 @@ def map_labels(
         label_set: see `find_label_set`; or a mapping from their ids to ours.
 
     Raises:
-        InputError: ids that the set does not have.
+        InputError: ids that the set does not have; it names the sets that have all of them.
     """
     name = "mapping" if isinstance(label_set, Mapping) else find_label_set(label_set).name
     mapping = label_set if isinstance(label_set, Mapping) else find_label_set(label_set).ours
@@ -198,13 +72,25 @@ def map_labels(
     whole = ids.dtype.kind == "f" and np.array_equal(ids, np.rint(ids)) and (np.abs(ids) < 2**53).all()
     if ids.dtype.kind not in "iub" and not whole:
         raise InputError("label ids", expected="integers", received=str(ids.dtype))
-    unique, inverse = np.unique(ids.astype(np.int64), return_inverse=True)
+    # Images hold bytes, of which a table is quicker than a sort.
+    of_image = ids.dtype == np.uint8
+    if of_image:
+        unique = np.flatnonzero(np.bincount(ids.ravel(), minlength=256))
+    else:
+        unique, inverse = np.unique(ids.astype(np.int64), return_inverse=True)
     unknown = [int(u) for u in unique if int(u) not in mapping]
     if unknown:
+        fitting = [one.name for one in LABEL_SETS.values() if set(unique.tolist()) <= set(one.ours)]
         raise InputError(
             f"label ids of set {name!r}",
             expected=f"ids among {sorted(mapping)}",
             received=f"{unknown[:10]}{' ...' if len(unknown) > 10 else ''}",
-            remedy="name the label set that the file uses, or give a JSON mapping",
+            remedy=f"{' and '.join(fitting) or 'no built-in set'} {'have' if len(fitting) > 1 else 'has'} all ids of "
+            "this file: name the set that it uses with --label-set, or describe it in a labels.yaml",
         )
-    return np.array([mapping[int(u)] for u in unique], dtype=np.int64)[inverse].reshape(ids.shape)
+    ours = np.array([mapping[int(u)] for u in unique], dtype=np.int64)
+    if not of_image:
+        return ours[inverse].reshape(ids.shape)
+    table = np.zeros(256, dtype=np.int64)
+    table[unique] = ours
+    return table[ids]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, Num
 from scipy.sparse import csr_matrix, identity
 
-from smplxpp.core import BACKGROUND, LABELS, OUTER, SKIN, UPPER, InputError, MeshLike, TriangleMesh, as_mesh
+from smplxpp.core import BACKGROUND, LABELS, OUTER, SKIN, UPPER, InputError, Labels, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import one_line
 from smplxpp.core.topology import face_adjacency
 from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
@@ -77,6 +77,7 @@ def segment_scan(
     colors: Num[np.ndarray, "N C"] | None = None,
     prior: SegmentedScan | None = None,
     config: SegmentConfig | None = None,
+    labels: Labels = LABELS,
 ) -> SegmentedScan:
     """Label every face of a scan from one of: votes, labels of its vertices, labels of its faces.
 
@@ -96,6 +97,7 @@ def segment_scan(
             the votes call them where both exist: of a dress that views call a lower garment, the rest becomes lower,
             too.
         config: options.
+        labels: what the ids stand for.
 
     Raises:
         InputError: none or several of the three, other lengths, unknown ids, or not a single label.
@@ -108,12 +110,12 @@ def segment_scan(
         raise InputError("segment_scan", expected=f"one of {', '.join(given)}", received=", ".join(present) or "none")
     trust = 1.0
     if votes is None:
-        votes, trust = _votes_of_labels(mesh, vertex_labels, face_labels), config.label_trust
+        votes, trust = _votes_of_labels(mesh, vertex_labels, face_labels, len(labels)), config.label_trust
     votes = np.asarray(votes, dtype=np.float64)
-    if votes.shape != (mesh.face_count, len(LABELS)) or not np.isfinite(votes).all() or (votes < 0).any():
+    if votes.shape != (mesh.face_count, len(labels)) or not np.isfinite(votes).all() or (votes < 0).any():
         raise InputError(
             "votes",
-            expected=f"finite, none negative, shape ({mesh.face_count}, {len(LABELS)})",
+            expected=f"finite, none negative, shape ({mesh.face_count}, {len(labels)})",
             received=f"shape {votes.shape}" if votes.ndim == 2 else f"{votes.ndim} dimensions",
         )
     if not votes.any():
@@ -123,11 +125,11 @@ def segment_scan(
     likely = None
     if prior is not None:
         _check_prior(mesh, prior)
-        votes = _votes_with_outer(votes, prior)
+        votes = _votes_with_outer(votes, prior, labels)
         likely = _prior_as_voted(prior, votes, mesh.face_areas)
     lab = None if colors is None else face_colors(mesh, colors)
     total = votes.sum(axis=1)
-    share = (votes + config.pseudo_votes) / (total + config.pseudo_votes * len(LABELS))[:, None]
+    share = (votes + config.pseudo_votes) / (total + config.pseudo_votes * len(labels))[:, None]
     certainty = np.minimum(total, config.full_votes) / config.full_votes
     pairs, ends = face_adjacency(mesh.faces)
     weights = edge_weights(mesh, pairs, ends, config, lab=lab)
@@ -139,22 +141,22 @@ def segment_scan(
         unary += (1.0 - (1.0 - config.prior_weight) * certainty)[:, None] * -np.log(likely)
     below = (total == 0) & (mesh.face_normals[:, 1] < -0.3)  # a normal more than 17 degrees below the horizon
     # Borders have about sqrt(faces) edges; dividing by it cuts a finer scan in the same place.
-    unary[below] += config.underside / np.sqrt(mesh.face_count) * (np.arange(len(LABELS)) != SKIN.id)
+    unary[below] += config.underside / np.sqrt(mesh.face_count) * (labels.kinds != SKIN.id)
     unary = unary[:, candidates]
     # Minimise the energy by graph cuts, and relabel patches that are too small.
     problem = PottsProblem.from_costs(unary, pairs, weights)
     before = problem.energy(unary.argmin(axis=1))
     index, after = minimize_potts(problem)
     cut = candidates[index]
-    labels = absorb_islands(mesh, cut, _confidence(votes, cut, pairs, config), pairs, ends, config)
-    confidence = _confidence(votes, labels, pairs, config)
+    found = absorb_islands(mesh, cut, _confidence(votes, cut, pairs, config), pairs, ends, config, labels=labels)
+    confidence = _confidence(votes, found, pairs, config)
     if likely is not None:
-        confidence = np.where(total > 0, confidence, likely[np.arange(len(labels)), labels])
+        confidence = np.where(total > 0, confidence, likely[np.arange(len(found)), found])
     return SegmentedScan(
-        labels,
+        found,
         confidence,
         total > 0,
-        int((labels != cut).sum()),
+        int((found != cut).sum()),
         before / COST_SCALE,
         after / COST_SCALE,
         # The prior's notes hold for the labels if 5 % of the area and more have no vote.
@@ -177,7 +179,7 @@ def _left_to_prior(mesh: TriangleMesh, votes: np.ndarray) -> float:
 def _known_to(likely: np.ndarray | None) -> Bool[np.ndarray, " L"]:
     """Return the labels that a prior is certain of somewhere."""
     if likely is None:
-        return np.zeros(len(LABELS), dtype=bool)
+        return np.zeros(1, dtype=bool)
     return np.asarray((likely > _CERTAIN_PRIOR).any(axis=0))
 
 
@@ -189,27 +191,29 @@ def _prior_as_voted(
     # How votes translate each label of the prior. Its own word counts as votes on 1 % of the area; ties agree with it.
     called = np.where(votes[rows, own] >= votes.max(axis=1), own, votes.argmax(axis=1))
     voted = votes.any(axis=1)
-    meaning = 0.01 * area.sum() * np.eye(len(LABELS))
+    count = votes.shape[1]
+    meaning = 0.01 * area.sum() * np.eye(count)
     np.add.at(meaning, (own[voted], called[voted]), area[voted])
     meaning /= meaning.sum(axis=1, keepdims=True)
     # Labels with more than 15 % of the votes are equal meanings, because the prior does not tell them apart.
     alike = meaning > 0.15
     meaning = np.where(alike, (meaning * alike).sum(axis=1, keepdims=True) / alike.sum(axis=1, keepdims=True), meaning)
-    share = np.clip(prior.confidence, 1.0 / len(LABELS), 0.99)[:, None]
-    rest = (1.0 - share) / (len(LABELS) - 1)
+    share = np.clip(prior.confidence, 1.0 / count, 0.99)[:, None]
+    rest = (1.0 - share) / (count - 1)
     return rest + (share - rest) * meaning[own]
 
 
-def _votes_with_outer(votes: np.ndarray, prior: SegmentedScan) -> np.ndarray:
+def _votes_with_outer(votes: np.ndarray, prior: SegmentedScan, labels: Labels) -> np.ndarray:
     """Copy the votes of upper to outer clothes if votes never name these and the prior does.
 
     Such a label set may not distinguish coats from shirts; the prior decides between the two.
     """
-    certain = (prior.face_labels == OUTER.id) & (prior.confidence > _CERTAIN_PRIOR)
-    if votes[:, OUTER.id].any() or not certain.any():
+    outer = labels.kinds == OUTER.id
+    certain = outer[prior.face_labels] & (prior.confidence > _CERTAIN_PRIOR)
+    if votes[:, outer].any() or not certain.any():
         return votes
     votes = votes.copy()
-    votes[:, OUTER.id] = votes[:, UPPER.id]
+    votes[:, prior.face_labels[certain][0]] = votes[:, labels.kinds == UPPER.id].max(axis=1)
     return votes
 
 
@@ -237,7 +241,7 @@ def _confidence(
 
 
 def _votes_of_labels(
-    mesh: TriangleMesh, vertex_labels: np.ndarray | None, face_labels: np.ndarray | None
+    mesh: TriangleMesh, vertex_labels: np.ndarray | None, face_labels: np.ndarray | None, label_count: int
 ) -> np.ndarray:
     """Return (M, L) votes of given labels: three a face, fewer where corners are unlabelled."""
     name, labels, count = (
@@ -248,15 +252,15 @@ def _votes_of_labels(
     labels = np.asarray(labels)
     if labels.shape != (count,):
         raise InputError(name, expected=f"shape ({count},)", received=f"shape {labels.shape}")
-    known = (labels >= BACKGROUND) & (labels < len(LABELS))
+    known = (labels >= BACKGROUND) & (labels < label_count)
     if labels.dtype.kind not in "iu" or not known.all():
         raise InputError(
             name,
-            expected=f"integers from -1 to {len(LABELS) - 1}",
+            expected=f"integers from -1 to {label_count - 1}",
             received=f"{labels.dtype}, {int((~known).sum())} values out of range",
             remedy="map them with map_labels first",
         )
     corner = labels[mesh.faces] if face_labels is None else np.repeat(labels[:, None], 3, axis=1)
     face, _ = np.nonzero(corner >= 0)
-    slot = face * len(LABELS) + corner[corner >= 0]
-    return np.bincount(slot, minlength=mesh.face_count * len(LABELS)).reshape(-1, len(LABELS)).astype(np.float64)
+    slot = face * label_count + corner[corner >= 0]
+    return np.bincount(slot, minlength=mesh.face_count * label_count).reshape(-1, label_count).astype(np.float64)

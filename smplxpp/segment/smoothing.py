@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64, Num
 
-from smplxpp.core import LABELS, SKIN, InputError, TriangleMesh
+from smplxpp.core import LABELS, SKIN, InputError, Labels, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb, oklab_from_linear
 from smplxpp.core.topology import component_labels
 
@@ -116,35 +116,39 @@ def edge_weights(
 
 def absorb_islands(
     mesh: TriangleMesh,
-    labels: Int64[np.ndarray, " M"],
+    face_labels: Int64[np.ndarray, " M"],
     confidence: Float64[np.ndarray, " M"],
     pairs: Int64[np.ndarray, "P 2"],
     ends: Int64[np.ndarray, "P 2"],
     config: SmoothingConfig,
+    *,
+    labels: Labels = LABELS,
 ) -> Int64[np.ndarray, " M"]:
     """Relabel patches that are too small to the label with which they share the longest border.
 
-    Only patches that are large enough pass on their label; a small patch that touches none of them keeps its own.
+    Only patches that are large enough pass on their label; a small patch that touches none of them keeps its own. A
+    user's own labels of small things (`Labels.small`) have the bound of skin, because glasses are no fragment.
     """
     # Patches are connected faces of one label; the least area depends on the label and the mean confidence.
-    same = labels[pairs[:, 0]] == labels[pairs[:, 1]]
-    patch = component_labels(pairs[same], len(labels))
+    same = face_labels[pairs[:, 0]] == face_labels[pairs[:, 1]]
+    patch = component_labels(pairs[same], len(face_labels))
     area = np.bincount(patch, mesh.face_areas)
     label_of_patch = np.empty(len(area), dtype=np.int64)
-    label_of_patch[patch] = labels
+    label_of_patch[patch] = face_labels
     uncertain = np.bincount(patch, mesh.face_areas * confidence) < config.uncertain * area
-    least = np.where(label_of_patch == SKIN.id, config.speck_area, config.island_area)
-    least = np.where(uncertain, np.maximum(least, config.uncertain_area), least)
+    things = labels.small[label_of_patch]
+    least = np.where(things | (label_of_patch == SKIN.id), config.speck_area, config.island_area)
+    least = np.where(uncertain & ~things, np.maximum(least, config.uncertain_area), least)
     small = area < least * area.sum()
     if not small.any():
-        return labels
+        return face_labels
     # Lengths of the borders between each small patch and the labels of large patches around it.
     crossing = pairs[~same]
     length = np.linalg.norm(np.diff(mesh.vertices[ends[~same]], axis=1)[:, 0], axis=1)
     here = np.concatenate([patch[crossing[:, 0]], patch[crossing[:, 1]]])
     there = np.concatenate([patch[crossing[:, 1]], patch[crossing[:, 0]]])
     usable = small[here] & ~small[there]
-    border = np.zeros((len(area), len(LABELS)))
+    border = np.zeros((len(area), len(labels)))
     np.add.at(border, (here[usable], label_of_patch[there[usable]]), np.concatenate([length, length])[usable])
     absorbed = border.any(axis=1)
     label_of_patch[absorbed] = border[absorbed].argmax(axis=1)

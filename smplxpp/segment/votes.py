@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float64, Integer
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 
-from smplxpp.core import BACKGROUND, LABELS, Camera, InputError, MeshLike, TriangleMesh, as_mesh
+from smplxpp.core import BACKGROUND, LABELS, Camera, InputError, Labels, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import one_line
 from smplxpp.raster import MeshMaps, rasterize_mesh
 
 
 def vote_on_faces(
-    mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]
+    mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]], *, labels: Labels = LABELS
 ) -> Float64[np.ndarray, "M L"]:
     """Sum `cos(view, normal) clip(d / 4, 0.1, 1)` over the views' pixels that show a face, for each label.
 
@@ -27,19 +27,22 @@ def vote_on_faces(
     Args:
         mesh: the scan.
         views: (camera, label map) pairs; a map is (H, W) in our ids, background -1, of its camera's size.
+        labels: what the ids stand for.
 
     Raises:
         InputError: sizes that do not agree, unknown ids, or no vote at all.
     """
     mesh = as_mesh(mesh, subject="mesh")
-    votes = np.zeros((mesh.face_count, len(LABELS)))
-    for camera, labels in views:
-        votes += votes_of_view(mesh, camera, labels)
+    votes = np.zeros((mesh.face_count, len(labels)))
+    for camera, shown in views:
+        votes += votes_of_view(mesh, camera, shown, label_count=len(labels))
     require_votes(bool(votes.any()))
     return votes
 
 
-def votes_of_view(mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray, "_ _"]) -> Float64[np.ndarray, "M L"]:
+def votes_of_view(
+    mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray, "_ _"], *, label_count: int = len(LABELS)
+) -> Float64[np.ndarray, "M L"]:
     """Return the votes of one view, as defined in `vote_on_faces`.
 
     Raises:
@@ -53,10 +56,10 @@ def votes_of_view(mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray
             received=f"{labels.shape}",
             remedy="scale the camera's intrinsics to the map's size",
         )
-    if labels.min() < BACKGROUND or labels.max() >= len(LABELS):
+    if labels.min() < BACKGROUND or labels.max() >= label_count:
         raise InputError(
             f"label map of camera {camera.name!r}",
-            expected=f"ids -1 to {len(LABELS) - 1}",
+            expected=f"ids -1 to {label_count - 1}",
             received=f"{labels.min()} to {labels.max()}",
             remedy="map them with map_labels first",
         )
@@ -73,9 +76,9 @@ def votes_of_view(mesh: TriangleMesh, camera: Camera, labels: Integer[np.ndarray
     inside = distance_transform_edt(np.pad(foreground, 1))[1:-1, 1:-1][row, col]
     cosine = -np.einsum("ij,ij->i", _rays(camera, row, col), mesh.face_normals[hit])
     weight = share * np.maximum(cosine, 0.0) * np.clip(inside / 4.0, 0.1, 1.0)
-    votes = np.bincount(hit * len(LABELS) + labels[row, col], weight, minlength=mesh.face_count * len(LABELS))
+    votes = np.bincount(hit * label_count + labels[row, col], weight, minlength=mesh.face_count * label_count)
     # `bincount` of no pixels returns integers.
-    return votes.astype(np.float64).reshape(mesh.face_count, len(LABELS))
+    return votes.astype(np.float64).reshape(mesh.face_count, label_count)
 
 
 def require_votes(some: bool) -> None:
@@ -139,7 +142,9 @@ class AgreedVotes:
     __repr__ = one_line
 
 
-def vote_in_agreement(mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]]) -> AgreedVotes:
+def vote_in_agreement(
+    mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.ndarray, "_ _"]]], *, labels: Labels = LABELS
+) -> AgreedVotes:
     """Sum votes as `vote_on_faces` does, without the label maps that the other views contradict.
 
     A view agrees on a face if its label wins the sum of all other views. A view is a candidate for exclusion if it
@@ -152,7 +157,7 @@ def vote_in_agreement(mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.n
     """
     mesh = as_mesh(mesh, subject="mesh")
     # Sparse matrices, because a view sees a part of the faces, and a studio has a hundred views.
-    each = [csr_matrix(votes_of_view(mesh, camera, labels)) for camera, labels in views]
+    each = [csr_matrix(votes_of_view(mesh, camera, shown, label_count=len(labels))) for camera, shown in views]
     require_votes(any(votes.nnz for votes in each))
     kept = [k for k, votes in enumerate(each) if votes.nnz]
     left_out: dict[str, float] = {}
@@ -167,7 +172,7 @@ def vote_in_agreement(mesh: MeshLike, views: Sequence[tuple[Camera, Integer[np.n
         left_out[views[kept[worst]][0].name or f"view {kept[worst]}"] = float(agreed[worst] / shared[worst])
         kept.pop(worst)
     votes = np.asarray(sum(each[k] for k in kept).todense())
-    return AgreedVotes(votes.reshape(mesh.face_count, len(LABELS)), left_out)
+    return AgreedVotes(votes.reshape(mesh.face_count, len(labels)), left_out)
 
 
 def _shares(each: Sequence[csr_matrix]) -> tuple[np.ndarray, np.ndarray]:

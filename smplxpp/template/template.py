@@ -14,9 +14,17 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 
 from smplxpp.body.model import BodyModel, PosedBody
-from smplxpp.core import CLOTH_LABELS, LABELS, BodyParams, InputError, SkinWeights, TriangleMesh, require_choice
+from smplxpp.core import (
+    LABELS,
+    BodyParams,
+    InputError,
+    Label,
+    Labels,
+    SkinWeights,
+    TriangleMesh,
+    require_choice,
+)
 from smplxpp.core.files.array_file import read_arrays, write_arrays
-from smplxpp.core.labels import semantic_colors
 from smplxpp.skinning.linear_blend import skin
 from smplxpp.template import template_arrays
 from smplxpp.template.template_arrays import check_arrays, metadata_of
@@ -50,7 +58,7 @@ class Template:
             whatever the model given held there; its bases are rounded to float32, the precision of the file.
         vertices: T-pose, metres.
         faces: the body's first, then each part's, no face across parts.
-        vertex_labels: ids of `smplxpp.core.labels`; skin on the body.
+        vertex_labels: ids of `labels`; skin on the body.
         vertex_part: index into `part_names`, increasing.
         part_names: "body", then the parts.
         vertex_colors: sRGB as scanned.
@@ -59,6 +67,7 @@ class Template:
         body_index: the nearest body vertex at rest; its own index for a body vertex.
         scan_index: vertex of the scan that a vertex comes from, or -1.
         metadata: short texts: name of the body, versions.
+        labels: the semantic classes, the built-in ones or with a user's own.
 
     Raises:
         InputError: arrays that do not fit each other.
@@ -82,6 +91,7 @@ class Template:
     body_index: Int64[np.ndarray, " V"]
     scan_index: Int64[np.ndarray, " V"]
     metadata: dict[str, str] = field(default_factory=dict)
+    labels: Labels = LABELS
 
     def __post_init__(self) -> None:
         for name, dtype in _DTYPES.items():
@@ -129,7 +139,7 @@ class Template:
             "faces": V,
             "vertex_part": len(self.part_names),
             "body_index": Vb,
-            "vertex_labels": len(LABELS),
+            "vertex_labels": len(self.labels),
         }.items():
             value = getattr(self, name)
             inside = not value.size or (value.min() >= 0 and value.max() < bound)
@@ -170,13 +180,35 @@ class Template:
 
     @property
     def cloth_mask(self) -> Bool[np.ndarray, " V"]:
-        """The vertices of clothes: upper, lower, outer."""
-        return np.isin(self.vertex_labels, [label.id for label in CLOTH_LABELS])
+        """The vertices of clothes: upper, lower, outer, and what behaves like them."""
+        return np.isin(self.vertex_labels, [label.id for label in self.labels.cloth])
+
+    def label_of(self, part: str) -> Label:
+        """Return the commonest label of a part.
+
+        Raises:
+            InputError: no such part.
+        """
+        require_choice("part", part, self.part_names)
+        own = self.vertex_labels[self.vertex_part == self.part_names.index(part)]
+        return self.labels[int(np.bincount(own, minlength=1).argmax())]
+
+    @property
+    def cloth_parts(self) -> tuple[str, ...]:
+        """The parts that are clothes, in the order of their labels."""
+        clothes = (label.name for label in self.labels.cloth)
+        return tuple(name for name in clothes if name in self.part_names)
+
+    @property
+    def loose_parts(self) -> tuple[str, ...]:
+        """The parts that are clothes and hang freely as far as their labels say: neither tight nor rigid."""
+        rigid = {label.name for label in self.labels if label.tight or label.stiff}
+        return tuple(name for name in self.cloth_parts if name not in rigid)
 
     @property
     def semantic_colors(self) -> UInt8[np.ndarray, "V 3"]:
         """The sRGB colours of the labels that a trainer sees."""
-        return semantic_colors(self.vertex_labels)
+        return self.labels.semantic_colors(self.vertex_labels)
 
     def part_faces(self, name: str) -> Bool[np.ndarray, " F"]:
         """Return the faces of one part of the template.
@@ -262,6 +294,9 @@ class Template:
             "part_names": template_arrays.plain_array(self.part_names),
             "metadata": np.array(json.dumps(self.metadata, sort_keys=True)),
         }
+        # Templates with the built-in labels are read by versions that know no others.
+        if self.labels != LABELS:
+            arrays["labels"] = np.array(json.dumps(self.labels.as_list()))
         write_arrays(path, template_arrays.in_file_order(arrays))
 
     def export(self, path: str | Path, *, animation: BodyParams | None = None, **options: Any) -> Path:
@@ -341,6 +376,7 @@ def _from_arrays(arrays: Mapping[str, np.ndarray]) -> Template:
         betas=arrays["betas"],
         body_index=arrays["body_index"],
         scan_index=arrays["scan_index"],
+        labels=template_arrays.labels_of(arrays),
     )
 
 

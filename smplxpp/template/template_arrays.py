@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from smplxpp.body.model import BodyModel
-from smplxpp.core import InputError, SkinWeights
+from smplxpp.core import LABELS, InputError, Labels, SkinWeights
 from smplxpp.core.files.json_file import as_object, as_text, parse_json
 
 # Kind of numbers ("f": any floats, "i": any integers, "b": bools, "U": texts) and number of axes, by name in the file.
@@ -47,6 +47,7 @@ _OPTIONAL = {
     "left_hand_mean": ("f", 1),
     "right_hand_mean": ("f", 1),
     "expression_names": ("U", 1),
+    "labels": ("U", 0),
 }
 _WORDS = {"f": "floats", "i": "integers", "b": "bools", "U": "texts"}
 _ROW_SUM = 1e-6  # largest difference of the sum of a vertex's weights from 1
@@ -80,6 +81,17 @@ def metadata_of(arrays: Mapping[str, np.ndarray]) -> dict[str, str]:
     """
     values = as_object(parse_json(str(arrays["metadata"]), subject="metadata"), subject="metadata")
     return {name: as_text(value, subject=f"metadata {name}") for name, value in values.items()}
+
+
+def labels_of(arrays: Mapping[str, np.ndarray]) -> Labels:
+    """The labels of a template's file, the built-in ones where it names none.
+
+    Raises:
+        InputError: something else than a list of labels.
+    """
+    if "labels" not in arrays:
+        return LABELS
+    return Labels.from_list(parse_json(str(arrays["labels"]), subject="labels"))
 
 
 def _check_skeleton(parents: np.ndarray) -> None:
@@ -142,7 +154,7 @@ _ORDER = (
     *(SCHEMA_KEY, "vertices", "faces", "vertex_labels", "vertex_part", "part_names", "vertex_colors", "weights"),
     *("joint_regressor", "parents", "joint_names", "betas", "shape_basis", "expression_basis", "pose_basis"),
     *("left_hand_components", "right_hand_components", "left_hand_mean", "right_hand_mean"),
-    *("body_labels", "body_label_names", "body_index", "scan_index", "expression_names", "metadata"),
+    *("body_labels", "body_label_names", "body_index", "scan_index", "expression_names", "metadata", "labels"),
 )
 _WEIGHTS = "weights_"
 _BASES = ("shapedirs", "exprdirs", "posedirs")

@@ -6,7 +6,7 @@ import warnings
 
 import igl
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
 from smplxpp.core import GeometryWarning, InputError, TriangleMesh, row_lengths
@@ -183,6 +183,12 @@ def welded(mesh: TriangleMesh) -> tuple[TriangleMesh, Int64[np.ndarray, " N"]]:
     if not (whole & once).any() or ((whole & once).all() and len(first) == count):
         return mesh, np.arange(count)
     return TriangleMesh(mesh.vertices[first], faces[whole & once]), index
+
+
+def surface_components(mesh: TriangleMesh) -> Int32[np.ndarray, " N"]:
+    """Return the connected component of every vertex as `SkinWeights` numbers it: copies at one place are joined."""
+    once, copies = welded(mesh)
+    return component_labels(once.edges, once.vertex_count).astype(np.int32)[copies]
 
 
 def restrict_source(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool
 
 from smplxpp.body.layout import JOINT_NAMES
-from smplxpp.core import InputError, require_at_least, require_between, require_choice, require_positive
+from smplxpp.core import LABELS, InputError, require_at_least, require_between, require_choice, require_positive
+from smplxpp.core.errors import did_you_mean
+from smplxpp.core.labels import PartRule
 
 _BOTH = ("left_", "right_")
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3")
@@ -71,6 +74,11 @@ class TransferConfig:
         length_scale: `l` of the energy, as a fraction of the source's extent.
         laplacian: "cotangent" as given; "intrinsic" mollified and Delaunay; "auto" the latter where a face is bad.
         max_influences: joints kept at a vertex; None keeps all.
+        rule: how the whole target follows the skeleton, as `smplxpp.core.labels.PartRule` reads it. "auto": as above.
+            "rigid:JOINT": one joint, also where the target matched well. "chain:JOINT,JOINT,...": the same transfer
+            from the skin of these joints alone, whose weights are normalised; what does not match it is inpainted.
+            "isolate": every connected component rigid, as in `rigid_weights`.
+        component_rules: other rules for some components, by their number in `SkinWeights.component`.
         averaging_steps: Jacobi averaging over unmatched vertices at the end (rate 0.2).
         joint_names: names for `allowed_joints` and `unmatched`; None takes the names of the SMPL family by the number
             of joints.
@@ -98,6 +106,8 @@ class TransferConfig:
     length_scale: float = 0.4
     laplacian: Literal["auto", "cotangent", "intrinsic"] = "auto"
     max_influences: int | None = 8
+    rule: str = "auto"
+    component_rules: Mapping[int, str] = field(default_factory=dict)
     averaging_steps: int = 0
     joint_names: tuple[str, ...] | None = None
 
@@ -129,6 +139,8 @@ class TransferConfig:
                 )
         if self.max_influences is not None:
             require_at_least("config max_influences", self.max_influences, 1)
+        for rule in (self.rule, *self.component_rules.values()):
+            PartRule.parse(rule, subject="config rule")
         require_choice("config laplacian", self.laplacian, ("auto", "cotangent", "intrinsic"))
         if self.unmatched not in ("extend", "nearest", "raise") and not self.unmatched.startswith("rigid:"):
             raise InputError(
@@ -169,9 +181,13 @@ class TransferConfig:
         """Settings for a part of one of `smplxpp.core.labels`: `base` with the joints that such a part can follow.
 
         Only what is impossible is left out (`JOINTS_OF_LABEL`): hair does not follow the jaw, arms and legs,
-        lower clothes not the arms, upper clothes not head, fingers and shins. A label that is not listed (skin) is not
-        restricted.
+        lower clothes not the arms, upper clothes not head, fingers and shins. Skin and things are not restricted. A
+        label of one's own has the settings of its `kind`.
+
+        Raises:
+            InputError: no built-in label of this name.
         """
+        require_choice("label", name, LABELS.names)
         base = base or TransferConfig()
         return replace(base, allowed_joints=JOINTS_OF_LABEL.get(name))
 
@@ -191,9 +207,27 @@ class TransferConfig:
                 f"joint {joint!r}",
                 expected=f"an index below {joint_count}, or a name of joint_names",
                 received=repr(joint),
-                remedy="give TransferConfig(joint_names=...) of the body model",
+                remedy=did_you_mean(joint, names) or "give TransferConfig(joint_names=...) of the body model",
             )
         return index
+
+    def rules_of(self, component_count: int, joint_count: int) -> tuple[PartRule, ...]:
+        """The rule of each component.
+
+        Raises:
+            InputError: a component that there is not, or a joint that the body has not.
+        """
+        strange = sorted(k for k in self.component_rules if not 0 <= k < component_count)
+        if strange:
+            raise InputError(
+                "config component_rules", expected=f"components 0 to {component_count - 1}", received=str(strange)
+            )
+        texts = (self.component_rules.get(k, self.rule) for k in range(component_count))
+        rules = tuple(PartRule.parse(text) for text in texts)
+        for rule in set(rules):
+            for joint in rule.joints:
+                self.joint_index(joint, joint_count)
+        return rules
 
     def allowed_mask(self, joint_count: int) -> Bool[np.ndarray, " J"] | None:
         """The joints that a part may follow, or None where all are allowed."""

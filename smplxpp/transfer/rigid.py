@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from smplxpp.core import MeshLike, SkinWeights, WeightsLike, as_mesh, dense_weights
+from smplxpp.core import MeshLike, SkinWeights, WeightsLike, as_mesh, dense_weights, require_choice
 from smplxpp.transfer.anchors import smooth_step
 from smplxpp.transfer.correspond import vertex_components
 
@@ -21,6 +21,7 @@ def rigid_weights(
     target: MeshLike,
     *,
     joint_names: tuple[str, ...],
+    joint: str | None = None,
 ) -> SkinWeights:
     """Return skin weights with which every piece of `target` follows one joint of the body, as it is in the scan.
 
@@ -33,6 +34,10 @@ def rigid_weights(
         source_weights: its skin weights.
         target: the thing, in the same place, one or several connected pieces.
         joint_names: names of the J joints, for which hands are looked for.
+        joint: name of the joint that all pieces follow; None: each that of the body nearest to it.
+
+    Raises:
+        InputError: no joint of this name.
 
     Example:
         >>> body = smplxpp.load_body()
@@ -45,6 +50,8 @@ def rigid_weights(
     target = as_mesh(target, subject="target")
     # Fingers count as the wrist that they belong to.
     names = list(joint_names)
+    if joint is not None:
+        require_choice("rigid joint", joint, names)
     owner = np.arange(len(names))
     for k, name in enumerate(names):
         side = name.partition("_")[0]
@@ -61,26 +68,28 @@ def rigid_weights(
         held[row] = cKDTree(source.vertices[limb == hand]).query(target.vertices)[0] < _HOLDS
     # One joint for every connected piece.
     component = vertex_components(target)
-    joint = np.zeros(target.vertex_count, dtype=np.int64)
+    follows = np.zeros(target.vertex_count, dtype=np.int64)
     policies = []
     for piece in range(int(component.max(initial=-1)) + 1):
         own = component == piece
         touches = held[:, own].sum(axis=1)
-        if touches.any():
-            joint[own] = hands[int(touches.argmax())]
+        if joint is not None:
+            follows[own] = names.index(joint)
+        elif touches.any():
+            follows[own] = hands[int(touches.argmax())]
         else:
             # The tenth of it that is nearest to the body, by the sum of the weights there.
             close = own & (distance <= np.quantile(distance[own], 0.1))
-            joint[own] = int(folded[nearest[close]].sum(axis=0).argmax())
-        policies.append(f"rigid:{names[joint[own][0]]}")
+            follows[own] = int(folded[nearest[close]].sum(axis=0).argmax())
+        policies.append(f"rigid:{names[follows[own][0]]}")
     dense = np.zeros((target.vertex_count, len(names)))
-    dense[np.arange(len(joint)), joint] = 1.0
+    dense[np.arange(len(follows)), follows] = 1.0
     return SkinWeights.from_dense(
         dense,
         max_influences=1,
-        matched=np.zeros(len(joint), dtype=bool),
+        matched=np.zeros(len(follows), dtype=bool),
         distance=distance,
-        angle=np.full(len(joint), np.nan),
+        angle=np.full(len(follows), np.nan),
         component=component,
         policies=tuple(policies),
     )

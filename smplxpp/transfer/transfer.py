@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import MeshLike, SkinWeights, TriangleMesh, WeightsLike, as_mesh, dense_weights
+from smplxpp.core.labels import PartRule
 from smplxpp.transfer.anchors import (
     anchor_share,
     anchor_weights,
@@ -38,6 +40,7 @@ from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes, unworn_arms
 from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.hanging import bounded_legs, leg_bound
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
+from smplxpp.transfer.rigid import rigid_weights
 
 _LEAST_SUM = 1e-3
 """Least sum of a row's weights that is worth normalising; also the least weight that counts as following a joint."""
@@ -68,7 +71,8 @@ def transfer_weights(
         source: the body. Inconsistent winding is repaired with a warning.
         source_weights: (V, J), rows sum to 1; read where a face uses the vertex.
         target: what it wears; open, with several components, bad faces or unreferenced vertices.
-        config: settings; `TransferConfig.for_label("lower")` and the like know which joints a part can follow.
+        config: settings; `TransferConfig.for_label("lower")` and the like know which joints a part can follow, `rule`
+            and `component_rules` make plates and bags rigid.
 
     Returns:
         Weights of the target's vertices; rows sum to 1, none negative. `matched`, `distance` and `angle` are those
@@ -76,7 +80,7 @@ def transfer_weights(
 
     Raises:
         InputError: meshes without faces, weights that are none, another unit or other axes than the source's, a
-            component without a match under the policy "raise".
+            component without a match under the policy "raise", a rule of a joint or component that there is not.
 
     Warns:
         GeometryWarning: repaired winding, a part inside out, components without a match that took the nearest weights.
@@ -101,12 +105,101 @@ def transfer_weights(
     target, copies = welded(target)
     target = consistent_winding(target, subject="target mesh")
     size = extent(source)
+    # Weights by each rule that a component has; most targets have "auto" alone.
+    component = vertex_components(target)
+    rules = config.rules_of(int(component.max(initial=-1)) + 1, joint_count)
+    answers = {rule: _by_rule(rule, source, weights, target, component, size, config) for rule in dict.fromkeys(rules)}
+    found = _chosen(tuple(answers[rule] for rule in rules), component)
+    return SkinWeights.from_dense(
+        found.dense[copies],
+        max_influences=config.max_influences,
+        matched=found.matched[copies],
+        distance=found.distance[copies],
+        angle=found.angle[copies],
+        component=component[copies],
+        policies=found.policies,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighted:
+    """Weights (N, J) of a target by one rule, their provenance by vertex, and the policy of each component."""
+
+    dense: np.ndarray
+    matched: np.ndarray
+    distance: np.ndarray
+    angle: np.ndarray
+    policies: tuple[str, ...]
+
+
+def _chosen(of_component: tuple[_Weighted, ...], component: np.ndarray) -> _Weighted:
+    """Return for every component the rows of its own answer."""
+    first = of_component[0]
+    if all(one is first for one in of_component):
+        return first
+    rows = {name: getattr(first, name).copy() for name in ("dense", "matched", "distance", "angle")}
+    for number, answer in enumerate(of_component):
+        own = component == number
+        for name, values in rows.items():
+            values[own] = getattr(answer, name)[own]
+    return _Weighted(**rows, policies=tuple(answer.policies[k] for k, answer in enumerate(of_component)))
+
+
+def _by_rule(
+    rule: PartRule,
+    source: TriangleMesh,
+    weights: np.ndarray,
+    target: TriangleMesh,
+    component: np.ndarray,
+    size: float,
+    config: TransferConfig,
+) -> _Weighted:
+    """Return the weights that a rule gives all components of the target."""
+    if rule.kind == "auto":
+        return _transferred(source, weights, target, component, size, config, whole=True)
+    joint_count = weights.shape[1]
+    chosen = [config.joint_index(joint, joint_count) for joint in rule.joints]
+    if rule.kind == "chain":
+        # Skin of other joints is out of reach; what lies over it is far from the chain, and inpainted from what is not.
+        mask = np.zeros(joint_count, dtype=bool)
+        mask[chosen] = True
+        near, own = restrict_source(source, weights, mask)
+        out = _transferred(near, own, target, component, size, replace(config, allowed_joints=None), whole=False)
+        return replace(out, policies=tuple(f"chain:{','.join(rule.joints)}" for _ in out.policies))
+    names = config.joint_names or JOINT_NAMES.get(joint_count) or tuple(map(str, range(joint_count)))
+    rigid = rigid_weights(source, weights, target, joint_names=names, joint=names[chosen[0]] if chosen else None)
+    return _Weighted(rigid.dense(), rigid.matched, rigid.distance, rigid.angle, rigid.policies)
+
+
+def _transferred(
+    source: TriangleMesh,
+    weights: np.ndarray,
+    target: TriangleMesh,
+    component: np.ndarray,
+    size: float,
+    config: TransferConfig,
+    *,
+    whole: bool,
+) -> _Weighted:
+    """Return the weights that the surface of the source gives the target, see `transfer_weights`.
+
+    Args:
+        source: the body, or a part of it.
+        weights: of its vertices.
+        target: what it wears.
+        component: of each vertex of the target.
+        size: the body's extent.
+        config: settings.
+        whole: whether the source is the whole body, which tells where the target lies and which arms are in sleeves.
+    """
+    joint_count = weights.shape[1]
     allowed = config.allowed_mask(joint_count)
     if allowed is not None and config.confident is None:
         source, weights = restrict_source(source, weights, allowed)
     # Match vertices to the source.
     found = closest_points(source, target)
-    check_placement(source, target, found.distance)
+    if whole:
+        check_placement(source, target, found.distance)
     # Find the rings that go around one limb, and leave out arms that are not in the sleeves.
     axes, limbs = [], None
     if config.confident is not None and found.distance.max() > config.around[0] * size:
@@ -114,11 +207,10 @@ def transfer_weights(
         if axes:
             limbs = enclosed_by_one(target, axes, joint_count)
             unworn = unworn_arms(target, axes, limbs, size, config, joint_count)
-            if unworn.any():
+            if whole and unworn.any():
                 source, weights = restrict_source(source, weights, ~unworn)
                 found = closest_points(source, target)
     # Find the confident vertices among the matched ones.
-    component = vertex_components(target)
     limit = config.max_distance * extent(target)
     found, normals = face_outward(found, target, component, max_distance=limit)
     if config.confident is not None:
@@ -154,21 +246,13 @@ def transfer_weights(
             share[total <= _LEAST_SUM] = 0.0
             answer /= np.maximum(total, _LEAST_SUM)[:, None]
         dense += share[:, None] * (answer - dense)
-    if limbs is not None and config.hanging is not None:
+    if whole and limbs is not None and config.hanging is not None:
         # Leave the pelvis its share of cloth that hangs free before both legs.
         arms = weights[:, [joint for axis in axes[2:4] for joint in axis.joints]].sum(axis=1, keepdims=True)
         off = np.where(found.interpolate(source, arms)[:, 0] > 0.5, np.inf, found.distance)
         bound = leg_bound(target, component, off, axes, limbs, size=size, cone=config.hanging)
         dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
-    return SkinWeights.from_dense(
-        dense[copies],
-        max_influences=config.max_influences,
-        matched=matched[copies],
-        distance=found.distance[copies],
-        angle=found.angle[copies],
-        component=component[copies],
-        policies=policies,
-    )
+    return _Weighted(dense, matched, found.distance, found.angle, policies)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,13 @@ from tests.fuzz.motion_light_sound import face_doors, light_doors, motion_doors,
 from tests.fuzz.run_doors import run_doors
 
 _FRAMES = 3
+_OWN_LABELS = """files: lip  # and two classes of one's own
+classes:
+  - name: hat
+    rule: rigid:head
+    ids: [hat, 255]
+  - {name: obi, kind: upper, ids: 7, color: "#102030", layer: 3.5}
+"""
 
 
 def _open_capture(root: Path) -> None:
@@ -271,6 +278,11 @@ def _label_doors() -> list[Door]:
             "label set",
             lambda folder: _write_json(folder / "set.json", {"0": "skin", "7": "upper", "9": "background"}),
             lambda folder: find_label_set(folder / "set.json"),
+        ),
+        Door(
+            "label set of one's own",
+            lambda folder: (folder / "labels.yaml").write_text(_OWN_LABELS),
+            lambda folder: find_label_set(folder / "labels.yaml"),
         ),
     ]
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from smplxpp.core import CLOTH_LABELS, matrix_from_rotvec
+from smplxpp.core import matrix_from_rotvec
 from smplxpp.register import BodyState, Kinematics
 from smplxpp.skinning.linear_blend import forward_kinematics
 from smplxpp.template.template import Template
@@ -43,7 +43,8 @@ def rigidity(
     if len(cloth):
         body = template.part_mesh("body")
         squared = igl.point_mesh_squared_distance(template.vertices[cloth], body.vertices, body.faces)[0]
-        of_label = {label.id: factors.get(label.name, 0.0) for label in CLOTH_LABELS}
+        # A label of the user's own has the factor of the class that it behaves like; what lies on the skin follows it.
+        of_label = {one.id: 1.0 if one.tight else factors.get(one.kind, 0.0) for one in template.labels.cloth}
         factor = np.array([of_label[int(label)] for label in template.vertex_labels[cloth]])
         rigid[cloth] = factor * np.exp(-squared / reach**2)
     rigid[rigid < least] = 0.0

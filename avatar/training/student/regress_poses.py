@@ -18,7 +18,6 @@ from scipy.spatial import cKDTree
 from avatar.data.sequence import AvatarSequence
 from avatar.models.networks.pose_dependence import PoseRegression, joint_steps
 from avatar.models.student import Student
-from smplxpp.core.labels import LABELS
 from smplxpp.core.spread import spread_inside
 
 log = logging.getLogger(__name__)
@@ -98,7 +97,7 @@ def regress_poses(student: Student, sequence: AvatarSequence) -> PoseRegression:
     for label, own in chosen.items():
         log.info(
             "pose regression of %s: error %.1f mm in left-out training frames, %.1f mm with their mean in its place",
-            *(LABELS[label].name, 1e3 * own.error, 1e3 * own.mean_error),
+            *(template.labels[label].name, 1e3 * own.error, 1e3 * own.mean_error),
         )
     return made.to(student.rig.device)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from avatar.data.cloth_motion import ClothMotions
 from smplxpp.cloth import Garment, GarmentConfig, cut_garment
-from smplxpp.core import CLOTH_LABELS, DEFAULT_FPS, BodyParams, GeometryWarning, InputError
+from smplxpp.core import DEFAULT_FPS, BodyParams, GeometryWarning, InputError
 from smplxpp.template.template import Template
 
 CORRECTION_DECAY = 0.3
@@ -102,7 +102,7 @@ def _loose_parts(template: Template, reference: BodyParams) -> list[Garment]:
     # Shallower pins than players have: photographs correct what a freer simulation gets wrong.
     pin_depth = 0.014  # metres of cloth, measured along it, that the body carries
     garments = []
-    for name in (label.name for label in CLOTH_LABELS if label.name in template.part_names):
+    for name in template.loose_parts:
         with suppress(InputError):
             garments.append(cut_garment(template, name, reference, GarmentConfig(pin_depth=pin_depth)))
     return garments

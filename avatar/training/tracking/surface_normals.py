@@ -14,7 +14,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.data.views import View
 from avatar.models.tracked_surface import Track
 from avatar.training.engine.photometric_task import TaskContext
-from smplxpp.core import CLOTH_LABELS, TriangleMesh
+from smplxpp.core import TriangleMesh
 from smplxpp.raster import rasterize_mesh
 
 
@@ -34,7 +34,7 @@ class SurfaceNormals:
         self.sequence, self.track = sequence, track
         # Faces of the chosen parts; the first array makes the union defined without any part.
         template = sequence.rig.template
-        parts = {label.name for label in CLOTH_LABELS} if parts is None else parts
+        parts = template.cloth_parts if parts is None else parts
         shown = [template.part_faces(name) for name in template.part_names if name in parts]
         self._faces = np.any([np.zeros(len(template.faces), dtype=bool), *shown], axis=0)
         self._meshes: dict[int, TriangleMesh] = {}

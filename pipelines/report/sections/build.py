@@ -64,7 +64,6 @@ from pipelines.stages.run_inputs import capture_of_build
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import jsonable
-from smplxpp.core.labels import CLOTH_LABELS
 from smplxpp.template.template import Template
 
 HEIGHT = 640
@@ -151,7 +150,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     )
     seconds = {name: r.manifest["seconds"] for name, r in records.items()}
     key_numbers = [
-        *readable_numbers(checked, lambda: _distances(checked)),
+        *readable_numbers(checked, lambda: _distances(checked, template.cloth_parts)),
         KeyNumber("template", f"{len(template.faces):,} faces", f"{len(template.vertices):,} vertices"),
         KeyNumber(
             "time of the template",
@@ -213,17 +212,15 @@ def _numbers(record: StageRecord | None, make: Callable[[StageRecord], tuple[Key
     return () if record is None else readable_numbers(record, lambda: make(record))
 
 
-def _distances(record: StageRecord) -> tuple[KeyNumber, ...]:
+def _distances(record: StageRecord, parts: tuple[str, ...]) -> tuple[KeyNumber, ...]:
     """How far the clothes are from the scan."""
     clothes = record.manifest["numbers"]["template_vs_scan"]["labels"]
     return tuple(
         KeyNumber(
-            f"template to scan, {label.name}: mean",
-            f"{clothes[label.name]['pred_to_gt']['mean']:.2f} mm",
-            "visible surface",
+            f"template to scan, {part}: mean", f"{clothes[part]['pred_to_gt']['mean']:.2f} mm", "visible surface"
         )
-        for label in CLOTH_LABELS
-        if clothes.get(label.name, {}).get("pred_to_gt")
+        for part in parts
+        if clothes.get(part, {}).get("pred_to_gt")
     )
 
 

@@ -11,13 +11,21 @@ from jaxtyping import Float, UInt8
 from pipelines.figures import body_cameras, encode_jpeg, render_heat, render_overlay, render_shaded, row
 from pipelines.figures.colors import blend_joint_colors
 from pipelines.report import CheckRow, Comparison, Histogram, Picture, Section, Table
-from pipelines.runs.artefacts import load_arrays, load_cleaned_parts, load_parts, load_weights, read_named, values_of
+from pipelines.runs.artefacts import (
+    load_arrays,
+    load_cleaned_parts,
+    load_labels,
+    load_parts,
+    load_weights,
+    read_named,
+    values_of,
+)
 from pipelines.runs.layout import SCAN_LABELS
 from pipelines.runs.stage import StageRecord
 from pipelines.stages.build_config import BuildInputs
 from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core import CLOTH_LABELS, LABELS, BodyParams, TriangleMesh, concatenate_meshes, display_colors, spread
+from smplxpp.core import BodyParams, TriangleMesh, concatenate_meshes, spread
 from smplxpp.core.camera import Camera
 from smplxpp.core.files.json_file import as_list, as_text
 from smplxpp.metrics.distance import MM, point_to_surface
@@ -72,11 +80,13 @@ def scan_section(
     labels, confidence = read_named(run / SCAN_LABELS, "face_labels", "confidence")
     certain = confidence >= UNSURE
     # A colour bar beside the last view serves all.
+    known = load_labels(run)
+    shown = known.display_colors(labels, certain)
     heat = [
         render_heat(scan, camera, confidence, cmap="weight", limits=(0.0, 1.0), bar=camera is cameras[-1])
         for camera in cameras
     ]
-    present = [label for label in LABELS if (labels == label.id).any()]
+    present = [label for label in known if (labels == label.id).any()]
     return Section(
         title="Scan and labels",
         text=(
@@ -85,7 +95,7 @@ def scan_section(
         ),
         pictures=(
             Picture("scan", _sheet(scan, cameras, vertex_colors=colors)),
-            Picture("labels, pale where uncertain", _sheet(scan, cameras, face_colors=display_colors(labels, certain))),
+            Picture("labels, pale where uncertain", _sheet(scan, cameras, face_colors=shown)),
             Picture("confidence of the labels", encode_jpeg(row(heat))),
         ),
         tables=(Table(("uncertain labels",), tuple((str(note),) for note in notes)),) if notes else (),
@@ -124,7 +134,7 @@ def parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks:
     return Section(
         title="Parts",
         text=(f"Clothes, hair and shoes cut out, cleaned and {_METHODS.get(method, method)}; openings are kept.",),
-        pictures=(Picture("parts", _sheet(mesh, cameras, face_colors=display_colors(labels))),),
+        pictures=(Picture("parts", _sheet(mesh, cameras, face_colors=load_labels(run).display_colors(labels))),),
         tables=(
             Table(("part", "faces before", "faces", "pieces", "openings", "to scan, mean mm", "p95 mm"), rows, "parts"),
         ),
@@ -148,6 +158,7 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
             n,
             numbers[n]["matched_share"],
             numbers[n]["components"],
+            str(numbers[n].get("rule", "")),
             ", ".join(numbers[n]["policies"]),
             numbers[n]["web_faces"],
             100.0 * numbers[n]["web_area_share"],
@@ -166,7 +177,11 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
             Picture("matched (green) and free (orange)", _sheet(mesh, cameras, vertex_colors=tint)),
         ),
         tables=(
-            Table(("part", "matched share", "pieces", "policies", "bridge faces", "of its area, %"), rows, "transfer"),
+            Table(
+                ("part", "matched share", "pieces", "rule", "policies", "bridge faces", "of its area, %"),
+                rows,
+                "transfer",
+            ),
         ),
         checks=checks,
     )
@@ -206,10 +221,10 @@ def fidelity_section(
     distance = point_to_surface(posed.vertices, scan)[0] * MM
     errors = load_arrays(record.folder / "errors.npz")
     histograms = []
-    for label in LABELS:
+    for label in template.labels:
         values = errors["template_to_scan"]["distance_mm"][errors["template_to_scan"]["label"] == label.id]
         if len(values) and label.id:
-            gates = (("mean gate", 1.0), ("p95 gate", 3.0)) if label in CLOTH_LABELS else ()
+            gates = (("mean gate", 1.0), ("p95 gate", 3.0)) if label in template.labels.cloth else ()
             histograms.append(Histogram(f"template to scan, {label.name}", values, gates=gates))
     back = errors["scan_to_template"]
     histograms.append(Histogram("scan to template, all labels", back["distance_mm"]))
