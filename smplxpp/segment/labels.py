@@ -86,7 +86,7 @@ def map_labels(
             expected=f"ids among {sorted(mapping)}",
             received=f"{unknown[:10]}{' ...' if len(unknown) > 10 else ''}",
             remedy=f"{' and '.join(fitting) or 'no built-in set'} {'have' if len(fitting) > 1 else 'has'} all ids of "
-            "this file: name the set that it uses with --label-set, or describe it in a labels.yaml",
+            "this file: name its label set with --label-set, or describe it in a labels.yaml",
         )
     ours = np.array([mapping[int(u)] for u in unique], dtype=np.int64)
     if not of_image:
