@@ -216,9 +216,7 @@ def _distances(record: StageRecord, parts: tuple[str, ...]) -> tuple[KeyNumber, 
     """How far the clothes are from the scan."""
     clothes = record.manifest["numbers"]["template_vs_scan"]["labels"]
     return tuple(
-        KeyNumber(
-            f"template to scan, {part}: mean", f"{clothes[part]['pred_to_gt']['mean']:.2f} mm", "visible surface"
-        )
+        KeyNumber(f"template to scan, {part}: mean", f"{clothes[part]['pred_to_gt']['mean']:.2f} mm", "visible surface")
         for part in parts
         if clothes.get(part, {}).get("pred_to_gt")
     )
