@@ -120,9 +120,8 @@ def _hold(where: str, pairs: dict[str, tuple[Any, Any]], held: set[Any]) -> None
 
 def _kind(value: Any) -> Any:
     """All of a value that decides whether it fits: its type, and the dtype and shape of arrays."""
-    shape = getattr(value, "shape", None)
-    if shape is not None:
-        return type(value), getattr(value, "dtype", None), tuple(shape)
+    if isinstance(shape := getattr(value, "shape", None), tuple):  # not a body's shape
+        return type(value), getattr(value, "dtype", None), shape
     if isinstance(value, list | tuple):
         return type(value), *map(_kind, value)
     return (dict, *map(_kind, value.values())) if isinstance(value, dict) else type(value)
