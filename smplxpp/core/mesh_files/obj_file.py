@@ -6,6 +6,7 @@ coordinates and normals; faces are its `f` lines.
 
 from __future__ import annotations
 
+import codecs
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +17,14 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.mesh_files.obj_material import Material, read_materials
+from smplxpp.core.mesh_files.polygons import cut_polygons
 from smplxpp.core.mesh_files.raw_mesh import (
     IS_SPACE,
     RawMesh,
     as_bytes,
     color_bytes,
     count_between,
-    fan_triangles,
+    decode_name,
     parse_numbers,
     require_indices,
     warn,
@@ -61,12 +63,12 @@ def read_obj(path: Path) -> RawMesh:
     # The line of each corner, (C,).
     corner_lines = np.repeat(face_lines, sizes)
     corners = _resolve(references[:, 0], lines.of_kind(b"v"), corner_lines)
-    fans = fan_triangles(corners, sizes, subject=subject)
-    require_indices(fans.faces, len(vertices), subject=subject)
+    cut = cut_polygons(corners, sizes, vertices, subject=subject)
+    require_indices(cut.faces, len(vertices), subject=subject)
     # Colours of the `v` lines win over materials.
-    if colors is None and len(fans.faces):
+    if colors is None and len(cut.faces):
         colors = _material_colors(path, lines, corners, references[:, 1], corner_lines, vertex_count=len(vertices))
-    return RawMesh(vertices, fans.faces, colors, source_faces=fans.source_faces)
+    return RawMesh(vertices, cut.faces, colors, source_faces=cut.source_faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +81,7 @@ class _Lines:
 
     @classmethod
     def of(cls, text: bytes) -> _Lines:
+        text = text.removeprefix(codecs.BOM_UTF8)
         # A backslash at a line's end joins the next line to it.
         text = re.sub(rb"\\[ \t]*\r?\n", b" ", text) if b"\\" in text else text
         text = text.replace(b"\r", b"\n") if b"\r" in text else text
@@ -132,7 +135,7 @@ class _Lines:
     def words(self, keyword: bytes) -> list[tuple[int, str]]:
         """Return the rest of each line that begins with a keyword, with the number of the line."""
         return [
-            (int(k), self.text[self.starts[k] + len(keyword) : self.ends[k]].decode("utf-8", "replace").strip())
+            (int(k), decode_name(self.text[self.starts[k] + len(keyword) : self.ends[k]]))
             for k in self.of_kind(keyword)
         ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from smplxpp.core.files.paths import read_bytes
-from smplxpp.core.mesh_files.raw_mesh import warn
+from smplxpp.core.mesh_files.raw_mesh import decode_name, warn
 from smplxpp.core.mesh_files.texture import file_beside
 
 # Options before the name of a texture, with the number of their arguments; vectors have one to three.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-cc": 1}
+_MOST_LIBRARIES = 1000  # material files that are looked for: scenes have a few
 _VECTORS = ("-mm", "-o", "-s", "-t")
 
 
@@ -47,25 +49,31 @@ def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
     """
     out: dict[str, Material] = {}
     seen: set[Path] = set()
-    for entry in dict.fromkeys(libraries):
+    names: list[str] = []
+    for entry in list(dict.fromkeys(libraries))[:_MOST_LIBRARIES]:
         # A name may contain blanks; only if no such file exists does the line list several libraries.
-        for name in [entry] if file_beside(path, entry) is not None else entry.split():
-            found = file_beside(path, name)
-            if found is None:
-                warn(f"mesh file {path}: colours of its materials are lost: {name[:200]!r} is not in its folder")
-            elif found not in seen:
-                seen.add(found)
-                data = read_bytes(found, subject="material file", most=1 << 24)
-                out |= _parse(data.decode("utf-8", "replace"))
+        names += [entry] if file_beside(path, entry) is not None else entry.split()
+    names = list(dict.fromkeys(names))
+    missing = names[_MOST_LIBRARIES:]
+    for name in names[:_MOST_LIBRARIES]:
+        found = file_beside(path, name)
+        if found is None:
+            missing.append(name)
+        elif found not in seen:
+            seen.add(found)
+            out |= _parse(read_bytes(found, subject="material file", most=1 << 24))
+    if missing:
+        more = f" and {len(missing) - 1} more are not" if len(missing) > 1 else " is not"
+        warn(f"mesh file {path}: colours of its materials are lost: {missing[0][:200]!r}{more} in its folder")
     return out
 
 
-def _parse(text: str) -> dict[str, Material]:
+def _parse(data: bytes) -> dict[str, Material]:
     out: dict[str, Material] = {}
     name = ""
-    for line in text.splitlines():
-        words = line.split(None, 1) + ["", ""]
-        keyword, rest = words[0].lower(), words[1].strip()
+    for line in data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n").split(b"\n"):
+        words = [*line.split(None, 1), b"", b""]
+        keyword, rest = words[0].lower().decode("latin-1"), decode_name(words[1])
         known = out.get(name, Material())
         if keyword == "newmtl":
             name = rest

@@ -11,12 +11,12 @@ from jaxtyping import Float64, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.mesh_files.ply_elements import TYPES, Cells, Columns, Element, ListColumn, Property, read_element
+from smplxpp.core.mesh_files.polygons import cut_polygons
 from smplxpp.core.mesh_files.raw_mesh import (
     RawMesh,
     as_bytes,
     color_bytes,
     count_between,
-    fan_triangles,
     parse_numbers,
     require_indices,
     word_starts,
@@ -32,7 +32,7 @@ _TEXTURE_COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 
 
 def read_ply(path: Path) -> RawMesh:
-    """Read the vertices and faces of a PLY mesh, with polygons cut into fans.
+    """Read the vertices and faces of a PLY mesh, with polygons cut into triangles.
 
     Face properties are repeated for each triangle of a polygon. Colours are those of the vertices. If there are none,
     or all are equal, they are sampled from the texture (`comment TextureFile`) at the coordinates of the vertices, or
@@ -70,7 +70,7 @@ def read_ply(path: Path) -> RawMesh:
         raise InputError(f"{subject}: faces", expected="lists of whole numbers", received="another property")
     # Indices beyond the vertices would read foreign memory in later steps.
     require_indices(corners.values, len(vertices), subject=subject)
-    fans = fan_triangles(corners.values, corners.lengths, subject=subject)
+    cut = cut_polygons(corners.values, corners.lengths, vertices, subject=subject)
     # A texture replaces vertex colours that are all equal.
     colors = _vertex_colors(vertex, subject)
     if pictures and (colors is None or (colors == colors[:1]).all()):
@@ -78,13 +78,13 @@ def read_ply(path: Path) -> RawMesh:
         colors = colors if found_in_pictures is None else found_in_pictures
     return RawMesh(
         vertices,
-        fans.faces,
+        cut.faces,
         colors,
         _extra(vertex),
         # A polygon's properties apply to each of its triangles.
-        {name: column[fans.polygons] for name, column in _extra(face).items()},
-        source_faces=fans.source_faces,
-        vertex_normals=None if len(fans.faces) else _normals(vertex),
+        {name: column[cut.polygons] for name, column in _extra(face).items()},
+        source_faces=cut.source_faces,
+        vertex_normals=None if len(cut.faces) else _normals(vertex),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 import warnings
 from dataclasses import dataclass, field
 
@@ -17,7 +18,7 @@ class RawMesh:
 
     Attributes:
         vertices: (N, 3) float64, all vertices of the file in its order; may contain NaN.
-        faces: (M, 3) int64, the faces of the file in its order, polygons cut into fans.
+        faces: (M, 3) int64, the faces of the file in its order, polygons cut into triangles.
         vertex_colors: (N, 3) uint8 or None.
         vertex_properties: other arrays (N,) of vertices by name (PLY).
         face_properties: other arrays (M,) of faces by name (PLY).
@@ -37,52 +38,6 @@ class RawMesh:
     def is_cloud(self) -> bool:
         """Whether the file has points but no faces."""
         return not len(self.faces)
-
-
-@dataclass(frozen=True, eq=False)
-class Fans:
-    """Polygons that are cut into fans of triangles.
-
-    Attributes:
-        faces: (M, 3) vertex indices; polygon (a, b, c, d) gives (a, b, c), (a, c, d).
-        corners: (M, 3) places of the same corners in the flat list of all corners.
-        polygons: (M,) polygon of each triangle.
-        count: number of polygons.
-    """
-
-    faces: Int64[np.ndarray, "M 3"]
-    corners: Int64[np.ndarray, "M 3"]
-    polygons: Int64[np.ndarray, " M"]
-    count: int
-
-    @property
-    def source_faces(self) -> Int64[np.ndarray, " M"] | None:
-        """Polygon of each triangle, None if every polygon is one triangle."""
-        return None if np.array_equal(self.polygons, np.arange(self.count)) else self.polygons
-
-
-def fan_triangles(corners: Integer[np.ndarray, " C"], sizes: Integer[np.ndarray, " F"], *, subject: str) -> Fans:
-    """Cut polygons into fans, in their order; polygons of fewer than three corners are left out with a warning.
-
-    Args:
-        corners: (C,) vertex indices of all polygons, concatenated.
-        sizes: (F,) number of corners of each polygon, which sum to C.
-        subject: name of the file in the warning.
-    """
-    few = int((sizes < 3).sum())
-    if few:
-        warn(f"{subject}: {few} faces with fewer than three corners are left out")
-    # The first corner of each polygon in the concatenated list.
-    first = np.cumsum(sizes) - sizes
-    # A polygon of n corners gives n - 2 triangles (0, k, k + 1).
-    triangles = np.maximum(sizes.astype(np.int64) - 2, 0)
-    polygons = np.repeat(np.arange(len(sizes), dtype=np.int64), triangles)
-    # The index of each triangle within its polygon.
-    step = np.arange(len(polygons), dtype=np.int64) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    start = first.astype(np.int64)[polygons]
-    # (M, 3) places of corners in the list.
-    places = np.stack([start, start + step + 1, start + step + 2], axis=1)
-    return Fans(corners.astype(np.int64)[places].reshape(-1, 3), places, polygons, len(sizes))
 
 
 def require_indices(faces: Integer[np.ndarray, "*n"], count: int, *, subject: str, kind: str = "faces") -> None:
@@ -147,6 +102,14 @@ def color_bytes(colors: Num[np.ndarray, "N C"], *, subject: str) -> UInt8[np.nda
 def warn(message: str) -> None:
     """Warn of a repair or a loss with a GeometryWarning."""
     warnings.warn(message, GeometryWarning, stacklevel=3)
+
+
+def decode_name(data: bytes) -> str:
+    """Decode a name in a mesh file: UTF-8, else a letter a byte, so that names that differ stay different."""
+    try:
+        return unicodedata.normalize("NFC", data.decode("utf-8")).strip()
+    except UnicodeDecodeError:
+        return data.decode("latin-1").strip()
 
 
 IS_SPACE = np.isin(np.arange(256), (9, 10, 11, 12, 13, 32))

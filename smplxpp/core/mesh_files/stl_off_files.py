@@ -13,12 +13,12 @@ from jaxtyping import Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.mesh_files.polygons import cut_polygons
 from smplxpp.core.mesh_files.raw_mesh import (
     RawMesh,
     as_bytes,
     color_bytes,
     count_between,
-    fan_triangles,
     parse_numbers,
     require_indices,
     word_starts,
@@ -110,8 +110,8 @@ def read_off(path: Path) -> RawMesh:
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     corners = _whole(values[np.repeat(first[end_vertices:end_faces] + 1, sizes) + within], subject)
     require_indices(corners, int(counts[0]), subject=subject)
-    fans = fan_triangles(corners, sizes, subject=subject)
-    return RawMesh(values[at], fans.faces, colors, source_faces=fans.source_faces)
+    cut = cut_polygons(corners, sizes, values[at], subject=subject)
+    return RawMesh(values[at], cut.faces, colors, source_faces=cut.source_faces)
 
 
 def _whole(numbers: Float64[np.ndarray, " n"], subject: str) -> Int64[np.ndarray, " n"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 MISSING_GRAY = 128
 """Gray of a vertex without a colour in a file in which other vertices have colours."""
+# Encodings of names in files that are no UTF-8: Western, Chinese, Japanese, Korean and Cyrillic systems.
+_ENCODINGS = ("cp1252", "gb18030", "shift_jis", "euc_kr", "big5", "cp1251")
 # Wrap modes outside of [0, 1].
 REPEAT, MIRROR, CLAMP = "repeat", "mirror", "clamp"
 
@@ -27,15 +31,36 @@ def file_beside(path: Path, name: str) -> Path | None:
     """Return the file that a mesh file names, if it is inside the mesh file's folder, else None.
 
     Windows paths are understood. A name that leads out of the folder, such as a path of another machine, is looked up
-    beside the mesh file by its last part; nothing outside the folder is ever opened.
+    beside the mesh file by its last part; nothing outside the folder is ever opened. Names of other letter case, of
+    accents written otherwise, and in the encodings of other systems (`decode_name`) are found, too.
     """
     name = name.strip().strip('"')
-    for candidate in (name, name.replace("\\", "/").rpartition("/")[2]):
+    last = name.replace("\\", "/").rpartition("/")[2]
+    for candidate in (name, last):
         try:
             return regular_file(path_inside(path.parent, candidate))
         except InputError:
             continue
+    # As systems compare names that do not tell case: by the letters of the last part, in every encoding.
+    wanted = {_letters(last)}
+    if not last.isascii():
+        for encoding in _ENCODINGS:
+            with contextlib.suppress(UnicodeError):
+                wanted.add(_letters(last.encode("latin-1").decode(encoding)))
+    folder = path.parent / name.replace("\\", "/").rpartition("/")[0]
+    for place in dict.fromkeys((folder, path.parent)):
+        try:
+            inside = place if place == path.parent else path_inside(path.parent, str(place.relative_to(path.parent)))
+            found = [one.name for one in inside.iterdir() if _letters(one.name) in wanted]
+            if found:
+                return regular_file(inside / min(found))
+        except (InputError, OSError, ValueError):
+            continue
     return None
+
+
+def _letters(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 class TextureCache:

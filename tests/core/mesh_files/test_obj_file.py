@@ -196,3 +196,109 @@ def test_files_longer_than_a_block_keep_their_order(tmp_path: Path, monkeypatch:
     raw = read_raw_mesh(path)
     np.testing.assert_array_equal(raw.vertices, vertices)
     np.testing.assert_array_equal(raw.faces, faces)
+
+
+# --- polygons --------------------------------------------------------------------------------------------------------
+
+STAR = np.array([[(0.4, 1.0)[k % 2] * f(k * np.pi / 7) for f in (np.cos, np.sin)] for k in range(14)])
+SPIRAL = [
+    (0, 0),
+    (6, 0),
+    (6, 6),
+    (1, 6),
+    (1, 2),
+    (4, 2),
+    (4, 4),
+    (3, 4),
+    (3, 3),
+    (2, 3),
+    (2, 5),
+    (5, 5),
+    (5, 1),
+    (0, 1),
+]
+POLYGONS = {
+    "dart": [(0, 0), (2, -2), (0, 3), (-2, -2)],
+    "dart from its wing": [(2, -2), (0, 3), (-2, -2), (0, 0)],
+    "L": [(0, 0), (4, 0), (4, 1), (1, 1), (1, 4), (0, 4)],
+    "arrow": [(0, 1), (3, 1), (3, 0), (5, 2), (3, 4), (3, 3), (0, 3)],
+    "star": STAR,
+    "spiral": SPIRAL,
+    "with corners on its edges": [(0, 0), (1, 0), (2, 0), (3, 0), (3, 1), (1, 1), (1, 2), (1, 3), (0, 3), (0, 1.5)],
+}
+
+
+def _written(folder: Path, suffix: str, points: np.ndarray) -> Path:
+    """The polygon as one face of a file, behind a triangle and before a square that stay as they are."""
+    path, n = folder / f"a.{suffix}", len(points)
+    faces = [[0, 1, 2], list(range(n)), [0, 1, 2, 3]]
+    lines = [" ".join(f"{value:.9g}" for value in point) for point in points]
+    if suffix == "obj":
+        text = "".join(f"v {line}\n" for line in lines)
+        text += "".join(f"f {' '.join(str(k + 1) for k in face)}\n" for face in faces)
+    else:
+        head = f"OFF\n{n} 3 0\n"
+        if suffix == "ply":
+            head = f"ply\nformat ascii 1.0\nelement vertex {n}\n"
+            head += "".join(f"property float {axis}\n" for axis in "xyz")
+            head += "element face 3\nproperty list uchar int vertex_indices\nend_header\n"
+        text = head + "".join(f"{line}\n" for line in lines)
+        text += "".join(f"{len(face)} {' '.join(map(str, face))}\n" for face in faces)
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "off"])
+@pytest.mark.parametrize("name", POLYGONS)
+def test_concave_polygons_keep_their_area_and_winding(tmp_path: Path, suffix: str, name: str):
+    """Fans about the first corner covered what lies outside of them, with triangles turned over."""
+    flat = np.array(POLYGONS[name], dtype=np.float64)
+    shifted = np.roll(flat, 1, axis=0)
+    whole = 0.5 * float((shifted[:, 0] * flat[:, 1] - shifted[:, 1] * flat[:, 0]).sum())
+    # In a slanted plane, far from the origin; the polygon's own orientation is the winding of each of its triangles.
+    x, y = np.array([0.8, 0.0, 0.6]), np.array([0.36, 0.8, -0.48])
+    points = flat[:, :1] * x + flat[:, 1:] * y + [50.0, -20.0, 10.0]
+    raw = read_raw_mesh(_written(tmp_path, suffix, points))
+    assert raw.source_faces is not None
+    own = raw.faces[raw.source_faces == 1]
+    a, b, c = (raw.vertices[own[:, k]] for k in range(3))
+    areas = 0.5 * np.cross(b - a, c - a) @ np.cross(x, y) * np.sign(whole)
+    assert len(own) == len(flat) - 2 and areas.min() > -1e-5
+    assert areas.sum() == pytest.approx(abs(whole), rel=1e-6)
+    # A triangulation uses every side of the polygon once, and every diagonal twice.
+    sides = np.sort(np.concatenate([own[:, [0, 1]], own[:, [1, 2]], own[:, [2, 0]]]), axis=1)
+    _, count = np.unique(sides, axis=0, return_counts=True)
+    assert (count == 1).sum() == len(flat) and set(count) <= {1, 2}
+    np.testing.assert_array_equal(raw.faces[raw.source_faces == 0], [[0, 1, 2]])
+
+
+def test_polygons_that_cross_themselves_are_told(tmp_path: Path):
+    crossing = [(0, 0), (3, 0), (3, 3), (0, 3), (4, 1), (1, -1), (1, 4)]
+    points = np.array([(x, y, 0.0) for x, y in crossing], dtype=np.float64)
+    with pytest.warns(GeometryWarning, match="1 polygons cross themselves"):
+        raw = read_raw_mesh(_written(tmp_path, "obj", points))
+    assert len(raw.faces) == 1 + 5 + 2
+
+
+# --- names -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "gb18030", "shift_jis", "cp1251"])
+def test_names_of_other_alphabets(tmp_path: Path, encoding: str):
+    """Names that are no UTF-8 became the same signs, so that two materials were one, and no texture was found."""
+    word = "кожа" if encoding == "cp1251" else "皮膚"
+    other = "куна" if encoding == "cp1251" else "青布"
+    Image.new("RGB", (2, 2), (10, 200, 30)).save(tmp_path / f"{word}.PNG")
+    library = f"newmtl {word}\nmap_Kd {word}.png\nnewmtl {other}\nKd 1 0 0\n"
+    (tmp_path / f"{word}.mtl").write_bytes(library.encode(encoding))
+    text = f"mtllib {word}.mtl\n{PLACES}v 5 5 5\nvt 0 0\nusemtl {word}\nf 1/1 2/1 3/1\nusemtl {other}\nf 4/1 5/1 5/1\n"
+    (tmp_path / "a.obj").write_bytes(text.encode(encoding))
+    colors = read_raw_mesh(tmp_path / "a.obj").vertex_colors
+    np.testing.assert_array_equal(colors[[0, 4]], [[10, 200, 30], [255, 0, 0]])
+
+
+def test_many_missing_libraries_are_one_warning(tmp_path: Path):
+    text = "".join(f"mtllib x{k}.mtl\n" for k in range(3000)) + f"usemtl a\n{PLACES}f 1 2 3\n"
+    with pytest.warns(GeometryWarning, match=r"'x0\.mtl' and 999 more are not in its folder") as caught:
+        read_raw_mesh(_write(tmp_path, text))
+    assert len(caught) == 1
