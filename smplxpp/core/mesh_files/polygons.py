@@ -11,7 +11,8 @@ from smplxpp.core.mesh_files.raw_mesh import warn
 
 _SHARE = 1e-9  # of a polygon's area: triangles may be turned over by so little, which is rounding
 _STARTS = 64  # polygons of more corners are not tried as fans about each of them
-_MOST_CORNERS = 4096  # of polygons that lose ears: the time grows with the square
+# Corners squared, summed over the polygons that lose ears, as their time grows; half a minute where all are spirals.
+_MOST_WORK = 1 << 25
 _AT_ONCE = 1 << 20  # corners that are looked at together, which bounds the work space
 
 
@@ -68,24 +69,29 @@ def cut_polygons(
     step = np.arange(len(polygons), dtype=np.int64) - np.repeat(np.cumsum(count) - count, count)
     local = np.stack([np.zeros_like(step), step + 1, step + 2], axis=1)
     # Polygons that their first corner does not see whole are cut otherwise, size by size.
-    begin, crossing = np.cumsum(count) - count, 0
+    begin, crossing, work = np.cumsum(count) - count, 0, _MOST_WORK
     for size in np.unique(sizes[sizes > 3]):
         rows = np.flatnonzero(sizes == size)
         index = corners[first[rows][:, None] + np.arange(size)].astype(np.int64)
         known = ((index >= 0) & (index < len(vertices))).all(axis=1)
         rows, index = rows[known], index[known]
         for some in np.array_split(np.arange(len(rows)), max(1, len(rows) * int(size) // _AT_ONCE)):
-            cut, chosen, crossed = _concave(vertices[index[some]])
+            cut, chosen, crossed = _concave(vertices[index[some]], most=work // int(size) ** 2)
+            work -= len(chosen) * int(size) ** 2
             crossing += crossed
             local[begin[rows[some[chosen]]][:, None] + np.arange(size - 2)] = cut
     if crossing:
-        warn(f"{subject}: {crossing} polygons cross themselves or have no area: cut about their first corner")
+        warn(
+            f"{subject}: {crossing} polygons that cross themselves, or are too many to look at, are cut about one corner"
+        )
     places = first[polygons][:, None] + local
     return Triangles(corners.astype(np.int64)[places].reshape(-1, 3), places, polygons, len(sizes))
 
 
-def _concave(points: Float64[np.ndarray, "P n 3"]) -> tuple[Int64[np.ndarray, "Q m 3"], Int64[np.ndarray, " Q"], int]:
-    """Cut the polygons of n corners that are no fan about their first corner.
+def _concave(
+    points: Float64[np.ndarray, "P n 3"], *, most: int
+) -> tuple[Int64[np.ndarray, "Q m 3"], Int64[np.ndarray, " Q"], int]:
+    """Cut the polygons of n corners that are no fan about their first corner, of those without any fan `most`.
 
     Returns:
         (Q, n - 2, 3) local corners of their triangles, which of the P polygons they are, and how many could not be cut.
@@ -116,8 +122,8 @@ def _concave(points: Float64[np.ndarray, "P n 3"]) -> tuple[Int64[np.ndarray, "Q
             cut.append(np.repeat((fan[None] + start) % size, int(whole.sum()), axis=0))
             left = left[~whole]
     crossed = 0
-    for row in left:
-        triangles = _clip_ears(_in_plane(relative[row], axis[row])) if size <= _MOST_CORNERS else None
+    for k, row in enumerate(left):
+        triangles = _clip_ears(_in_plane(relative[row], axis[row])) if k < most else None
         if triangles is None:
             crossed += 1
         else:
@@ -128,7 +134,7 @@ def _concave(points: Float64[np.ndarray, "P n 3"]) -> tuple[Int64[np.ndarray, "Q
     return np.concatenate(cut), np.concatenate(chosen), crossed
 
 
-def _in_plane(points: Float64[np.ndarray, "n 3"], normal: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 2"]:
+def _in_plane(points: Float64[np.ndarray, "n 3"], normal: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "*n"]:
     """Return coordinates in the plane across a normal, counter-clockwise as seen against it."""
     x = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     x /= np.linalg.norm(x)
@@ -164,8 +170,8 @@ def _clip_ears(points: Float64[np.ndarray, "n 2"]) -> Int64[np.ndarray, "m 3"] |
 
 
 def _doubled(
-    a: Float64[np.ndarray, "... 2"], b: Float64[np.ndarray, "... 2"], c: Float64[np.ndarray, "... 2"]
-) -> Float64[np.ndarray, "..."]:
+    a: Float64[np.ndarray, "*a 2"], b: Float64[np.ndarray, "*b 2"], c: Float64[np.ndarray, "*c 2"]
+) -> Float64[np.ndarray, "*n"]:
     """Return twice the signed area of triangles."""
     ab, ac = b - a, c - a
     return ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]

@@ -275,7 +275,7 @@ def test_concave_polygons_keep_their_area_and_winding(tmp_path: Path, suffix: st
 def test_polygons_that_cross_themselves_are_told(tmp_path: Path):
     crossing = [(0, 0), (3, 0), (3, 3), (0, 3), (4, 1), (1, -1), (1, 4)]
     points = np.array([(x, y, 0.0) for x, y in crossing], dtype=np.float64)
-    with pytest.warns(GeometryWarning, match="1 polygons cross themselves"):
+    with pytest.warns(GeometryWarning, match="1 polygons that cross themselves"):
         raw = read_raw_mesh(_written(tmp_path, "obj", points))
     assert len(raw.faces) == 1 + 5 + 2
 
