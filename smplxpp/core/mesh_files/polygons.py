@@ -81,9 +81,7 @@ def cut_polygons(
             crossing += crossed
             local[begin[rows[some[chosen]]][:, None] + np.arange(size - 2)] = cut
     if crossing:
-        warn(
-            f"{subject}: {crossing} polygons that cross themselves, or are too many to look at, are cut about one corner"
-        )
+        warn(f"{subject}: {crossing} polygons that cross themselves, or are too many, are cut about one corner")
     places = first[polygons][:, None] + local
     return Triangles(corners.astype(np.int64)[places].reshape(-1, 3), places, polygons, len(sizes))
 
