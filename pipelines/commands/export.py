@@ -151,6 +151,8 @@ class Export:
     max_influences: OptionalInt = None
     """Most joints that move a vertex of a rigged template, such as the 4 or 8 of an engine; the largest weights stay.
     By default as many as the format holds, 8 in a GLB."""
+    faces: tuple[int, ...] = ()
+    """Faces of a coarser template, such as 10000; several numbers make a file each: NAME_LOD0, NAME_LOD1 and so on."""
     blender: OptionalPath = None
     """Blender, or a Python with bpy, which writes FBX; by default $BLENDER, `blender` on the path, or bpy."""
     name: OptionalText = None
@@ -228,12 +230,13 @@ class Export:
                 blender=self.blender,
                 meta=self._meta() if name == "vrm" else None,
             ),
+            faces=self.faces,
         )
         # The notes go to standard error, so that a script that reads the output sees the file alone.
         report = export_file(request)
         if not self.json:
             frames = f", {report['frames']} frames" if report["frames"] > 1 else ""
-            Console().print(f"{out}: {report['bytes'] / 1e6:.2f} MB{frames}", markup=False, soft_wrap=True)
+            Console().print(f"{report['out']}: {report['bytes'] / 1e6:.2f} MB{frames}", markup=False, soft_wrap=True)
             for sentence in report["notes"]:
                 Console(stderr=True).print(sentence, markup=False, soft_wrap=True)
         return report

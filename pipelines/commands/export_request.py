@@ -58,6 +58,7 @@ class FileRequest:
         up: upward axis of a PLY.
         quiet: whether to hide the progress bar.
         rigged: options of files with a skeleton.
+        faces: faces of the template's levels of detail, a file each; () for all of its faces.
     """
 
     source: Path
@@ -72,11 +73,19 @@ class FileRequest:
     up: str = "y"
     quiet: bool = True
     rigged: ExportOptions = field(default_factory=ExportOptions)
+    faces: tuple[int, ...] = ()
 
     @property
     def is_series(self) -> bool:
         """Return whether the output is a folder with a file a frame."""
         return self.out.suffix == SERIES
+
+    @property
+    def files(self) -> list[Path]:
+        """Return the files of the levels of detail: the output itself, or `NAME_LOD0` and so on for several."""
+        if len(self.faces) < 2:
+            return [self.out]
+        return [self.out.with_name(f"{self.out.stem}_LOD{k}{self.out.suffix}") for k in range(len(self.faces))]
 
     def chosen(self, count: int, *, moves: bool) -> range:
         """Return the chosen rows of `count`, only the first one for outputs that do not move.
@@ -180,7 +189,8 @@ def export_file(request: FileRequest) -> dict[str, Any]:
     """Write a file or a series of them, whole or not at all.
 
     Returns:
-        "out", "format", "frames", "fps" (None for a single pose), "bytes" and "notes", remarks on what was not kept.
+        "out" (all files, if there are several), "format", "frames", "fps" (None for a single pose), "bytes" and
+        "notes", remarks on what was not kept.
 
     Raises:
         InputError: options that do not go together, a source that lacks what is asked for, parameters of another body.
@@ -204,9 +214,14 @@ def export_file(request: FileRequest) -> dict[str, Any]:
     for option, given in (("full-harmonics", request.full_harmonics), ("up", request.up != "y")):
         if given and request.format != "ply":
             raise InputError(f"option {option}", expected="a PLY", received=request.format)
-    if request.rigged != ExportOptions() and model == "student" and ("template", request.format) in _BY_MODEL:
+    of_template = ("template", request.format) in _BY_MODEL
+    if (request.rigged != ExportOptions() and model == "student" and of_template) or (
+        request.faces and (model == "student" or not of_template or request.is_series)
+    ):
         raise InputError(
-            "options of the skeleton", expected="--model template", received=f"--model {model}, splats without bones"
+            "options of the mesh",
+            expected=f"--model template and {', '.join(name for model, name in _BY_MODEL if model == 'template')}",
+            received=f"--model {model}, {request.format}" + (" in a folder" if request.is_series else ""),
         )
     request.rigged.check(request.out.suffix.lower() or "of a series")
     if request.is_series:
@@ -214,21 +229,23 @@ def export_file(request: FileRequest) -> dict[str, Any]:
     # Import the writer only now: some of them need packages of an extra.
     module, function = writers
     fps, frames, notes = getattr(import_module(module), function)(request)
-    count = _write_series(request, fps, frames) if request.is_series else _write_one(request, frames)
+    count = _write_series(request, fps, frames) if request.is_series else _write_files(request, frames)
     return {
-        "out": str(request.out),
+        "out": ", ".join(map(str, [request.out] if request.is_series else request.files)),
         "format": request.format,
         "frames": count,
         "fps": fps,
-        "bytes": sum(path.stat().st_size for path in (request.out.iterdir() if request.is_series else [request.out])),
+        "bytes": sum(path.stat().st_size for path in (request.out.iterdir() if request.is_series else request.files)),
         "notes": notes,
     }
 
 
-def _write_one(request: FileRequest, frames: Iterator[tuple[int, Write]]) -> int:
-    count, write = next(frames)
-    write(request.out)
-    return count
+def _write_files(request: FileRequest, frames: Iterator[tuple[int, Write]]) -> int:
+    counts = []
+    for path, (count, write) in zip(request.files, frames, strict=True):
+        write(path)
+        counts.append(count)
+    return max(counts)
 
 
 def _write_series(request: FileRequest, fps: float | None, frames: Iterator[tuple[int, Write]]) -> int:

@@ -16,13 +16,14 @@ from pipelines.commands.animate_student import motion_for
 from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
 from pipelines.commands.templates import BUNDLE_SUFFIX, load_params_for, load_run_template
 from pipelines.runs.layout import GARMENTS
+from smplxpp.body.layout import names_of_joints
+from smplxpp.build.detail import simplified_template
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
 from smplxpp.core import BodyParams, InputError
 from smplxpp.export.amass import write_amass
 from smplxpp.export.bvh import write_bvh
 from smplxpp.export.by_suffix import export_template, pruning_error
-from smplxpp.export.joint_names import names_of_joints
 from smplxpp.template.template import Template
 
 Writers = tuple[float | None, Iterator[tuple[int, Callable[[Path], object]]], list[str]]
@@ -51,9 +52,22 @@ def template_writers(request: FileRequest) -> Writers:
     if params is not None:
         rows = request.chosen(len(params), moves=True)
         chosen = replace(params.select(list(rows)), fps=request.rate(params))
-    write = partial(export_template, template=template, animation=chosen, options=request.rigged)
-    notes = [] if request.rigged.max_influences is None else [_pruned(template, request.rigged.max_influences)]
-    return None if chosen is None else chosen.fps, iter([(1 if chosen is None else len(chosen), write)]), notes
+    levels, notes = _levels(request, template)
+    if request.rigged.max_influences is not None:
+        notes.append(_pruned(template, request.rigged.max_influences))
+    write = partial(export_template, animation=chosen, options=request.rigged)
+    count = 1 if chosen is None else len(chosen)
+    files = iter([(count, partial(write, template=level)) for level in levels])
+    return None if chosen is None else chosen.fps, files, notes
+
+
+def _levels(request: FileRequest, template: Template) -> tuple[list[Template], list[str]]:
+    """Return the levels of detail that are asked for, all before one is written, and how many faces they have."""
+    if not request.faces:
+        return [template], []
+    levels = [simplified_template(template, faces) for faces in request.faces]
+    named = zip(request.files, levels, strict=True)
+    return levels, [f"{path.name}: {len(level.faces):,} faces" for path, level in named]
 
 
 def _pruned(template: Template, most: int) -> str:
@@ -71,11 +85,18 @@ def _surfaces(request: FileRequest, template: Template, params: BodyParams | Non
     if params is None:
         if request.is_series:
             raise InputError("option params", expected="a motion, for a file a frame", received="none")
-        return None, iter([(1, partial(write_obj, template=template))]), []
+        levels, notes = _levels(request, template)
+        return None, iter([(1, partial(write_obj, template=level)) for level in levels]), notes
+    if request.faces:
+        raise InputError(
+            "option faces",
+            expected="an OBJ of the T-pose",
+            received="one of --params, whose clothes have all their faces",
+        )
     rows = request.chosen(len(params), moves=request.is_series)
-    notes: list[str] = []
+    said: list[str] = []
     surfaces = track(
-        _posed(request, template, params, rows, notes),
+        _posed(request, template, params, rows, said),
         total=len(rows),
         description="frames",
         console=Console(stderr=True),
@@ -83,7 +104,7 @@ def _surfaces(request: FileRequest, template: Template, params: BodyParams | Non
     )
     # The generator poses one frame at a time while files are written, so that a long motion needs little memory.
     files = ((1, partial(write_obj, template=replace(template, vertices=surface))) for surface in surfaces)
-    return request.rate(params) if request.is_series else None, files, notes
+    return request.rate(params) if request.is_series else None, files, said
 
 
 def _posed(

@@ -1,4 +1,4 @@
-"""List the joints of the SMPL family and the orders in which detectors list their keypoints.
+"""List the joints of the SMPL family, other programs' names for them, and the orders of detectors' keypoints.
 
 An order holds a name of `Keypoints2D` for each point, or None for a point that has no name here: necks and midpoints of
 hips (OpenPose's are midpoints of other points), tops of heads, pupils, the contour of the face, roots of hands (the
@@ -8,11 +8,15 @@ Sources: OpenPose, `src/openpose/pose/poseParameters.cpp` (POSE_BODY_25_BODY_PAR
 POSE_BODY_135_BODY_PARTS) and its `doc/02_output.md` (hands, face); COCO (Lin et al. 2014); COCO-WholeBody (Jin et al.
 2020) and Halpe (AlphaPose, Fang et al. 2022) as in mmpose's `configs/_base_/datasets/coco_wholebody.py`, `halpe26.py`
 and `halpe.py`; MediaPipe's lists of pose, hand and face landmarks; the vertices of its face mesh (Kartynnik et al.
-2019) at dlib's points as in P. Yan's Mediapipe_2_Dlib_Landmarks.
+2019) at dlib's points as in P. Yan's Mediapipe_2_Dlib_Landmarks. Programs: Mixamo's automatic rig; Unity's enumeration
+`HumanBodyBones`; Unreal's `SK_Mannequin` (Manny has two more joints of the spine and one more of the neck); VRM 1.0.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from smplxpp.core.errors import InputError, require_choice
 from smplxpp.core.params import POSE_BLOCKS
 
 _BODY = (
@@ -123,3 +127,97 @@ BY_COUNT: dict[int, Order] = {
 VOCABULARY: frozenset[str] = frozenset(SMPLX_JOINTS) | {
     name for order in (*BY_COUNT.values(), BODY_25B, MEDIAPIPE_POSE) for name in order if name is not None
 }
+
+OWN_NAMES = "smplx"
+"""The scheme that keeps the body's own names."""
+PROGRAMS = ("mixamo", "unity", "unreal", "vrm")
+NAME_SCHEMES = (OWN_NAMES, *PROGRAMS)
+"""Whose names a file's joints can have."""
+
+# A joint a line: our name, then those of `PROGRAMS`. Joints of the left side stand for both; - where there is none.
+_JOINTS = """
+pelvis            Hips          Hips          pelvis      hips
+spine1            Spine         Spine         spine_01    spine
+spine2            Spine1        Chest         spine_02    chest
+spine3            Spine2        UpperChest    spine_03    upperChest
+neck              Neck          Neck          neck_01     neck
+head              Head          Head          head        head
+jaw               -             Jaw           -           jaw
+left_eye_smplhf   LeftEye       LeftEye       -           leftEye
+left_collar       LeftShoulder  LeftShoulder  clavicle_l  leftShoulder
+left_shoulder     LeftArm       LeftUpperArm  upperarm_l  leftUpperArm
+left_elbow        LeftForeArm   LeftLowerArm  lowerarm_l  leftLowerArm
+left_wrist        LeftHand      LeftHand      hand_l      leftHand
+left_hip          LeftUpLeg     LeftUpperLeg  thigh_l     leftUpperLeg
+left_knee         LeftLeg       LeftLowerLeg  calf_l      leftLowerLeg
+left_ankle        LeftFoot      LeftFoot      foot_l      leftFoot
+left_foot         LeftToeBase   LeftToes      ball_l      leftToes
+"""
+# The bones of a finger from the hand on: all of Unity's and four of VRM's, whose thumb starts at the carpus.
+_BONES = ("Proximal", "Intermediate", "Distal")
+_THUMB = ("Metacarpal", "Proximal", "Distal")
+
+
+def _program_names() -> dict[str, dict[str, str]]:
+    """Return the name of each of our joints by program."""
+    rows = [line.split() for line in _JOINTS.strip().splitlines()]
+    for finger in FINGERS:
+        called = "Little" if finger == "pinky" else finger.title()
+        for k, bone in enumerate(_BONES, start=1):
+            vrm = (_THUMB if finger == "thumb" else _BONES)[k - 1]
+            rows.append(
+                [
+                    f"left_{finger}{k}",
+                    f"LeftHand{finger.title()}{k}",
+                    f"Left{called}{bone}",
+                    f"{finger}_0{k}_l",
+                    f"left{called}{vrm}",
+                ]
+            )
+    rows += [[_mirrored(name) for name in row] for row in rows if row[0].startswith("left_")]
+    return {
+        program: {row[0]: row[column] for row in rows if row[column] != "-"}
+        for column, program in enumerate(PROGRAMS, start=1)
+    }
+
+
+def _mirrored(name: str) -> str:
+    """Return the name of the joint on the right."""
+    if name.endswith("_l"):
+        return f"{name[:-2]}_r"
+    return name.replace("left", "right", 1).replace("Left", "Right", 1)
+
+
+PROGRAM_NAMES = _program_names()
+"""By program, the name of each of our joints that it knows; Mixamo's without the prefix of its name space."""
+_PREFIXES = {"mixamo": "mixamorig:"}
+"""Name space before the names of a program."""
+
+
+def names_of_joints(joint_names: Sequence[str], scheme: str) -> tuple[str, ...]:
+    """Return the names that a program gives to joints; a joint that it has no name for keeps its own.
+
+    Args:
+        joint_names: of the body, as SMPL-X calls them.
+        scheme: one of `NAME_SCHEMES`.
+
+    Raises:
+        InputError: another scheme, or a body without any joint of the SMPL family.
+
+    Example:
+        >>> from smplxpp.body.layout import names_of_joints
+        >>> names_of_joints(["pelvis", "left_hip", "jaw"], "mixamo")
+        ('mixamorig:Hips', 'mixamorig:LeftUpLeg', 'jaw')
+    """
+    require_choice("joint names", scheme, NAME_SCHEMES)
+    if scheme == OWN_NAMES:
+        return tuple(joint_names)
+    if not set(joint_names) & set(SMPLX_JOINTS):
+        raise InputError(
+            "joint names",
+            expected=f"joints of the SMPL family, to name them as {scheme} does",
+            received=", ".join(joint_names[:3]),
+            remedy=f"keep the body's own with {OWN_NAMES!r}",
+        )
+    prefix, known = _PREFIXES.get(scheme, ""), PROGRAM_NAMES[scheme]
+    return tuple(f"{prefix}{known[name]}" if name in known else name for name in joint_names)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from smplxpp.body.layout import NAME_SCHEMES, OWN_NAMES
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core import BodyParams, InputError, require_between, require_choice
 from smplxpp.export.fbx import ROOT, write_fbx
 from smplxpp.export.gltf import write_glb
-from smplxpp.export.gltf_skin import MAX_INFLUENCES
-from smplxpp.export.joint_names import OWN, SCHEMES, with_joint_names
+from smplxpp.export.gltf_skin import MAX_INFLUENCES, with_joint_names
 from smplxpp.export.obj import write_obj
 from smplxpp.export.usd import write_usd
 from smplxpp.export.vrm import checked_meta, write_vrm
@@ -33,7 +33,7 @@ class ExportOptions:
     """What a rigged file may be asked for.
 
     Attributes:
-        joint_names: whose names the joints have: one of `smplxpp.export.joint_names.SCHEMES`.
+        joint_names: whose names the joints have: one of `smplxpp.body.layout.NAME_SCHEMES`.
         max_influences: most joints of a vertex, 1 to 8; None: as many as the format holds.
         blender: Blender, or a Python with bpy, which writes FBX; None: as `smplxpp.export.fbx.blender_command` finds
             it.
@@ -43,13 +43,13 @@ class ExportOptions:
         InputError: a value that no format takes.
     """
 
-    joint_names: str = OWN
+    joint_names: str = OWN_NAMES
     max_influences: int | None = None
     blender: str | Path | None = None
     meta: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        require_choice("option joint_names", self.joint_names, SCHEMES)
+        require_choice("option joint_names", self.joint_names, NAME_SCHEMES)
         if self.max_influences is not None:
             require_between("option max_influences", self.max_influences, 1, MAX_INFLUENCES)
         checked_meta(self.meta, name="me")

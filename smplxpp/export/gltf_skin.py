@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pygltflib
 from jaxtyping import Float32, Float64, Int, Integer
 
+from smplxpp.body.layout import OWN_NAMES, names_of_joints
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.template.template import Template
@@ -81,3 +84,16 @@ def rest_offsets(template: Template) -> Float64[np.ndarray, "J 3"]:
     """Return the offset of each rest joint from its parent, of a root from the origin; metres."""
     joints, parents = template.joints, template.body.parents
     return joints - np.where(parents[:, None] >= 0, joints[parents], 0.0)
+
+
+def with_joint_names(template: Template, scheme: str) -> Template:
+    """Return the template with its joints named by `smplxpp.body.layout.names_of_joints`.
+
+    Raises:
+        InputError: another scheme, or a body without any joint of the SMPL family.
+    """
+    if scheme == OWN_NAMES:
+        return template
+    return replace(
+        template, body=replace(template.body, joint_names=names_of_joints(template.body.joint_names, scheme))
+    )

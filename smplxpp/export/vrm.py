@@ -17,11 +17,11 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body.blendshapes import ARKIT, both_sides, transfer_blendshapes
-from smplxpp.body.layout import FINGERS
+from smplxpp.body.layout import FINGERS, OWN_NAMES, PROGRAM_NAMES
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export.gltf import MorphTargets, rigged_gltf
-from smplxpp.export.joint_names import NAMES, OWN, with_joint_names
+from smplxpp.export.gltf_skin import with_joint_names
 from smplxpp.skinning.linear_blend import forward_kinematics, skin
 from smplxpp.template.template import BODY_PART, Template
 from smplxpp.template.template_arrays import fitted_regressor
@@ -143,7 +143,7 @@ def checked_meta(meta: Mapping[str, Any] | None, *, name: str) -> dict[str, Any]
 
 
 def write_vrm(
-    path: str | Path, template: Template, *, meta: Mapping[str, Any] | None = None, joint_names: str = OWN
+    path: str | Path, template: Template, *, meta: Mapping[str, Any] | None = None, joint_names: str = OWN_NAMES
 ) -> None:
     """Write the template as a VRM 1.0 file, whole or not at all.
 
@@ -161,7 +161,11 @@ def write_vrm(
         InputError: a skeleton without the bones that VRM requires, or fields of `meta` that VRM does not have.
     """
     stated = checked_meta(meta, name=Path(path).stem)
-    bones = {NAMES["vrm"][name]: k for k, name in enumerate(template.body.joint_names) if name in NAMES["vrm"]}
+    bones = {
+        PROGRAM_NAMES["vrm"][name]: k
+        for k, name in enumerate(template.body.joint_names)
+        if name in PROGRAM_NAMES["vrm"]
+    }
     missing = [bone for bone in _NEEDED if bone not in bones]
     if missing:
         raise InputError(
@@ -277,6 +281,7 @@ def in_vrm_pose(template: Template) -> Template:
         body.exprdirs,
         joints=placed[0],
         moved=np.tensordot(body.joint_regressor, body.exprdirs, axes=1),
+        sums=body.joint_regressor.sum(axis=1),
     )
     return replace(template, vertices=vertices, body=replace(body, joint_regressor=regressor))
 

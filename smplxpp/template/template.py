@@ -299,7 +299,9 @@ class Template:
             arrays["labels"] = np.array(json.dumps(self.labels.as_list()))
         write_arrays(path, template_arrays.in_file_order(arrays))
 
-    def export(self, path: str | Path, *, animation: BodyParams | None = None, **options: Any) -> Path:
+    def export(
+        self, path: str | Path, *, animation: BodyParams | None = None, faces: int | None = None, **options: Any
+    ) -> Path:
         """Write the template in a format of other programs, chosen by the path's suffix.
 
         `.glb` (skin, expressions, colours, motion), `.fbx` (the same, by Blender), `.usd`, `.usda`, `.usdc` or `.usdz`
@@ -309,6 +311,7 @@ class Template:
         Args:
             path: of the file.
             animation: T frames that the file plays; None: the template alone.
+            faces: of a coarser level of detail, by `smplxpp.build.detail.simplified_template`; None: all.
             options: of rigged files, the fields of `smplxpp.export.by_suffix.ExportOptions`: `joint_names`,
                 `max_influences`, `blender`, `meta`.
 
@@ -324,7 +327,9 @@ class Template:
         """
         # Writers lie above this room; they are imported when they are called, by name.
         writers = import_module("smplxpp.export.by_suffix")
-        return writers.export_template(path, self, animation=animation, options=writers.ExportOptions(**options))
+        asked = writers.ExportOptions(**options)
+        detail = self if faces is None else import_module("smplxpp.build.detail").simplified_template(self, faces)
+        return writers.export_template(path, detail, animation=animation, options=asked)
 
     @staticmethod
     def load(path: str | Path) -> Template:

@@ -235,11 +235,12 @@ def fitted_regressor(
     *,
     joints: Float64[np.ndarray, "J 3"],
     moved: Float64[np.ndarray, "J 3 K"],
+    sums: Float64[np.ndarray, " J"],
 ) -> Float64[np.ndarray, "J V"]:
     """Return the joint regressor nearest to another one that puts the joints where they belong on a changed surface.
 
-    `min |R - S|^2` where `R v = J`, `R 1 = S 1` and `R e_k = d_k` for every base: rest joints, and how expressions
-    move them (jaw and eyes), stay what they were.
+    `min |R - S|^2` where `R v = J`, `R 1 = s` and `R e_k = d_k` for every base: rest joints, and how expressions move
+    them (jaw and eyes), stay what they were.
 
     Args:
         start: regressor S to stay near to.
@@ -247,10 +248,11 @@ def fitted_regressor(
         bases: displacements e_k of its vertices, metres a unit.
         joints: J at rest, metres.
         moved: displacements d_k of the joints, metres a unit.
+        sums: s of the rows, 1 where a joint moves with the body.
     """
     count = len(vertices)
     known = np.hstack([vertices, np.ones((count, 1)), bases.reshape(count, -1)])
-    wanted = np.hstack([joints, start.sum(axis=1, keepdims=True), moved.reshape(len(joints), -1)])
+    wanted = np.hstack([joints, sums[:, None], moved.reshape(len(joints), -1)])
     # Fewer conditions than vertices: of all solutions least squares returns the shortest.
     change = np.linalg.lstsq(known.T, (wanted - start @ known).T, rcond=None)[0]
     return start + change.T

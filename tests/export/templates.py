@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from smplxpp.body import load_body
@@ -69,6 +71,27 @@ def open_body_template() -> Template:
         betas=np.zeros(body.num_betas),
         body_index=np.arange(count),
         scan_index=np.full(count, -1),
+    )
+
+
+def with_part(template: Template, name: str, label: int, faces: np.ndarray, offset: float) -> Template:
+    """The template with faces of its body once more, a part of their own so far off the skin, with its weights."""
+    used, local = np.unique(faces, return_inverse=True)
+    count = template.vertex_count
+    per_vertex = ("joint_indices", "joint_weights", "matched", "distance", "angle", "component")
+    weights = {key: getattr(template.weights, key) for key in per_vertex}
+    moved = template.vertices[used] + offset * template.mesh.vertex_normals[used]
+    return replace(
+        template,
+        vertices=np.concatenate([template.vertices, moved]),
+        faces=np.concatenate([template.faces, local.reshape(-1, 3) + count]),
+        vertex_labels=np.concatenate([template.vertex_labels, np.full(len(used), label)]),
+        vertex_part=np.concatenate([template.vertex_part, np.full(len(used), len(template.part_names))]),
+        part_names=(*template.part_names, name),
+        vertex_colors=np.concatenate([template.vertex_colors, template.vertex_colors[used]]),
+        weights=replace(template.weights, **{key: np.concatenate([x, x[used]]) for key, x in weights.items()}),
+        body_index=np.concatenate([template.body_index, used]),
+        scan_index=np.concatenate([template.scan_index, np.full(len(used), -1)]),
     )
 
 

@@ -20,7 +20,7 @@ from smplxpp.core import BodyParams, InputError
 from smplxpp.export.vrm import LICENCE, checked_meta, in_vrm_pose, preset_displacements
 from smplxpp.template.template import Template
 from tests.export.glb_reader import GlbReader
-from tests.export.templates import open_body_template, random_template
+from tests.export.templates import open_body_template, random_template, with_part
 from tests.export.test_glb_validator import validate
 
 LOADER = Path(__file__).with_name("load_vrm.mjs")
@@ -50,24 +50,7 @@ def bearded() -> Template:
     """The open body with a part that hangs on its jaw: 60 faces of the chin, a centimetre before it."""
     body = open_body_template()
     chin = body.weights.dense()[:, body.body.joint_names.index("jaw")] > 0.99
-    faces = body.faces[chin[body.faces].all(axis=1)][:60]
-    used, local = np.unique(faces, return_inverse=True)
-    count = body.vertex_count
-    more = {name: np.concatenate([getattr(body, name), getattr(body, name)[used]]) for name in ("vertex_colors",)}
-    per_vertex = ("joint_indices", "joint_weights", "matched", "distance", "angle", "component")
-    weights = {name: getattr(body.weights, name) for name in per_vertex}
-    return replace(
-        body,
-        vertices=np.concatenate([body.vertices, body.vertices[used] + [0.0, 0.0, 0.01]]),
-        faces=np.concatenate([body.faces, local.reshape(-1, 3) + count]),
-        vertex_labels=np.repeat([0, 1], [count, len(used)]),
-        vertex_part=np.repeat([0, 1], [count, len(used)]),
-        part_names=("body", "beard"),
-        weights=replace(body.weights, **{name: np.concatenate([x, x[used]]) for name, x in weights.items()}),
-        body_index=np.concatenate([body.body_index, used]),
-        scan_index=np.full(count + len(used), -1),
-        **more,
-    )
+    return with_part(body, "beard", 1, body.faces[chin[body.faces].all(axis=1)][:60], 0.01)
 
 
 @pytest.fixture(scope="module")

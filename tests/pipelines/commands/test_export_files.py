@@ -22,6 +22,7 @@ from smplxpp.core import BodyParams, InputError
 from smplxpp.template.template import Template
 from tests.cloth.test_driver import swaying
 from tests.dolls.dancing import dance, write_dance_run
+from tests.dolls.doll import ball, make_template
 from tests.export.glb_reader import GlbReader
 from tests.formats.foreign import pygltflib_splats
 from tests.runtime.bundles import EXACT, student, write, write_dressed
@@ -239,3 +240,25 @@ def test_a_motion_becomes_bvh_and_amass(folder, tmp_path, capsys):
         )
         assert report["error"]["subject"] == "option params"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_levels_of_detail_are_files_of_their_own_and_the_rig_has_what_is_asked_for(folder, tmp_path, capsys):
+    run = tmp_path / "run"
+    (run / TEMPLATE).parent.mkdir(parents=True)
+    make_template([ball((0.2, 0.28, 0.15), 0.35, {"pelvis": 1.0}, subdivisions=4)], {}).save(run / TEMPLATE)
+    report = export(capsys, run, "--out", tmp_path / "me.glb", "--faces", 2000, 1200, "--max-influences", 4)
+    assert report["out"] == f"{tmp_path / 'me_LOD0.glb'}, {tmp_path / 'me_LOD1.glb'}"
+    assert report["bytes"] == sum(path.stat().st_size for path in tmp_path.glob("*.glb"))
+    counts = []
+    for k in range(2):
+        reader = GlbReader(tmp_path / f"me_LOD{k}.glb")
+        accessors = [reader.json["accessors"][mesh["primitives"][0]["indices"]] for mesh in reader.json["meshes"]]
+        counts.append(sum(accessor["count"] for accessor in accessors) // 3)
+    assert counts[0] <= 2050 and counts[1] <= 1250 < counts[0]
+    assert f"me_LOD1.glb: {counts[1]:,} faces" in report["notes"]
+    assert any(note.startswith("weights of at most 4 joints") for note in report["notes"])
+    for options in (("--out", tmp_path / "a.ply"), ("--out", tmp_path / "a.glb", "--model", "student")):
+        refused = export(capsys, folder / "run", *options, "--faces", 2000)
+        assert refused["error"]["subject"] == "options of the mesh"
+    said = export(capsys, run, "--out", tmp_path / "me.obj", "--params", folder / "motion.npz", "--faces", 2000)
+    assert said["error"]["subject"] == "option faces"

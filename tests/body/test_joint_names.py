@@ -9,11 +9,11 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.body.bvh_params import load_bvh
-from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.body.layout import NAME_SCHEMES, PROGRAMS, SMPLX_JOINTS, names_of_joints
 from smplxpp.body.retarget import Skeleton
 from smplxpp.core import InputError
 from smplxpp.export.bvh import write_bvh
-from smplxpp.export.joint_names import PROGRAMS, SCHEMES, names_of_joints, with_joint_names
+from smplxpp.export.gltf_skin import with_joint_names
 from tests.export.glb_reader import GlbReader
 from tests.export.templates import open_body_template, random_motion, random_template
 
@@ -103,7 +103,8 @@ def test_names_change_a_file_and_nothing_that_moves_in_it(tmp_path):
 def test_a_motion_with_their_names_plays(tmp_path, scheme):
     """As a BVH of Mixamo or Unreal does: our reader of other programs' skeletons finds every limb and finger."""
     body = load_body()
-    motion = replace(random_motion(3, expressions=0, fps=30.0), flat_hand_mean=True)
+    still = {name: np.zeros((3, 3)) for name in ("jaw_pose", "leye_pose", "reye_pose")}
+    motion = replace(random_motion(3, expressions=0, fps=30.0), flat_hand_mean=True, **still)
     names = names_of_joints(body.joint_names, scheme)
     write_bvh(tmp_path / "a.bvh", replace(body, joint_names=names), motion)
     played = load_bvh(tmp_path / "a.bvh", Skeleton.of(body))
@@ -115,7 +116,7 @@ def test_a_motion_with_their_names_plays(tmp_path, scheme):
 
 
 def test_a_skeleton_of_another_kind_and_another_program_are_refused():
-    assert SCHEMES == ("smplx", *PROGRAMS)
+    assert NAME_SCHEMES == ("smplx", *PROGRAMS)
     assert names_of_joints(SMPLX_JOINTS, "smplx") == SMPLX_JOINTS
     with pytest.raises(InputError, match="joints of the SMPL family, to name them as unity does"):
         with_joint_names(random_template(), "unity")
