@@ -31,6 +31,7 @@ STAGES = {
     "register",
     "reconstruct",
     "detect",
+    "texture",
 }
 # Rooms from low to high: an import goes down, never up and never to a room of the same floor.
 FLOORS: dict[str, tuple[set[str], ...]] = {

@@ -25,4 +25,5 @@ def outer_template(template: Template) -> Template:
     seen = seen_faces(template.mesh)
     if not seen.any():
         raise InputError("template", expected="faces that a view from outside sees", received="none")
-    return replace(template, faces=template.faces[seen], vertex_labels=np.full_like(template.vertex_labels, SKIN.id))
+    labels = np.full_like(template.vertex_labels, SKIN.id)
+    return replace(template, faces=template.faces[seen], vertex_labels=labels, texture=None)

@@ -106,6 +106,13 @@ class Build:
     """Distance kept between layers, 0.1 to 10."""
     max_influences: int = 8
     """Largest number of joints with weight at a vertex."""
+    texture_size: Literal[0, 1024, 2048, 4096] = 2048
+    """Texels a side of the template's texture, painted from the scan's own or from the photographs; 0: vertices are
+    coloured instead."""
+    texture_layout: Literal["one", "part"] = "one"
+    """One picture for all parts, or one a part; then the body lies as in its own file."""
+    normal_map: bool = True
+    """Paint the scan's normals onto the simplified parts, too."""
     samples: int = 100_000
     """Surface samples of the validation."""
     seed: int = 0

@@ -112,8 +112,8 @@ PARTS: dict[str, _Part] = {
             *(layout.CAPTURE_STAGE, layout.POSE_BODY_STAGE, layout.SEGMENT_STAGE),
             *(layout.CLEAN_STAGE, layout.TRANSFER_STAGE, layout.UNPOSE_STAGE),
         ),
-        settings=("clearance_mm", "fill_holes"),
-        files=("body",),
+        settings=("clearance_mm", "fill_holes", "texture_size", "texture_layout", "normal_map"),
+        files=("body", "scan"),
         writers=("smplxpp.export.gltf", "smplxpp.export.obj"),
     ),
     layout.VALIDATE_STAGE: _Part(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ from pipelines.runs.layout import (
 from pipelines.stages.build_config import BuildContext
 from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body import load_body, load_params
-from smplxpp.build.assemble import assemble_parts
+from smplxpp.build.assemble import add_texture, assemble_parts
 from smplxpp.build.data import RestPart
 from smplxpp.build.locate import locate_in_scan
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
@@ -205,21 +206,24 @@ def unpose(folder: Path, build: BuildContext) -> StageOutput:
 
 
 def assemble(folder: Path, build: BuildContext) -> StageOutput:
-    """Write body and parts as one `Template`, layers apart: npz, GLB and OBJ."""
+    """Write body and parts as one `Template`, layers apart and painted: npz, GLB and OBJ."""
     body, scan, posed = load_body(build.inputs.body), load_prepared_scan(build.run), load_parts(build.run)
     # Weights and rest vertices are stored per part and matched by the part's name.
     at_rest, weights = load_canonical(build.run, posed), load_weights(build.run, posed)
+    params, labels = load_params_of_run(build.run), load_scan_labels(build.run, scan.mesh.face_count)
     template, output = assemble_parts(
         body,
-        load_params_of_run(build.run),
+        params,
         scan,
-        load_scan_labels(build.run, scan.mesh.face_count),
+        labels,
         load_fit(build.run, body),
         load_cleaned_parts(build.run),
         {name: RestPart(part, weights[name], at_rest[name].vertices) for name, part in posed.items()},
         build.config,
         labels=load_labels(build.run),
     )
+    template, painted = add_texture(template, params, scan, labels, build.inputs, build.config, body)
+    output = replace(output, numbers={**output.numbers, **painted})
     template.save(folder / "smplxpp.npz")
     # Other programs expect a figure that stands on the floor.
     write_glb(folder / "template.glb", template.on_floor())

@@ -18,6 +18,8 @@ from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 _REQUIRED = ("v_template", "f", "shapedirs", "weights", "J_regressor", "kintree_table")
 _OPTIONAL = (
     "posedirs",
+    "vt",
+    "ft",
     "hands_componentsl",
     "hands_componentsr",
     "hands_meanl",
@@ -131,6 +133,7 @@ class _Builder:
             part_label_names=label_names,
             landmarks=self._landmarks(faces, vertex_count),
             expression_names=(self._names("expr_names", exprdirs.shape[2]) or ())[: kept_expressions.shape[2]],
+            uv=self._uv(len(faces)),
         )
         # Read-only arrays let callers share one model.
         for value in (*vars(model).values(), *(array for pair in model.landmarks.values() for array in pair)):
@@ -207,6 +210,15 @@ class _Builder:
         if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):
             raise self._error("f", f"indices in [0, {vertex_count})", f"[{faces.min()}, {faces.max()}]")
         return faces
+
+    def _uv(self, face_count: int) -> tuple[np.ndarray, np.ndarray] | None:
+        # A file with coordinates outside the picture, as some tools' tiles are, is unwrapped anew like one without.
+        if not {"vt", "ft"} <= self.raw.keys():
+            return None
+        uv, face_uv = self._array("vt", (None, 2)), self._array("ft", (face_count, 3)).astype(np.int64)
+        if face_uv.size and (face_uv.min() < 0 or face_uv.max() >= len(uv)):
+            raise self._error("ft", f"indices in [0, {len(uv)})", f"[{face_uv.min()}, {face_uv.max()}]")
+        return (uv, face_uv) if ((uv >= 0) & (uv <= 1)).all() else None
 
     def _parents(self, joint_count: int) -> np.ndarray:
         # The root's parent is stored as -1 or as 2^32 - 1.

@@ -79,6 +79,7 @@ class BodyModel:
         expression_names: E names; numbered where the file gives none.
         landmarks: points that detectors mark, by the names of `Keypoints2D`, as weighted means of vertices: indices and
             weights that sum to 1. Those that the file has: COCO's of the open body, faces of SMPL-X; else none.
+        uv: texture coordinates in [0, 1], v upwards, and their rows at each corner of the faces; None where absent.
 
     Example:
         >>> smplxpp.load_body()
@@ -103,6 +104,7 @@ class BodyModel:
     part_label_names: tuple[str, ...]
     expression_names: tuple[str, ...] = ()
     landmarks: Mapping[str, tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]] = field(default_factory=dict)
+    uv: tuple[Float64[np.ndarray, "U 2"], Int64[np.ndarray, "F 3"]] | None = None
     # Tensors of the arrays above, by (name, dtype, device).
     _tensors: dict = field(default_factory=dict, init=False, repr=False)
 

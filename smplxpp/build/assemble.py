@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Integer
@@ -12,8 +13,9 @@ from smplxpp.assemble import FilledHoles, FillHolesConfig, body_colors_from_scan
 from smplxpp.assemble.drape import drape_patches
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.body import BodyModel
-from smplxpp.build.config import BuildConfig
+from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
+from smplxpp.build.scan import raw_scan
 from smplxpp.clean.shreds import cut_borders
 from smplxpp.clean.smooth import smooth_cuts
 from smplxpp.core import (
@@ -32,6 +34,9 @@ from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import pose
 from smplxpp.template.mouth import MOUTH_COLOR, inside_of_mouth
 from smplxpp.template.template import Template
+from smplxpp.texture.atlas import can_unwrap, texture_stretch, unwrap
+from smplxpp.texture.bake import bake
+from smplxpp.texture.painted_scan import PaintedScan, pictures_of
 
 
 def assemble_parts(
@@ -116,6 +121,60 @@ def assemble_parts(
     ]
     numbers = report.as_dict() | {"darned": {name: one.as_dict() for name, one in filled.items()}}
     return template, StageOutput(checks, numbers)
+
+
+def add_texture(
+    template: Template,
+    params: BodyParams,
+    scan: PreparedScan,
+    face_labels: Integer[np.ndarray, " M"],
+    inputs: BuildInputs,
+    config: BuildConfig,
+    body: BodyModel,
+) -> tuple[Template, dict[str, Any]]:
+    """Paint the texture of an assembled template with what the scan shows, in the scan's pose.
+
+    Args:
+        template: body and parts in the T-pose.
+        params: of the scan's pose.
+        scan: prepared.
+        face_labels: of the scan.
+        inputs: they name the scan, whose textures are read again.
+        config: size and layout.
+        body: the model, whose file may have a layout.
+
+    Returns:
+        The template with its texture, or as it is where none was asked for or there is nothing to paint, and numbers.
+    """
+    if not config.texture_size:
+        return template, {"texture": "none was asked for"}
+    if not can_unwrap():
+        return template, {"texture": "none: xatlas, which unwraps, is not installed (pip install xatlas)"}
+    raw = raw_scan(inputs.scan) if inputs.scan is not None else None
+    pictures = None if raw is None else pictures_of(raw, scan.mesh, scan.source_vertex, scan.source_face)
+    if scan.own_colors is None and pictures is None:
+        return template, {"texture": "none: the scan has no colours"}
+    # Classes of skin of a user's own are the body's, as the built-in one is.
+    skin = template.labels.kind_ids(face_labels) == SKIN.id
+    painted = PaintedScan(scan.mesh, scan.colors, np.where(skin, SKIN.id, face_labels), pictures)
+    # The inside of the mouth has a colour that no scan shows.
+    mouth = (template.vertex_colors == MOUTH_COLOR).all(axis=1) & (template.scan_index < 0)
+    atlas = unwrap(template, body.uv, layout=config.texture_layout)
+    texture, report = bake(
+        *(template, template.pose(params)[0], atlas, painted),
+        size=config.texture_size,
+        fixed=mouth & (template.vertex_part == 0),
+        normals=config.normal_map,
+    )
+    stretch, _ = texture_stretch(atlas, template.mesh)
+    numbers = {
+        "texture": "of the scan's texture" if pictures is not None else "of the colours of the scan's vertices",
+        "texture_seen": report.by_part,
+        "texture_stretch": stretch,
+        "texture_texels": report.texels,
+        "texture_bytes": sum(map(len, (*texture.colors, *texture.normals))),
+    }
+    return replace(template, texture=texture), numbers
 
 
 def _filled(

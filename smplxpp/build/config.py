@@ -27,6 +27,7 @@ from smplxpp.core import (
 from smplxpp.core.errors import one_line
 from smplxpp.core.labels import PartRule
 from smplxpp.segment import LABEL_SETS, LabelSet, find_label_set
+from smplxpp.template.texture import LAYOUTS, TEXTURE_SIZES
 
 STEPS = (
     *("reconstruct", "locate", "register"),
@@ -77,6 +78,9 @@ class BuildConfig:
         bridges: settings for cutting faces that bridge two limbs; `rounds=0` disables it.
         fill_holes: settings for closing the holes that this leaves; `width=0` disables it.
         method: skin-weight transfer, "ours", or "paper" for robust transfer as published.
+        texture_size: texels a side of the template's pictures, one of `TEXTURE_SIZES`; 0: no texture.
+        texture_layout: "one" picture for all parts, or one a "part"; then the body lies as in its own file.
+        normal_map: paint the scan's normals onto the simplified parts, too.
         samples: surface samples of the validation.
         seed: of the samples.
         accept_failures: build on a body that was found with too little confidence; the command then ends with status 0
@@ -109,6 +113,9 @@ class BuildConfig:
     bridges: BridgeConfig = field(default_factory=BridgeConfig)
     fill_holes: FillHolesConfig = field(default_factory=FillHolesConfig)
     method: str = "ours"
+    texture_size: int = 2048
+    texture_layout: str = "one"
+    normal_map: bool = True
     samples: int = 100_000
     seed: int = 0
     accept_failures: bool = False
@@ -123,6 +130,8 @@ class BuildConfig:
         require_choice("option whose", self.whose, WHOSE)
         require_choice("option register", self.register, (AUTO, "on", "off"))
         require_choice("option method", self.method, ("ours", "paper"))
+        require_choice("option texture-size", str(self.texture_size), [str(size) for size in TEXTURE_SIZES])
+        require_choice("option texture-layout", self.texture_layout, LAYOUTS)
         # The labels of a file are known when it is read, before the first step.
         if isinstance(self.label_set, LabelSet) or self.label_set in (AUTO, *LABEL_SETS):
             self.check_parts(find_label_set("4ddress" if self.label_set == AUTO else self.label_set).labels)

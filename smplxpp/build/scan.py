@@ -10,16 +10,18 @@ import warnings
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64, UInt8
 
 from smplxpp.clean import PointSurface, Sanitized, sanitize, surface_from_points
 from smplxpp.clean.scan_frame import AUTO, check_human_scale, convert_points, find_scan_frame
-from smplxpp.core import GeometryWarning, InputError, MeshLike, as_mesh
+from smplxpp.core import GeometryWarning, InputError, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import one_line
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
-from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes
+from smplxpp.core.mesh_files.raw_mesh import FacePictures, RawMesh, color_bytes
+from smplxpp.core.mesh_files.texture import REPEAT, bounded_places, sample_texture
 from smplxpp.segment import LabelSet, map_labels, read_labels
 from smplxpp.segment.label_files import check_element_count
 
@@ -114,6 +116,21 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", h
     return ScanFile(raw, clean, scale if isinstance(scale, str) else f"{1000.0 * scale:.4g} mm", up, note)
 
 
+def raw_scan(scan: str | Path | MeshLike) -> RawMesh | None:
+    """Read a scan as its file has it, for its textures; None for formats that have none.
+
+    Raises:
+        InputError: as `read_scan`.
+    """
+    if not isinstance(scan, str | Path):
+        return _raw_of(scan)
+    if Path(scan).suffix.lower() not in (".obj", ".glb", ".gltf"):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)  # `read_scan` said what is wrong with the file
+        return read_raw_mesh(scan)
+
+
 def _named(error: InputError, name: str) -> InputError:
     """Return the error with the scan's name before its subject."""
     subject = error.subject if error.subject.startswith(f"scan {name}") else f"scan {name}: {error.subject}"
@@ -169,10 +186,29 @@ def _raw_of(mesh: MeshLike) -> RawMesh:
     """The arrays of a mesh in memory, with its colours where it has any (`visual.vertex_colors` of trimesh)."""
     found = as_mesh(mesh, subject="scan")
     visual = getattr(mesh, "visual", None)
+    if getattr(visual, "kind", None) == "texture":
+        return _textured(found, visual)
     # trimesh invents grey colours where a mesh has none, and says so by `kind`.
     colors = getattr(visual, "vertex_colors", None) if getattr(visual, "kind", None) == "vertex" else None
     kept = None if colors is None else color_bytes(np.asarray(colors), subject="scan")
     return RawMesh(found.vertices, found.faces, vertex_colors=kept)
+
+
+def _textured(mesh: TriangleMesh, visual: Any) -> RawMesh:
+    """The arrays of a `trimesh.Trimesh` with a picture; of one whose material has none, the shape alone."""
+    material = getattr(visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    uv = np.asarray([] if visual.uv is None else visual.uv, dtype=np.float64)
+    if image is None or uv.shape != (mesh.vertex_count, 2):
+        return RawMesh(mesh.vertices, mesh.faces)
+    picture = np.array(image.convert("RGB"))
+    # trimesh counts v upwards.
+    places = bounded_places(uv * [1, -1] + [0, 1])
+    pictures = FacePictures(
+        places[mesh.faces], np.zeros(mesh.face_count, np.int64), (lambda: picture,), ((REPEAT, REPEAT),)
+    )
+    colors = sample_texture(picture, places.astype(np.float64), top_down=True)
+    return RawMesh(mesh.vertices, mesh.faces, vertex_colors=colors, pictures=pictures)
 
 
 def _of_cloud(path: Path | None, raw: RawMesh, units: str | float, up: str) -> Sanitized:

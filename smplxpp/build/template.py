@@ -6,13 +6,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from smplxpp.body import BodyModel
-from smplxpp.build.assemble import assemble_parts
+from smplxpp.build.assemble import add_texture, assemble_parts
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.build.data import LocatedInScan, RestPart
 from smplxpp.build.inputs import check_inputs, given_motion, plan_build
@@ -189,6 +190,8 @@ class _Build:
             template, step.output = assemble_parts(
                 body, params, scan, face_labels, fit, cleaned, parts, config, labels=labels
             )
+            template, painted = add_texture(template, params, scan, face_labels, inputs, config, body)
+            step.output = replace(step.output, numbers=step.output.numbers | painted)
         with self._step("validate") as step:
             # The motion that the template is tried with: the registered one, else the given one; None without either.
             motion = registration.fit.params if registration is not None else given_motion(inputs, body)

@@ -18,6 +18,7 @@ from smplxpp.export.gltf_animation import add_animation
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
 from smplxpp.export.gltf_skin import add_skin, influence_sets, quantized_influences
 from smplxpp.template.template import BODY_PART, Template
+from smplxpp.template.texture import Texture, part_surface
 
 # A vertex that an expression of one unit moves by less, in metres, is left out of that morph target.
 _STILL = 1e-6
@@ -37,7 +38,8 @@ def add_parts(
 ) -> list[int]:
     """Add a mesh, a material and a node for every part that has faces; skin 0 moves them all.
 
-    Vertices of a part keep their order; the body's are the body model's own.
+    Vertices of a part keep their order, the body's being the body model's own; where a texture's seams split them,
+    the copies follow.
 
     Returns:
         Indices of the nodes, the body's first.
@@ -46,38 +48,56 @@ def add_parts(
     joints, weights = quantized_influences(template.weights)
     normals = _unit_normals(template)
     colors = linear_rgba16(template.vertex_colors)
+    pictures = add_pictures(buffers, template.texture)
     nodes = []
     for index, name in enumerate(template.part_names):
-        faces = template.faces[template.part_faces(name)]
-        if not len(faces):
+        surface = part_surface(template, index)
+        if surface is None:
             continue
-        rows = np.flatnonzero(template.vertex_part == index)
+        rows = surface.rows
         attributes = {
             "POSITION": buffers.add(template.vertices[rows].astype(np.float32), target=ARRAY_BUFFER, bounds=True),
             "NORMAL": buffers.add(normals[rows], target=ARRAY_BUFFER),
-            "COLOR_0": buffers.add(colors[rows], target=ARRAY_BUFFER, normalized=True),
         }
+        if surface.uv is None:
+            attributes["COLOR_0"] = buffers.add(colors[rows], target=ARRAY_BUFFER, normalized=True)
+        else:
+            # Viewers multiply COLOR_0 by the texture, so that a part has one or the other.
+            attributes["TEXCOORD_0"] = buffers.add(surface.uv.astype(np.float32), target=ARRAY_BUFFER)
+        if surface.tangents is not None:
+            attributes["TANGENT"] = buffers.add(surface.tangents.astype(np.float32), target=ARRAY_BUFFER)
         # glTF holds four influences a set, so that more of them need further sets.
         for k, (set_joints, set_weights) in enumerate(influence_sets(joints[rows], weights[rows])):
             attributes[f"JOINTS_{k}"] = buffers.add(set_joints, target=ARRAY_BUFFER)
             attributes[f"WEIGHTS_{k}"] = buffers.add(set_weights, target=ARRAY_BUFFER)
         primitive = pygltflib.Primitive(
             attributes=pygltflib.Attributes(**attributes),
-            # Parts follow each other in the vertices, so the part's own indices are these.
-            indices=buffers.add(
-                (faces - rows[0]).reshape(-1).astype(index_dtype(len(rows))), target=ELEMENT_ARRAY_BUFFER
-            ),
+            indices=buffers.add(surface.faces.reshape(-1).astype(index_dtype(len(rows))), target=ELEMENT_ARRAY_BUFFER),
             material=len(gltf.materials),
         )
-        gltf.materials.append(_material(template, name, rows))
+        gltf.materials.append(_material(template, name, rows, pictures.get(index)))
         mesh = pygltflib.Mesh(name=name, primitives=[primitive])
         if morph_targets and name == BODY_PART and template.body.num_expressions:
-            _add_expressions(buffers, template, mesh)
+            _add_expressions(buffers, template, mesh, rows)
         _add_shapes(buffers, mesh, {name: moved[rows] for name, moved in (shapes or {}).items()})
         nodes.append(len(gltf.nodes))
         gltf.nodes.append(pygltflib.Node(name=name, mesh=len(gltf.meshes), skin=0))
         gltf.meshes.append(mesh)
     return nodes
+
+
+def add_pictures(buffers: BufferBuilder, texture: Texture | None) -> dict[int, tuple[int, int | None]]:
+    """Add the pictures of a texture, and return glTF's textures of colours and normals of each part."""
+    if texture is None:
+        return {}
+    made = [
+        (
+            buffers.add_image(color, "image/jpeg"),
+            buffers.add_image(texture.normals[k], "image/png") if texture.normals else None,
+        )
+        for k, color in enumerate(texture.colors)
+    ]
+    return {part: made[k] for part, k in enumerate(texture.picture.tolist())}
 
 
 def linear_rgba16(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]:
@@ -89,9 +109,9 @@ def linear_rgba16(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]
     return np.pad(table[colors], ((0, 0), (0, 1)), constant_values=65535)
 
 
-def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib.Mesh) -> None:
-    # (E, Vb, 3): each target's rows lie together.
-    offsets = np.ascontiguousarray(np.moveaxis(template.body.exprdirs, 2, 0), dtype=np.float32)
+def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib.Mesh, rows: np.ndarray) -> None:
+    # (E, n, 3): each target's rows lie together.
+    offsets = np.ascontiguousarray(np.moveaxis(template.body.exprdirs[rows], 2, 0), dtype=np.float32)
     moved = np.einsum("evc,evc->ev", offsets, offsets) > _STILL**2
     mesh.primitives[0].targets = [
         {"POSITION": buffers.add_sparse(target, np.flatnonzero(rows))}
@@ -122,11 +142,19 @@ def _unit_normals(template: Template) -> np.ndarray:
     return normals
 
 
-def _material(template: Template, name: str, rows: np.ndarray) -> pygltflib.Material:
+def _material(
+    template: Template, name: str, rows: np.ndarray, pictures: tuple[int, int | None] | None
+) -> pygltflib.Material:
     label = template.labels[int(np.bincount(template.vertex_labels[rows]).argmax())]
+    color, relief = pictures or (None, None)
     return pygltflib.Material(
         name=label.name,
-        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.9),
+        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
+            metallicFactor=0.0,
+            roughnessFactor=0.9,
+            baseColorTexture=None if color is None else pygltflib.TextureInfo(index=color),
+        ),
+        normalTexture=None if relief is None else pygltflib.NormalMaterialTexture(index=relief),
         # Clothes are open sheets, seen from inside at hems and cuffs; the body is closed.
         doubleSided=name != BODY_PART,
         alphaCutoff=None,
@@ -139,10 +167,11 @@ def write_glb(
 ) -> None:
     """Write the template as a GLB file, whole or not at all; the same template gives the same bytes.
 
-    The axes are the template's: metres, +Y up. Each part is a mesh of its own with the material of its label and the
-    scan's colours; one skin moves all. A vertex keeps its 8 strongest joints in two sets (`JOINTS_0` the four
-    strongest), exactly normalised. With at most 8 joints a vertex, no pose correctives and linear interpolation aside,
-    the file's skinning gives what `template.pose(animation)` gives, to float32.
+    The axes are the template's: metres, +Y up. Each part is a mesh of its own with the material of its label, and the
+    template's texture or, without one, the colours of its vertices; one skin moves all. A vertex keeps its 8 strongest
+    joints in two sets (`JOINTS_0` the four strongest), exactly normalised. With at most 8 joints a vertex, no pose
+    correctives and linear interpolation aside, the file's skinning gives what `template.pose(animation)` gives, to
+    float32.
 
     Args:
         path: of the file, with any suffix; `.glb` is usual.

@@ -82,6 +82,23 @@ class BufferBuilder:
             )
         return self._append(accessor)
 
+    def add_image(self, data: bytes, mime_type: str) -> int:
+        """Store an encoded picture and return its texture, sampled without repeating."""
+        gltf = self._gltf
+        if not gltf.samplers:
+            gltf.samplers.append(
+                pygltflib.Sampler(
+                    magFilter=pygltflib.LINEAR,
+                    minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
+                    wrapS=pygltflib.CLAMP_TO_EDGE,
+                    wrapT=pygltflib.CLAMP_TO_EDGE,
+                )
+            )
+        view = self._view(np.frombuffer(data, np.uint8))
+        gltf.images.append(pygltflib.Image(bufferView=view, mimeType=mime_type))
+        gltf.textures.append(pygltflib.Texture(sampler=0, source=len(gltf.images) - 1))
+        return len(gltf.textures) - 1
+
     def glb(self) -> bytes:
         """The file: header, JSON chunk, binary chunk (glTF 2.0, section 4.4)."""
         binary = b"".join(self._chunks)

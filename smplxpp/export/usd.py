@@ -16,6 +16,7 @@ from smplxpp.export.gltf_animation import joint_motion
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.export.usd_stage import open_usd, usd_modules
 from smplxpp.template.template import BODY_PART, Template
+from smplxpp.template.texture import part_surface, picture_files
 
 _ROOT = "template"
 # A vertex that an expression of one unit moves by less, in metres, is left out of that blend shape.
@@ -25,13 +26,13 @@ _STILL = 1e-6
 def write_usd(path: str | Path, template: Template, *, animation: BodyParams | None = None) -> None:
     """Write the template as a `SkelRoot`, whole or not at all.
 
-    A mesh a part with all its skin weights, normals, linear colours (`displayColor`) and a material of its label; one
-    skeleton; the expressions as blend shapes of the body; the motion as a `SkelAnimation`, one time code a frame.
-    UsdSkel's skinning then gives what `template.pose(animation)` gives, to float32, but for pose correctives. Metres,
-    +Y up.
+    A mesh a part with all its skin weights, normals, linear colours (`displayColor`) and a material of its label, in
+    the template's texture where it has one, whose pictures lie beside the file, or within a .usdz; one skeleton; the
+    expressions as blend shapes of the body; the motion as a `SkelAnimation`, one time code a frame. UsdSkel's skinning
+    then gives what `template.pose(animation)` gives, to float32, but for pose correctives. Metres, +Y up.
 
     Args:
-        path: .usdc, .usda or .usd.
+        path: .usdc, .usda, .usd or .usdz.
         animation: T frames, played at their `fps` or `DEFAULT_FPS`.
 
     Raises:
@@ -47,10 +48,16 @@ def write_usd(path: str | Path, template: Template, *, animation: BodyParams | N
     fps = None if animation is None else animation.fps or DEFAULT_FPS
     if fps is not None:
         require_positive("frames a second of the animation", fps)
-    with open_usd(path, default=_ROOT, fps=fps) as stage:
+    files = {} if template.texture is None else picture_files(template.texture, Path(path).stem)
+    # The stage names the files by their places beside it.
+    named = (
+        tuple(f"./{name}" for name in files if name.endswith(".jpg")),
+        tuple(f"./{name}" for name in files if name.endswith(".png")),
+    )
+    with open_usd(path, default=_ROOT, fps=fps, beside=files) as stage:
         pxr.UsdSkel.Root.Define(stage, f"/{_ROOT}")
         joints = _add_skeleton(pxr, stage, template)
-        shapes = _add_parts(pxr, stage, template)
+        shapes = _add_parts(pxr, stage, template, named)
         if animation is not None:
             _add_motion(pxr, stage, template, animation, (joints, shapes))
             stage.SetEndTimeCode(len(animation) - 1)
@@ -69,22 +76,23 @@ def _add_skeleton(pxr: SimpleNamespace, stage: Any, template: Template) -> list[
     return paths
 
 
-def _add_parts(pxr: SimpleNamespace, stage: Any, template: Template) -> list[str]:
-    """Add a mesh a part; return the names of the body's blend shapes."""
+def _add_parts(
+    pxr: SimpleNamespace, stage: Any, template: Template, pictures: tuple[tuple[str, ...], tuple[str, ...]]
+) -> list[str]:
+    """Add a mesh a part, with the files of its colours and normals; return the names of the body's blend shapes."""
     Vt, shapes = pxr.Vt, []
     normals = template.mesh.vertex_normals.astype(np.float32)
     influences = template.weights.joint_indices.shape[1]
     for index, name in enumerate(template.part_names):
-        faces = template.faces[template.part_faces(name)]
-        if not len(faces):
+        surface = part_surface(template, index)
+        if surface is None:
             continue
-        rows = np.flatnonzero(template.vertex_part == index)
+        rows, faces = surface.rows, surface.faces
         points = np.ascontiguousarray(template.vertices[rows], np.float32)
         mesh = pxr.UsdGeom.Mesh.Define(stage, f"/{_ROOT}/{_identifier(name)}")
         mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-        # Parts follow each other in the vertices, so the part's own indices are these.
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy((faces - rows[0]).astype(np.int32).ravel()))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
         mesh.CreateSubdivisionSchemeAttr("none")
         # Garments are open surfaces, whose inside shows at hems; of the body only the outside shows.
         mesh.CreateDoubleSidedAttr(name != BODY_PART)
@@ -100,16 +108,21 @@ def _add_parts(pxr: SimpleNamespace, stage: Any, template: Template) -> list[str
         weights = template.weights.joint_weights[rows].astype(np.float32).ravel()
         binding.CreateJointIndicesPrimvar(False, influences).Set(Vt.IntArray.FromNumpy(joints))
         binding.CreateJointWeightsPrimvar(False, influences).Set(Vt.FloatArray.FromNumpy(weights))
-        _add_material(pxr, stage, template, mesh, rows)
+        if surface.uv is not None:
+            # USD's pictures begin at the lower left corner.
+            uv = np.ascontiguousarray(surface.uv * [1, -1] + [0, 1], np.float32)
+            places = pxr.UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", pxr.Sdf.ValueTypeNames.TexCoord2fArray, "vertex")
+            places.Set(Vt.Vec2fArray.FromNumpy(uv))
+        _add_material(pxr, mesh, *_material_of(template, index, rows, pictures))
         if name == BODY_PART:
-            shapes = _add_expressions(pxr, stage, template, mesh)
+            shapes = _add_expressions(pxr, stage, template, mesh, rows)
     return shapes
 
 
-def _add_expressions(pxr: SimpleNamespace, stage: Any, template: Template, mesh: Any) -> list[str]:
+def _add_expressions(pxr: SimpleNamespace, stage: Any, template: Template, mesh: Any, used: np.ndarray) -> list[str]:
     names, targets = [], []
     for k, expression in enumerate(template.body.expression_names):
-        offsets = np.ascontiguousarray(template.body.exprdirs[:, :, k], np.float32)
+        offsets = np.ascontiguousarray(template.body.exprdirs[used, :, k], np.float32)
         # Blend shapes are sparse: only vertices that an expression moves are stored.
         rows = np.flatnonzero(np.square(offsets).sum(axis=1) > _STILL**2)
         shape = pxr.UsdSkel.BlendShape.Define(stage, mesh.GetPath().AppendChild(_identifier(expression)))
@@ -124,21 +137,49 @@ def _add_expressions(pxr: SimpleNamespace, stage: Any, template: Template, mesh:
     return names
 
 
-def _add_material(pxr: SimpleNamespace, stage: Any, template: Template, mesh: Any, rows: np.ndarray) -> None:
-    """Add a preview surface in the colours of the vertices, named by the part's commonest label."""
-    label = template.labels[int(np.bincount(template.vertex_labels[rows]).argmax())]
-    path = mesh.GetPath().AppendChild(f"{_identifier(label.name)}_material")
+def _material_of(
+    template: Template, part: int, rows: np.ndarray, pictures: tuple[tuple[str, ...], tuple[str, ...]]
+) -> tuple[str, str | None, str | None]:
+    """Return the name of a part's material, its commonest label's, and its files of colours and normals."""
+    name = template.labels[int(np.bincount(template.vertex_labels[rows]).argmax())].name
+    colors, reliefs = pictures
+    k = 0 if template.texture is None else int(template.texture.picture[part])
+    return name, colors[k] if colors else None, reliefs[k] if reliefs else None
+
+
+def _add_material(pxr: SimpleNamespace, mesh: Any, name: str, color: str | None, relief: str | None) -> None:
+    """Add a preview surface in the colours of a picture, or of the vertices where there is none."""
+    stage, path = mesh.GetPrim().GetStage(), mesh.GetPath().AppendChild(f"{_identifier(name)}_material")
     types = pxr.Sdf.ValueTypeNames
     material = pxr.UsdShade.Material.Define(stage, path)
     surface = pxr.UsdShade.Shader.Define(stage, path.AppendChild("surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", types.Float).Set(0.9)
-    # The colour is read from the vertices' primvar `displayColor`, since the template has no texture.
-    reader = pxr.UsdShade.Shader.Define(stage, path.AppendChild("color"))
-    reader.CreateIdAttr("UsdPrimvarReader_float3")
-    reader.CreateInput("varname", types.String).Set("displayColor")
-    color = reader.CreateOutput("result", types.Float3)
-    surface.CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
+    # Vertices' colours are read from their primvar `displayColor`, places in pictures from `st`.
+    varname, kind = ("displayColor", "float3") if color is None else ("st", "float2")
+    reader = pxr.UsdShade.Shader.Define(stage, path.AppendChild("reader"))
+    reader.CreateIdAttr(f"UsdPrimvarReader_{kind}")
+    reader.CreateInput("varname", types.String).Set(varname)
+    place = reader.CreateOutput("result", types.Float3 if color is None else types.Float2)
+
+    def picture(kind: str, file: str, space: str) -> Any:
+        shader = pxr.UsdShade.Shader.Define(stage, path.AppendChild(kind))
+        shader.CreateIdAttr("UsdUVTexture")
+        shader.CreateInput("file", types.Asset).Set(pxr.Sdf.AssetPath(file))
+        shader.CreateInput("sourceColorSpace", types.Token).Set(space)
+        shader.CreateInput("wrapS", types.Token).Set("clamp")
+        shader.CreateInput("wrapT", types.Token).Set("clamp")
+        shader.CreateInput("st", types.Float2).ConnectToSource(place)
+        return shader
+
+    seen = place if color is None else picture("color", color, "sRGB").CreateOutput("rgb", types.Float3)
+    surface.CreateInput("diffuseColor", types.Color3f).ConnectToSource(seen)
+    if relief is not None:
+        shader = picture("normals", relief, "raw")
+        # From bytes in [0, 1] to directions in [-1, 1].
+        shader.CreateInput("scale", types.Float4).Set(pxr.Gf.Vec4f(2, 2, 2, 1))
+        shader.CreateInput("bias", types.Float4).Set(pxr.Gf.Vec4f(-1, -1, -1, 0))
+        surface.CreateInput("normal", types.Normal3f).ConnectToSource(shader.CreateOutput("rgb", types.Float3))
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
     pxr.UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -10,11 +11,11 @@ from types import SimpleNamespace
 from typing import Any
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes
 from smplxpp.core.lazy import import_extra
 
-SUFFIXES = (".usdc", ".usda", ".usd")
-_MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdVol", "Vt")
+SUFFIXES = (".usdc", ".usda", ".usd", ".usdz")
+_MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "UsdVol", "Vt")
 
 
 def usd_modules(purpose: str) -> SimpleNamespace:
@@ -29,13 +30,16 @@ def usd_modules(purpose: str) -> SimpleNamespace:
 
 
 @contextmanager
-def open_usd(path: str | Path, *, default: str, fps: float | None = None) -> Iterator[Any]:
+def open_usd(
+    path: str | Path, *, default: str, fps: float | None = None, beside: Mapping[str, bytes] | None = None
+) -> Iterator[Any]:
     """A new stage in metres with +Y up, written when the block ends without an error.
 
     Args:
-        path: .usdc (binary), .usda (text) or .usd (binary).
+        path: .usdc (binary), .usda (text), .usd (binary) or .usdz (one package).
         default: name of the prim that stands for the file.
         fps: time codes a second; None: nothing moves.
+        beside: files that the stage names, such as pictures; they are written beside it, or into the package.
 
     Raises:
         InputError: another suffix.
@@ -44,7 +48,8 @@ def open_usd(path: str | Path, *, default: str, fps: float | None = None) -> Ite
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"output {path}", expected=f"one of {', '.join(SUFFIXES)}", received=path.suffix or "none")
     pxr = usd_modules("writing USD")
-    stage = pxr.Usd.Stage.CreateInMemory(f"stage{path.suffix.lower()}")
+    packed = path.suffix.lower() == ".usdz"
+    stage = pxr.Usd.Stage.CreateInMemory(f"stage{'.usdc' if packed else path.suffix.lower()}")
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.GetRootLayer().comment = f"smplxpp {metadata.version('smplxpp')}"
@@ -54,5 +59,24 @@ def open_usd(path: str | Path, *, default: str, fps: float | None = None) -> Ite
         stage.SetStartTimeCode(0)
     yield stage
     stage.SetDefaultPrim(stage.GetPrimAtPath(f"/{default}"))
+    if packed:
+        _write_package(pxr, stage, path, beside or {})
+        return
+    # Pictures first, so that no stage names files that are not there.
+    for name, data in (beside or {}).items():
+        atomic_write_bytes(path.parent / name, data)
     with atomic_path(path) as temporary:
         stage.GetRootLayer().Export(str(temporary))
+
+
+def _write_package(pxr: SimpleNamespace, stage: Any, path: Path, beside: Mapping[str, bytes]) -> None:
+    """Write a stage and its files as one package, uncompressed as the format demands."""
+    with tempfile.TemporaryDirectory(prefix="smplxpp_usdz_") as folder, atomic_path(path) as temporary:
+        inner = Path(folder) / f"{path.stem}.usdc"
+        for name, data in beside.items():
+            (Path(folder) / name).write_bytes(data)
+        stage.GetRootLayer().Export(str(inner))
+        # The package must be new, and be named as one.
+        made = Path(folder) / "package.usdz"
+        pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(inner)), str(made))
+        temporary.write_bytes(made.read_bytes())

@@ -28,6 +28,7 @@ from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.skinning.linear_blend import skin
 from smplxpp.template import template_arrays
 from smplxpp.template.template_arrays import check_arrays, metadata_of
+from smplxpp.template.texture import Texture, texture_arrays, texture_from_arrays
 
 # The name of the part that comes first.
 BODY_PART = "body"
@@ -68,6 +69,7 @@ class Template:
         scan_index: vertex of the scan that a vertex comes from, or -1.
         metadata: short texts: name of the body, versions.
         labels: the semantic classes, the built-in ones or with a user's own.
+        texture: pictures of the surface; None: the colours of the vertices are all there is.
 
     Raises:
         InputError: arrays that do not fit each other.
@@ -92,6 +94,7 @@ class Template:
     scan_index: Int64[np.ndarray, " V"]
     metadata: dict[str, str] = field(default_factory=dict)
     labels: Labels = LABELS
+    texture: Texture | None = None
 
     def __post_init__(self) -> None:
         for name, dtype in _DTYPES.items():
@@ -163,6 +166,10 @@ class Template:
         _require(body_first, "vertex_part", f"0 for the body's {Vb} vertices, then increasing", "another order")
         crossing = (self.vertex_part[self.faces] != self.vertex_part[self.faces[:, :1]]).any()
         _require(not crossing, "faces", "corners within one part", "faces across parts")
+        if self.texture is not None:
+            found = (len(self.texture.face_uv), len(self.texture.picture))
+            wanted = (len(self.faces), len(self.part_names))
+            _require(found == wanted, "texture", "as many faces and parts: {}, {}".format(*wanted), str(found))
 
     @property
     def vertex_count(self) -> int:
@@ -229,10 +236,12 @@ class Template:
         own = ("vertices", "vertex_labels", "vertex_part", "vertex_colors", "body_index", "scan_index")
         per_vertex = ("joint_indices", "joint_weights", "matched", "distance", "angle", "component")
         weights = replace(self.weights, **{name: getattr(self.weights, name)[:count] for name in per_vertex})
+        kept = self.part_faces(BODY_PART)
         return replace(
             self,
             **{name: getattr(self, name)[:count] for name in own},
-            faces=self.faces[self.part_faces(BODY_PART)],
+            faces=self.faces[kept],
+            texture=None if self.texture is None else self.texture.of_faces(kept, 1),
             part_names=(BODY_PART,),
             weights=weights,
         )
@@ -297,7 +306,8 @@ class Template:
         # Templates with the built-in labels are read by versions that know no others.
         if self.labels != LABELS:
             arrays["labels"] = np.array(json.dumps(self.labels.as_list()))
-        write_arrays(path, template_arrays.in_file_order(arrays))
+        pictures = {} if self.texture is None else texture_arrays(self.texture)
+        write_arrays(path, template_arrays.in_file_order(arrays) | pictures)
 
     def export(
         self, path: str | Path, *, animation: BodyParams | None = None, faces: int | None = None, **options: Any
@@ -382,6 +392,7 @@ def _from_arrays(arrays: Mapping[str, np.ndarray]) -> Template:
         body_index=arrays["body_index"],
         scan_index=arrays["scan_index"],
         labels=template_arrays.labels_of(arrays),
+        texture=texture_from_arrays(arrays),
     )
 
 

@@ -225,6 +225,7 @@ def completed_body(
         right_hand_mean=_optional(body.right_hand_mean),
         part_labels=read_only(body.part_labels, np.int64),
         landmarks={},
+        uv=None,
     )
 
 

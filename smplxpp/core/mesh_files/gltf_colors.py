@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float64, Num, UInt8
+from jaxtyping import Float32, Float64, Num, UInt8
 
 from smplxpp.core.colors import decode_srgb, encode_srgb
 from smplxpp.core.errors import InputError
@@ -13,7 +14,7 @@ from smplxpp.core.files.image_file import decode_image
 from smplxpp.core.files.json_file import as_number, as_numbers, as_text
 from smplxpp.core.mesh_files.gltf_document import GltfDocument
 from smplxpp.core.mesh_files.raw_mesh import warn
-from smplxpp.core.mesh_files.texture import CLAMP, MIRROR, REPEAT, sample_texture
+from smplxpp.core.mesh_files.texture import CLAMP, MIRROR, REPEAT, bounded_places, sample_texture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -65,24 +66,57 @@ def _surface(document: GltfDocument, primitive: dict[str, Any]) -> tuple[dict[st
     return document.part(material, "pbrMetallicRoughness"), "baseColorTexture", "baseColorFactor"
 
 
+def primitive_texture(
+    document: GltfDocument, primitive: dict[str, Any], count: int
+) -> tuple[Float32[np.ndarray, "N 2"], tuple[str, str], Callable[[], UInt8[np.ndarray, "H W 3"]]] | None:
+    """Return texture coordinates (v downwards), wrap modes, and what loads the texture of a primitive's base colour.
+
+    The factor of the base colour is multiplied in, `COLOR_0` is not. None without a texture or where it is damaged,
+    which `primitive_colors` warns of.
+    """
+    try:
+        use, uv = _texture_use(document, primitive, count)
+        if use is None or uv is None:
+            return None
+        _picture(document, use)
+        factor, index = _factor(document, primitive), _image_index(document, use)
+    except InputError:
+        return None
+
+    def load() -> UInt8[np.ndarray, "H W 3"]:
+        picture = np.array(_decoded(document, index).convert("RGB"))
+        return picture if factor is None or (factor == 1).all() else _srgb8(_linear(picture) * factor)
+
+    return bounded_places(uv), _wrap(document, use), load
+
+
 def _picture_colors(document: GltfDocument, primitive: dict[str, Any], count: int) -> UInt8[np.ndarray, "N 3"] | None:
     """Sample the base colour's texture at the vertices; None without texture or texture coordinates."""
+    use, uv = _texture_use(document, primitive, count)
+    if use is None or uv is None:
+        return None
+    # glTF puts the origin of texture coordinates at the upper left corner.
+    return sample_texture(_picture(document, use), uv, top_down=True, wrap=_wrap(document, use))
+
+
+def _texture_use(
+    document: GltfDocument, primitive: dict[str, Any], count: int
+) -> tuple[dict[str, Any] | None, Float64[np.ndarray, "N 2"] | None]:
+    """Return how a primitive uses the texture of its base colour, and its texture coordinates; None without them."""
     surface, name, _ = _surface(document, primitive)
     if name not in surface:
-        return None
+        return None, None
     use = document.part(surface, name)
     # The extension may name another set of texture coordinates than the texture's own.
     transform = document.part(document.part(use, "extensions"), "KHR_texture_transform")
     layer = document.number(transform if "texCoord" in transform else use, "texCoord", 0)
     attributes = document.part(primitive, "attributes")
     if f"TEXCOORD_{layer}" not in attributes:
-        return None
+        return use, None
     uv = document.accessor(attributes[f"TEXCOORD_{layer}"]).astype(np.float64)
     if uv.shape != (count, 2):
         raise InputError("texture coordinates", expected="two a vertex", received=f"shape {uv.shape}")
-    picture = _picture(document, use)
-    # glTF puts the origin of texture coordinates at the upper left corner.
-    return sample_texture(picture, _transformed(uv, transform), top_down=True, wrap=_wrap(document, use))
+    return use, _transformed(uv, transform)
 
 
 def _wrap(document: GltfDocument, use: dict[str, Any]) -> tuple[str, str]:
@@ -94,10 +128,16 @@ def _wrap(document: GltfDocument, use: dict[str, Any]) -> tuple[str, str]:
 
 
 def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the decoded image of a texture.
+    """Return the decoded image of a texture; raises what `_image_index` raises, and for a missing or damaged file."""
+    index = _image_index(document, use)
+    return document.pictures.get(index, lambda: _decoded(document, index))
+
+
+def _image_index(document: GltfDocument, use: dict[str, Any]) -> int:
+    """Return the number of the image of a texture.
 
     Raises:
-        InputError: a missing file, a damaged image, or pictures of formats alone that are not read (KTX2, AVIF, DDS).
+        InputError: pictures of formats alone that are not read (KTX2, AVIF, DDS).
     """
     texture = document.entry("textures", use.get("index"))
     extensions = document.part(texture, "extensions")
@@ -110,8 +150,7 @@ def _picture(document: GltfDocument, use: dict[str, Any]) -> UInt8[np.ndarray, "
             received=f"only the pictures of {', '.join(sorted(map(str, extensions)))}",
             remedy="export the mesh with PNG or JPEG textures, or with one beside the compressed picture",
         )
-    index = document.number({"source": texture.get("source", webp.get("source"))}, "source")
-    return document.pictures.get(index, lambda: _decoded(document, index))
+    return document.number({"source": texture.get("source", webp.get("source"))}, "source")
 
 
 def _decoded(document: GltfDocument, index: int) -> Image:

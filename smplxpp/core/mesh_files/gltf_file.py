@@ -6,17 +6,18 @@ positions share its vertices.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_numbers, as_object
-from smplxpp.core.mesh_files.gltf_colors import primitive_colors
+from smplxpp.core.mesh_files.gltf_colors import primitive_colors, primitive_texture
 from smplxpp.core.mesh_files.gltf_document import GltfDocument, compression_error
-from smplxpp.core.mesh_files.raw_mesh import RawMesh, require_indices, warn
+from smplxpp.core.mesh_files.raw_mesh import FacePictures, RawMesh, require_indices, warn
 from smplxpp.core.mesh_files.texture import MISSING_GRAY
 
 # Modes of primitives: triangles, triangle strip, triangle fan. Lower ones are points and lines.
@@ -65,6 +66,9 @@ class _Parts:
         self._colored: list[np.ndarray] = []
         self._faces: list[Int64[np.ndarray, "m 3"]] = []
         self._starts: list[int] = []
+        self._uv: list[Float32[np.ndarray, "m 3 2"]] = []
+        self._picture: list[Int64[np.ndarray, " m"]] = []
+        self._load: list[tuple[tuple[str, str], Callable[[], np.ndarray]]] = []
         self._count = self._made = self._visits = self._left_out = 0
 
     def add(
@@ -113,8 +117,13 @@ class _Parts:
         # A reflection turns faces inside out, so their corners are reversed.
         faces = _triangles(indices, mode)
         mirrored = joints is None and np.linalg.det(world[:3, :3]) < 0
-        self._faces.append((faces[:, ::-1] if mirrored else faces) + self._starts[part])
+        faces = faces[:, ::-1] if mirrored else faces
+        self._faces.append(faces + self._starts[part])
         self._charge(len(faces))
+        texture = primitive_texture(document, primitive, count)
+        self._picture.append(np.full(len(faces), -1 if texture is None else len(self._load)))
+        self._uv.append(np.zeros((len(faces), 3, 2), np.float32) if texture is None else texture[0][faces])
+        self._load += [] if texture is None else [texture[1:]]
         # A vertex that several primitives share keeps the colour of the first one that colours it.
         used = np.zeros(count, bool)
         used[indices] = True
@@ -170,7 +179,11 @@ class _Parts:
         if not self._vertices:
             return RawMesh(np.empty((0, 3)), np.empty((0, 3), np.int64))
         colors = np.concatenate(self._colors) if any(mask.any() for mask in self._colored) else None
-        return RawMesh(np.concatenate(self._vertices), np.concatenate(self._faces), colors)
+        pictures = None
+        if self._load:
+            wraps, load = zip(*self._load, strict=True)
+            pictures = FacePictures(np.concatenate(self._uv), np.concatenate(self._picture), load, wraps)
+        return RawMesh(np.concatenate(self._vertices), np.concatenate(self._faces), colors, pictures=pictures)
 
 
 def _triangles(indices: Int64[np.ndarray, " n"], mode: int) -> Int64[np.ndarray, "m 3"]:

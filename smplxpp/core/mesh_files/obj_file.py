@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from smplxpp.core.mesh_files.obj_material import Material, read_materials
 from smplxpp.core.mesh_files.polygons import cut_polygons
 from smplxpp.core.mesh_files.raw_mesh import (
     IS_SPACE,
+    FacePictures,
     RawMesh,
     as_bytes,
     color_bytes,
@@ -36,6 +39,9 @@ from smplxpp.core.mesh_files.texture import (
     REPEAT,
     TextureCache,
     average_corner_colors,
+    bounded_places,
+    file_beside,
+    picture_bytes,
     sample_texture,
 )
 
@@ -66,9 +72,13 @@ def read_obj(path: Path) -> RawMesh:
     cut = cut_polygons(corners, sizes, vertices, subject=subject)
     require_indices(cut.faces, len(vertices), subject=subject)
     # Colours of the `v` lines win over materials.
+    pictures = None
     if colors is None and len(cut.faces):
-        colors = _material_colors(path, lines, corners, references[:, 1], corner_lines, vertex_count=len(vertices))
-    return RawMesh(vertices, cut.faces, colors, source_faces=cut.source_faces)
+        placed = _places(path, lines, references[:, 1], corner_lines)
+        if placed is not None:
+            colors = _material_colors(path, placed, corners, vertex_count=len(vertices))
+            pictures = _pictures(path, placed, cut.corners) if colors is not None else None
+    return RawMesh(vertices, cut.faces, colors, source_faces=cut.source_faces, pictures=pictures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,52 +220,67 @@ def _resolve(
     return references - 1
 
 
-def _material_colors(
-    path: Path,
-    lines: _Lines,
-    corners: Int64[np.ndarray, " C"],
-    uv_references: Int64[np.ndarray, " C"],
-    corner_lines: Int64[np.ndarray, " C"],
-    *,
-    vertex_count: int,
-) -> UInt8[np.ndarray, "N 3"] | None:
-    """Return vertex colours by the materials, averaged over the corners of a vertex; None if no material has any."""
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Materials and texture coordinates of the C corners: names, (C,) material (-1: none), (T, 2) coordinates of the
+    whole file and (C,) their row (-1: none)."""
+
+    materials: dict[str, Material]
+    used: Int64[np.ndarray, " C"]
+    uv: Float64[np.ndarray, "T 2"]
+    index: Int64[np.ndarray, " C"]
+
+    def at(self, chosen: np.ndarray, material: Material) -> Float64[np.ndarray, "n 2"]:
+        """Return the texture coordinates of corners as a material places them."""
+        with np.errstate(all="ignore"):
+            return self.uv[self.index[chosen]] * material.scale + material.offset
+
+
+def _places(
+    path: Path, lines: _Lines, uv_references: Int64[np.ndarray, " C"], corner_lines: Int64[np.ndarray, " C"]
+) -> _Places | None:
+    """Return the materials and texture coordinates of all corners; None for a file that uses no materials."""
     uses, libraries = lines.words(b"usemtl"), lines.words(b"mtllib")
     if not uses or not libraries:
         return None
-    materials = read_materials(path, [name for _, name in libraries])
+    known = read_materials(path, [name for _, name in libraries])
     names = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in uses))}
-    inside = (corners >= 0) & (corners < vertex_count)  # other corners belong to faces that were left out
-    corners, uv_references, corner_lines = corners[inside], uv_references[inside], corner_lines[inside]
     # The last `usemtl` before the face's line is in force; -1 before the first.
     use = np.searchsorted([line for line, _ in uses], corner_lines) - 1
     used = np.where(use >= 0, np.array([names[name] for _, name in uses])[use], -1)
-    # A vertex between two materials takes the material of its first corner.
-    first = np.zeros(vertex_count, np.int64)
-    vertices, places = np.unique(corners, return_index=True)
-    first[vertices] = used[places]
-    used = np.where(used == first[corners], used, -1)
     # Texture coordinates of the whole file, (T, 2); a third coordinate is left out.
     rows = _rows(lines, b"vt", f"mesh file {path}")
     uv = np.concatenate([np.empty((0, 2))] + [_first_two(values, counts) for values, counts in rows])
     index = _resolve(uv_references, lines.of_kind(b"vt"), corner_lines)
     index = np.where(index < len(uv), index, -1)
+    return _Places({name: known.get(name, Material()) for name in names}, used, uv, index)
+
+
+def _material_colors(
+    path: Path, placed: _Places, corners: Int64[np.ndarray, " C"], *, vertex_count: int
+) -> UInt8[np.ndarray, "N 3"] | None:
+    """Return vertex colours by the materials, averaged over the corners of a vertex; None if no material has any."""
+    inside = np.flatnonzero((corners >= 0) & (corners < vertex_count))  # others belong to faces that were left out
+    vertex, used = corners[inside], placed.used[inside]
+    # A vertex between two materials takes the material of its first corner.
+    first = np.zeros(vertex_count, np.int64)
+    vertices, places = np.unique(vertex, return_index=True)
+    first[vertices] = used[places]
+    used = np.where(used == first[vertex], used, -1)
     colors, found = np.full((vertex_count, 3), MISSING_GRAY, np.uint8), False
     pictures = TextureCache(f"mesh file {path}")
     # Corners sorted by material, so that each texture is decoded and sampled once.
     order = np.argsort(used, kind="stable")
-    bounds = np.searchsorted(used[order], np.arange(len(names) + 1))
+    bounds = np.searchsorted(used[order], np.arange(len(placed.materials) + 1))
     # One material at a time: texture at the corners' coordinates, else the plain colour.
-    for (name, _), start, end in zip(names.items(), bounds[:-1], bounds[1:], strict=True):
-        material, chosen = materials.get(name, Material()), order[start:end]
+    for material, start, end in zip(placed.materials.values(), bounds[:-1], bounds[1:], strict=True):
+        chosen = inside[order[start:end]]
         if material.picture is not None:
             picture = pictures.load(path, material.picture)
-            chosen = chosen[index[chosen] >= 0]
+            chosen = chosen[placed.index[chosen] >= 0]
             if picture is not None:
-                with np.errstate(all="ignore"):
-                    place = uv[index[chosen]] * material.scale + material.offset
-                wrap = (CLAMP, CLAMP) if material.clamp else (REPEAT, REPEAT)
-                at, mean = average_corner_colors(corners[chosen], sample_texture(picture, place, wrap=wrap))
+                sampled = sample_texture(picture, placed.at(chosen, material), wrap=_wrap(material))
+                at, mean = average_corner_colors(corners[chosen], sampled)
                 colors[at] = mean
                 # A file without texture coordinates has no colours, whatever its materials name.
                 found = found or len(at) > 0
@@ -263,6 +288,28 @@ def _material_colors(
             colors[corners[chosen]] = material.color
             found = True
     return colors if found else None
+
+
+def _pictures(path: Path, placed: _Places, corners: Int64[np.ndarray, "M 3"]) -> FacePictures | None:
+    """Return the textures of triangles, given as places in the list of corners; None if none has one."""
+    uv, picture = np.zeros((len(corners), 3, 2), np.float32), np.full(len(corners), -1)
+    load, wraps = list[Callable[[], np.ndarray]](), list[tuple[str, str]]()
+    complete = (placed.index[corners] >= 0).all(axis=1)
+    for k, material in enumerate(placed.materials.values()):
+        found = None if material.picture is None else file_beside(path, material.picture)
+        faces = np.flatnonzero(complete & (placed.used[corners[:, 0]] == k))
+        if found is None or not len(faces):
+            continue
+        places = placed.at(corners[faces].ravel(), material)
+        uv[faces] = bounded_places(places * [1, -1] + [0, 1]).reshape(-1, 3, 2)
+        picture[faces] = len(load)
+        load.append(partial(picture_bytes, found))
+        wraps.append(_wrap(material))
+    return FacePictures(uv, picture, tuple(load), tuple(wraps)) if load else None
+
+
+def _wrap(material: Material) -> tuple[str, str]:
+    return (CLAMP, CLAMP) if material.clamp else (REPEAT, REPEAT)
 
 
 def _first_two(values: Float64[np.ndarray, " n"], counts: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 2"]:

@@ -4,12 +4,30 @@ from __future__ import annotations
 
 import unicodedata
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, Int64, Integer, Num, UInt8
+from jaxtyping import Float32, Float64, Int64, Integer, Num, UInt8
 
 from smplxpp.core.errors import GeometryWarning, InputError
+
+
+@dataclass(frozen=True, eq=False)
+class FacePictures:
+    """Textures of a mesh file and where its faces lie in them; they are decoded when they are asked for.
+
+    Attributes:
+        uv: (M, 3, 2) texture coordinates of the corners, v downwards from the upper edge.
+        picture: (M,) texture of each face, -1 for a face without one.
+        load: functions that return the textures, (H, W, 3) uint8 sRGB.
+        wraps: what is outside [0, 1] along u and v of each texture: "repeat", "mirror" or "clamp".
+    """
+
+    uv: Float32[np.ndarray, "M 3 2"]
+    picture: Int64[np.ndarray, " M"]
+    load: tuple[Callable[[], UInt8[np.ndarray, "H W 3"]], ...]
+    wraps: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +42,7 @@ class RawMesh:
         face_properties: other arrays (M,) of faces by name (PLY).
         source_faces: (M,) int64, the file's face of each triangle; None if all are triangles.
         vertex_normals: (N, 3) float64 of a file without faces (PLY, npz); else None.
+        pictures: the textures that colour the faces (OBJ, glTF); None without any.
     """
 
     vertices: Float64[np.ndarray, "N 3"]
@@ -33,6 +52,7 @@ class RawMesh:
     face_properties: dict[str, np.ndarray] = field(default_factory=dict)
     source_faces: Int64[np.ndarray, " M"] | None = None
     vertex_normals: Float64[np.ndarray, "N 3"] | None = None
+    pictures: FacePictures | None = None
 
     @property
     def is_cloud(self) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Float32, Int64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.image_file import open_image
@@ -61,6 +61,15 @@ def file_beside(path: Path, name: str) -> Path | None:
 
 def _letters(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def picture_bytes(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """Decode a texture; `TextureCache` warned of it already if it cannot be read.
+
+    Raises:
+        InputError: no whole image.
+    """
+    return np.array(open_image(path).convert("RGB"))
 
 
 class TextureCache:
@@ -124,6 +133,35 @@ def sample_texture(
     down = v if top_down else 1.0 - v
     column = np.minimum((u * width).astype(np.int64), width - 1)
     return picture[np.minimum((down * height).astype(np.int64), height - 1), column]
+
+
+def bounded_places(uv: Float[np.ndarray, "N 2"]) -> Float32[np.ndarray, "N 2"]:
+    """Return texture coordinates in float32: 0 where they are not finite, cut where they repeat a million times."""
+    return np.clip(np.nan_to_num(uv, nan=0.0, posinf=0.0, neginf=0.0), -1e6, 1e6).astype(np.float32)
+
+
+def sample_bilinear(
+    picture: UInt8[np.ndarray, "H W 3"], uv: Float[np.ndarray, "N 2"], *, wrap: tuple[str, str] = (REPEAT, REPEAT)
+) -> UInt8[np.ndarray, "N 3"]:
+    """Return the colour between the four nearest texels, blended as sRGB; v is 0 at the upper edge.
+
+    Args:
+        picture: texture, rows from the top, texel centres at +0.5.
+        uv: texture coordinates.
+        wrap: as in `sample_texture`; across the edges of a repeated texture the last texels are not blended.
+    """
+    height, width = picture.shape[:2]
+    uv = np.where(np.isfinite(uv), uv, 0.0)
+    # In 1/256 of a texel, so that whole numbers blend the bytes.
+    x = np.clip(_within(uv[:, 0], wrap[0]) * width - 0.5, 0.0, width - 1.0)
+    y = np.clip(_within(uv[:, 1], wrap[1]) * height - 0.5, 0.0, height - 1.0)
+    column, row = x.astype(np.int64), y.astype(np.int64)
+    right, below = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
+    du, dv = (np.rint(256 * part).astype(np.uint32)[:, None] for part in (x - column, y - row))
+    texels = picture.reshape(-1, 3)
+    above = texels[row * width + column] * (256 - du) + texels[row * width + right] * du
+    under = texels[below * width + column] * (256 - du) + texels[below * width + right] * du
+    return ((above * (256 - dv) + under * dv + 32768) >> 16).astype(np.uint8)
 
 
 def _within(x: Float[np.ndarray, " N"], wrap: str) -> Float[np.ndarray, " N"]:
