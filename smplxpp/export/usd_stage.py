@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -79,4 +80,4 @@ def _write_package(pxr: SimpleNamespace, stage: Any, path: Path, beside: Mapping
         # The package must be new, and be named as one.
         made = Path(folder) / "package.usdz"
         pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(inner)), str(made))
-        temporary.write_bytes(made.read_bytes())
+        shutil.copyfile(made, temporary)
