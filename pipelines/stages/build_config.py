@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pipelines.runs.artefacts import values_of
+from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, RECONSTRUCT_FILE, REGISTER_FILE
 from pipelines.runs.manifest import require_plain_fields
+from pipelines.runs.stage import read_manifest
 from smplxpp.assemble import FillHolesConfig
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.clean import BridgeConfig
@@ -50,27 +53,28 @@ def stages_of(inputs: BuildInputs) -> tuple[str, ...]:
 
 def save_build(run: Path, inputs: BuildInputs, config: BuildConfig) -> None:
     """Write `build.json` into a run, unless the file has the same content."""
-    content = {"inputs": _plain(asdict(inputs)), "config": _plain(asdict(config))}
+    content = {"run": _plain(run), "inputs": _plain(asdict(inputs)), "config": _plain(asdict(config))}
     text, path = json.dumps(content, indent=1) + "\n", run / BUILD_FILE
     if not path.is_file() or path.read_bytes() != text.encode():
         atomic_write_text(path, text)
 
 
-def load_build(run: Path) -> tuple[BuildInputs, BuildConfig] | None:
+def load_build(run: Path, *, capture: Path | None = None) -> tuple[BuildInputs, BuildConfig] | None:
     """Read what `save_build` wrote; None without a record, or (with a warning) for one that cannot be read.
 
+    Inputs are found again where run and capture were moved together, or in `capture`, where it was moved alone.
     Optional inputs whose files are missing are left out.
     """
 
     def parsed(content: Mapping[str, Any]) -> tuple[BuildInputs, BuildConfig]:
         return _build_inputs(content["inputs"]), _build_config(content["config"])
 
-    return _load(run / BUILD_FILE, parsed, "%s is treated as a run without a record of its inputs: %s")
+    return _load(run / BUILD_FILE, parsed, "%s is treated as a run without a record of its inputs: %s", capture=capture)
 
 
 def save_register(run: Path, inputs: RegisterInputs) -> None:
     """Write the inputs of a registration to a run's `register.json`."""
-    atomic_write_text(run / REGISTER_FILE, json.dumps(_plain(asdict(inputs)), indent=1) + "\n")
+    _save_inputs(run, REGISTER_FILE, inputs)
 
 
 def load_register(run: Path) -> RegisterInputs | None:
@@ -86,7 +90,14 @@ def load_register(run: Path) -> RegisterInputs | None:
 
 def save_reconstruct(run: Path, inputs: ReconstructInputs) -> None:
     """Write the inputs of a reconstruction to a run's `reconstruct.json`."""
-    atomic_write_text(run / RECONSTRUCT_FILE, json.dumps(_plain(asdict(inputs)), indent=1) + "\n")
+    atomic_write_text(
+        run / RECONSTRUCT_FILE, json.dumps({"run": _plain(run), **_plain(asdict(inputs))}, indent=1) + "\n"
+    )
+
+
+def _save_inputs(run: Path, name: str, inputs: RegisterInputs | ReconstructInputs) -> None:
+    content = {"run": _plain(run), **_plain(asdict(inputs))}
+    atomic_write_text(run / name, json.dumps(content, indent=1) + "\n")
 
 
 def load_reconstruct(run: Path) -> ReconstructInputs | None:
@@ -99,18 +110,54 @@ def load_reconstruct(run: Path) -> ReconstructInputs | None:
     return _load(run / RECONSTRUCT_FILE, parsed, "%s is treated as a run without a reconstruction: %s")
 
 
-def _load(path: Path, parsed: Callable[[dict[str, Any]], _T], warning: str) -> _T | None:
+def _load(
+    path: Path, parsed: Callable[[dict[str, Any]], _T], warning: str, *, capture: Path | None = None
+) -> _T | None:
     """Parse a record; None without one, or for one that cannot be read, with this warning in the log."""
     if not path.exists():
         return None
     try:
         values = as_object(read_json(path), subject=f"file {path}")
         with values_of(path):
+            written = values.pop("run", None)
+            if written is not None:
+                before = Path(as_text(written, subject=f"{path.name}: run"))
+                values = _found_again(values, before, absolute(path.parent), capture)
             return parsed(values)
     except InputError as error:
         # An unreadable record must not block the run, whose stages can be made again without it.
         log.warning(warning, path.parent, error)
         return None
+
+
+def _found_again(value: Any, written: Path, run: Path, capture: Path | None) -> Any:
+    """Return a value whose absolute paths are looked for where they lie now, if they are not there any more.
+
+    Run and inputs that were moved together still lie beside each other. A capture that was moved alone is named by the
+    user; a file in it is the same file if a stage of the build has recorded its SHA-256.
+
+    Args:
+        written: folder of the run when the record was written.
+        run: folder of the run now.
+        capture: folder of the capture now; None: not known.
+    """
+    if isinstance(value, dict):
+        return {key: _found_again(one, written, run, capture) for key, one in value.items()}
+    if not isinstance(value, str) or not os.path.isabs(value) or os.path.exists(value):
+        return value
+    beside = os.path.normpath(run / os.path.relpath(value, written))
+    if os.path.exists(beside):
+        return beside
+    # The longest end of the path that is a file of the capture.
+    ends = (
+        () if capture is None else (capture.joinpath(*Path(value).parts[k:]) for k in range(1, len(Path(value).parts)))
+    )
+    file = next((end for end in ends if end.is_file()), None)
+    if file is None:
+        return value
+    manifests = [read_manifest(run / stage) or {} for stage in BUILD_STAGES]
+    known = {digest for manifest in manifests for digest in manifest.get("inputs", {}).values()}
+    return str(file) if sha256_file(file) in known else value
 
 
 def _plain(value: Any) -> Any:

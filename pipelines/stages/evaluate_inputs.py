@@ -31,7 +31,7 @@ def input_protocol(run: Path, capture: Capture) -> InputProtocol:
         InputError: a statement that docs/captures.md does not define.
     """
     declared = DeclaredInputs.of(capture)
-    build = load_build(run)
+    build = load_build(run, capture=capture.root)
     parameters, stage = parameters_in_run(declared, run, path_of_params(capture.recording.params))
     # The template may have been built with other parameters than those the views are read with. Figures then depend on
     # both, and the protocol is mixed.

@@ -148,8 +148,8 @@ def test_a_build_is_remembered_and_what_is_gone_left_out(tmp_path, caplog):
     motion.unlink()
     assert load_build(tmp_path) == (replace(inputs, motion=None), config)
     good = json.loads((tmp_path / "build.json").read_text())
-    wrong: list[object] = [{}, [], 3, "words", {"config": 1, "inputs": 2}]
-    for part in good:
+    wrong: list[object] = [{}, [], 3, "words", {"config": 1, "inputs": 2}, {**good, "run": [1]}]
+    for part in ("inputs", "config"):
         wrong.append({**good, part: []})
         wrong += [{**good, part: {**good[part], name: [[1]]}} for name in good[part]]
     for content in wrong:

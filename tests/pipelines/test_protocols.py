@@ -18,6 +18,7 @@ from avatar.training.presets import training_preset
 from avatar.training.recipe import STEPS, Recipe
 from pipelines.cli import main
 from pipelines.commands.build import Build
+from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import SCHEMA
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from pipelines.stages.evaluate_inputs import input_protocol
@@ -200,6 +201,32 @@ def test_files_of_a_protocol_are_what_its_name_says(root, tmp_path):
     assert input_protocol(scan, open_capture(root, protocol="exact")).name == "exact"
     driven = input_protocol(tmp_path / "tracked", open_capture(root, protocol="exact"))
     assert (driven.name, driven.parameters) == ("mixed", "mixed")
+
+
+def test_figures_keep_their_protocol_where_run_and_capture_are_moved(root, tmp_path):
+    """Labels and parameters were "not known" after a folder was renamed, and everything was measured anew."""
+    place = tmp_path / "place"
+    place.mkdir()
+    root = root.rename(place / "capture")
+    run = run_of(place / "run", root, "tracked")
+    before = input_protocol(run, open_capture(root, protocol="tracked"))
+    assert (before.name, before.labels) == ("tracked", "estimated")
+    # Both together.
+    place = place.rename(tmp_path / "renamed")
+    run, root = place / "run", place / "capture"
+    assert input_protocol(run, open_capture(root, protocol="tracked")) == before
+    assert load_build(run)[0].scan == root / "scans" / "scan_000000.ply"
+    # The capture alone: its files are the same if a stage of the build has seen their content.
+    root = root.rename(tmp_path / "elsewhere")
+    assert input_protocol(run, open_capture(root, protocol="tracked")).labels == "not known"
+    (run / "20_segment").mkdir()
+    seen = {"label_maps/Ring0": sha256_file(root / "labels_estimated" / "Ring0" / "Ring0_label000000.png")}
+    seen["params"] = sha256_file(root / "params" / "params_noisy.npz")
+    (run / "20_segment" / "manifest.json").write_text(json.dumps({"schema": SCHEMA, "inputs": seen}))
+    assert input_protocol(run, open_capture(root, protocol="tracked")) == before
+    for file in (root / "labels_estimated").rglob("*.png"):
+        file.write_bytes(b"other labels")
+    assert input_protocol(run, open_capture(root, protocol="tracked")).labels == "not known"
 
 
 def test_what_a_capture_says_of_a_file_goes_before_the_name_of_a_protocol(root, tmp_path):
