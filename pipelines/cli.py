@@ -17,6 +17,7 @@ from rich.logging import RichHandler
 from rich.table import Table
 from rich.text import Text
 
+from pipelines.commands.help import alike, checked_arguments, command_help
 from pipelines.commands.terminal import OutputError, end_of_output, error_in_words, print_error, standard_streams
 from pipelines.runs.folders import refuse_old_run
 from smplxpp import __version__
@@ -191,8 +192,13 @@ def _answer(args: list[str], console: Console) -> int:
             _print_help(args[0])
             return 0
         groups = [n for n in COMMANDS if n.split()[0] == args[0]]
+        # Of a group its second word is compared, because the first is right.
+        asked, word = (" ".join(args[:2]), args[1]) if len(args) > 1 and groups else (args[0], args[0])
+        meant = alike(word, [n.split()[-1] for n in groups] or COMMANDS)
+        hint = f"; did you mean {meant}?" if meant else ""
         known = ", ".join(groups or COMMANDS)
-        console.print(Text("error: ", style="red") + Text(f"no command {' '.join(args[:2])!r}; known: {known}"))
+        answer = Text(f"no command {asked!r}{hint}{' Known' if hint else '; known'}: {known}")
+        console.print(Text("error: ", style="red") + answer)
         return USER_ERROR
     # Log lines and warnings go to standard error, so that standard output holds the answer alone.
     rest = args[len(name.split()) :]
@@ -231,7 +237,7 @@ def _run(name: str, args: list[str]) -> int:
     """Parse the options of a command, run it, and print its answer as JSON if asked for.
 
     Raises:
-        InputError: an option of earlier versions, a run folder of earlier versions, or an error of the command.
+        InputError: an option or a run folder of earlier versions, an unknown option, or an error of the command.
     """
     import tyro
 
@@ -245,11 +251,15 @@ def _run(name: str, args: list[str]) -> int:
         )
 
     module, cls, description = COMMANDS[name]
+    options = getattr(import_module(module), cls)
+    if any(arg in HELP for arg in args):
+        sys.stdout.write(command_help(name, options, description))
+        return 0
     command = tyro.cli(
-        getattr(import_module(module), cls),
+        options,
         prog=f"smplxpp {name}",
         description=description,
-        args=args,
+        args=checked_arguments(name, options, args),
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     # Every folder of a run that a command opens or writes comes in as one of its paths.

@@ -45,7 +45,7 @@ class Animate:
     params: Path
     """A motion: body parameters in any layout that `smplxpp params convert` reads, or a .bvh. Their shape is ignored:
     the template has one."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
     model: Literal["auto", "template", "student"] = "auto"
     """Model to draw: the textured template, or the trained student in the runtime. auto: the student where the run has

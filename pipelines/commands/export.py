@@ -138,7 +138,7 @@ class Export:
     step: int = 1
     """Of what moves: take every step-th row."""
     fps: OptionalFloat = None
-    """Frames a second of --params, for a file that states none or a wrong rate (None: as it says)."""
+    """Frames a second of --params, for a file that states none or a wrong rate (default: as it says)."""
     cloth: ClothMode = "simulate"
     """What moves loose clothes in splats and OBJ files of --params: a simulation, the joints alone, or (splats) the
     student's own field."""

@@ -31,28 +31,29 @@ class ParamsConvert:
     layout: LayoutName = "auto"
     """Layout of the input; auto tells it by its keys. 4D-Dress is smplx, THuman4 is avatarrex."""
     body: OptionalPath = None
-    """Body model file that the parameters will pose; EasyMocap and TalkBody4D need its root joint (None: open body)."""
+    """Body model file that the parameters will pose; EasyMocap and TalkBody4D need its root joint. Default: the
+    open body."""
     frames: OptionalText = None
-    """Frames to keep, as START:STOP or START:STOP:STEP, which divides the frames a second (None: all)."""
+    """Frames to keep, as START:STOP or START:STOP:STEP, which divides the frames a second (default: all)."""
     fps: OptionalFloat = None
-    """Frames a second of the input, for a file that states none or a wrong rate (None: as it says)."""
+    """Frames a second of the input, for a file that states none or a wrong rate (default: as it says)."""
     person: OptionalInt = None
     """Id of the person, for files with several."""
     up: UpAxis | None = None
-    """Axis that points up in the input; the output has y up. None: as the input states, z for AMASS, -y for TalkBody4D,
-    for a .bvh that along which its skeleton stands at rest, else y."""
+    """Axis that points up in the input; the output has y up. By default as the input states, z for AMASS, -y for
+    TalkBody4D, for a .bvh that along which its skeleton stands at rest, else y."""
     joint_map: OptionalPath = None
     """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
     whose: Whose = "auto"
     """Whose parameters the input has. auto: as its counts and keys tell. body: those of --body. Parameters of SMPL,
     SMPL-H or SMPL-X are brought to the open body without their shape, as a start for a registration."""
     betas: OptionalInt = None
-    """Number of leading betas to keep, for a body that has no more; the lost share is logged (None: all)."""
+    """Number of leading betas to keep, for a body that has no more; the lost share is logged (default: all)."""
     joints: OptionalPath = None
     """Also write an npz of SMPL's 22 joints of the posed body (`joints`, frames x 22 x 3, metres, and `joint_names`):
     of the open body by a regressor, so that joint errors compare with those of SMPL's fits."""
     flat_hand_mean: bool | None = None
-    """Whether the hands are complete without the model's mean hand (None: as the layout implies)."""
+    """Whether the hands are complete without the model's mean hand (default: as the layout implies)."""
     json: bool = False
     """Print the summary as JSON."""
 

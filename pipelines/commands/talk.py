@@ -36,7 +36,7 @@ class Talk:
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|BUNDLE")]
     """Folder that `smplxpp train` wrote, or a bundle NAME.avatar; a motion needs no student."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH", help_behavior_hint="(optional)")] = None
+    out: OptionalPath = None
     """Result: .mp4, a film with sound; .npz, body parameters for `animate`, `web` and `export`."""
     web: OptionalPath = None
     """Write a page that plays it with its sound: NAME.html, one file that opens from disk, or a folder for any host."""

@@ -6,6 +6,8 @@ import errno
 import os
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
@@ -183,11 +185,47 @@ def _redirect_to_nothing(stream: TextIO) -> None:
         os.close(nothing)
 
 
+EVERY_SECONDS = 30.0
+"""Seconds between two lines of progress where the output is no terminal, as in the log of a job."""
+
+
+@contextmanager
+def _shown(bar: Progress) -> Iterator[Progress]:
+    """Show a bar; where the output is no terminal, a line from time to time in its place.
+
+    The line is written by a thread of its own, because a long step calls nobody.
+    """
+    if bar.disable or bar.console.is_terminal:
+        with bar:
+            yield bar
+        return
+    done, began = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        while not done.wait(EVERY_SECONDS):
+            for task in bar.tasks:
+                share = f"{100 * task.completed / task.total:.0f} %" if task.total else ""
+                parts = (task.description, share, task.fields.get("figures", ""), _minutes(time.monotonic() - began))
+                bar.console.print("  ".join(filter(None, parts)), soft_wrap=True, highlight=False, markup=False)
+
+    thread = threading.Thread(target=tell, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield bar
+    finally:
+        done.set()
+        thread.join()
+
+
+def _minutes(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d} min"
+
+
 @contextmanager
 def stage_progress(count: int, *, enabled: bool = True) -> Iterator[Callable[[str, bool], None]]:
     """Show a bar over `count` stages; yields `step(name, done)` to call before (False) and after (True) each."""
     columns = (SpinnerColumn(), TextColumn("{task.description:<14}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not enabled) as progress:
+    with _shown(Progress(*columns, console=Console(stderr=True), disable=not enabled)) as progress:
         task = progress.add_task("start", total=count)
 
         def step(name: str, done: bool) -> None:
@@ -216,12 +254,14 @@ def training_progress(
     )
     psnr: float | None = None  # of the last evaluation that measured it
     psnr_held_out = held_out
-    bar = Progress(*columns, console=Console(stderr=True), disable=not enabled, speed_estimate_period=20.0)
+    console = Console(stderr=True)
+    bar = Progress(*columns, console=console, disable=not enabled, speed_estimate_period=20.0)
     task = bar.add_task(name, total=total, figures="")
 
     def show(state: TrainingProgress) -> None:
         nonlocal psnr, psnr_held_out
-        bar.start()  # not before: a training that stands reports nothing
+        if console.is_terminal:
+            bar.start()  # not before: a training that stands reports nothing
         if state.evaluation is not None:
             psnr = state.evaluation["mean"].get("psnr", psnr)
             psnr_held_out = state.evaluation.get("held_out", held_out)
@@ -234,6 +274,10 @@ def training_progress(
             figures.append(f"PSNR {psnr:.2f} dB {'held out' if psnr_held_out else 'in training'}")
         bar.update(task, completed=state.iteration, total=state.iterations, figures="  ".join(figures))
 
+    if not console.is_terminal:
+        with _shown(bar):
+            yield show
+        return
     try:
         yield show
     finally:
@@ -245,7 +289,7 @@ def shared_progress(*, enabled: bool = True) -> Iterator[ProgressCallback]:
     """Show a bar that fills once for each step of the work; yields the callback that moves it."""
     name = TextColumn("{task.description:<14}")
     columns = (SpinnerColumn(), name, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not enabled, transient=True) as progress:
+    with _shown(Progress(*columns, console=Console(stderr=True), disable=not enabled, transient=True)) as progress:
         task = progress.add_task("start", total=1.0)
 
         def show(step: str, share: float) -> None:

@@ -82,7 +82,7 @@ class View:
     params: OptionalPath = None
     """Motion to go through, in any layout that `smplxpp params convert` reads; by default the capture's frames."""
     fps: OptionalFloat = None
-    """Frames a second of --params, for a file that states none or a wrong rate (None: as it says)."""
+    """Frames a second of --params, for a file that states none or a wrong rate (default: as it says)."""
     lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
     """The light that the Gaussians are shown in."""
     port: int = 8080

@@ -47,7 +47,7 @@ class Web:
     params: OptionalPath = None
     """Motion of a run's avatar, any layout that `smplxpp params convert` reads; without it what training saw."""
     fps: OptionalFloat = None
-    """Frames a second of --params, for a file that states none or a wrong rate (None: as it says)."""
+    """Frames a second of --params, for a file that states none or a wrong rate (default: as it says)."""
     name: OptionalText = None
     """Name of a run's avatar; by default that of the run's folder."""
     licence: str = ""

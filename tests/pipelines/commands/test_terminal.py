@@ -7,12 +7,14 @@ import io
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from pipelines.cli import COMMANDS, main
+from pipelines.commands import terminal
 from pipelines.commands.terminal import OutputError, error_in_words, standard_streams
 from smplxpp.core.errors import InputError
 from tests.runs.stages import add_stage
@@ -144,3 +146,17 @@ def test_an_interrupt_is_quiet(monkeypatch, capsys):
     monkeypatch.setattr("pipelines.cli._run", interrupted)
     assert main(["inspect", "x"]) == 130
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_job_without_a_terminal_gets_a_line_from_time_to_time(capsys, monkeypatch):
+    monkeypatch.setattr(terminal, "EVERY_SECONDS", 0.02)
+    with terminal.stage_progress(4) as step:
+        step("20_segment", False)
+        time.sleep(0.3)  # one long step, which reports nothing
+        step("20_segment", True)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= 3 and set(lines[:3]) == {"20_segment  0 %  0:00 min"}
+    with terminal.stage_progress(4, enabled=False) as step:
+        step("20_segment", False)
+        time.sleep(0.1)
+    assert capsys.readouterr().err == ""
