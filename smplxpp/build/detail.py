@@ -20,6 +20,7 @@ from smplxpp.core import GeometryWarning, SkinWeights, TriangleMesh, require_at_
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 from smplxpp.template.template import BODY_PART, Template
 from smplxpp.template.template_arrays import fitted_regressor
+from smplxpp.texture.bake import repainted
 
 LEAST_FACES = 1000
 """Fewest faces of a level: below, the borders of clothes alone need more."""
@@ -33,6 +34,7 @@ _MARGIN = 0.03
 # Parts share faces by this power of their own. Chosen with the emphasis: at 1 hair and trousers of 2,500 faces are torn,
 # at 0.5 the face has none left at 5,000.
 _SHARE = 0.7
+_TEXELS = 1024  # a side of a level's texture; half of a template's own, as a level has half of its size on the screen
 _DIRECTIONS = ("shapedirs", "exprdirs", "posedirs")
 
 
@@ -60,7 +62,7 @@ def simplified_template(template: Template, faces: int) -> Template:
     small ones (`simplify`: edges collapsed by quadric error, borders and their vertices kept; head and hands count as
     larger than they are). A vertex of the result takes weights, expressions, and shape and pose bases of the nearest
     place on the source's faces that collapsed into it, so that upper and lower lip, or two fingers, cannot exchange
-    theirs; its colour is their mean. Joints stay where they are and follow expressions as before.
+    theirs; its colour is their mean. A texture is painted anew from the source's. Joints stay where they are and follow expressions as before.
 
     A template within the number is returned as it is.
 
@@ -79,7 +81,7 @@ def simplified_template(template: Template, faces: int) -> Template:
     faces_of = [template.part_faces(name) & shown for name in template.part_names]
     budgets = _shares(np.array([int(one.sum()) for one in faces_of]), faces)
     parts = [_simplified_part(template, *one, space) for one in zip(faces_of, budgets.tolist(), strict=True)]
-    return _joined(template, parts)
+    return repainted(_joined(template, parts), template, size=_TEXELS)
 
 
 def _shares(counts: Int64[np.ndarray, " P"], faces: int) -> Int64[np.ndarray, " P"]:
@@ -237,6 +239,7 @@ def _joined(template: Template, parts: list[_Places]) -> Template:
     surface = vertices[:count]
     return replace(
         template,
+        texture=None,
         vertices=vertices,
         faces=np.concatenate([part.mesh.faces + start for part, start in zip(parts, starts, strict=False)]),
         vertex_labels=template.vertex_labels[nearest],

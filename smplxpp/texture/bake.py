@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
@@ -11,9 +12,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from smplxpp.core import SKIN, TriangleMesh, normalize_rows, row_lengths
+from smplxpp.core.mesh_files.raw_mesh import FacePictures
 from smplxpp.template.template import BODY_PART, Template
 from smplxpp.template.texture import Texture, corner_tangents, encode_texture
-from smplxpp.texture.atlas import Atlas, Texels, texels_of
+from smplxpp.texture.atlas import Atlas, Texels, can_unwrap, texels_of, unwrap
 from smplxpp.texture.painted_scan import LabelledSurface, PaintedScan
 
 # Metres. A template lies within 1 mm of its scan except where holes were filled and layers pushed apart, its body
@@ -86,6 +88,30 @@ def bake(
     total = np.maximum(work.texels, 1)
     shares = {name: float(share) for name, share in zip(template.part_names, work.seen / total, strict=True)}
     return made, BakeReport(int(work.texels.sum()), float(work.seen.sum() / max(int(work.texels.sum()), 1)), shares)
+
+
+def repainted(level: Template, source: Template, *, size: int) -> Template:
+    """Return a coarser level of a template with a texture of its own, painted from its source's.
+
+    Args:
+        level: the level in the T-pose; without a texture.
+        source: what it is a level of; without a texture the level stays as it is, and so it does without xatlas.
+        size: texels a side.
+    """
+    texture = source.texture
+    if texture is None or not can_unwrap():
+        return level
+    pictures = FacePictures(
+        texture.uv[texture.face_uv].astype(np.float32),
+        texture.picture[source.vertex_part[source.faces[:, 0]]],
+        tuple(partial(texture.color_image, k) for k in range(len(texture.colors))),
+        (("clamp", "clamp"),) * len(texture.colors),
+    )
+    labels = source.vertex_labels[source.faces[:, 0]]
+    scan = PaintedScan(source.mesh, source.vertex_colors, labels, pictures)
+    atlas = unwrap(level, None, layout="one" if len(texture.colors) == 1 else "part")
+    made, _ = bake(level, level.vertices, atlas, scan, size=size, normals=bool(texture.normals))
+    return replace(level, texture=made)
 
 
 class _Bake:

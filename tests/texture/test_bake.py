@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
+from smplxpp.build.detail import simplified_template
 from smplxpp.core import SKIN, UPPER, TriangleMesh
 from smplxpp.core.mesh_files.raw_mesh import FacePictures, RawMesh
 from smplxpp.core.mesh_files.texture import sample_bilinear
@@ -64,6 +65,20 @@ def test_every_point_has_the_scans_colour_and_hidden_skin_that_of_bare_skin(pers
     assert 0.3 < report.seen < 0.95 and report.by_part == {"body": report.seen}
     again, _ = bake(person, posed, atlas, scan, size=512, normals=False)
     assert again.colors == texture.colors
+
+
+def test_a_level_of_detail_is_painted_anew_from_its_source(person, atlas):
+    bands = replace(person, vertex_colors=painted(person.vertices))
+    scan = PaintedScan(bands.mesh, bands.vertex_colors, np.full(len(bands.faces), SKIN.id))
+    texture, _ = bake(bands, bands.vertices, atlas, scan, size=512, normals=False)
+    level = simplified_template(replace(bands, texture=texture), 4000)
+    assert 3500 < len(level.faces) < 4500 and level.texture.size == 1024
+    face, barycentric = draw_on_surface(level.mesh, 5000)
+    uv = np.einsum("nk,nkd->nd", barycentric, level.texture.uv[level.texture.face_uv[face]])
+    found = sample_bilinear(level.texture.color_image(0), uv).astype(float)
+    points = np.einsum("nk,nkd->nd", barycentric, level.mesh.triangles[face])
+    # Faces of centimetres cut the bands' crests off by some bytes; other places of the person differ by 60.
+    assert np.abs(found - painted(points)).max(axis=1).mean() < 6
 
 
 def test_charts_do_not_overlap_stay_apart_and_keep_their_shape(person, atlas):
