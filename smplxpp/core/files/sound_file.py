@@ -26,6 +26,11 @@ REMEDY = "`ffmpeg -i INPUT -ac 1 -ar 16000 speech.wav` makes one of any recordin
 """What helps where a recording cannot be read."""
 MAX_BYTES = 1 << 30
 """Size from which a sound file is refused."""
+_LONGEST = 7200  # seconds that are read; 16 bits of two channels at 48 kHz stay below `MAX_BYTES`
+_BLOCK = 1 << 20  # samples of all channels that are converted at a time, which bounds the work space
+# Largest relative change of a rate by rounding, 18 ms in an hour: half a frame of a film. Filters of 4 to 384 kHz then
+# have thousands of taps, at worst a million, in the place of twenty times the rate.
+_DRIFT = 5e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +51,17 @@ class Sound:
         return len(self.samples) / self.rate
 
     def at_rate(self, rate: int) -> Sound:
-        """Return the sound resampled to another rate, with a low-pass filter against aliasing."""
+        """Return the sound resampled to another rate, with a low-pass filter against aliasing.
+
+        The ratio of odd rates is rounded to small numbers, within `_DRIFT`, as the length of the filter grows with them.
+        """
         if rate == self.rate or not len(self.samples):
             return Sound(self.samples, rate)
-        ratio = Fraction(rate, self.rate)
-        samples = resample_poly(self.samples.astype(np.float64), ratio.numerator, ratio.denominator)
+        ratio = _rounded(Fraction(rate, self.rate))
+        samples = resample_poly(self.samples, ratio.numerator, ratio.denominator)
+        # The last samples, which the rounding may add or lose.
+        count = -(-len(self.samples) * rate // self.rate)
+        samples = np.pad(samples[:count], (0, max(0, count - len(samples))))
         return Sound(samples.astype(np.float32), rate)
 
     def integers(self) -> np.ndarray:
@@ -58,11 +69,21 @@ class Sound:
         return np.round(np.clip(self.samples, -1.0, 1.0) * 32767.0).astype("<i2")
 
 
+def _rounded(ratio: Fraction) -> Fraction:
+    """Return a ratio of small numbers that differs by less than `_DRIFT`."""
+    most = 1000
+    while True:
+        near = ratio.limit_denominator(most) if ratio <= 1 else 1 / (1 / ratio).limit_denominator(most)
+        if abs(near / ratio - 1) <= _DRIFT:
+            return near
+        most *= 2
+
+
 def read_wave(path: str | Path) -> Sound:
     """Read a WAV file and average its channels.
 
     Raises:
-        InputError: missing, damaged or foreign; a coding other than integers and floats; NaN.
+        InputError: missing, damaged or foreign; a coding other than integers and floats; NaN; over two hours.
     """
     return sound_of_wave(read_bytes(path, subject="sound", most=MAX_BYTES), path)
 
@@ -74,7 +95,7 @@ def sound_of_wave(data: bytes, path: str | Path) -> Sound:
     if data[:4] != b"RIFF" or data[8:12] != b"WAVE":
         raise InputError(subject, expected=_EXPECTED, received="another kind of file", remedy=REMEDY)
     chunks = _chunks(data)
-    if len(chunks.get(b"fmt ", b"")) < 16 or b"data" not in chunks:
+    if len(chunks.get(b"fmt ", memoryview(b""))) < 16 or b"data" not in chunks:
         raise InputError(subject, expected=_EXPECTED, received="no description or no samples", remedy=REMEDY)
     # Format header: sample format, channels, rate, bytes per second, bytes per block, bits per sample.
     kind, channels, rate, _, block, bits = struct.unpack("<HHIIHH", chunks[b"fmt "][:16])
@@ -90,13 +111,29 @@ def sound_of_wave(data: bytes, path: str | Path) -> Sound:
             expected=f"1 to {max_channels} channels at {lowest_rate} to {highest_rate} Hz",
             received=f"{channels} at {rate} Hz in blocks of {block} bytes",
         )
-    # Drop an incomplete last block, which recorders leave when they are interrupted; (N, channels) afterwards.
+    # Drop an incomplete last block, which recorders leave when they are interrupted.
     raw = np.frombuffer(chunks[b"data"], np.uint8)
-    values = _numbers(raw[: len(raw) // block * block], kind, bits).reshape(-1, channels)
-    if not np.isfinite(values).all():
-        raise InputError(subject, expected="finite samples", received="NaN or infinity")
-    # Floats may exceed 1; the bound of 8 (18 dB) keeps damaged samples from overflowing later sums.
-    return Sound(np.clip(values.mean(axis=1), -8.0, 8.0).astype(np.float32), rate)
+    count = len(raw) // block
+    if count > _LONGEST * rate:
+        raise _too_long(subject, count / rate)
+    samples = np.empty(count, np.float32)
+    step = max(1, _BLOCK // channels)
+    for begin in range(0, count, step):
+        values = _numbers(raw[begin * block : min(begin + step, count) * block], kind, bits).reshape(-1, channels)
+        if not np.isfinite(values).all():
+            raise InputError(subject, expected="finite samples", received="NaN or infinity")
+        # Floats may exceed 1; the bound of 8 (18 dB) keeps damaged samples from overflowing later sums.
+        samples[begin : begin + step] = np.clip(values.mean(axis=1), -8.0, 8.0)
+    return Sound(samples, rate)
+
+
+def _too_long(subject: str, seconds: float) -> InputError:
+    return InputError(
+        subject,
+        expected="at most two hours",
+        received=f"{seconds / 3600.0:.2f} hours",
+        remedy="cut it into parts",
+    )
 
 
 def wave_bytes(sound: Sound) -> bytes:
@@ -107,13 +144,13 @@ def wave_bytes(sound: Sound) -> bytes:
     return b"RIFF" + struct.pack("<I", len(body)) + body
 
 
-def _chunks(data: bytes) -> dict[bytes, bytes]:
-    """Return the first chunk of each name; an interrupted recording may state sizes past its end."""
-    out: dict[bytes, bytes] = {}
-    at = 12
+def _chunks(data: bytes) -> dict[bytes, memoryview]:
+    """Return the first chunk of each name, without copies; an interrupted recording may state sizes past its end."""
+    out: dict[bytes, memoryview] = {}
+    view, at = memoryview(data), 12
     while at + 8 <= len(data):
         size = int.from_bytes(data[at + 4 : at + 8], "little")
-        out.setdefault(data[at : at + 4], data[at + 8 : at + 8 + size])
+        out.setdefault(data[at : at + 4], view[at + 8 : at + 8 + size])
         at += 8 + size + size % 2
     return out
 
@@ -133,7 +170,6 @@ def _numbers(raw: UInt8[np.ndarray, " B"], kind: int, bits: int) -> np.ndarray:
     return raw.view(f"<i{bits // 8}").astype(np.float64) / 2.0 ** (bits - 1)
 
 
-_LONGEST = 7200  # seconds that are decoded; 16 bits of two channels at 48 kHz stay below `MAX_BYTES`
 _TIMEOUT = 900  # seconds that ffmpeg may take
 
 
@@ -175,10 +211,7 @@ def read_sound(path: str | Path) -> Sound:
     if done.returncode or len(done.stdout) < 48:
         reason = words[-1] if words else "no sound in it"
         raise InputError(subject, expected=f"{name} with sound", received=f"ffmpeg: {reason}", remedy=REMEDY)
-    sound = sound_of_wave(done.stdout, path)
-    if sound.seconds > _LONGEST:
-        raise InputError(subject, expected="at most two hours", received="more", remedy="cut it into parts")
-    return sound
+    return sound_of_wave(done.stdout, path)
 
 
 def _kind(head: bytes) -> tuple[str, str] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -62,6 +63,41 @@ def test_another_rate_is_the_same_tone(rate):
     t = np.arange(len(sound.samples)) / rate
     inner = (t > 0.02) & (t < 0.48)
     np.testing.assert_allclose(sound.samples[inner], 0.5 * np.sin(2 * np.pi * 440 * t)[inner], atol=0.01)
+
+
+@pytest.mark.parametrize("given", [16001, 44099, 383_999])
+def test_odd_rates_take_no_filter_of_millions_of_taps(given):
+    """Rates without a common factor made a filter of as many taps as twenty times the rate: 7.7 million."""
+    t = np.arange(given // 2) / given
+    sound = Sound((0.5 * np.sin(2 * np.pi * 440 * t)).astype(np.float32), given)
+    tracemalloc.start()
+    other = sound.at_rate(16000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(other.samples) == -(-len(t) * 16000 // given)
+    assert peak < 8 * sound.samples.nbytes + 20e6
+    t = np.arange(len(other.samples)) / 16000
+    inner = (t > 0.02) & (t < 0.48)
+    np.testing.assert_allclose(other.samples[inner], 0.5 * np.sin(2 * np.pi * 440 * t)[inner], atol=0.01)
+
+
+@pytest.mark.parametrize(("kind", "bits", "channels"), [(1, 8, 1), (1, 16, 2), (1, 24, 2), (3, 32, 1)])
+def test_a_recording_takes_little_more_than_its_samples(tmp_path, kind, bits, channels):
+    """It took ten times the size of its file."""
+    data = coded(np.tile(TONE, 250 * channels), kind, bits)
+    (tmp_path / "a.wav").write_bytes(file_of(data, kind, bits, channels=channels))
+    tracemalloc.start()
+    sound = read_wave(tmp_path / "a.wav")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # The file, the samples, and a block of a million samples in float64 with what its conversion needs.
+    assert peak < len(data) + 1.1 * sound.samples.nbytes + 4 * (8 << 20)
+
+
+def test_recordings_over_two_hours_are_refused(tmp_path):
+    (tmp_path / "a.wav").write_bytes(file_of(bytes(4000 * 7201), 1, 8, rate=4000))
+    with pytest.raises(InputError, match=r"at most two hours, received 2\.00 hours\. Cut it"):
+        read_wave(tmp_path / "a.wav")
 
 
 @pytest.mark.parametrize(
