@@ -53,7 +53,7 @@ class Sound:
     def at_rate(self, rate: int) -> Sound:
         """Return the sound resampled to another rate, with a low-pass filter against aliasing.
 
-        The ratio of odd rates is rounded to small numbers, within `_DRIFT`, as the length of the filter grows with them.
+        The ratio of odd rates is rounded to small numbers, within `_DRIFT`, as the filter grows with them.
         """
         if rate == self.rate or not len(self.samples):
             return Sound(self.samples, rate)
