@@ -126,6 +126,7 @@ class Curves:
 
 
 _MAX_ROWS = 200_000  # of a table: 55 minutes at 60 frames a second
+_TIMECODE_RATES = (24, 25, 30, 50, 60)  # frames that the second of a timecode counts
 _INDEX_OF_NAME = {name.lower(): k for k, name in enumerate(ARKIT)}
 
 
@@ -202,17 +203,28 @@ def _floats(texts: Sequence[str], subject: str) -> np.ndarray:
 
 
 def _clock(texts: Sequence[str], subject: str) -> np.ndarray:
-    """Parse seconds, or timecodes hours:minutes:seconds:frames at 60 frames a second as Live Link Face writes them."""
+    """Parse seconds, or timecodes hours:minutes:seconds:frames.
+
+    A second counts as many frames as the highest number shows: 24, 25, 30, 50 or 60. Within a single second, which may
+    end early, it counts 60, as Live Link Face does.
+    """
     if not any(":" in text for text in texts):
         return _floats(texts, subject)
-    out = []
+    whole: list[float] = []
+    counted: list[float] = []
     for text in texts:
         found = re.fullmatch(r"\s*(\d{1,3}):(\d{1,2}):(\d{1,2})[:;.](\d{1,3}(?:\.\d{1,9})?)\s*", text)
         if not found:
             raise InputError(subject, expected="hours:minutes:seconds:frames", received=repr(text[:40]))
         hours, minutes, seconds, frames = (float(one) for one in found.groups())
-        out.append(3600.0 * hours + 60.0 * minutes + seconds + frames / 60.0)
-    return np.array(out)
+        whole.append(3600.0 * hours + 60.0 * minutes + seconds)
+        counted.append(frames)
+    most = int(max(counted)) + 1
+    rate = next((rate for rate in _TIMECODE_RATES if rate >= most), None)
+    if rate is None:
+        raise InputError(subject, expected=f"frames below {_TIMECODE_RATES[-1]}", received=f"frame {most - 1}")
+    rate = rate if len(set(whole)) > 1 else _TIMECODE_RATES[-1]
+    return np.array(whole) + np.array(counted) / rate
 
 
 def _json(path: Path, fps: float) -> Curves:

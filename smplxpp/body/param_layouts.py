@@ -14,10 +14,12 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, GeometryWarning, InputError, rotvec_from_matrix
+from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, GeometryWarning, InputError
 from smplxpp.core.files.json_file import as_numbers
+from smplxpp.core.rotations import axis_angle_rows
 
 _JOINTS = dict(POSE_BLOCKS)
+_WHOLE = (24, 52, 55)  # joints of a whole pose of SMPL, SMPL-H and SMPL-X
 _EASYMOCAP_HAND_PCA = 6
 # Largest number of radians or metres that is accepted; larger ones are damage.
 _FARTHEST = 1e6
@@ -106,11 +108,9 @@ def _read_smplx(content: Mapping[str, Any], person: int | None, *, complete_hand
     if "expressions" in content:
         values.setdefault("expression", np.asarray(content["expressions"]))
     family: Family | None = None
-    body_pose = np.asarray(content["body_pose"])
-    if body_pose.shape[-1] == 69 or body_pose.shape[-2:] == (23, 3) or body_pose.shape[-3:] == (23, 3, 3):
-        matrices = body_pose.shape[-3:] == (23, 3, 3)
-        joints = body_pose.reshape(-1, 23, *((3, 3) if matrices else (3,)))
-        values["body_pose"] = _flat_joints("body_pose", joints[:, :21])
+    body_pose = axis_angle_rows(np.asarray(content["body_pose"]), [21, 23], subject="parameter body_pose")
+    if body_pose.shape[-1] == 69:
+        values["body_pose"] = body_pose.reshape(-1, 69)[:, :63]
         family = "smpl"
     extras = {name: content[name] for name in ("fps", "flat_hand_mean", "v_shape") if content.get(name) is not None}
     if complete_hands is not None:
@@ -141,7 +141,7 @@ def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
 
     Our own files state the body that they are of and their axis (`body`, `up`), which other programs may do as well.
     """
-    poses = np.atleast_2d(np.asarray(content["poses"], dtype=np.float64))
+    poses = np.atleast_2d(axis_angle_rows(np.asarray(content["poses"], np.float64), _WHOLE, subject="poses"))
     families: dict[int, Family] = {72: "smpl", 156: "smplh", 165: "smplx"}
     family = families.get(poses.shape[-1])
     if family is None:
@@ -163,8 +163,7 @@ def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
 
 def _read_smpl(content: Mapping[str, Any], person: int | None) -> Frames:
     """SMPL as fits of images and scans write it: `pose` (72; SMPL-H 156, SMPL-X 165), `betas` or `shape`, `trans`."""
-    pose = np.atleast_2d(np.asarray(content["pose"], dtype=np.float64))
-    pose = pose.reshape(len(pose), -1) if pose.ndim == 3 else pose
+    pose = np.atleast_2d(axis_angle_rows(np.asarray(content["pose"], np.float64), _WHOLE, subject="pose"))
     families: dict[int, Family] = {72: "smpl", 156: "smplh", 165: "smplx"}
     family = families.get(pose.shape[-1])
     if family is None:
@@ -359,45 +358,6 @@ def _outer(record: Mapping[str, Any], frames: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _flat_joints(name: str, value: Any) -> np.ndarray:
-    """Return a pose block as one axis-angle row a frame.
-
-    Blocks of shape (..., joints, 3) are flattened; rotation matrices, (..., joints, 3, 3), or (..., 3, 3) of one joint,
-    become axis-angle vectors.
-
-    Raises:
-        InputError: matrices that are no rotations, or joints of six numbers, whose order the file does not tell.
-    """
-    value = np.asarray(value)
+    """Return a block of the pose as one axis-angle row a frame, whatever form it has; other arrays as they are."""
     joints = _JOINTS.get(name)
-    if not joints:
-        return value
-    if value.ndim >= 2 and value.shape[-2:] == (joints, 3) and (joints > 1 or value.ndim == 3):
-        return value.reshape(-1, 3 * joints)
-    # Three rows of numbers may be three frames of axis-angle vectors: without an axis for the joint, one matrix is
-    # only taken for one if it is a rotation.
-    single = joints == 1 and value.shape == (3, 3) and _are_rotations(value)
-    stacked = value.shape[-2:] == (3, 3) and (value.shape[-3:-2] == (joints,) or (joints == 1 and value.ndim == 3))
-    if single or stacked:
-        matrices = value.astype(np.float64).reshape(-1, joints, 3, 3)
-        if not _are_rotations(matrices):
-            raise InputError(
-                f"parameter {name}",
-                expected="rotation matrices, orthonormal with determinant 1, or axis-angle vectors",
-                received=f"other matrices of shape {value.shape}",
-            )
-        return rotvec_from_matrix(matrices).reshape(-1, 3 * joints)
-    if value.ndim >= 3 and value.shape[-2:] == (joints, 6):
-        raise InputError(
-            f"parameter {name}",
-            expected="axis-angle vectors or rotation matrices",
-            received=f"six numbers a joint, shape {value.shape}",
-            remedy="convert them with the program that wrote them: some mean the first two columns of the matrix, "
-            "others its first two rows, and the file does not tell which",
-        )
-    return value
-
-
-def _are_rotations(matrices: np.ndarray) -> bool:
-    """Whether all matrices (..., 3, 3) are rotations, within the rounding of float16."""
-    square = np.swapaxes(matrices, -1, -2) @ matrices
-    return bool(np.abs(square - np.eye(3)).max(initial=0.0) < 1e-2 and (np.linalg.det(matrices) > 0).all())
+    return axis_angle_rows(np.asarray(value), [joints], subject=f"parameter {name}") if joints else np.asarray(value)

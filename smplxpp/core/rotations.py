@@ -1,14 +1,17 @@
-"""Convert rotations between axis-angle vectors and matrices, for numpy arrays and torch tensors."""
+"""Convert rotations between axis-angle vectors and matrices, for numpy arrays and torch tensors, and read others."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
+
+from smplxpp.core.errors import InputError
 
 Array: TypeAlias = Any
 """A numpy array or a torch tensor; functions return the kind that they receive."""
@@ -57,6 +60,65 @@ def rotvec_from_matrix(matrix: Float[np.ndarray, "*N 3 3"]) -> Float64[np.ndarra
     """
     matrix = np.array(matrix, dtype=np.float64)  # a copy: scipy takes no read-only arrays
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-2] + (3,))
+
+
+def axis_angle_rows(value: np.ndarray, counts: Sequence[int], *, subject: str) -> np.ndarray:
+    """Return rotations of joints as one row of axis-angle vectors a frame, from whichever form a file has them in.
+
+    Read are (..., J, 3) vectors and matrices (..., J, 3, 3), (..., J, 9) or (..., 9 J), of one joint without its axis,
+    too: a lone (3, 3) is a matrix if it is a rotation, else three vectors. Arrays of other shapes are returned as they
+    are.
+
+    Args:
+        value: of one or more frames.
+        counts: numbers of joints J that it may have.
+        subject: name of the array, for messages.
+
+    Raises:
+        InputError: matrices that are no rotations; six or four numbers a joint, whose order a file does not tell.
+
+    Example:
+        >>> axis_angle_rows(np.eye(3), [1], subject="parameter global_orient")
+        array([[0., 0., 0.]])
+    """
+    value = np.asarray(value)
+    for joints in counts:
+        if (value.ndim > 2 and value.shape[-2:] == (joints, 3)) or (joints > 1 and value.shape == (joints, 3)):
+            return value.reshape(-1, 3 * joints)
+        stacked = value.shape[-3:] == (joints, 3, 3) or (joints == 1 and value.ndim == 3 and value.shape[1:] == (3, 3))
+        lone = joints == 1 and value.shape == (3, 3) and _are_rotations(value)
+        if stacked or lone or _numbers_a_joint(value, joints, 9):
+            matrices = value.astype(np.float64).reshape(-1, joints, 3, 3)
+            if not _are_rotations(matrices):
+                raise InputError(
+                    subject,
+                    expected="rotation matrices, orthonormal with determinant 1, or axis-angle vectors",
+                    received=f"other matrices of shape {value.shape}",
+                )
+            return rotvec_from_matrix(matrices).reshape(-1, 3 * joints)
+        for numbers, kind, reason in (
+            (6, "six numbers", "some mean the first two columns of the matrix, others its first two rows"),
+            (4, "four numbers", "some write quaternions with w first, others with w last"),
+        ):
+            if _numbers_a_joint(value, joints, numbers):
+                raise InputError(
+                    subject,
+                    expected="axis-angle vectors or rotation matrices",
+                    received=f"{kind} a joint, shape {value.shape}",
+                    remedy=f"convert them with the program that wrote them: {reason}, and the file does not tell which",
+                )
+    return value
+
+
+def _numbers_a_joint(value: np.ndarray, joints: int, numbers: int) -> bool:
+    """Whether an array has so many numbers for each joint, with an axis for the joints or in one row."""
+    return value.shape[-1:] == (joints * numbers,) or (value.ndim > 1 and value.shape[-2:] == (joints, numbers))
+
+
+def _are_rotations(matrices: np.ndarray) -> bool:
+    """Whether all matrices (..., 3, 3) are rotations, within the rounding of float16."""
+    square = np.swapaxes(matrices, -1, -2) @ matrices
+    return bool(np.abs(square - np.eye(3)).max(initial=0.0) < 1e-2 and (np.linalg.det(matrices) > 0).all())
 
 
 def rotation_between(source: Float[np.ndarray, "P 3"], target: Float[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3 3"]:

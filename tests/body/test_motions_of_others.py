@@ -135,14 +135,46 @@ def test_rotation_matrices_are_read(tmp_path, frames):
         np.testing.assert_allclose(load_params(tmp_path / "one.npz").global_orient, walked.global_orient, atol=2e-6)
 
 
-def test_what_is_no_rotation_is_named(tmp_path):
+@pytest.mark.parametrize("form", ["flat matrices", "no axis for the joint", "a joint a row", "SMPL's 23", "whole"])
+def test_rotations_of_any_shape_are_read(tmp_path, form):
+    """Shapes of estimators that were refused without a word on what they are, or taken for frames."""
+    params = walk(None).select(slice(3))
+    arrays, whole = as_matrices(params), params.as_dict()
+    if form == "flat matrices":
+        whole |= {name: arrays[name].reshape(3, -1) for name in ("global_orient", "body_pose")}
+    elif form == "no axis for the joint":
+        whole |= {"global_orient": arrays["global_orient"][:, 0], "body_pose": arrays["body_pose"]}
+    elif form == "a joint a row":
+        whole |= {"body_pose": whole["body_pose"].reshape(3, 21, 3), "global_orient": whole["global_orient"][:, None]}
+    else:
+        hands = np.tile(np.eye(3), (3, 2, 1, 1))
+        whole |= {
+            "global_orient": arrays["global_orient"],
+            "body_pose": np.concatenate([arrays["body_pose"], hands], 1),
+        }
+    if form == "whole":
+        pose = np.concatenate([whole["global_orient"], whole["body_pose"]], axis=1)
+        whole = {"pose": pose, "trans": whole["transl"], "betas": np.zeros((3, 10))}
+    np.savez(tmp_path / "m.npz", **whole)
+    read = load_params(tmp_path / "m.npz", whose="body")
+    for name in ("global_orient", "body_pose", "transl"):
+        np.testing.assert_allclose(getattr(read, name), getattr(params, name), atol=2e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda turns: 2.0 * turns, r"body_pose: expected rotation matrices"),
+        (lambda turns: turns[..., :2].reshape(-1, 21, 6), r"six numbers a joint.*first two columns"),
+        (lambda turns: turns[..., :2].reshape(-1, 126), r"six numbers a joint.*first two columns"),
+        (lambda turns: turns[..., :1, :].repeat(2, -1)[..., :4].reshape(-1, 21, 4), r"four numbers a joint.*w first"),
+    ],
+)
+def test_what_is_no_rotation_is_named(tmp_path, change, words):
     arrays = as_matrices(walk(None))
-    np.savez(tmp_path / "scaled.npz", **arrays | {"body_pose": 2.0 * arrays["body_pose"]})
-    with pytest.raises(InputError, match=r"body_pose: expected rotation matrices"):
-        load_params(tmp_path / "scaled.npz")
-    np.savez(tmp_path / "six.npz", **arrays | {"body_pose": arrays["body_pose"][..., :2].reshape(-1, 21, 6)})
-    with pytest.raises(InputError, match=r"six numbers a joint.*first two columns"):
-        load_params(tmp_path / "six.npz")
+    np.savez(tmp_path / "m.npz", **arrays | {"body_pose": change(arrays["body_pose"])})
+    with pytest.raises(InputError, match=words):
+        load_params(tmp_path / "m.npz")
 
 
 def test_a_dictionary_in_an_npy_is_read(tmp_path):

@@ -33,13 +33,13 @@ def waving(frames: int = 61) -> np.ndarray:
     return values
 
 
-def live_link(values: np.ndarray, fps: float = 30.0) -> str:
+def live_link(values: np.ndarray, fps: float = 30.0, count: int = 60) -> str:
     """As Live Link Face writes: a timecode at 60 a second, a count, names with capitals, angles of head and eyes."""
     order = [ARKIT.index(name[0].lower() + name[1:]) for name in LIVE]
     rows = [",".join(["Timecode", "BlendshapeCount", *LIVE, "HeadYaw", "LeftEyeYaw"])]
     for k, row in enumerate(values):
-        ticks = 59.0 * 60.0 + k * 60.0 / fps
-        code = f"10:59:{int(ticks // 60):02d}:{ticks % 60:06.3f}"
+        ticks = 59.0 * count + k * count / fps
+        code = f"10:59:{int(ticks // count):02d}:{ticks % count:06.3f}"
         rows.append(",".join([code, "61", *(f"{one:.8f}" for one in row[order]), "0.1", "0.2"]))
     return "\n".join(rows) + "\n"
 
@@ -49,6 +49,16 @@ def test_live_link_face_is_read_over_the_minute(tmp_path):
     curves = read_curves(tmp_path / "a.csv")
     np.testing.assert_allclose(curves.values, waving(), atol=1e-8)
     np.testing.assert_allclose(curves.times, np.arange(61) / 30.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("count", [24, 25, 30, 50])
+def test_timecodes_count_what_they_show(tmp_path, count):
+    """Frames of 24, 25 or 30 were taken for sixtieths, so that each second jumped."""
+    text = live_link(waving(), fps=count, count=count)
+    for late in (2, 1, 0):
+        text = text.replace(f"10:59:{60 + late}", f"11:00:{late:02d}")
+    (tmp_path / "a.csv").write_text(text)
+    np.testing.assert_allclose(read_curves(tmp_path / "a.csv").times, np.arange(61) / count, atol=1e-3)
 
 
 def test_audio2face_is_read_as_rows_and_as_json(tmp_path):
