@@ -223,7 +223,8 @@ def on_heel(search: Search, state: BodyState, side: str, heel: tuple[float, floa
     height, foot, toes = heel
     names = search.kinematics.body.joint_names
     index = {name: names.index(f"{side}_{name}") for name in ("hip", "knee", "ankle", "foot")}
-    hip, knee, ankle = (search.kinematics.posture(state, 0).joints[index[name]] for name in ("hip", "knee", "ankle"))
+    joints = search.kinematics.posture(state, 0).joints
+    hip, knee, ankle = (joints[index[name]] for name in ("hip", "knee", "ankle"))
     a, b, d = (float(np.linalg.norm(v)) for v in (knee - hip, ankle - knee, ankle - hip))
 
     def angles(d: float) -> np.ndarray:

@@ -79,29 +79,24 @@ def even_vertices(body: BodyModel, count: int, seed: int) -> Int64[np.ndarray, "
 def regions(body: BodyModel) -> Int64[np.ndarray, " V"]:
     """Return the region of every vertex by its joint of largest weight; the face is the part of the head before the
     ears, from brows to chin."""
-    names = np.array(body.joint_names)
-    limb = names[np.argmax(body.weights, axis=1)]
-    out = np.full(body.vertex_count, Region.TRUNK, dtype=np.int64)
-    joints = body.joint_regressor @ body.v_template
-    place = {str(name): k for k, name in enumerate(names)}
-    for k, name in enumerate(limb):
-        part = str(name).removeprefix("left_").removeprefix("right_")
-        if is_finger(part) or part in ("hand", "wrist"):
-            out[k] = Region.HAND
-        elif part in ("ankle", "foot"):
-            out[k] = Region.FOOT
-        elif part in ("hip", "knee"):
-            out[k] = Region.LEG
-        elif part in ("shoulder", "elbow"):
-            out[k] = Region.ARM
-        elif part == "neck":
-            out[k] = Region.NECK
-        elif part in ("head", "jaw") or "eye" in part:
-            out[k] = Region.SCALP
+    of_joint = np.array([_region_of(name) for name in body.joint_names], dtype=np.int64)
+    out = of_joint[np.argmax(body.weights, axis=1)]
     # The face, in fractions of the height from the head joint to the crown.
-    head = joints[place["head"]]
+    head = (body.joint_regressor @ body.v_template)[body.joint_names.index("head")]
     size = body.v_template[:, 1].max() - head[1]
     v = body.v_template
     front = (v[:, 2] > head[2] + 0.15 * size) & (v[:, 1] < head[1] + 0.52 * size)
     out[(out == Region.SCALP) & front] = Region.FACE
     return out
+
+
+def _region_of(joint: str) -> Region:
+    """Return the region of the vertices that a joint carries."""
+    part = joint.removeprefix("left_").removeprefix("right_")
+    if is_finger(part) or part in ("hand", "wrist"):
+        return Region.HAND
+    if part in ("head", "jaw") or "eye" in part:
+        return Region.SCALP
+    of_parts = {"ankle": Region.FOOT, "foot": Region.FOOT, "hip": Region.LEG, "knee": Region.LEG}
+    of_parts |= {"shoulder": Region.ARM, "elbow": Region.ARM, "neck": Region.NECK}
+    return of_parts.get(part, Region.TRUNK)
