@@ -16,22 +16,25 @@ from smplxpp.raster import visibility
 
 
 def install() -> None:
-    """Remember what is seen of a mesh from outside; before a module that imports the function by name."""
+    """Remember what is seen of a mesh from outside; before a module that imports the functions by name."""
     from smplxpp import raster
 
     raster.outer_visible_faces = visibility.outer_visible_faces = of_a_mesh(visibility.outer_visible_faces)
+    raster.outer_visible_points = visibility.outer_visible_points = of_a_mesh(visibility.outer_visible_points)
 
 
 def of_a_mesh(function: Any) -> Any:
-    """The function of a mesh and plain options, which is called once for the same bytes; arrays come back as copies."""
+    """The function of a mesh, arrays and plain options, called once for the same bytes; its array comes as a copy."""
     known: dict[tuple[Any, ...], np.ndarray] = {}
 
     @functools.wraps(function)
-    def call(mesh: TriangleMesh, **options: Any) -> np.ndarray:
-        digest = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).digest()
-        key = (digest, *sorted(options.items()))
+    def call(mesh: TriangleMesh, *arrays: Any, **options: Any) -> np.ndarray:
+        digest = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes())
+        for array in map(np.asarray, arrays):
+            digest.update(repr((array.dtype, array.shape)).encode() + array.tobytes())
+        key = (digest.digest(), *sorted(options.items()))
         if key not in known:
-            known[key] = function(mesh, **options)
+            known[key] = function(mesh, *arrays, **options)
         return known[key].copy()
 
     return call

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from smplxpp.body import load_body, load_params
 from smplxpp.build import locate
 from smplxpp.core import BACKGROUND, SKIN, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
-from smplxpp.register.locate import BodyNotFoundError, Candidate, LocatedBody
+from smplxpp.register.locate import BodyNotFoundError, Candidate, LocateConfig, LocatedBody
 from smplxpp.segment import read_labels
 
 PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
@@ -121,7 +122,9 @@ def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, scan, monkeyp
     assert shown[0] is None and set(shown[1]) == {"nose"} and len(shown) == 2
 
 
-def test_nothing_is_built_on_what_is_no_person(tmp_path):
+def test_nothing_is_built_on_what_is_no_person(tmp_path, monkeypatch):
+    few = LocateConfig(directions=6, starts=6, limbs_tried=2, candidates=2, dress_steps=5, finish_steps=5)
+    monkeypatch.setattr(locate, "locate_body", partial(locate.locate_body, config=few))
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     faces = np.array(
         [
