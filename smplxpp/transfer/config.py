@@ -95,7 +95,7 @@ class TransferConfig:
     confident: float | None = 0.015
     far: tuple[float, float] = (0.045, 0.08)
     around: tuple[float, float] = (0.015, 0.04)
-    hanging: tuple[float, float] | None = (0.2, 0.34)
+    hanging: tuple[float, float] | None = (0.2, 0.32)
     anchor_length: float = 0.06
     published: float = 0.5
     published_length: float = 0.02

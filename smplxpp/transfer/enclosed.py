@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import connected_components
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import TriangleMesh, row_lengths
-from smplxpp.core.topology import border_loops, manifold_corners
 from smplxpp.transfer.config import TransferConfig
 
 _SPACING = 0.01
@@ -22,8 +21,6 @@ _BEYOND = 0.1
 """How far a limb's axis continues past ankle and wrist, as a share of the body's extent: hems reach lower."""
 _CLOSED = 0.99
 """Least share of a turn about the axis that a ring has to make: a plane that leaves through a hem makes no ring."""
-_LEAST_TUBE = 0.1
-"""Length of the border of the narrowest empty tube, as a share of the body's extent; of the widest, three times it."""
 _KERNEL = 0.006
 """Standard deviation of the mean of weights along a limb, as a share of the body's extent (1 cm)."""
 
@@ -123,7 +120,7 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         count = sum((side > 0)[:, mesh.faces[:, c]].astype(np.int8) for c in range(3))
         cut = (count > 0) & (count < 3)
         for i in np.flatnonzero(cut.sum(axis=1) > 2):
-            for corners, single in _rings(mesh, np.flatnonzero(cut[i]), side[i], axis, int(i), others):
+            for corners, single in rings_about(mesh, np.flatnonzero(cut[i]), side[i], axis, int(i), others):
                 # A vertex of a cut face counts the more, the nearer it lies to the plane.
                 near = step / (np.abs(side[i, corners]) + 0.05 * step)
                 (alone if single else other)[k, corners] += near
@@ -197,7 +194,7 @@ def _continue_to_hems(
         open_rows = open_rows & (share == 0)
 
 
-def _rings(
+def rings_about(
     mesh: TriangleMesh, cut: np.ndarray, side: np.ndarray, axis: LimbAxis, index: int, others: list[LimbAxis]
 ) -> Iterator[tuple[np.ndarray, bool]]:
     """Yield the vertices (n,) of faces of each ring that goes around an axis, and whether it goes around it alone.
@@ -233,65 +230,11 @@ def _rings(
     # Another axis is within the ring if that goes around it, too, be it with a gap where the plane grazes a hem.
     shared = np.zeros(count, dtype=bool)
     for other in others:
-        for at in _piercings(other.whole, point, tangent):
+        for at in piercings(other.whole, point, tangent):
             turn = np.abs(np.bincount(ring, _angle(start - at, end - at, tangent), minlength=count))
             shared |= turn > np.pi
     for k in np.flatnonzero(around):
         yield np.unique(faces[ring == k]), not shared[k]
-
-
-def empty_tubes(mesh: TriangleMesh, axes: list[LimbAxis], size: float) -> Bool[np.ndarray, " N"]:
-    """Return the vertices of tubes that no limb is in, such as the sleeves of a coat over the shoulders.
-
-    A tube starts at a border loop. Loops of equal distance from it along the surface stay about as long as it and hold
-    no axis, over at least half their length; about a hole they grow, on a sheet they shrink.
-    """
-    empty = np.zeros(mesh.vertex_count, dtype=bool)
-    edges = mesh.edges
-    lengths = row_lengths(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]])
-    graph = coo_matrix((lengths, edges.T), shape=(mesh.vertex_count,) * 2).tocsr()
-    faces, vertex = manifold_corners(mesh.faces)
-    for loop in (vertex[border] for border in border_loops(faces)):
-        around = float(row_lengths(np.diff(mesh.vertices[loop], axis=0, append=mesh.vertices[loop[:1]])).sum())
-        if not _LEAST_TUBE * size < around < 3 * _LEAST_TUBE * size or _holds_an_axis(mesh.vertices[loop], axes):
-            continue
-        distance = dijkstra(graph, directed=False, indices=loop, min_only=True, limit=around)
-        depth = 0.0
-        for level in np.arange(0.1, 1.0, 0.05) * around:
-            ring = mesh.vertices[edges[((distance < level)[edges]).sum(axis=1) == 1]].mean(axis=1)
-            # The ring's length, as that of the circle which its points would lie on.
-            if len(ring) < 3 or _holds_an_axis(ring, axes):
-                break
-            spread = 2 * np.pi * np.sqrt(((ring - ring.mean(axis=0)) ** 2).sum(axis=1).mean())
-            if not 0.5 * around < spread < 1.5 * around:
-                break
-            depth = level
-        if depth > 0.5 * around:
-            empty |= distance <= depth
-    return empty
-
-
-def unworn_arms(
-    mesh: TriangleMesh, axes: list[LimbAxis], found: Enclosure, size: float, config: TransferConfig, joint_count: int
-) -> Bool[np.ndarray, " J"]:
-    """Return the joints (J,) of arms that are in no sleeve, where the part has an empty one."""
-    names = config.joint_names or JOINT_NAMES.get(joint_count, ())
-    out = np.zeros(joint_count, dtype=bool)
-    # The arms are the third and the fourth axis; fingers belong to their side's arm.
-    bare = [side for k, side in ((2, "left_"), (3, "right_")) if not (found.limb == k).any()]
-    if bare and empty_tubes(mesh, axes, size).any():
-        kept = ("hip", "knee", "ankle", "foot", "collar", "eye")
-        for k, name in enumerate(names):
-            out[k] = name.startswith(tuple(bare)) and not any(word in name for word in kept)
-    return out
-
-
-def _holds_an_axis(ring: np.ndarray, axes: list[LimbAxis]) -> bool:
-    """Return whether an axis pierces the plane of a ring's points within the middle of the ring."""
-    centre = ring.mean(axis=0)
-    normal = np.linalg.svd(ring - centre, full_matrices=False)[2][2]
-    radius = np.median(row_lengths(ring - centre))
-    return any((row_lengths(_piercings(axis.points, centre, normal) - centre) < radius).any() for axis in axes)
 
 
 def _crossing(vertices: np.ndarray, side: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -300,7 +243,7 @@ def _crossing(vertices: np.ndarray, side: np.ndarray, a: np.ndarray, b: np.ndarr
     return vertices[a] + t[:, None] * (vertices[b] - vertices[a])
 
 
-def _piercings(points: np.ndarray, point: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+def piercings(points: np.ndarray, point: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     """Return where a polyline crosses the plane."""
     side = (points - point) @ tangent
     k = np.flatnonzero((side[:-1] > 0) != (side[1:] > 0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.transfer.anchors import smooth_step
@@ -17,8 +17,34 @@ _HALF = 1.6
 """Cone of a skirt (distance off the legs by height below the waist) of which the legs have at most a half."""
 _RING = 0.02
 """Height of the bins over which distances are averaged, as a share of the body's extent (4 cm)."""
+_TOUCHES = 0.01
+"""Distance within which cloth touches the skin, as a share of the body's extent (2 cm)."""
+_TOP = 0.1
+"""Share of a component's height from which it hangs."""
 _LEG_SHARE = 0.05
 """Share of a component that rings about one leg alone hold from which on it counts as trousers."""
+
+
+def hung_from_top(
+    vertices: Float[np.ndarray, "N 3"],
+    component: Int[np.ndarray, " N"],
+    distance: Float[np.ndarray, " N"],
+    trunk: LimbAxis,
+    size: float,
+) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """Return the top tenth of components that touch the skin nowhere, and all of their vertices.
+
+    A beard stands off the chest by less than off the jaw from which it hangs, so that the nearest skin is not what
+    carries it. Up is from the pelvis to the head.
+    """
+    nearest = np.full(component.max() + 1, np.inf)
+    np.minimum.at(nearest, component, distance)
+    hangs = nearest[component] > _TOUCHES * size
+    height = vertices @ (trunk.points[-1] - trunk.points[0])
+    low, high = np.full((2, len(nearest)), np.inf)
+    np.minimum.at(low, component, height)
+    np.minimum.at(high, component, -height)
+    return hangs & (height >= (-high - _TOP * (-high - low))[component]), hangs
 
 
 def leg_bound(

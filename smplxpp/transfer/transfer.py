@@ -36,12 +36,17 @@ from smplxpp.transfer.correspond import (
     settle_unmatched,
     vertex_components,
 )
-from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes, unworn_arms
+from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes
 from smplxpp.transfer.extend import extend_weights, sample_weights
-from smplxpp.transfer.hanging import bounded_legs, leg_bound
+from smplxpp.transfer.hanging import bounded_legs, hung_from_top, leg_bound
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 from smplxpp.transfer.rigid import rigid_weights
+from smplxpp.transfer.unfollowed import unfollowed_arms
 
+_PUBLISHED_FAR = 0.4
+"""By how much of itself the published method's share grows where anchor weights replace those of the body nearby: the
+free end of a sari has the shoulder alone as an anchor (worst ratio of `benchmarks transfer_garments` and the embedded
+person's skirt)."""
 _LEAST_SUM = 1e-3
 """Least sum of a row's weights that is worth normalising; also the least weight that counts as following a joint."""
 
@@ -206,9 +211,9 @@ def _transferred(
         axes = limb_axes(source, weights, size, config)
         if axes:
             limbs = enclosed_by_one(target, axes, joint_count)
-            unworn = unworn_arms(target, axes, limbs, size, config, joint_count)
-            if whole and unworn.any():
-                source, weights = restrict_source(source, weights, ~unworn)
+            unfollowed = unfollowed_arms(target, axes, limbs, size, config, joint_count)
+            if whole and unfollowed.any():
+                source, weights = restrict_source(source, weights, ~unfollowed)
                 found = closest_points(source, target)
     # Find the confident vertices among the matched ones.
     limit = config.max_distance * extent(target)
@@ -220,8 +225,14 @@ def _transferred(
     matched = found.matched(max_distance=limit, max_angle=angle)
     near = min(limit, (config.confident or 0.0) * size)
     confident = found.matched(max_distance=near, max_angle=angle) & (config.confident is not None)
+    hangs = np.zeros(target.vertex_count, dtype=bool)
+    if axes:
+        # What touches the skin nowhere hangs from its top.
+        tops, hangs = hung_from_top(target.vertices, component, found.distance, axes[-1], size)
+        confident |= tops
     # Compute each vertex's own value, then smooth the values over the surface.
-    values = _values(source, weights, _Matches(target, normals, found, component, confident), allowed, size, config)
+    at = _Matches(target, normals, found, component, confident, hangs)
+    values = _values(source, weights, at, allowed, size, config)
     far_off = np.zeros(len(values))
     if limbs is not None:
         far_off = limbs.share * smooth_step(found.distance, *(k * size for k in config.around))
@@ -230,15 +241,20 @@ def _transferred(
     # Joints without weight are left out of the linear systems.
     occurring = np.flatnonzero(values.any(axis=0))
     dense = np.zeros((target.vertex_count, joint_count))
-    closer = replace(found, distance=found.distance * (1.0 - 0.7 * far_off))
+    # The angle says nothing on components without a confident vertex, such as the closed tube of a braid.
+    alone = components_without(component, confident)
+    angles = np.where(alone & (config.confident is not None), 0.0, found.angle)
+    closer = replace(found, distance=found.distance * (1.0 - 0.7 * far_off), angle=angles)
     dense[:, occurring] = _smooth(target, closer, values[:, occurring], matched, settled, size, config)
     if config.published:
         # Mix in the published method's weights. Their share rises from 1 % to 2.5 % of the source's extent off the
         # skin.
-        answer = _published(_Matches(target, normals, found, component, matched), source, weights, size, config)
+        answer = _published(replace(at, confident=matched), source, weights, size, config)
         share = config.published * smooth_step(found.distance, *(k * size for k in (0.01, 0.025)))
+        share *= 1.0 + _PUBLISHED_FAR * smooth_step(found.distance, *(k * size for k in config.far))
+        share = np.minimum(share, 1.0)
         share *= 1.0 - far_off
-        share[settled | components_without(component, matched)] = 0.0
+        share[settled | hangs | components_without(component, confident)] = 0.0
         if allowed is not None:
             # Leave out joints that the label excludes and nothing here follows, such as the hand beside a skirt.
             answer = np.where(allowed | (dense > _LEAST_SUM), answer, 0.0)
@@ -265,6 +281,7 @@ class _Matches:
         found: closest points of the source.
         component: of each vertex.
         confident: vertices that keep the weights of their closest points.
+        hangs: vertices that touch nothing and follow the confident ones alone.
     """
 
     target: TriangleMesh
@@ -272,6 +289,7 @@ class _Matches:
     found: Correspondence
     component: np.ndarray
     confident: np.ndarray
+    hangs: np.ndarray
 
 
 def _values(
@@ -307,6 +325,7 @@ def _values(
     if anchors is not None:
         far = (config.far[0] * size, config.far[1] * size)
         share = anchor_share(at.found.distance, at.found.angle, admissible_share, far=far)
+        share = np.where(at.hangs, 1.0, share)
         share[at.confident | alone] = 0.0
         values = values + share[:, None] * (anchors - values)
     if admissible is not None and alone.any():

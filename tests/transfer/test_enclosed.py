@@ -14,7 +14,8 @@ from smplxpp.people.garments.wardrobe import Case, garments_of, scan
 from smplxpp.skinning import skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.checks import extent
-from smplxpp.transfer.enclosed import empty_tubes, enclosed_by_one, limb_axes
+from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes
+from smplxpp.transfer.unfollowed import empty_tubes
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +137,23 @@ def test_a_coat_over_the_shoulders_does_not_follow_the_arms_under_it(mannequin, 
     sleeves = np.abs(case.mesh.vertices[:, 0]) > 0.4
     assert tubes[sleeves & (case.mesh.vertices[:, 1] < 0.2)].all()
     assert not tubes[np.abs(case.mesh.vertices[:, 0]) < 0.2].any()
+
+
+def test_a_poncho_follows_no_forearm_under_it(mannequin, worn):
+    """Its sides had up to 0.6 of the forearms' weight and came along as two bags."""
+    case, names = worn("poncho"), mannequin.body.joint_names
+    config = TransferConfig.for_label("outer")
+    dense = transfer_weights(case.source, mannequin.body.weights, case.mesh, config=config).dense()
+    assert dense[:, [k for k, name in enumerate(names) if "elbow" in name or "wrist" in name]].max() == 0
+    assert dense[:, names.index("left_shoulder")].max() > 0.3
+
+
+def test_a_beard_hangs_from_the_jaw_though_the_chest_is_nearer(mannequin, worn):
+    """A half of it followed neck and chest, so that it stayed behind by 6 cm when the head turned."""
+    case, names = worn("beard"), mannequin.body.joint_names
+    config = TransferConfig.for_label("hair")
+    dense = transfer_weights(case.source, mannequin.body.weights, case.mesh, config=config).dense()
+    assert dense[:, [names.index("head"), names.index("jaw")]].sum(axis=1).min() > 0.95
 
 
 @pytest.mark.parametrize("name", ["wide sleeves", "hakama", "scarf", "mini skirt"])

@@ -152,14 +152,15 @@ def test_a_forbidden_limb_is_never_followed(body, skirt):
     assert transfer_weights(mesh, weights, skirt, config=config).dense()[:, 3].max() == 0
 
 
-def test_the_published_answer_has_its_share_off_the_skin_alone(body, skirt):
+def test_the_published_answer_has_its_share_off_the_skin_alone(body):
     mesh, weights = body
+    skirt = tube(0.19, 0.1, 0.95, around=40)  # so close to the legs' sides that some of it is confident
     near = closest_points(mesh, skirt).distance < 0.01 * extent(mesh)
-    far = closest_points(mesh, skirt).distance > 0.025 * extent(mesh)
+    far = closest_points(mesh, skirt).distance > 0.08 * extent(mesh)
     assert near.any() and far.any()
     none, half, whole = (
         transfer_weights(mesh, weights, skirt, config=TransferConfig(published=share, max_influences=None)).dense()
-        for share in (0.0, 0.5, 1.0)
+        for share in (0.0, 0.35, 0.7)  # 0.7 near the skin is 0.98 far off
     )
     paper = replace(TransferConfig.paper(), max_influences=None, length_scale=TransferConfig().published_length)
     published = transfer_weights(mesh, weights, skirt, config=paper)
