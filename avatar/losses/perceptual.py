@@ -220,7 +220,9 @@ def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
     require_choice("backbone of LPIPS", backbone, ("alex", "vgg"))
     try:
         import lpips
-    except ImportError as error:
+    except ModuleNotFoundError as error:
+        if error.name not in ("lpips", "torchvision"):  # a broken package says itself what it lacks
+            raise
         raise MissingPackageError("lpips", command="pip install lpips torchvision", purpose="LPIPS") from error
     return PackagedLPIPS(lpips.LPIPS(net=backbone, verbose=False), backbone)
 

@@ -91,9 +91,13 @@ def options_of(command: type) -> list[Option]:
             if positional:
                 name, value = metavar or plain.upper(), ""
             else:
-                name, value = f"--{plain}", "" if hint is bool else metavar or _value(hint)
+                # The flag of a choice that is on by default takes it away.
+                name = f"--{'no-' if one.default is True else ''}{plain}"
+                value = "" if hint is bool else metavar or _value(hint)
             group = next((g for g, names in _NAMED.items() if plain in names), QUALITY)
             said = words.get(one.name, "")
+            if name.startswith("--no-") and one.default is True and said:
+                said = f"Leave out what is done otherwise: {said[0].lower()}{said[1:]}"
             if value == _MANY:
                 said += f" One of {', '.join(map(str, _choices(hint)))}."
             out.append(Option(name, value, said, _default(one, hint), NEED if positional or required else group))

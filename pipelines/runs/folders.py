@@ -9,7 +9,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipelines.runs.layout import ABLATION, ALL_STAGES, OLD_STAGE_NAMES
+from pipelines.runs.layout import (
+    ABLATION,
+    ALL_STAGES,
+    BUILD_FILE,
+    OLD_STAGE_NAMES,
+    RECONSTRUCT_FILE,
+    REGISTER_FILE,
+)
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.paths import absolute, read_bytes, same_place
@@ -17,6 +24,7 @@ from smplxpp.core.files.paths import absolute, read_bytes, same_place
 RUNS_OF_A_CAPTURE = "runs"
 """The one folder of a capture in which runs may lie, because no reader of captures looks there."""
 LOCK_NAME = ".lock"
+_RECORDS = (LOCK_NAME, BUILD_FILE, REGISTER_FILE, RECONSTRUCT_FILE)
 
 
 def keep_out_of_capture(out: Path, capture: Path | None, *, subject: str = "--out") -> None:
@@ -92,6 +100,7 @@ def own_run_folder(run: Path, names: Sequence[str]) -> Iterator[None]:
         InputError: the folder cannot be written, another build works in it, or its stages have old names.
     """
     refuse_old_run(run)
+    new = not run.exists()
     try:
         run.mkdir(parents=True, exist_ok=True)
         lock = open(run / LOCK_NAME, "w", opener=_at_once)
@@ -117,7 +126,24 @@ def own_run_folder(run: Path, names: Sequence[str]) -> Iterator[None]:
             # Temporary files of a killed build are incomplete, and under the lock no other process can be writing them.
             for left in run.glob(f".{name}.*"):
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
-        yield
+        try:
+            yield
+        except BaseException:
+            if new:
+                _remove_if_empty(run)
+            raise
+
+
+def _remove_if_empty(run: Path) -> None:
+    """Remove the folder of a first build that failed, unless it holds more than records of what was asked for.
+
+    A finished stage, the state of one that was stopped, a picture that tells why and the user's own files are kept.
+    """
+    left = list(run.iterdir())
+    if all(path.name in _RECORDS for path in left):
+        for path in left:
+            path.unlink()
+        run.rmdir()
 
 
 def take_file(run: Path, name: str, source: Path | None, *, read: Callable[[Path], object]) -> None:

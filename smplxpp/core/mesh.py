@@ -89,7 +89,9 @@ class TriangleMesh:
         """
         try:
             import trimesh
-        except ImportError:
+        except ModuleNotFoundError as error:
+            if error.name != "trimesh":  # a package that trimesh needs is missing, which its own words say
+                raise
             raise ImportError(
                 "TriangleMesh.to_trimesh needs trimesh, which is not installed: pip install trimesh"
             ) from None

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from smplxpp.body.layout import FACE, LEFT_HAND, MEDIAPIPE_FACE, MEDIAPIPE_POSE, RIGHT_HAND
-from smplxpp.core import InputError, MissingExtraError, require_between
+from smplxpp.core import InputError, require_between
+from smplxpp.core.lazy import import_extra
 from smplxpp.detect.detector import RELIABLE, Box, DetectedPerson, grown, inside, most_confident_first
 from smplxpp.detect.plates import cleaned
 
@@ -167,16 +168,11 @@ def mediapipe_package(purpose: str) -> Any:
     """Import mediapipe and check that its wheel has the weights.
 
     Raises:
-        MissingExtraError: not installed.
+        MissingExtraError: not installed, or it does not start.
         InputError: a version whose wheel has no weights.
     """
-    try:
-        with quiet():
-            import mediapipe
-    except ImportError as error:
-        if error.name not in (None, "mediapipe"):
-            raise MissingExtraError(f"mediapipe with {error.name}", extra="detect", purpose=purpose) from None
-        raise MissingExtraError("mediapipe", extra="detect", purpose=purpose) from None
+    with quiet():
+        mediapipe = import_extra("mediapipe", extra="detect", purpose=purpose)
     if not hasattr(mediapipe, "solutions"):
         raise InputError(
             "mediapipe",

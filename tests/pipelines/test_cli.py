@@ -16,8 +16,11 @@ import numpy as np
 import pytest
 import tyro
 
+from avatar.losses.perceptual import load_lpips
 from pipelines.cli import COMMANDS, main
 from pipelines.commands.help import EXPERT_OPTIONS, INPUT_OPTIONS, NEED, NEEDED_OPTIONS, known_options, options_of
+from pipelines.runs.folders import own_run_folder
+from smplxpp.core import InputError
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import write_ply
 from tests.runs.stages import add_stage
@@ -232,3 +235,29 @@ def test_warnings_are_words_without_lines_of_code(tmp_path, cube):
 def test_options_of_earlier_versions_that_named_the_run_are_explained(capsys, command, option):
     text = fails(capsys, command, option, "x", "--capture", "y")
     assert f"option {option}" in text and f"smplxpp {command} RUN" in text
+
+
+def test_a_first_build_that_fails_leaves_no_folder(capsys, tmp_path, cube):
+    build = ("--scan", cube, "--units", "mm")  # a person of one millimetre
+    assert "a person" in fails(capsys, "build", tmp_path / "run", *build)
+    assert not (tmp_path / "run").exists()
+    # A folder that was there before stays, and so does one with anything else than records of what was asked for.
+    (tmp_path / "kept").mkdir()
+    fails(capsys, "build", tmp_path / "kept", *build)
+    assert (tmp_path / "kept" / "build.json").is_file()
+    with pytest.raises(InputError), own_run_folder(tmp_path / "begun", ()):
+        (tmp_path / "begun" / "08_capture").mkdir()
+        raise InputError("x", expected="y", received="z")
+    assert (tmp_path / "begun" / "08_capture").is_dir()
+
+
+def test_only_a_package_that_is_missing_is_called_missing(tmp_path, monkeypatch):
+    """A library that did not load, and a package that its own package lacks, were answered with "not installed"."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("lpips", "trimesh"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        (tmp_path / f"{name}.py").write_text("import a_package_that_is_not_there")
+    with pytest.raises(ModuleNotFoundError, match="a_package_that_is_not_there"):
+        load_lpips()
+    with pytest.raises(ModuleNotFoundError, match="a_package_that_is_not_there"):
+        TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).to_trimesh()

@@ -240,8 +240,14 @@ def _ffmpeg(name: str) -> str:
         import imageio_ffmpeg
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError):  # RuntimeError: the package has no program for this machine
-        program = shutil.which("ffmpeg")
+    except (ImportError, RuntimeError) as error:  # RuntimeError: the package has no program for this machine
+        program, reason = shutil.which("ffmpeg"), error
     if program is None:
-        raise MissingExtraError("imageio-ffmpeg", extra="video", purpose=f"reading {name} (WAV needs nothing)")
+        absent = isinstance(reason, ModuleNotFoundError) and reason.name == "imageio_ffmpeg"
+        raise MissingExtraError(
+            "imageio-ffmpeg",
+            extra="video",
+            purpose=f"reading {name} (WAV needs nothing)",
+            reason="" if absent else str(reason),
+        )
     return program
