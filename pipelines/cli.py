@@ -145,6 +145,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "keypoints of a capture's images by MediaPipe or your own ONNX model",
     ),
     "params convert": ("pipelines.commands.params", "ParamsConvert", "body parameters of any known layout to ours"),
+    "params inspect": (
+        "pipelines.commands.params",
+        "ParamsInspect",
+        "what a motion holds: skeleton, frames, rate, unit, axes, what is left out, likely mistakes",
+    ),
 }
 HELP = ("-h", "--help")
 # Options of earlier versions that named the folder of the run, which is the first argument of every command now.

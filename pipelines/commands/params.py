@@ -1,4 +1,4 @@
-"""`smplxpp params convert`: body parameters of any known layout to ours."""
+"""`smplxpp params convert` and `inspect`: body parameters of any known layout to ours; what a motion holds."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from pathlib import Path
 import numpy as np
 import tyro
 from jaxtyping import Float64
+from rich.console import Console
 
 from pipelines.commands.driving import BVH, Driving
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from smplxpp.body import LayoutName, UpAxis, Whose, detect_layout, load_body, load_params, smpl_joints
+from smplxpp.body.bvh_params import read_joint_map
+from smplxpp.body.motion_facts import inspect_motion
 from smplxpp.body.smpl_joints import BODY_JOINTS, is_open_body
+from smplxpp.body.smpl_params import FAMILY_NAMES
 from smplxpp.core import BodyParams, InputError, require_positive
 from smplxpp.core.files.array_file import write_arrays
 
@@ -98,6 +102,60 @@ class ParamsConvert:
         """Return SMPL's joints of the posed body, which are a model's own in its family."""
         body = load_body(self.body)
         return smpl_joints(body, params) if is_open_body(body) else body.forward(params).joints[:, : len(BODY_JOINTS)]
+
+
+@dataclass(frozen=True)
+class ParamsInspect:
+    """Options of the command."""
+
+    input: tyro.conf.Positional[Path]
+    """Body parameters in any layout that `params convert` reads, a folder of numbered frames, or a .bvh."""
+    body: OptionalPath = None
+    """Body model file that shall move; by default the open body."""
+    person: OptionalInt = None
+    """Id of the person, for files with several."""
+    up: UpAxis | None = None
+    """Axis that points up in the input, where it is not the one that is found."""
+    joint_map: OptionalPath = None
+    """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
+    json: bool = False
+    """Print the facts as JSON."""
+
+    def run(self) -> dict:
+        """Say what the motion holds; prints it unless `json`."""
+        facts = inspect_motion(
+            self.input,
+            body=None if self.body is None else load_body(self.body),
+            joint_map=None if self.joint_map is None else read_joint_map(self.joint_map),
+            person=self.person,
+            up=self.up,
+        )
+        report = {"input": str(self.input), **facts.as_dict()}
+        if not self.json:
+            for line in _in_words(report):
+                Console().print(line, markup=False, highlight=False, soft_wrap=True)
+        return report
+
+
+def _in_words(report: dict) -> list[str]:
+    rate = "no rate stated" if report["fps"] is None else f"{report['fps']:g} a second"
+    whose = f", parameters of {FAMILY_NAMES[report['family']]}" if report["family"] else ""
+    lines = [
+        f"{report['input']}: {report['kind']}{whose}, {report['frames']} frames, {rate}, {report['seconds']:.2f} s"
+    ]
+    lines += [f"unit      {report['unit']}", f"up        {report['up']}"]
+    skeleton = report["skeleton"]
+    if "joints" in skeleton:
+        lines += [f"rest      {skeleton['rest']}"]
+        body = {ours: own for ours, own in skeleton["joints"].items() if ours[-1] not in "123"}
+        lines += [f"  {ours:15} {' + '.join(theirs)}" for ours, theirs in body.items()]
+        lines.append(f"fingers   {len(skeleton['joints']) - len(body)} joints")
+        lines += [f"missing   {', '.join(skeleton['missing'])}"] if skeleton["missing"] else []
+    for name, value in report["ranges"].items():
+        shown = ", ".join(f"{k} {v:g}" for k, v in value.items()) if isinstance(value, dict) else value
+        lines.append(f"{name:15} {shown}")
+    lines += [f"left out  {one}" for one in report["left_out"]]
+    return [*lines, *(f"look at   {one}" for one in report["mistakes"])]
 
 
 def _parse_frames(text: str | None) -> slice:

@@ -101,7 +101,7 @@ def load_bvh(
     motion = motion if fps is None else replace(motion, fps=fps)
     joints = named_joints(motion, joint_map, subject=f"motion {path}")
     found = matched_skeleton(motion, joints, up=up)
-    _warn_of_stretching(motion, joints, str(path))
+    warn_of_stretching(motion, joints, str(path))
     if found.left_out:
         more = f" and {len(found.left_out) - _NAMED} more" if len(found.left_out) > _NAMED else ""
         warnings.warn(
@@ -130,9 +130,10 @@ def matched_skeleton(motion: BvhMotion, joints: Mapping[str, int], *, up: str | 
     """
     reference = reference_pose(motion, joints)
     tree = Tree(motion.names, motion.parents, reference.rest)
-    taken = {name: tuple(motion.names[k] for k in _path(tree, joints, name)) for name in joints}
+    taken = {name: tuple(motion.names[k] for k in _path(tree, joints, name)) for name in OURS if name in joints}
     if not any(f"spine{k}" in joints for k in (1, 2, 3)):
-        taken["spine"] = tuple(motion.names[k] for k in spine_of(tree, joints))
+        spine = tuple(motion.names[k] for k in spine_of(tree, joints))
+        taken = {"pelvis": taken.pop("pelvis"), "spine": spine, **taken}
     # Turns of joints above those that are matched are composed into them; of all others those that move are left out.
     carried = {above for joint in joints.values() for above in tree.above(joint)}
     moved = Rotation.from_matrix(
@@ -150,7 +151,7 @@ def matched_skeleton(motion: BvhMotion, joints: Mapping[str, int], *, up: str | 
     )
 
 
-def _warn_of_stretching(motion: BvhMotion, joints: Mapping[str, int], source: str) -> None:
+def warn_of_stretching(motion: BvhMotion, joints: Mapping[str, int], source: str) -> None:
     """Warn of bones below the pelvis that change their length, which a body's cannot."""
     above, joint = set(), joints["pelvis"]
     while joint >= 0:

@@ -140,6 +140,22 @@ def family_of_params(path: str | Path, *, layout: LayoutName = "auto") -> Family
     Raises:
         InputError: as `load_params`.
     """
+    frames = _first_frames(path, layout)
+    return None if frames is None else frames.family
+
+
+def up_of_params(path: str | Path) -> str:
+    """Return the axis that points up in a file, as "z" or "-y": what it states, or what its layout defines.
+
+    Raises:
+        InputError: as `load_params`.
+    """
+    frames = _first_frames(path, "auto")
+    return (None if frames is None else frames.up) or _OWN_UP.get(detect_layout(path)) or "y"
+
+
+def _first_frames(path: str | Path, layout: LayoutName) -> Frames | None:
+    """Return the frames of the first file of a path as they stand there; None for a frame without people."""
     file = _frame_files(Path(path))[0]
     content, source = _content(file), f"file {file}"
     content, _ = with_valid_frames(content)
@@ -151,8 +167,7 @@ def family_of_params(path: str | Path, *, layout: LayoutName = "auto") -> Family
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)  # given when the file is read for use
-        frames = _read_content(content, name, None, source)
-    return None if frames is None else frames.family
+        return _read_content(content, name, None, source)
 
 
 def _read_parts(path: Path, layout: str, person: int | None, *, filled: list[int] | None) -> tuple[list[Frames], str]:
