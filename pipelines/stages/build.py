@@ -113,7 +113,7 @@ PARTS: dict[str, _Part] = {
             *(layout.CLEAN_STAGE, layout.TRANSFER_STAGE, layout.UNPOSE_STAGE),
         ),
         settings=("clearance_mm", "fill_holes", "texture_size", "texture_layout", "normal_map"),
-        files=("body", "scan"),
+        files=("body", "scan", "photographs", "cameras"),
         writers=("smplxpp.export.gltf", "smplxpp.export.obj"),
     ),
     layout.VALIDATE_STAGE: _Part(

@@ -13,6 +13,7 @@ from smplxpp.assemble import FilledHoles, FillHolesConfig, body_colors_from_scan
 from smplxpp.assemble.drape import drape_patches
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.body import BodyModel
+from smplxpp.build.completeness import photograph_views
 from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
 from smplxpp.build.scan import raw_scan
@@ -37,6 +38,10 @@ from smplxpp.template.template import Template
 from smplxpp.texture.atlas import can_unwrap, texture_stretch, unwrap
 from smplxpp.texture.bake import bake
 from smplxpp.texture.painted_scan import PaintedScan, pictures_of
+from smplxpp.texture.photographs import Painter, Photograph, PhotographPainter, finer_than_the_scan
+
+# Pixels of the longer side at which photographs are read: two a texel of a person that fills a 2048 texture's views.
+_LONGER_SIDE = 2400
 
 
 def assemble_parts(
@@ -139,7 +144,7 @@ def add_texture(
         params: of the scan's pose.
         scan: prepared.
         face_labels: of the scan.
-        inputs: they name the scan, whose textures are read again.
+        inputs: they name the scan, whose textures are read again, and photographs of its moment.
         config: size and layout.
         body: the model, whose file may have a layout.
 
@@ -152,23 +157,33 @@ def add_texture(
         return template, {"texture": "none: xatlas, which unwraps, is not installed (pip install xatlas)"}
     raw = raw_scan(inputs.scan) if inputs.scan is not None else None
     pictures = None if raw is None else pictures_of(raw, scan.mesh, scan.source_vertex, scan.source_face)
-    if scan.own_colors is None and pictures is None:
-        return template, {"texture": "none: the scan has no colours"}
+    views, unread = photograph_views(inputs, longer_side=_LONGER_SIDE) if pictures is None else ([], [])
+    photographs = [Photograph(camera, color) for camera, color in views]
+    if scan.own_colors is None and pictures is None and not photographs:
+        return template, {"texture": "none: neither the scan nor photographs have colours"}
     # Classes of skin of a user's own are the body's, as the built-in one is.
     skin = template.labels.kind_ids(face_labels) == SKIN.id
     painted = PaintedScan(scan.mesh, scan.colors, np.where(skin, SKIN.id, face_labels), pictures)
+    # Photographs whose pixels are coarser than the scan's vertices would blur what the scan has.
+    photographed = scan.own_colors is None or finer_than_the_scan(scan.mesh, photographs)
+    paint: Painter = painted.colors_at
+    if photographs and photographed:
+        paint = PhotographPainter(scan.mesh, photographs, painted.colors_at)
     # The inside of the mouth has a colour that no scan shows.
     mouth = (template.vertex_colors == MOUTH_COLOR).all(axis=1) & (template.scan_index < 0)
     atlas = unwrap(template, body.uv, layout=config.texture_layout)
     texture, report = bake(
         *(template, template.pose(params)[0], atlas, painted),
         size=config.texture_size,
+        paint=paint,
         fixed=mouth & (template.vertex_part == 0),
         normals=config.normal_map,
     )
     stretch, _ = texture_stretch(atlas, template.mesh)
+    source = "of the scan's texture" if pictures is not None else "of the colours of the scan's vertices"
     numbers = {
-        "texture": "of the scan's texture" if pictures is not None else "of the colours of the scan's vertices",
+        "texture": f"of {len(photographs)} photographs" if isinstance(paint, PhotographPainter) else source,
+        "texture_unread": unread,
         "texture_seen": report.by_part,
         "texture_stretch": stretch,
         "texture_texels": report.texels,

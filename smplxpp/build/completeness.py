@@ -29,6 +29,8 @@ EXPLAINED = 15e-3
 """Metres from the template within which it explains the scan."""
 OFF_BODY = 20e-3
 """Metres off the body from which skin looks like cloth."""
+_SIDES_APART = 256
+"""Pixels of a photograph's longer side at which left and right differ: in large areas, not in details."""
 _LOOKS_DOWN = -0.5
 """Vertical component of a normal below which no scanner sees the surface."""
 
@@ -165,12 +167,13 @@ def photograph_checks(
     # Without photographs, or with one colour for the whole scan, colours cannot tell an object from its mirror image.
     if not inputs.photographs or (colors == colors[0]).all():
         return [], {}
-    views, notes = _views(inputs)
+    views, notes = photograph_views(inputs, longer_side=_SIDES_APART)
     figure = template.posed_body(params).frame(0)
     center, across = sagittal_plane(template, figure.joints)
     body = template.body.mesh(figure.vertices)
     # Colours in [0, 1], as the photographs have them; the mirror image is taken across the body's sagittal plane.
-    share = mirrored_by_views(scan, colors / 255.0, views, body=body, center=center, across=across)
+    shown = [(camera, color / 255.0) for camera, color in views]
+    share = mirrored_by_views(scan, colors / 255.0, shown, body=body, center=center, across=across)
     numbers = {"views": [camera.name for camera, _ in views], "unread": notes, "mirrored": share}
     if share is None:
         return [], numbers
@@ -180,9 +183,10 @@ def photograph_checks(
     return [check], numbers
 
 
-def _views(inputs: BuildInputs) -> tuple[list[tuple[Camera, np.ndarray]], list[str]]:
-    """Small photographs (H, W, 3) in [0, 1] with their cameras, and notes on those that cannot be read."""
-    longer_side = 256  # pixels; left and right differ in large areas, not in details
+def photograph_views(
+    inputs: BuildInputs, *, longer_side: int
+) -> tuple[list[tuple[Camera, np.ndarray]], list[str]]:
+    """Return photographs (H, W, 3) uint8, no longer than a side, with their cameras; notes on those not to be read."""
     if inputs.cameras is None:
         return [], ["no camera file"]
     try:
@@ -199,7 +203,7 @@ def _views(inputs: BuildInputs) -> tuple[list[tuple[Camera, np.ndarray]], list[s
             # The window scales the intrinsics with the image, so that camera and pixels agree at the small size.
             window = Window.full(camera).resized(min(1.0, longer_side / max(camera.width, camera.height)))
             # The reader removes lens distortion, because the projection that follows is that of a pinhole.
-            views.append((window.camera(camera), ViewReader(camera, window, lens).color(path) / 255.0))
+            views.append((window.camera(camera), ViewReader(camera, window, lens).color(path)))
         except InputError as error:
             notes.append(f"camera {name}: {error}")
     return views, notes

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
@@ -17,6 +16,7 @@ from smplxpp.template.template import BODY_PART, Template
 from smplxpp.template.texture import Texture, corner_tangents, encode_texture
 from smplxpp.texture.atlas import Atlas, Texels, can_unwrap, texels_of, unwrap
 from smplxpp.texture.painted_scan import LabelledSurface, PaintedScan
+from smplxpp.texture.photographs import Painter
 
 # Metres. A template lies within 1 mm of its scan except where holes were filled and layers pushed apart, its body
 # within 15 mm where skin shows (`smplxpp.assemble.body_colors` draws the same line).
@@ -27,8 +27,6 @@ _BEYOND_RIM = 0.004
 _ROUNDS = 40
 # Texels a side of the squares within which empty texels take colours: 32 mm of the surface at 2048.
 _SQUARE = 32
-
-Painter = Callable[[Int64[np.ndarray, " T"], Float64[np.ndarray, "T 3"]], UInt8[np.ndarray, "T 3"]]
 
 
 @dataclass(frozen=True)
