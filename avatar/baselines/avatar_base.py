@@ -20,8 +20,6 @@ from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from smplxpp.core.errors import require_between
 
-POSITION_SCALE = 0.05
-"""Metres of displacement for an output of 1, as the teacher's."""
 RESIDUALS = 12
 """Outputs a Gaussian: position 3, log scales 2, quaternion 4, colour 3."""
 
@@ -87,6 +85,7 @@ class ResidualBaseline(Baseline):
 
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar as cameras with these centres, metres, see it."""
+        position_scale = 0.05  # metres of displacement for an output of 1, as the teacher's
         # Frames without a code take the null code, as the student's.
         code = self.codes([pose.frame if pose.frame in self.codes.row else None])[0]
         position, log_scales, quats, colour = self.residuals(pose, code).split((3, 2, 4, 3), dim=-1)
@@ -95,7 +94,7 @@ class ResidualBaseline(Baseline):
         bound = self.gaussians()
         bound = replace(
             bound,
-            offset=bound.offset + local_offsets(POSITION_SCALE * position, self.canonical_from_local),
+            offset=bound.offset + local_offsets(position_scale * position, self.canonical_from_local),
             log_scales=bound.log_scales + log_scales,
             quats=bound.quats + quats,
             dc=bound.dc + colour,

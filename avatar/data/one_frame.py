@@ -20,9 +20,6 @@ from smplxpp.template.template import Template
 
 FRAME = 0
 """Number of the first frame."""
-# Frames of a turn besides the reference. More of them than every 15 degrees show no other side, but have to be read and
-# kept in memory.
-_MOST_OTHERS = 23
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +37,12 @@ class PosedViews:
 
 def frames_beside(capture: Capture, frame: int) -> tuple[int, ...]:
     """Return the training frames that show other sides of a person who turns before one camera; none elsewhere."""
+    # Frames of a turn besides the reference. More of them than every 15 degrees show no other side, but have to
+    # be read and kept in memory.
+    most_others = 23
     if capture.kind != TURNTABLE:
         return ()
-    return tuple(spread([one for one in capture.splits.train_frames if one != frame], _MOST_OTHERS))
+    return tuple(spread([one for one in capture.splits.train_frames if one != frame], most_others))
 
 
 def views_of_turn(capture: Capture) -> int:

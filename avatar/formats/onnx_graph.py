@@ -11,9 +11,6 @@ import numpy as np
 
 from smplxpp.core.lazy import import_extra
 
-OPSET = 17
-"""Version of the ONNX operators."""
-
 
 class Graph:
     """A graph under construction: nodes and constants; a value is the name that a call returned.
@@ -88,6 +85,7 @@ class Graph:
             outputs: value and shape by name.
             about: metadata of the file.
         """
+        opset = 17  # version of the ONNX operators
         # An `Identity` gives each output its public name, even where one value is two outputs.
         helper, infos = self._onnx.helper, []
         for name, (value, shape) in outputs.items():
@@ -95,7 +93,7 @@ class Graph:
             infos.append(helper.make_tensor_value_info(name, self._onnx.TensorProto.FLOAT, shape))
         graph = helper.make_graph(self._nodes, self._name, self._inputs, infos, self._initializers)
         model = helper.make_model(
-            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8, producer_name="smplxpp"
+            graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8, producer_name="smplxpp"
         )
         helper.set_model_props(model, dict(about))
         self._onnx.checker.check_model(model)

@@ -20,8 +20,6 @@ from smplxpp.raster import rasterize_mesh
 from smplxpp.template.template import Template
 
 OPACITY_THRESHOLD = 0.02
-HEAD_MARGIN = 0.08
-"""Share of the head's box that is added on every side."""
 CONVENTION = (
     "Images are composited on the capture's plain background, rendered colours clamped to [0, 1]. "
     "PSNR: over pixels where mask or rendered opacity exceed 0.02. Image: over all pixels. "
@@ -151,13 +149,14 @@ def head_vertices(template: Template) -> Int[np.ndarray, " N"]:
 
 def head_box(points: Float[np.ndarray, "N 3"], camera: Camera) -> Box | None:
     """Return x0, y0, x1, y1 in pixels around projected points, a little wider; None where nothing is in the image."""
+    head_margin = 0.08  # share of the head's box that is added on every side
     # A point behind the camera has no projection, so that such a view has no box.
     x, y, depth = camera.screen_from_world(points).T[:3]
     if not (depth > 0).all():
         return None
     # Widened on every side, rounded outward to whole pixels, and cut at the image's border.
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
-    margin = HEAD_MARGIN * (high - low)
+    margin = head_margin * (high - low)
     x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int)
     x1, y1 = np.minimum(np.ceil(high + margin), (camera.width, camera.height)).astype(int)
     return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else None

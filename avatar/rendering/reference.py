@@ -17,8 +17,6 @@ from avatar.rendering.settings import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, R
 
 BLOCK = 16
 """Side in pixels of the square blocks that are blended at once."""
-FRUSTUM_MARGIN = 0.3
-"""Clamp of the point at which the projection is linearised: this share of half the image outside of its border."""
 
 
 def rasterize_reference(
@@ -129,12 +127,15 @@ def _project(
 
 def _projection_jacobian(centers: Tensor, K: Tensor, settings: RasterSettings) -> Tensor:
     """Return the (M, 2, 3) derivative of pixels by points in camera space, at `centers` clamped to a wider frustum."""
+    # Clamp of the point at which the projection is linearised: this share of half the image outside of its
+    # border.
+    frustum_margin = 0.3
     size = centers.new_tensor([settings.width, settings.height])
     focal, principal = K.diagonal()[:2], K[:2, 2]
     # Far outside of the image the affine approximation of the projection grows without
     # bound; the point at which it is taken is therefore clamped in x / z and y / z.
     # Pixels are u = f x / z + c, so du/dx = f / z and du/dz = -(f / z) (x / z).
-    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    margin = frustum_margin * 0.5 * size / focal
     z = centers[:, 2:]
     slope = torch.clamp(centers[:, :2] / z, -principal / focal - margin, (size - principal) / focal + margin)
     return torch.cat([torch.diag_embed(focal / z), (-focal * slope / z)[..., None]], dim=-1)

@@ -24,8 +24,6 @@ QUAT_NORM_MIN = 1e-12
 """Shortest quaternion; the direction of a shorter one is lost in rounding."""
 ROTATION_TOLERANCE = 1e-3
 """Largest accepted entry of R R^T - I: float32 matrices multiplied along a chain pass, a scale or a shear does not."""
-SKEW_TOLERANCE = 1e-6
-"""Skew accepted as rounding, as a share of the focal length."""
 
 _RANGES = {
     "scales": (math.ulp(0.0), math.inf),
@@ -214,11 +212,12 @@ def _check_viewmats(viewmats: np.ndarray) -> None:
 
 
 def _check_Ks(Ks: np.ndarray) -> None:
+    skew_tolerance = 1e-6  # skew accepted as rounding, as a share of the focal length
     focal, skew = Ks[:, [0, 1], [0, 1]], np.abs(Ks[:, [0, 1], [1, 0]])
     for camera in np.flatnonzero((focal <= 0).any(1))[:1]:
         received = f"{focal[camera].tolist()} in camera {camera}"
         raise InputError("Ks", expected="positive focal lengths in pixels", received=received)
-    for camera in np.flatnonzero((skew > SKEW_TOLERANCE * focal).any(1))[:1]:
+    for camera in np.flatnonzero((skew > skew_tolerance * focal).any(1))[:1]:
         raise InputError(
             "Ks",
             expected="intrinsics without skew (K[0, 1] = K[1, 0] = 0)",

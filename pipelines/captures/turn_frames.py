@@ -23,11 +23,9 @@ from smplxpp.core import InputError, spread
 from smplxpp.core.files.image_file import open_image
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-_DIAGONAL_MM = 43.27  # of a frame of 35 mm film, to which equivalent focal lengths refer
 _PHONE_MM = 27.0  # main cameras of phones, filming: 24 to 30 mm
 _UNKNOWN_LENS, _STATED_LENS = 0.25, 0.03  # standard deviations of log f
 _FFMPEG_SECONDS = 900
-_SHARPNESS_PIXELS = 256  # of a frame that is judged: finer detail is noise of the sensor, and minutes have 2000 frames
 
 
 @dataclass(frozen=True)
@@ -102,9 +100,11 @@ def decoded_frames(video: Path, folder: Path, most: int) -> list[TurnFrame]:
         MissingExtraError: imageio-ffmpeg is not installed.
         InputError: a file that is no video.
     """
+    # Of a frame that is judged: finer detail is noise of the sensor, and minutes have 2000 frames.
+    sharpness_pixels = 256
     program = ffmpeg_program()
     # All frames, small and grey, show which of them are sharp; those that are chosen are decoded whole.
-    side = _SHARPNESS_PIXELS
+    side = sharpness_pixels
     small = _ffmpeg(program, video, f"scale={side}:{side},format=gray", "-f", "rawvideo", "-")
     grey = np.frombuffer(small, np.uint8)
     chosen = sharpest_of_intervals(grey[: len(grey) // side**2 * side**2].reshape(-1, side, side), most)
@@ -180,7 +180,8 @@ def lens_of(path: Path, size: tuple[int, int], focal_mm: float | None) -> Lens:
         size: width and height in pixels.
         focal_mm: focal length as the user states it, millimetres of 35 mm film.
     """
-    pixels_a_mm = float(np.hypot(*size)) / _DIAGONAL_MM
+    diagonal_mm = 43.27  # of a frame of 35 mm film, to which equivalent focal lengths refer
+    pixels_a_mm = float(np.hypot(*size)) / diagonal_mm
     if focal_mm is not None:
         return Lens(focal_mm * pixels_a_mm, _STATED_LENS, f"stated, {focal_mm:g} mm")
     exif = open_image(path, subject="photograph").getexif().get_ifd(ExifTags.IFD.Exif)

@@ -46,7 +46,6 @@ CAMERA = "cam"
 """Name of the one camera."""
 # Of 20 frames and more every tenth is held out, so that a training can be measured; never the first, the reference.
 _HOLD_OUT_FROM, _HOLD_OUT_EVERY = 20, 10
-_TURN_SECONDS = 8.0  # in which players show a turn; photographs have no rate, and faster turns make a person spin
 
 
 @dataclass(frozen=True)
@@ -357,13 +356,14 @@ def held_out_frames(count: int, chosen: tuple[int, ...] = ()) -> tuple[int, ...]
 
 def _describe(root: Path, name: str, made: TurntableCapture) -> None:
     """Write capture.json, which says of what kind the capture is and what is not known."""
+    turn_seconds = 8.0  # in which players show a turn; photographs have no rate, and faster turns make a person spin
     held_out = made.held_out
     train = [frame for frame in range(made.frames) if frame not in held_out]
     content = {
         "name": name,
         "kind": TURNTABLE,
         "background": None,
-        "fps": made.frames / _TURN_SECONDS,
+        "fps": made.frames / turn_seconds,
         "inputs": {"parameters": "tracked"},
         "train_frames": [[frame, frame] for frame in train],
         **({"novel_pose_frames": [[frame, frame] for frame in held_out]} if held_out else {}),

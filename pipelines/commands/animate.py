@@ -31,7 +31,6 @@ from smplxpp.raster.shading import ShadeStyle
 from smplxpp.template.template import Template
 
 _FRAMING_POSES = 24  # poses that the camera is fitted to
-_PRE_ROLL = 0.7  # seconds of the motion before the first frame that loose clothes follow
 _BLOCK = 16  # frames posed at a time
 _SMALLEST = 16  # pixels of a picture
 
@@ -244,6 +243,7 @@ class Animate:
 
         That has all frames, begins a moment before the first one, and is what loose clothes follow.
         """
+        pre_roll = 0.7  # seconds of the motion before the first frame that loose clothes follow
         count = len(params)
         # Select the shown frames.
         chosen = range(count)[self.start : self.stop : self.step]
@@ -256,7 +256,7 @@ class Animate:
         # A step of n frames shows 1/n of the rate, so that the motion keeps its speed.
         fps = self.fps or (params.fps or DEFAULT_FPS) / self.step
         # Clothes begin to move before the first shown frame, so that they swing there already.
-        begin = max(0, chosen[0] - round(_PRE_ROLL * fps * self.step))
+        begin = max(0, chosen[0] - round(pre_roll * fps * self.step))
         whole = params.select(slice(begin, chosen[-1] + 1))
         return replace(params.select(list(chosen)), fps=fps), fps, whole
 

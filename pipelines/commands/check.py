@@ -35,8 +35,6 @@ from smplxpp.template.template import BODY_PART, Template
 # Chosen on templates of two real scans: a right shirt has 0.2 % of cut faces, one that is torn 2 %.
 _SHARES = {"faces that cut another": (0.0, 1.0), "needles": (0.1, 5.0)}
 _INSIDE_REST, _INSIDE_POSED, _STRETCH = (0.0, 1.0), (2.0, 10.0), (3.0, 10.0)
-_FAR_MM = 10.0
-"""Distance from which a face is coloured as off the scan: twice the threshold of the F-score."""
 # Colours of regions, the later over the earlier where both are; grey is fine.
 _GREY = (190, 190, 190)
 _PALETTE = {
@@ -202,10 +200,11 @@ class _Verdict:
 
     def check_scan(self, scan: TriangleMesh, posed: TriangleMesh) -> None:
         """Distance to the scan of what can be seen from outside."""
+        far_mm = 10.0  # distance from which a face is coloured as off the scan: twice the threshold of the F-score
         result = compare(posed, scan, config=CompareConfig(visible_only=self.template is not None, certified=True))
         self.numbers["scan"] = result.as_dict()
         assert result.pred_to_gt is not None and result.gt_to_pred is not None
-        far = point_to_surface(posed.face_centers, scan)[0] * 1e3 > _FAR_MM
+        far = point_to_surface(posed.face_centers, scan)[0] * 1e3 > far_mm
         self._add("all", "off the scan", result.pred_to_gt.mean, "mm", (2.0, 6.0), np.flatnonzero(far))
         self._add("all", "scan without a surface", result.gt_to_pred.mean, "mm", (2.0, 6.0), None)
 

@@ -20,10 +20,6 @@ from smplxpp.core.light import STUDIO, Irradiance, Relighting, panoramas
 log = logging.getLogger(__name__)
 
 
-TURNS = (0.0, 120.0, 240.0)
-"""Rotations of the light about the vertical for the report's pictures, degrees."""
-
-
 @dataclass(frozen=True)
 class Evaluate:
     """Options of `smplxpp evaluate`."""
@@ -158,8 +154,9 @@ class Evaluate:
 
     def _lights(self) -> dict[str, Relighting]:
         """Return the lights of the report's pictures by their captions."""
+        turns = (0.0, 120.0, 240.0)  # rotations of the light about the vertical for the report's pictures, degrees
         out = {}
-        for turn in TURNS:
+        for turn in turns:
             turned = replace(self.lighting, environment_turn=self.lighting.environment_turn + turn)
             # Without a panorama, turn our studio light; white light is assumed for the capture.
             lit = (self.lighting if self.lighting.environment is None else turned).relighting()

@@ -31,7 +31,6 @@ from smplxpp.metrics import CompareConfig, MeshComparison, compare, doubtful_pai
 # A folder's frames are its geometry files; arrays (which also hold labels) only where there is nothing else.
 FRAME_SUFFIXES = ((".ply", ".obj", ".glb", ".gltf", ".stl", ".off"), (".pkl",), (".npz",))
 LABEL_KEYS = ("face_labels", "vertex_labels", "labels", "label")
-PLAUSIBLE_METRES = 20.0  # bounding-box diagonal above which the units are probably wrong
 Preset = Literal["smplxpp", "pifuhd-cm", "icon-cm", "now-mm", "occnet-l1", "occnet-l2", "pytorch3d"]
 
 
@@ -107,12 +106,13 @@ class Metrics:
         return report
 
     def _compare(self, path_a: Path, path_b: Path) -> MeshComparison:
+        plausible_metres = 20.0  # bounding-box diagonal above which the units are probably wrong
         meshes, labels = [], []
         for path, given in ((path_a, self.labels_a), (path_b, self.labels_b)):
             # Convert to metres, the unit of all metrics.
             file = read_mesh(path)
             mesh = as_mesh(file.mesh, unit=self.units)
-            if mesh.bbox_diagonal > PLAUSIBLE_METRES:
+            if mesh.bbox_diagonal > plausible_metres:
                 warnings.warn(
                     f"{path} is {mesh.bbox_diagonal:.0f} m across: are its units {self.units}? See --units",
                     GeometryWarning,

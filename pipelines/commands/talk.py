@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows
-_HANGING = 0.7  # seconds of simulation before the film, in which cloth comes to rest in the first pose
 _SMALLEST = 16  # pixels, least height of a picture
 
 
@@ -188,10 +187,11 @@ class Talk:
 
     def _film(self, out: Path, bundle: AvatarBundle, motion: BodyParams, sound: Sound, notes: list[str]) -> None:
         """Draw the motion with the student and write it as a film with sound; remarks go to `notes`."""
+        hanging = 0.7  # seconds of simulation before the film, in which cloth comes to rest in the first pose
         portrait = self.view == "portrait"
         simulate = bool(bundle.garments) and self.cloth == "simulate"
         # Repeat the first pose before the film, so that simulated cloth hangs at rest when it begins.
-        lead = round(_HANGING * self.fps) if simulate else 0
+        lead = round(hanging * self.fps) if simulate else 0
         motion = BodyParams.concatenate([motion.select([0] * lead), motion]) if lead else motion
         film = StudentFilm(
             view="front" if portrait else self.view,

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from avatar.training.engine.loop import Progress as TrainingProgress
 
 STDOUT = "standard output"
-CLOSED_PIPE = 128 + 13
-"""Exit status after the reader of the output has closed its pipe: 128 + SIGPIPE, as a shell reports it."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REMEDIES = {
     errno.ENOSPC: "free some space or name a place on another disk; nothing half-written was kept",
@@ -115,8 +113,10 @@ def standard_streams() -> Iterator[None]:
 
 def end_of_output(error: OutputError, console: Console) -> int:
     """Print that standard output failed, unless its reader has closed the pipe; return the exit status."""
+    # Exit status after the reader of the output has closed its pipe: 128 + SIGPIPE, as a shell reports it.
+    closed_pipe = 128 + 13
     if error.errno == errno.EPIPE:
-        return CLOSED_PIPE
+        return closed_pipe
     print_error(error, console)
     return 2
 

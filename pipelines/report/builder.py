@@ -217,10 +217,6 @@ def _ticks(low: float, high: float, count: int) -> list[float]:
     return [round(float(t), 12) for t in np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step]
 
 
-_WORDS_BYTES = 450_000
-"""Room for words, tables and charts in a page: twice what the embedded person's page has."""
-
-
 def write_report(path: str | Path, report: Report) -> Path:
     """Write `report` to `path` as one self-contained HTML file, whole or not at all."""
     folder = resources.files("pipelines.report")
@@ -267,11 +263,12 @@ def write_report(path: str | Path, report: Report) -> Path:
 
 def _embedded(report: Report) -> dict[Picture, Embedded]:
     """Encode all pictures of a report for the room that films leave."""
+    words_bytes = 450_000  # room for words, tables and charts in a page: twice what the embedded person's page has
     pictures = list(report.hero)
     for section in report.sections:
         pictures += [*section.pictures, *(one for pair in section.comparisons for one in (pair.before, pair.after))]
     films = sum(len(film.uri) for section in report.sections for film in section.films)
-    return embed_pictures(pictures, room=PAGE_BYTES - _WORDS_BYTES - films)
+    return embed_pictures(pictures, room=PAGE_BYTES - words_bytes - films)
 
 
 def _by_stage(checks: tuple[CheckRow, ...]) -> dict[str, list[CheckRow]]:

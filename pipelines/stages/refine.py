@@ -153,20 +153,17 @@ def _work(
     return StageOutput(checks, numbers)
 
 
-SHOWN_FRAMES = 4
-"""Number of frames with pictures: those with the largest loss after refinement."""
-
-
 def write_pictures(folder: Path, sequence: AvatarSequence, found: Refinement) -> list[dict[str, str]]:
     """Write `pictures/CAM_FFFFFF.png` of the worst frames, seen by the camera that sees most of the person.
 
     Returns:
         File and title of each, the worst first.
     """
+    shown_frames = 4  # number of frames with pictures: those with the largest loss after refinement
     avatar = Student(StudentConfig(field=None), sequence.rig, found.gaussians.to(device=sequence.device), ())
     out = []
     # The stable sort keeps the order of frames with equal losses.
-    for row in np.argsort(-found.after, kind="stable")[:SHOWN_FRAMES]:
+    for row in np.argsort(-found.after, kind="stable")[:shown_frames]:
         frame = found.frames[row]
         # Choose the camera with the largest foreground.
         names = [name for name in sequence.train_cameras if sequence.capture.file(name, frame) is not None]

@@ -32,7 +32,6 @@ _SWAY = {
     "right_hip": 2.0,
 }
 _LEAN_DEGREES, _DRIFT_M = 1.0, 0.03  # standard deviation of the trunk's lean, and of its place on the floor
-_TURN_DEGREES = 345.0  # from the first frame to the last, which therefore do not show the same side
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +42,7 @@ class Turntable(SeededMotion):
 
     def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
         """Return the parameters at `times` in seconds; `fps` is stored as it is given."""
+        turn_degrees = 345.0  # from the first frame to the last, which therefore do not show the same side
         t = self.instants(times)
         rng = np.random.default_rng([self.seed, 7])
         # The performance begins at rest, so that cloth starts settled; all sway grows within half a second.
@@ -50,7 +50,7 @@ class Turntable(SeededMotion):
         pose = np.repeat(relaxed_pose()[None], len(t), axis=0)
         for name, degrees in _SWAY.items():
             pose[:, SMPLX_JOINTS.index(name)] += np.radians(degrees) * grown * wander(t, rng, hertz=0.5)
-        turn = np.radians(_TURN_DEGREES) * t / max(self.seconds, 1e-9)
+        turn = np.radians(turn_degrees) * t / max(self.seconds, 1e-9)
         lean = np.radians(_LEAN_DEGREES) * grown * wander(t, rng, hertz=0.4)
         pose[:, 0] = _rotvec_about_y_then(turn, lean)
         drift = _DRIFT_M * grown * wander(t, rng, hertz=0.2)

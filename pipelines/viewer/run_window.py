@@ -16,8 +16,6 @@ from pipelines.viewer.server import address_of, one_at_a_time, plain_markdown, s
 from smplxpp.core.files.image_file import open_image
 
 log = logging.getLogger(__name__)
-LOOK_EVERY = 3.0
-"""Seconds between two checks for new files of a training."""
 # Ranges of the controls: degrees of a joint, number of expressions with a slider, and bound of a numbered coefficient.
 _DEGREES, _EXPRESSIONS, _STRONGEST = 120.0, 10, 3.0
 _NONE = "none"
@@ -226,6 +224,7 @@ class RunWindow:
 
     def _live(self) -> None:
         """Play, and look again every few seconds, until the window is closed."""
+        look_every = 3.0  # seconds between two checks for new files of a training
         waited = 0.0
         while True:
             pause = 1.0 / self.session.motion.fps if self._play.value else 0.2
@@ -235,6 +234,6 @@ class RunWindow:
             if self._play.value:
                 self._frame.value = (int(self._frame.value) + 1) % len(self.session.motion.numbers)
                 self._go()
-            if waited >= LOOK_EVERY:
+            if waited >= look_every:
                 waited = 0.0
                 self.look_again()

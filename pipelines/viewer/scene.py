@@ -15,11 +15,6 @@ from smplxpp.core import LABELS, Labels, TriangleMesh
 from smplxpp.export.gltf import linear_rgba16
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
 
-MOST_SPLIT_FACES = 250_000
-"""Scans with more faces are drawn with vertex colours, because separate corners for every face would take too long."""
-_LIFT = 0.0007
-"""Distance of painted faces above the scan, metres, against flickering depth."""
-
 
 def confidence_colors(confidence: Float64[np.ndarray, " M"]) -> UInt8[np.ndarray, "M 3"]:
     """Return colours of confidence: pale where it is high, dark red where it is low."""
@@ -33,7 +28,10 @@ def colored_glb(
     vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
 ) -> bytes:
     """A GLB of a mesh with colours of its faces or its vertices, dull as cloth, seen from both sides."""
-    if face_colors is not None and mesh.face_count <= MOST_SPLIT_FACES:
+    # Scans with more faces are drawn with vertex colours, because separate corners for every face would take too
+    # long.
+    most_split_faces = 250_000
+    if face_colors is not None and mesh.face_count <= most_split_faces:
         corners = np.arange(3 * mesh.face_count).reshape(-1, 3)
         rows = mesh.faces.reshape(-1)
         return _glb(mesh.vertices[rows], mesh.vertex_normals[rows], np.repeat(face_colors, 3, axis=0), corners)
@@ -46,10 +44,11 @@ def colored_glb(
 
 def painted_glb(mesh: TriangleMesh, faces: Int64[np.ndarray, " n"], colors: UInt8[np.ndarray, "n 3"]) -> bytes:
     """A GLB of some of a mesh's faces in these colours, a little above it."""
+    lift = 0.0007  # distance of painted faces above the scan, metres, against flickering depth
     rows = mesh.faces[faces].reshape(-1)
     normals = mesh.vertex_normals[rows]
     corners = np.arange(len(rows)).reshape(-1, 3)
-    return _glb(mesh.vertices[rows] + _LIFT * normals, normals, np.repeat(colors, 3, axis=0), corners)
+    return _glb(mesh.vertices[rows] + lift * normals, normals, np.repeat(colors, 3, axis=0), corners)
 
 
 def _glb(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, faces: np.ndarray) -> bytes:

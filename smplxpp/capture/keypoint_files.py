@@ -29,7 +29,6 @@ from smplxpp.core.files.safe_pickle import safe_npz
 
 KeypointFormat = Literal["auto", "simple", "openpose", "openpose-25b", "easymocap", "mmpose", "coco", "mediapipe"]
 _HOLISTIC = ("pose", "face", "left_hand", "right_hand")
-_SAMPLED = 40  # files of a camera that tell the order of OpenPose's 25 points
 T = TypeVar("T")
 
 
@@ -159,10 +158,11 @@ def _order_of(path: Path) -> KeypointFormat:
 
 def sampled_people(path: Path) -> Iterator[Any]:
     """Yield `pose_keypoints_2d` of the people in evenly spread files; nothing for files of other formats."""
+    sampled = 40  # files of a camera that tell the order of OpenPose's 25 points
     if path.suffix.lower() == ".npz":
         return
     files = list(frame_files(path).values()) if path.is_dir() else [path] if path.is_file() else []
-    for file in files[:: max(1, len(files) // _SAMPLED)]:
+    for file in files[:: max(1, len(files) // sampled)]:
         content = read_json(file)
         people = content.get("people") if isinstance(content, Mapping) else None
         for one in people if isinstance(people, list) else ():

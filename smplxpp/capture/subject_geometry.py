@@ -22,10 +22,6 @@ _LEAST_SHARED = 5
 _LEAST_DEGREES = 3.0
 # Size of a person: distance of two points that 90 % of the pairs do not exceed, metres.
 _SMALLEST, _LARGEST = 0.25, 2.4
-# Share of all cameras from which a person needs no better proposal.
-_CLEARLY_SEEN = 0.75
-# Pairs of views that are tried as the start of a person.
-_MOST_SEEDS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,18 +69,20 @@ def people_in_space(seen: Sighted) -> list[PersonInSpace]:
     distance is below 10 cm. The proposal with the most views wins, of equals the one with the smallest distances; its
     views are taken out, and the next is looked for.
     """
+    most_seeds = 20  # pairs of views that are tried as the start of a person
+    clearly_seen = 0.75  # share of all cameras from which a person needs no better proposal
     free = np.ones(len(seen), dtype=bool)
     found: list[PersonInSpace] = []
     pairs = _pairs(seen)
     while True:
-        seeds = [pair for pair in pairs if free[pair[1]] and free[pair[2]]][:_MOST_SEEDS]
+        seeds = [pair for pair in pairs if free[pair[1]] and free[pair[2]]][:most_seeds]
         best: tuple[PersonInSpace, float] | None = None
         for _, i, j in seeds:
             # A pair that is part of the best person already would propose it again.
             if best is not None and {i, j} <= set(best[0].members):
                 continue
             one = _grown(seen, (i, j), free)
-            if one is not None and len(one[0].members) > _CLEARLY_SEEN * len(np.unique(seen.camera)):
+            if one is not None and len(one[0].members) > clearly_seen * len(np.unique(seen.camera)):
                 best = one
                 break
             if one is not None and (best is None or (len(one[0].members), -one[1]) > (len(best[0].members), -best[1])):

@@ -23,7 +23,6 @@ _SMALL = 64  # pixels of the longer side of pictures that are compared
 # 0 by `_DEVIATIONS` standard deviations of a chance correlation.
 _CLEARLY, _APART, _DEVIATIONS = 1.15, 0.15, 3.0
 _LEAST_OVERLAP = 1.0  # seconds that two recordings must share
-_SLOW = 1.0  # seconds over which signals are compared to their own mean: light and gain change slowly
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +146,8 @@ def best_lag(a: Float64[np.ndarray, " N"], b: Float64[np.ndarray, " M"]) -> tupl
 
 def _without_trend(signal: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
     """Return a signal less its mean over the second around each value."""
-    width = min(len(signal), int(_SLOW * _RATE)) | 1
+    slow = 1.0  # seconds over which signals are compared to their own mean: light and gain change slowly
+    width = min(len(signal), int(slow * _RATE)) | 1
     padded = np.pad(signal, width // 2, mode="reflect") if len(signal) > width // 2 else signal
     mean = np.convolve(padded, np.full(width, 1.0 / width), mode="same")[width // 2 : width // 2 + len(signal)]
     return signal - (mean if len(mean) == len(signal) else signal.mean())

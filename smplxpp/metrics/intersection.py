@@ -15,8 +15,6 @@ from smplxpp.metrics.comparison import MM
 
 CM3 = 1e6
 """Cubic centimetres in a cubic metre."""
-# Nearer to the surface than this share of the mesh's size the sign of the distance is rounding.
-SIGN_RESOLUTION = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +69,8 @@ def penetration(outer: PointsLike, inner: MeshLike, *, clearance: float = 0.0) -
     Raises:
         InputError: no points, as `signed_distance`, or a clearance that is negative or not finite.
     """
+    # Nearer to the surface than this share of the mesh's size the sign of the distance is rounding.
+    sign_resolution = 1e-6
     inner = as_mesh(inner, subject="inner mesh")
     points = as_array(outer) if isinstance(outer, np.ndarray) else as_points(outer, subject="outer layer")[0]
     if not len(points):
@@ -78,7 +78,7 @@ def penetration(outer: PointsLike, inner: MeshLike, *, clearance: float = 0.0) -
     require_at_least("clearance in metres", clearance, 0.0)
     signed, _, _ = signed_distance(points, inner)
     # A margin relative to the size of the mesh, below which the sign of a distance is round-off.
-    penetrating = signed < clearance - SIGN_RESOLUTION * inner.bbox_diagonal
+    penetrating = signed < clearance - sign_resolution * inner.bbox_diagonal
     depth = (clearance - signed[penetrating]) * MM
     return PenetrationReport(
         count=int(penetrating.sum()),

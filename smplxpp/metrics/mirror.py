@@ -30,8 +30,6 @@ _ALIGNED = 3_000
 # Largest local shift of colours in pixels, and the window in which the smallest difference is searched.
 _LOCAL = 2
 _WINDOW = 25
-# Least share of the photographs' variance that the scan or its image explains: below it they show something else.
-_LEAST_EXPLAINED = 0.4
 # Share of that variance below which the two look the same.
 _SAME = 1e-3
 
@@ -62,6 +60,9 @@ def mirrored_by_views(
     Returns:
         None where the photographs look like neither, or no view shows enough.
     """
+    # Least share of the photographs' variance that the scan or its image explains: below it they show something
+    # else.
+    least_explained = 0.4
     scan = as_mesh(scan, subject="scan")
     body = as_mesh(body, subject="body")
     # A reflection turns faces inside out, so that their order of corners is reversed.
@@ -71,7 +72,7 @@ def mirrored_by_views(
         for meshes in ((scan, _moved_to(scan, body)), (_moved_to(image, scan), _moved_to(image, body)))
     )
     # Photographs of something else, or a wrong calibration, decide nothing.
-    if min(given.unexplained, other.unexplained) > 1.0 - _LEAST_EXPLAINED:
+    if min(given.unexplained, other.unexplained) > 1.0 - least_explained:
         return None
     # Project the photograph on the line from the scan's rendering h to the mirror image's m, over all views at once:
     #   place = sum (p - h) . (m - h) / sum |m - h|^2, which minimises |p - h - place (m - h)|^2.

@@ -20,8 +20,6 @@ _INSIDE = ("teeth", "tongue", "gum", "mouth")  # in names of a body's parts
 # Towards the viewer, in the frame of a head that looks along z.
 _VIEWS = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [-0.5, 0.0, 1.0], [0.0, 0.4, 1.0], [0.0, -0.4, 1.0]])
 _HALF_EXTENT, _PIXELS = 0.16, 400  # of a view, metres; a pixel is 0.8 mm
-_MOUTH_RADIUS = 0.04  # metres about its middle
-_OF_HEAD = 0.95  # weight of the head from which a vertex moves with it alone
 
 
 def inside_of_mouth(template: Template) -> Bool[np.ndarray, " V"]:
@@ -30,6 +28,7 @@ def inside_of_mouth(template: Template) -> Bool[np.ndarray, " V"]:
 
     A body without joints "head" and "jaw", and one whose jaw uncovers nothing, has none that is not named.
     """
+    mouth_radius = 0.04  # metres about its middle
     body, inside = template.body, np.zeros(template.vertex_count, dtype=bool)
     named = [k for k, name in enumerate(body.part_label_names) if any(word in name for word in _INSIDE)]
     inside[: body.vertex_count] = np.isin(body.part_labels, named)
@@ -44,7 +43,7 @@ def inside_of_mouth(template: Template) -> Bool[np.ndarray, " V"]:
     uncovered = np.any(opened, axis=0) & ~closed & (_weight(naked, "head", "jaw") > 0.5)
     if uncovered.any():  # a jaw uncovers folds below the ears too
         middle = np.median(naked.vertices[uncovered], axis=0)
-        uncovered &= np.linalg.norm(naked.vertices - middle, axis=1) < _MOUTH_RADIUS
+        uncovered &= np.linalg.norm(naked.vertices - middle, axis=1) < mouth_radius
     inside[: body.vertex_count] |= uncovered
     return inside
 
@@ -67,8 +66,9 @@ def shown_mouth(
 
 def _seen_from_ahead(naked: Template, posed: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
     """Mark the vertices of the faces that views from ahead of the head see."""
+    of_head = 0.95  # weight of the head from which a vertex moves with it alone
     seen = np.zeros(naked.vertex_count, dtype=bool)
-    head = _weight(naked, "head") > _OF_HEAD
+    head = _weight(naked, "head") > of_head
     if not head.any():
         return seen
     mesh = TriangleMesh(np.asarray(posed, dtype=np.float64), naked.faces)

@@ -50,7 +50,6 @@ _OPTIONAL = {
     "labels": ("U", 0),
 }
 _WORDS = {"f": "floats", "i": "integers", "b": "bools", "U": "texts"}
-_ROW_SUM = 1e-6  # largest difference of the sum of a vertex's weights from 1
 
 
 def check_arrays(arrays: Mapping[str, np.ndarray]) -> None:
@@ -107,6 +106,7 @@ def _check_skeleton(parents: np.ndarray) -> None:
 
 
 def _check_weights(arrays: Mapping[str, np.ndarray]) -> None:
+    row_sum = 1e-6  # largest difference of the sum of a vertex's weights from 1
     indices, weights = arrays["weights_joint_indices"], arrays["weights_joint_weights"]
     vertices, joints = len(arrays["vertices"]), len(arrays["parents"])
     if indices.shape != weights.shape or len(indices) != vertices:
@@ -123,7 +123,7 @@ def _check_weights(arrays: Mapping[str, np.ndarray]) -> None:
     if indices.size and not 0 <= indices.min() <= indices.max() < joints:
         raise InputError("weights_joint_indices", expected=f"joints in [0, {joints})", received="others")
     sums = weights.sum(axis=1) if weights.size else np.ones(vertices)
-    if not np.isfinite(weights).all() or (weights < 0).any() or (np.abs(sums - 1.0) > _ROW_SUM).any():
+    if not np.isfinite(weights).all() or (weights < 0).any() or (np.abs(sums - 1.0) > row_sum).any():
         raise InputError(
             "weights_joint_weights", expected="finite values, none negative, rows that sum to 1", received="others"
         )

@@ -17,11 +17,6 @@ from smplxpp.template.template import BODY_PART, Template
 # Charts are packed on a grid of so many cells a side, whatever the pictures' size, and stand this many cells apart:
 # two texels of the smallest picture, which bilinear filtering needs, and four and eight of the larger ones.
 _GRID, _APART = 1024, 2
-# Square metres. Larger charts have fewer seams and take longer: without a limit 20,000 faces of trousers take 3.5
-# seconds and have 113 charts, with this one 1.0 and 139.
-_LARGEST_CHART = 0.02
-# Share of the picture that charts are packed to at first; more of it needed further attempts on three people of four.
-_FIRST_SHARE = 0.55
 # How much finer than the whole body a part of it may lie in its file's own layout, as faces do.
 _FINER = 2.0
 # Texels a side of the tiles in which pictures are made, which bounds the memory: 512 x 512 take 80 MB at most.
@@ -86,13 +81,16 @@ def unwrap(template: Template, body_uv: BodyUV | None, *, layout: str = "one") -
 
 def _charts(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     """Cut a mesh into charts: texture coordinates in metres, and their rows at the corners."""
+    # Square metres. Larger charts have fewer seams and take longer: without a limit 20,000 faces of trousers
+    # take 3.5 seconds and have 113 charts, with this one 1.0 and 139.
+    largest_chart = 0.02
     import xatlas
 
     if not mesh.face_count:
         return np.zeros((0, 2)), np.zeros((0, 3), np.int64)
     used, corners = np.unique(mesh.faces, return_inverse=True)
     atlas, options, packing = xatlas.Atlas(), xatlas.ChartOptions(), xatlas.PackOptions()
-    options.max_chart_area = _LARGEST_CHART
+    options.max_chart_area = largest_chart
     # A coarse packing that nobody sees: the charts are packed together with all others afterwards.
     packing.texels_per_unit = 200.0
     faces = corners.reshape(mesh.faces.shape)
@@ -120,13 +118,16 @@ def _file_charts(mesh: TriangleMesh, uv: BodyUV) -> tuple[np.ndarray, np.ndarray
 
 def _packed(charts: list[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Pack charts given in metres into the unit square; every face keeps its corners' order."""
+    # Share of the picture that charts are packed to at first; more of it needed further attempts on three people
+    # of four.
+    first_share = 0.55
     import xatlas
 
     area = sum(0.5 * float(np.abs(_cross(*_edges(uv, rows))).sum()) for uv, rows in charts)
     if area <= 0:
         return [(np.full((max(len(uv), 1), 2), 0.5), np.zeros_like(rows)) for uv, rows in charts]
     # The packer takes a density and gives a size, so that the density is brought down until the size fits.
-    density = _GRID * np.sqrt(_FIRST_SHARE / area)
+    density = _GRID * np.sqrt(first_share / area)
     while True:
         atlas, options = xatlas.Atlas(), xatlas.PackOptions()
         options.padding, options.texels_per_unit, options.bilinear = _APART, density, True

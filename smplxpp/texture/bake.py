@@ -21,8 +21,6 @@ from smplxpp.texture.photographs import Painter
 # Metres. A template lies within 1 mm of its scan except where holes were filled and layers pushed apart, its body
 # within 15 mm where skin shows (`smplxpp.assemble.body_colors` draws the same line).
 _FAR = 0.015
-# Metres beyond the rim of a label up to which its outermost colours are drawn out; farther in they would be streaks.
-_BEYOND_RIM = 0.004
 # Rounds in which the colours that were carried under clothes become smooth, a vertex's with those of its neighbours.
 _ROUNDS = 40
 # Texels a side of the squares within which empty texels take colours: 32 mm of the surface at 2048.
@@ -175,13 +173,16 @@ class _Bake:
 
     def _shown(self, texels: Texels, part: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the scan's points that texels of a part show: which texels have one, its face and its place there."""
+        # Metres beyond the rim of a label up to which its outermost colours are drawn out; farther in they
+        # would be streaks.
+        beyond_rim = 0.004
         surface = self.surfaces[part]
         shown = self.reached[texels.face]
         if surface is None or not shown.any():
             return np.zeros(len(shown), dtype=bool), np.zeros(0, np.int64), np.zeros((0, 3))
         tried = texels.select(shown)
         distance, face, barycentric, rim = surface.nearest(tried.interpolate(self.posed.triangles))
-        near = distance <= np.where(rim, _BEYOND_RIM, _FAR)
+        near = distance <= np.where(rim, beyond_rim, _FAR)
         if self.template.part_names[part] == BODY_PART:
             # The body closes where the scan's skin has two sides, as between fingers: only what faces alike is meant.
             facing = np.einsum("td,td->t", tried.interpolate(self.corner_normals), self.scan.mesh.face_normals[face])

@@ -15,10 +15,6 @@ from smplxpp.core.mesh_files.raw_mesh import FacePictures, RawMesh
 from smplxpp.core.mesh_files.texture import sample_bilinear
 from smplxpp.core.signed_distance import barycentric_coordinates
 
-# Metres from the rim of a label within which colours may be its neighbour's: labels and skins' edges are that exact.
-_RUN_IN = 0.012
-_LEAST_INNER = 0.1  # share of a label's faces
-
 
 @dataclass(frozen=True, eq=False)
 class PaintedScan:
@@ -96,15 +92,19 @@ class LabelledSurface:
     @cached_property
     def inner(self) -> Bool[np.ndarray, " M"]:
         """Which faces of the whole scan lie well within the label, where no other one's colour has run in."""
+        # Metres from the rim of a label within which colours may be its neighbour's: labels and skins' edges
+        # are that exact.
+        run_in = 0.012
+        least_inner = 0.1  # share of a label's faces
         corners = self.mesh.faces[self.faces]
         inside = np.zeros(self.mesh.face_count, dtype=bool)
         inside[self.faces] = True
         ends = np.unique(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2)[self._rim])
         if len(ends):
             distance = cKDTree(self.mesh.vertices[ends]).query(self.mesh.face_centers[self.faces])[0]
-            inside[self.faces] = (distance > _RUN_IN) & ~np.isin(corners, ends).any(axis=1)
+            inside[self.faces] = (distance > run_in) & ~np.isin(corners, ends).any(axis=1)
         # A label that is all rim, such as a strap, has nothing better than its rim.
-        if inside.sum() < _LEAST_INNER * len(self.faces):
+        if inside.sum() < least_inner * len(self.faces):
             inside[self.faces] = True
         return inside
 

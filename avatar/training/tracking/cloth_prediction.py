@@ -23,8 +23,6 @@ CORRECTION_DECAY = 0.3
 
 Errors of a simulated swing are a difference of phase, which changes sign within a swing; an old correction is wrong.
 """
-RECENT_FRAMES = 4
-"""Number of last solved frames in which predictors are compared."""
 ERROR_FLOOR = 1e-3
 """Metres added to every predictor's error; smaller errors are treated as equal."""
 
@@ -223,11 +221,12 @@ class ClothPrediction:
 
     def _recent(self, frame: int, solved: Solved) -> list[int]:
         """Return the nearest solved frames on the same side of the first one that had solved frames before them."""
+        recent_frames = 4  # number of last solved frames in which predictors are compared
         # Frames before the first one were predicted from other neighbours than frames after it.
         done = list(solved)
         first = done[0]
         side = [other for other in done[1:] if (other - first) * (frame - first) > 0]
-        return sorted(side, key=lambda other: abs(other - frame))[:RECENT_FRAMES]
+        return sorted(side, key=lambda other: abs(other - frame))[:recent_frames]
 
     def _extrapolated(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
         """Return the last frame's displacements, continued with a share of the last velocity."""

@@ -31,8 +31,6 @@ from smplxpp.core import DEFAULT_FPS, InputError
 
 LEVEL_DECAY = 0.1
 """Learning rate at the end of a level, as a fraction of that at its start."""
-STRUCTURE_HALVINGS = 1
-"""Halvings of the photographs of which structure tensors are taken, or the nearest number that a level has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,9 +223,12 @@ class TrackTask(PhotometricTask):
 
     def _structure(self, frame: int, controls: Tensor) -> Tensor:
         """Return the structure tensors of a frame's photographs by all training cameras, about given displacements."""
+        # Halvings of the photographs of which structure tensors are taken, or the nearest number that a
+        # level has.
+        structure_halvings = 1
         # Use photographs of a size that the levels load anyway.
         sizes = [level.halvings for level in self.track_config.levels]
-        halvings = min(sizes, key=lambda size: abs(size - STRUCTURE_HALVINGS))
+        halvings = min(sizes, key=lambda size: abs(size - structure_halvings))
         names = self.sequence.cameras(frame, 0, len(self.sequence.train_cameras), self.track_config.seed)
         views = [self._halved(self.sequence.view(name, frame), frame, halvings) for name in names]
         pose, background = self.sequence.pose(frame), self.sequence.background

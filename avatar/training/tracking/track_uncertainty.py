@@ -21,7 +21,6 @@ from avatar.training.tracking.cloth_prediction import CORRECTION_DECAY
 
 # Structure tensors. The kernel is flat and the weight 1, so that every full-size pixel counts once.
 _PLAIN_SUMS = RefineConfig(robust=1e3, pixel_sigma=1.0, pixels_per_error=1.0)
-_PIXELS_NEEDED = 16.0  # full-size pixels of all views together at which a point's tensor has half its weight
 
 OBSERVED_GRADIENT = 6.0
 """Change of colours in [0, 1] per metre at which the prior is weakened to a quarter.
@@ -60,6 +59,7 @@ def structure_tensors(
         background: sRGB.
         halvings: of the photographs' full size.
     """
+    pixels_needed = 16.0  # full-size pixels of all views together at which a point's tensor has half its weight
     rig = avatar.rig
     with torch.no_grad():
         vertices = rig.skin(pose, avatar.cage(avatar.moves * controls))
@@ -77,7 +77,7 @@ def structure_tensors(
     tensors = turned.transpose(1, 2) @ seen.curvature @ turned
     # Sum tensors (9 numbers) and pixel masses (1 number) with the interpolation's weights, then take the mean.
     (sums,) = torch.autograd.grad(spread, table, torch.cat([tensors.flatten(1), seen.color_mass[:, None]], dim=1))
-    return (sums[:, :9] / (sums[:, 9:] + _PIXELS_NEEDED)).view(-1, 3, 3)
+    return (sums[:, :9] / (sums[:, 9:] + pixels_needed)).view(-1, 3, 3)
 
 
 def unobserved_weight(structure: Float[Tensor, "K 3 3"], normals: Float[Tensor, "K 3"]) -> Float[Tensor, "K 3 3"]:

@@ -80,7 +80,6 @@ FORMATS: tuple[CalibrationFormat, ...] = (
 # Files of these names are settings of the same tools.
 _NOT_CALIBRATIONS = ("config.toml", "charuco.toml", "project_settings.toml", "pyproject.toml")
 _MOST_BYTES = 16 << 20  # of a candidate: 500 cameras of the Panoptic studio take 250 kB
-_MOST_CANDIDATES = 200  # files of a folder that are opened in the search for a calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,11 +162,12 @@ def find_calibration(folder: Path) -> Path | None:
 
     Of several the one whose name has "calib" is taken, or "cam", else the first in alphabetical order.
     """
+    most_candidates = 200  # files of a folder that are opened in the search for a calibration
     suffixes = {suffix for own, _ in _LOADERS.values() for suffix in own}
     files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in suffixes and path.is_file()]
     files = [p for p in files if p.name.lower() not in _NOT_CALIBRATIONS and p.stat().st_size <= _MOST_BYTES]
     files.sort(key=lambda path: ("calib" not in path.name.lower(), "cam" not in path.name.lower(), path.name))
-    return next((path for path in files[:_MOST_CANDIDATES] if format_of(path) is not None), None)
+    return next((path for path in files[:most_candidates] if format_of(path) is not None), None)
 
 
 def format_of(path: Path) -> CalibrationFormat | None:

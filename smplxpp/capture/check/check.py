@@ -26,8 +26,6 @@ from smplxpp.capture.check.views import OPAQUE, ViewCheck, check_view
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, matrix_from_rotvec, spread
 from smplxpp.core.errors import one_line
 
-# Frame offsets that are tried where images and parameters may not be synchronised.
-_SHIFTS = (-3, -2, -1, 1, 2, 3)
 # Number of posed bodies that are kept in memory.
 _KEPT = 32
 
@@ -164,6 +162,7 @@ class _Poser:
 
 def _sample(small: Capture, poser: _Poser, camera: str, frame: int) -> Sample | None:
     """Return the view to try corrections on; None where the body or the mask is missing."""
+    shifts = (-3, -2, -1, 1, 2, 3)  # frame offsets that are tried where images and parameters may not be synchronised
     vertices = poser.vertices(frame)
     mask = small.mask(camera, frame)
     if vertices is None or mask is None:
@@ -171,7 +170,7 @@ def _sample(small: Capture, poser: _Poser, camera: str, frame: int) -> Sample | 
     p = poser.params[frame]
     # Rotation about the origin instead of the root joint moves the body by R r - r, with r the root joint at rest.
     root = poser.body.rest_joints(p)[0, 0]
-    neighbours = {k: poser.vertices(frame + k) for k in _SHIFTS}
+    neighbours = {k: poser.vertices(frame + k) for k in shifts}
     return Sample(
         camera=small.cameras[camera],
         mask=mask > OPAQUE,
