@@ -12,7 +12,7 @@ from jaxtyping import Float, Integer, UInt8
 
 from smplxpp.body import BodyModel
 from smplxpp.body.named_poses import rare_poses, standing_poses
-from smplxpp.core import SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
+from smplxpp.core import HAIR, SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.register.kinematics import Kinematics
 from smplxpp.register.locate.decision import confidence_of, findings_of, is_doubtful, no_person, notes_of
@@ -21,7 +21,7 @@ from smplxpp.register.locate.icp import PinnedLandmarks
 from smplxpp.register.locate.located import BodyNotFoundError, Candidate, LocatedBody
 from smplxpp.register.locate.persons import convex_share
 from smplxpp.register.locate.search import Found, LocateConfig, Search
-from smplxpp.register.locate.second_look import look_again
+from smplxpp.register.locate.second_look import look_again, raise_head
 
 Labeller = Callable[[BodyParams], "Integer[np.ndarray, ' M'] | None"]
 """Labels every face of the surface, given the body in it, negative where unknown; None for no labels at all."""
@@ -83,9 +83,7 @@ def locate_body(
             found += rare
     reason = no_person(best)
     if labeller is not None and not reason:
-        labels = labeller(best.state.to_params(body))
-        if labels is not None:
-            best = search.finished(best, np.asarray(labels)[search.fine.face] == SKIN.id)
+        best = _labelled(search, best, labeller, colored=colors is not None and np.ptp(colors, axis=0).max() > 0)
     if not reason:
         best = settle_feet(search, best)
     others = tuple(found[1:])
@@ -118,8 +116,44 @@ def _settled(
     best, moved = search.finished(found), tuple[str, ...]()
     if not no_person(best):
         best, moved = look_again(search, best, hints=hints)
+        best = raise_head(search, best)
         best = lift_heels(search, best)
     return best, moved
+
+
+def _labelled(search: Search, best: Found, labeller: Labeller, *, colored: bool) -> Found:
+    """Fit a body with what is bare skin, and once more where the labels of the fitted body call something else skin.
+
+    A body that was fitted as clothed stays a centimetre or two within a person who is not, and what lies that far off
+    it looks like clothes. Without colours it is therefore also fitted to the whole surface as skin: clothes show their
+    hems then all the more, and who has none stays unclothed.
+    """
+    body = search.kinematics.body
+
+    def labels_of(found: Found) -> np.ndarray | None:
+        labels = labeller(found.state.to_params(body))
+        return None if labels is None else np.asarray(labels)[search.fine.face]
+
+    if not colored:
+        bare = search.polished(best.name, best.state, np.ones(len(search.fine), bool), steps=search.config.finish_steps)
+        labels = labels_of(bare)
+        if labels is None:
+            return best
+        known = labels[labels >= 0]
+        if len(known) > _KNOWN * len(labels) and np.isin(known, (SKIN.id, HAIR.id)).all():
+            return bare
+    skin = np.zeros(len(search.fine), bool)
+    for _ in range(2):
+        labels = labels_of(best)
+        if labels is None or np.mean((labels == SKIN.id) != skin) < _SAME:
+            break
+        skin = labels == SKIN.id
+        best = search.finished(best, skin)
+    return best
+
+
+_KNOWN, _SAME = 0.6, 0.03
+"""Shares of the surface: that has to be labelled for a person without clothes; whose labels may change without a fit."""
 
 
 def _candidate(found: Found) -> Candidate:
