@@ -47,8 +47,8 @@ def confidence_bound(
     ring = np.clip(np.floor((chart.reach[arm] - ARM_START) / STEP).astype(np.int64), 0, len(sleeve) - 1)
     own = labels[arm]
     most[arm] = np.where(own == UPPER.id, sleeve[ring], np.where(own == SKIN.id, bare[ring], 1.0))
-    # Precision of rules on the procedural people of the benchmark `labels_by_body`, without colours also on public scans,
-    # as the mean over people, each of whom would change it by 0.06 to 0.17. One garment over trunk and legs
+    # Precision of rules on the procedural people of the benchmark `labels_by_body`, without colours on public
+    # scans too, as the mean over people; leaving one out changes it by at most 0.17. One garment over trunk and legs
     # is `upper`, although a truth may call a dress lower, or two garments of one cloth look like one; an `upper`
     # without a coat is no jacket, cape or waistcoat.
     upper = labels == UPPER.id

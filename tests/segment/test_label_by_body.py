@@ -162,7 +162,7 @@ def test_calves_that_no_shape_of_the_body_has_are_no_trousers(body, calves):
 
 
 def test_who_wears_nothing_wears_no_shirt(body):
-    """Without colours the bare body was labelled shirt, shoes and hair; and tight clothes may look the same."""
+    """Without colours the bare body was labelled shirt, shoes and hair, then skin in doubt; three of four are right."""
     params = BodyParams.rest()
     mesh = body.mesh(body.forward(params).vertices[0])
     result = label_by_body(mesh, body, params)
@@ -171,26 +171,93 @@ def test_who_wears_nothing_wears_no_shirt(body):
     area = mesh.face_areas[below]
     assert area @ (labels[below] == SKIN.id) > 0.99 * area.sum()
     trunk = np.abs(mesh.face_centers[:, 1] - body.forward(params).joints[0, body.joint_names.index("spine1"), 1]) < 0.05
-    assert result.confidence[trunk].max() < UNSURE
-    assert any("no hem" in note for note in result.notes) and any("trunk as skin" in note for note in result.notes)
+    assert UNSURE < np.median(result.confidence[trunk]) <= result.confidence[trunk].max() <= 0.75
+    assert any("no hem" in note for note in result.notes)
 
 
-def test_a_jacket_ends_at_its_hem_and_not_at_the_waist(body):
-    """A jacket's lower half was labelled trousers, although its hem stepped in by 2 cm at the hips."""
+@pytest.mark.parametrize("open_by", [0.0, 0.12])
+def test_a_jacket_ends_at_its_hem_and_not_at_the_waist(body, open_by):
+    """A jacket's lower half was labelled trousers, closed by a hem at the hips or open over the waist of trousers."""
     params = BodyParams.rest()
     posed = body.forward(params)
     mesh = body.mesh(posed.vertices[0])
     joint = {name: posed.joints[0, k] for k, name in enumerate(body.joint_names)}
-    x, y, _ = mesh.vertices.T
-    hem, sleeve = joint["left_hip"][1] - 0.06, np.abs(x) < joint["left_wrist"][0] - 0.02
-    above = np.where((y > hem) & (y < joint["neck"][1] - 0.03) & sleeve, 0.03, 0.0)
+    x, y, z = mesh.vertices.T
+    hip, sleeve = joint["left_hip"][1], np.abs(x) < joint["left_wrist"][0] - 0.02
+    hem, waist = hip - 0.06, hip + 0.08
+    above = np.where((y > hem) & (y < joint["neck"][1] - 0.03) & sleeve, 0.06 if open_by else 0.03, 0.0)
     above = np.where((y < hem) & sleeve, 0.01, above)
+    # In the opening trousers reach up to the waist, and the shirt that hangs over them stands off by 3 cm more.
+    strip = (np.abs(x) < open_by) & (z > 0) & (y > hem) & (y < joint["neck"][1] - 0.2)
+    above = np.where(strip, np.where(y < waist, 0.0, 0.03), above)
     labels = label_by_body(mesh.with_vertices(mesh.vertices + above[:, None] * mesh.vertex_normals), body, params)
-    for low, high, label in ((hem + 0.03, hem + 0.2, UPPER), (hem - 0.3, hem - 0.03, LOWER)):
-        own = (y[mesh.faces] > low).all(axis=1) & (y[mesh.faces] < high).all(axis=1) & sleeve[mesh.faces].all(axis=1)
-        own &= (np.abs(x[mesh.faces]) < joint["left_shoulder"][0]).all(axis=1)
+    trunk = np.abs(x) < joint["left_shoulder"][0]
+    below = (hem + 0.02, waist - 0.01, LOWER, strip) if open_by else (hem - 0.3, hem - 0.03, LOWER, ~strip)
+    places = [(hem + 0.03, hem + 0.2, UPPER, ~strip), below]
+    for low, high, label, part in places:
+        own = ((y > low) & (y < high) & trunk & part)[mesh.faces].all(axis=1)
         area = mesh.face_areas[own]
         assert area @ (labels.face_labels[own] == label.id) > 0.9 * area.sum(), label.name
+
+
+@pytest.mark.parametrize("hem", [0.0, 0.015])
+def test_a_front_in_the_colour_of_the_trousers_is_a_waistcoat_where_it_ends_over_them(body, hem):
+    """A black waistcoat over a white shirt was labelled trousers, as a bib is that goes on above the waist."""
+    mesh, colors, params = painted(body, {"shirt": (240, 240, 240), "trousers": _GREY, "hair": _GREY})
+    joint = {name: body.forward(params).joints[0, k] for k, name in enumerate(body.joint_names)}
+    x, y, z = mesh.vertices.T
+    trunk = (y > joint["pelvis"][1]) & (y < joint["neck"][1] - 0.06) & (np.abs(x) < joint["left_shoulder"][0])
+    front = trunk & (z > joint["spine2"][2])
+    colors[front] = _GREY
+    moved = mesh.vertices + np.where(trunk, hem, 0.0)[:, None] * mesh.vertex_normals
+    labels = label_by_body(mesh.with_vertices(moved), body, params, colors=colors).face_labels
+    own = front[mesh.faces].all(axis=1) & (mesh.face_centers[:, 1] > joint["spine1"][1] + 0.05)
+    share = mesh.face_areas[own] @ (labels[own] == (UPPER if hem else LOWER).id) / mesh.face_areas[own].sum()
+    assert share > 0.8
+
+
+@pytest.mark.parametrize("heels", [False, True])
+def test_shoes_in_the_colour_of_skin_are_told_by_their_heels(body, heels):
+    """Pumps in the colour of skin became bare feet; a person on tiptoe has them."""
+    _, colors, params = painted(body, {"shirt": _BLUE, "trousers": _GREY, "hair": _GREY})
+    pose = params.body_pose.copy()
+    names = list(body.joint_names)
+    for side in ("left", "right"):
+        pose[0, 3 * names.index(f"{side}_ankle") - 3] = np.radians(45.0)
+        pose[0, 3 * names.index(f"{side}_foot") - 3] = np.radians(-30.0)
+    params = replace(params, body_pose=pose)
+    posed = body.forward(params)
+    feet = body.mesh(posed.vertices[0])
+    points, faces = [feet.vertices], [feet.faces]
+    floor = feet.vertices[:, 1].min()
+    for side in ("left", "right") if heels else ():
+        ankle = posed.joints[0, names.index(f"{side}_ankle")]
+        # A post of 2 cm from the floor up to the heel, 4 cm behind the ankle.
+        corner = np.array([[a, b, c] for a in (-0.01, 0.01) for b in (0.0, 1.0) for c in (-0.05, -0.03)])
+        post = np.stack(
+            [ankle[0] + corner[:, 0], floor + corner[:, 1] * (ankle[1] - 0.06 - floor), ankle[2] + corner[:, 2]], 1
+        )
+        sides = np.array(
+            [
+                [0, 1, 3],
+                [0, 3, 2],
+                [4, 6, 7],
+                [4, 7, 5],
+                [0, 4, 5],
+                [0, 5, 1],
+                [2, 3, 7],
+                [2, 7, 6],
+                [0, 2, 6],
+                [0, 6, 4],
+            ]
+        )
+        faces.append(sides + sum(map(len, points)))
+        points.append(post)
+    scan = TriangleMesh(np.concatenate(points), np.concatenate(faces))
+    painted_too = np.concatenate([colors, np.tile(np.uint8(_SKIN_RGB), (scan.vertex_count - len(colors), 1))])
+    labels = label_by_body(scan, body, params, colors=painted_too).face_labels
+    toes = scan.face_centers[:, 1] < floor + 0.03
+    assert (labels[toes] == (SHOE if heels else SKIN).id).mean() > 0.9
 
 
 def test_a_dress_without_a_hem_at_the_waist_is_one_garment(body):

@@ -153,7 +153,7 @@ def _labelled(search: Search, best: Found, labeller: Labeller, *, colored: bool)
 
 
 _KNOWN, _SAME = 0.6, 0.03
-"""Shares of the surface: that has to be labelled for a person without clothes; whose labels may change without a fit."""
+"""Shares of the surface: what has to be labelled for a person to be unclothed; what may change without another fit."""
 
 
 def _candidate(found: Found) -> Candidate:

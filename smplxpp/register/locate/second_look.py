@@ -123,7 +123,8 @@ def raise_head(search: Search, found: Found, *, skin: np.ndarray | None = None) 
     """
     match = search.outer.match(search.outer.mesh(search.kinematics.posture(found.state, 0)), search.fine)
     face = match.distance[match.region == Region.FACE]
-    if len(face) < 20 or float(np.percentile(np.abs(face), 75)) < _NO_FACE:
+    off = len(face) >= 20 and float(np.percentile(np.abs(face), 75)) > _NO_FACE
+    if not off and found.misfit.parts["head"] > _NO_HEAD:
         return found
     names = list(search.kinematics.body.joint_names)
     joints, best = [names.index("neck"), names.index("head")], found
@@ -137,9 +138,9 @@ def raise_head(search: Search, found: Found, *, skin: np.ndarray | None = None) 
     return best
 
 
-_NO_FACE = 0.012
-"""Metres that a quarter of a face's surface lies off the body's from which it is no face; of 15 real people a head in
-a collar has 23 mm, the others at most 7."""
+_NO_FACE, _NO_HEAD = 0.012, 0.4
+"""Metres that a quarter of a face's surface lies off the body's from which it is no face (of 15 real people a head in a
+collar has 23 mm, the others at most 7), and the share of a head that is shown up to which it is none (hoods: 0.58)."""
 
 
 def _travelled(search: Search, one: Found, other: Found, limb: _Limb) -> float:

@@ -14,7 +14,7 @@ from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.locate.search import LocateConfig, Search
-from smplxpp.register.locate.second_look import doubtful_limbs, look_again
+from smplxpp.register.locate.second_look import doubtful_limbs, look_again, raise_head
 
 PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
 BODY = load_body()
@@ -79,3 +79,14 @@ def test_a_detector_that_sees_an_arm_elsewhere_makes_it_doubtful_and_the_surface
     same, moved = look_again(search, found, hints=hints)
     assert moved == ()
     assert _off(search, same.state, truth, "left_wrist") < 0.02
+
+
+def test_a_head_that_started_in_the_collar_is_raised(search, truth):
+    """A head bowed into a turned-up collar showed no face, and the collar was labelled skin."""
+    low = _with(truth, {"neck": ((28, 0, 0),), "head": ((23, 0, 0),)})
+    low = replace(low, transl=low.transl - [0.0, 0.03, 0.0])
+    found = search.polished("low", low, None, steps=0)
+    raised = raise_head(search, found)
+    assert _off(search, low, truth, "jaw") > 0.05 > 0.03 > _off(search, raised.state, truth, "jaw")
+    right = search.polished("truth", truth, None, steps=0)
+    assert raise_head(search, right) is right
