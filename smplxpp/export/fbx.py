@@ -33,7 +33,7 @@ _REMEDY = (
 # Runs inside Blender. The file's data is turned to +Y up and its objects back to Blender's +Z, which the exporter's own
 # turn to +Y cancels: no object of the FBX is turned or scaled, as engines like it.
 _SCRIPT = """
-import json, math, sys
+import json, math, os, sys
 import bpy
 from mathutils import Matrix
 
@@ -55,6 +55,14 @@ for thing in worn:
 rig.data.transform(up)
 rig.matrix_world = up.inverted() @ rig.matrix_world
 rig.name = rig.data.name = given["root"]
+# Pictures get names with a suffix, which engines that unpack them need, and keep their bytes.
+for k, picture in enumerate([one for one in bpy.data.images if one.packed_file]):
+    stem, suffix = os.path.splitext(given["fbx"])[0], {"JPEG": "jpg"}.get(picture.file_format, "png")
+    picture.name = f"{os.path.basename(stem)}_{k}"
+    with open(f"{stem}_{k}.{suffix}", "wb") as file:
+        file.write(picture.packed_file.data)
+    picture.filepath = f"{stem}_{k}.{suffix}"
+    picture.unpack(method="REMOVE")
 scene.frame_start, scene.frame_end = 0, max(0, given["frames"] - 1)
 bpy.ops.export_scene.fbx(
     filepath=given["fbx"], object_types={"ARMATURE", "MESH"}, axis_forward="-Z", axis_up="Y", add_leaf_bones=False,
@@ -89,9 +97,11 @@ def blender_command(program: str | Path | None = None) -> list[str]:
             found = sys.executable
     if found is None:
         raise InputError("writing FBX", expected="Blender or bpy", received="neither on the path", remedy=_REMEDY)
+    # Not resolved: a virtual environment's Python is a link.
+    command = str(Path(found).absolute())
     if Path(found).name.lower().startswith("python"):
-        return [found]
-    return [found, "--background", "--factory-startup", "--python-exit-code", "1", "--python"]
+        return [command]
+    return [command, "--background", "--factory-startup", "--python-exit-code", "1", "--python"]
 
 
 def write_fbx(
@@ -121,12 +131,13 @@ def write_fbx(
     fps = DEFAULT_FPS if animation is None else animation.fps or DEFAULT_FPS
     require_positive("frames a second of the animation", fps)
     with tempfile.TemporaryDirectory() as folder, atomic_path(path) as written:
-        glb, script = Path(folder) / "template.glb", Path(folder) / "to_fbx.py"
+        # The file says where it was first written: under its own name, not the temporary one beside the target.
+        glb, script, fbx = Path(folder) / "template.glb", Path(folder) / "to_fbx.py", Path(folder) / Path(path).name
         write_glb(glb, template, animation=animation)
         script.write_text(_SCRIPT)
         asked = {
             "glb": str(glb),
-            "fbx": str(written.resolve()),
+            "fbx": str(fbx),
             "fps": fps,
             "frames": 0 if animation is None else len(animation),
             "units": UNITS_A_METRE,
@@ -134,10 +145,12 @@ def write_fbx(
         }
         line = [*command, str(script), "--", json.dumps(asked)]
         try:
-            done = subprocess.run(line, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, check=False)
+            done = subprocess.run(
+                line, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, check=False, cwd=folder
+            )
         except subprocess.TimeoutExpired:
             raise InputError(command[0], expected=f"an end within {_TIMEOUT} s", received="none") from None
-        if done.returncode or not written.stat().st_size:
+        if done.returncode or not fbx.is_file():
             said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
             raise InputError(
                 f"{command[0]} on the rigged GLB",
@@ -145,3 +158,4 @@ def write_fbx(
                 received=f"exit status {done.returncode}: {said}"[:600],
                 remedy="Blender 4.2 and later and bpy 5.0 are known to work; a Python needs bpy",
             )
+        shutil.copyfile(fbx, written)

@@ -9,8 +9,10 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from smplxpp.core import InputError
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
 from smplxpp.export import write_glb, write_obj
+from smplxpp.export.fbx import blender_command
 from smplxpp.template.template import Template
 from smplxpp.template.texture import Texture, encode_texture, split_at_seams
 from tests.export.glb_reader import GlbReader
@@ -71,6 +73,19 @@ def test_glb_has_places_pictures_and_equal_copies_at_seams(tmp_path, textured):
         data = reader.binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
         assert data == textured.texture.colors[textured.texture.picture[index]]
     assert validate(tmp_path / "a.glb")["issues"]["messages"] == []
+
+
+def test_fbx_carries_the_pictures_under_names_that_engines_unpack(tmp_path, textured, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where nothing else may appear
+    try:
+        blender_command()
+    except InputError:
+        pytest.skip("neither bpy nor Blender is installed")
+    data = textured.export(tmp_path / "anna.fbx").read_bytes()
+    assert all(picture in data for picture in (*textured.texture.colors, *textured.texture.normals))
+    names = [f"anna_{k}.{suffix}".encode() for k, suffix in enumerate(("jpg", "png", "jpg", "png"))]
+    assert all(name in data for name in names) and b".anna." not in data
+    assert [path.name for path in tmp_path.iterdir()] == ["anna.fbx"]
 
 
 def test_obj_and_glb_come_back_with_the_same_places(tmp_path, textured):
