@@ -2,7 +2,7 @@
 
     python -m benchmarks transfer_garments [--shapes 3] [--poses T A hands] [--no-store]
 
-42 garments are made by procedure on the open body, on persons of up to three shapes, in the T-pose and, with a scan's
+45 garments are made by procedure on the open body, on persons of up to three shapes, in the T-pose and, with a scan's
 noise and simplified, in an A-pose and with the arms as low as they come before a hand touches the cloth; what is worn
 over the arms, with hanging arms (`smplxpp.people.garments`). Their weights are painted by rules in the garments' own
 coordinates, none of which is a method compared here; what lies on the skin keeps the weights of the skin that it was
@@ -50,7 +50,8 @@ VARIANTS = {
     "default": _DEFAULT,
     "published 0.35": replace(_DEFAULT, published=0.35),
     "published 0.65": replace(_DEFAULT, published=0.65),
-    "published_length 0.008": replace(_DEFAULT, published_length=0.008),
+    "hanging from 0.16": replace(_DEFAULT, hanging=(0.16, 0.28)),
+    "nothing hangs": replace(_DEFAULT, hanging=None),
 }
 FAMILIES = {
     "trousers": ("trousers", "shorts", "overalls", "jumpsuit", "hakama"),
@@ -59,7 +60,7 @@ FAMILIES = {
     "coats": ("coat", "cape", "poncho", "jacket"),
     "head": ("hood", "scarf", "hair", "bob", "braid", "beard", "hijab"),
     "hands and feet": ("boots", "shoes", "gloves"),
-    "things": ("backpack", "plates"),
+    "things": ("backpack", "plates", "beads"),
 }
 _ANY_DETERMINANT = UnposeConfig(warn_below=-np.inf, fail_below=-np.inf)  # baselines may fold a vertex: measure it
 

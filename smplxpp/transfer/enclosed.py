@@ -195,7 +195,14 @@ def _continue_to_hems(
 
 
 def rings_about(
-    mesh: TriangleMesh, cut: np.ndarray, side: np.ndarray, axis: LimbAxis, index: int, others: list[LimbAxis]
+    mesh: TriangleMesh,
+    cut: np.ndarray,
+    side: np.ndarray,
+    axis: LimbAxis,
+    index: int,
+    others: list[LimbAxis],
+    *,
+    closed: float = _CLOSED,
 ) -> Iterator[tuple[np.ndarray, bool]]:
     """Yield the vertices (n,) of faces of each ring that goes around an axis, and whether it goes around it alone.
 
@@ -206,6 +213,7 @@ def rings_about(
         axis: the limb's.
         index: of the axis' point.
         others: axes of other limbs and of the trunk.
+        closed: least share of a turn about the axis that a ring makes.
     """
     point, tangent = axis.points[index], axis.tangents[index]
     faces, above = mesh.faces[cut], side[mesh.faces[cut]] > 0
@@ -224,7 +232,7 @@ def rings_about(
     # The angle of every ring as seen from the axis, wound the same way all around.
     start, end = np.where(flip[:, None], p, q), np.where(flip[:, None], q, p)
     turn = np.abs(np.bincount(ring, _angle(start - point, end - point, tangent), minlength=count))
-    around = turn > _CLOSED * 2 * np.pi
+    around = turn > closed * 2 * np.pi
     if not around.any():
         return
     # Another axis is within the ring if that goes around it, too, be it with a gap where the plane grazes a hem.

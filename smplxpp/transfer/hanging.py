@@ -13,6 +13,10 @@ _RAMP = (-0.05, 0.1)
 """From how far above the hip joints (negative) to how far below them the bound grows from 0 on, as shares of the body's
 extent. Skin follows the leg from 5 cm under the joint on, cloth that hangs from the waist later: between the authored
 weights of `benchmarks transfer_garments` and those that fit the same garments simulated."""
+_LEAST = 0.1
+"""The bound above the ramp: a tutu, which stands off the hips, follows the thighs a little (worst ratio there)."""
+_LEGS = 0.03
+"""Depth below the hip joints that cloth has to reach, as a share of the body's extent (6 cm): a shirt ends above it."""
 _HALF = 1.6
 """Cone of a skirt (distance off the legs by height below the waist) of which the legs have at most a half."""
 _RING = 0.02
@@ -61,9 +65,9 @@ def leg_bound(
 
     A skirt hangs from the waist. The wider it falls, the less of a thigh's turn reaches it. With u the height below the
     hip joints along the legs, and r the mean distance of the cloth at that height by that height (the tangent of half
-    the cone's angle; above u = 0.05 E its value there), the bound is
+    the cone's angle; above u = 0.03 E its value there), the bound is
 
-        1 - hung (1 - ramp(u) / (1 + r / 1.6)) ,   ramp from u = -0.05 E to 0.1 E
+        1 - hung (1 - ramp(u) / (1 + r / 1.6)) ,   ramp from 0.1 at u = -0.05 E to 1 at 0.1 E
 
     where `hung` is 1 off the skin (from 0.01 E to 0.025 E) where r is above `cone`, no ring goes around one limb alone
     and, in a component with trouser legs, below the crotch. A shirt ends before there are legs below it; its r is 0.
@@ -85,9 +89,10 @@ def leg_bound(
     for k in np.unique(component):
         rows = component == k
         wide[rows] = _mean_at_depth(depth[rows], off[rows], (free * known)[rows])
-    r = wide / (np.maximum(depth, -_RAMP[0]) - _RAMP[0])
+    r = wide / (np.maximum(depth, _LEGS) - _RAMP[0])
     hung = free * smooth_step(distance / size, 0.01, 0.025) * smooth_step(r, *cone)
-    return 1.0 - hung * (1.0 - smooth_step(depth, *_RAMP) / (1.0 + r / _HALF))
+    ramp = _LEAST + (1.0 - _LEAST) * smooth_step(depth, *_RAMP)
+    return 1.0 - hung * (1.0 - ramp / (1.0 + r / _HALF))
 
 
 def bounded_legs(
@@ -132,14 +137,13 @@ def _below_crotch(component: np.ndarray, depth: np.ndarray, limbs: Enclosure) ->
 
 
 def _mean_at_depth(depth: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the weighted mean of values over vertices of about the same depth, at least 0.05 below the hips."""
+    """Return the weighted mean of values over vertices of about the same depth, at least `_LEGS`."""
     # Bins of a component from its lowest depth on, smoothed by a binomial kernel as wide as a bin.
     kernel = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
     bins = np.floor((depth - depth.min()) / _RING).astype(int)
     total, count = (np.convolve(np.bincount(bins, w), kernel)[2:-2] for w in (values * weight, weight))
     mean = total / np.maximum(count, 1e-9)
-    least = -_RAMP[0]
-    if depth.max() < least + _RING:
+    if depth.max() < _LEGS:
         return np.zeros(len(depth))
-    at = (np.maximum(depth, least) - depth.min()) / _RING - 0.5
+    at = (np.maximum(depth, _LEGS) - depth.min()) / _RING - 0.5
     return np.interp(at, np.arange(len(mean)), mean)

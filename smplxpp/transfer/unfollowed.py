@@ -15,6 +15,8 @@ from smplxpp.transfer.enclosed import Enclosure, LimbAxis, piercings, rings_abou
 
 _LEAST_TUBE = 0.1
 """Length of the border of the narrowest empty tube, as a share of the body's extent; of the widest, three times it."""
+_OPEN = 0.75
+"""Least share of a turn about the trunk that what covers the arms has to make: a cape is open in front."""
 _COVERED = 10
 """Planes across the trunk (20 cm) in which a ring has to go around an arm, too: armholes of a waistcoat are shorter."""
 
@@ -81,7 +83,10 @@ def _covers(mesh: TriangleMesh, trunk: LimbAxis, arm: LimbAxis) -> bool:
     cut = (count > 0) & (count < 3)
     both = 0
     for i in np.flatnonzero(cut.sum(axis=1) > 2):
-        both += any(not alone for _, alone in rings_about(mesh, np.flatnonzero(cut[i]), side[i], trunk, int(i), [arm]))
+        both += any(
+            not alone
+            for _, alone in rings_about(mesh, np.flatnonzero(cut[i]), side[i], trunk, int(i), [arm], closed=_OPEN)
+        )
     return both >= _COVERED
 
 

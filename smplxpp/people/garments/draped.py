@@ -15,6 +15,7 @@ from smplxpp.people.garments.cut import (
     grid_faces,
     hang,
     joined,
+    layer,
     skirt_weights,
 )
 from smplxpp.people.garments.loose import hung
@@ -54,6 +55,12 @@ def draped_garments(mannequin: Mannequin) -> list[Garment]:
             "sari", "outer", partial(_sari, mannequin), f"{trunk}; over the shoulder its skin; below as a skirt", True
         ),
     ]
+
+
+def hooded_cape(mannequin: Mannequin) -> Garment:
+    """Return a cape over hanging arms, open in front, and its hood."""
+    rule = "trunk at the same height and azimuth, below as a skirt; hood: head and neck"
+    return Garment("cape with a hood", "outer", partial(_hooded_cape, mannequin), rule, True, pose="down")
 
 
 def leg_weights(mannequin: Mannequin, points: Float[np.ndarray, "N 3"], side: str) -> Float[np.ndarray, "N J"]:
@@ -272,6 +279,33 @@ def _coat_over_shoulders(mannequin: Mannequin) -> ClothMesh:
         pieces.append(ClothMesh(points, tube.faces, rows))
     whole = _welded(joined(submesh(ClothMesh(p, body.faces, weights), ~holes), *pieces))
     return ClothMesh(unpose(whole.vertices, whole.weights, transforms).vertices, whole.faces, whole.weights)
+
+
+def _hooded_cape(mannequin: Mannequin) -> ClothMesh:
+    """Return the cape with its hood, in the T-pose."""
+    j = mannequin.joints
+    hip, neck, chin = j["left_hip"][1], j["neck"][1], j["jaw"][1] - 0.02
+    azimuths = np.linspace(np.pi / 2 + 0.35, 2.5 * np.pi - 0.35, 110)
+    cloth, transforms, _ = _over_arms(
+        mannequin, j["left_knee"][1] + 0.1, azimuths, closed=False, neck=0.1, flare=0.1, rows=64
+    )
+    p = cloth.vertices
+    below = ramp(p[:, 1], hip + 0.05, hip - 0.05)[:, None]
+    weights = (1 - below) * _shoulder_cloth_weights(mannequin, p) + below * skirt_weights(
+        mannequin, p, legs=0.4, shins=0.0
+    )
+
+    def level(q: np.ndarray) -> np.ndarray:
+        x, y, z = q.T
+        face = np.where(z > j["head"][2] + 0.02, np.hypot(x / 0.9, y - j["jaw"][1] - 0.04) - 0.08, 1.0)
+        return np.minimum(face, y - neck)
+
+    hood = layer(mannequin, level, ease=0.03, fairing=20)
+    count = len(hood.vertices)
+    head = ramp(hood.vertices[:, 1], neck - 0.01, chin)[:, None]
+    own = head * mannequin.rigid("head", count) + (1 - head) * mannequin.rigid("neck", count)
+    cape = ClothMesh(unpose(p, weights, transforms).vertices, cloth.faces, weights)
+    return joined(cape, ClothMesh(hood.vertices, hood.faces, own))
 
 
 def _sari(mannequin: Mannequin) -> ClothMesh:

@@ -1,4 +1,4 @@
-"""Hair as a scan shows it: shells over the head and locks that lie on shoulders, back and chest."""
+"""Hair as a scan shows it: shells over the head and locks that lie on shoulders, back and chest; beads about a neck."""
 
 from __future__ import annotations
 
@@ -49,6 +49,23 @@ def hairstyles(mannequin: Mannequin) -> list[Garment]:
 def beards(mannequin: Mannequin) -> list[Garment]:
     """Return a full beard."""
     return [Garment("beard", "hair", partial(_beard, mannequin), "half jaw, half head")]
+
+
+def beads(mannequin: Mannequin) -> Garment:
+    """Return a string of beads about the neck that lies on the chest."""
+    neck, t = mannequin.joints["neck"], np.append(np.linspace(0, 2 * np.pi, 120, endpoint=False), 0.0)
+    front = np.sin(t)
+    curve = np.column_stack(
+        [0.085 * np.cos(t), neck[1] - 0.02 - 0.16 * (1 + front), neck[2] + 0.02 + 0.13 * front + 0.03 * (front > 0)]
+    )
+
+    def make() -> ClothMesh:
+        points, faces = tube_along(curve, np.full(len(curve), 0.007), sides=10)
+        cloth = facing_out(mannequin.unweighted(points, faces), np.repeat(curve, 10, axis=0))
+        vertices = lift_outside(cloth.mesh, mannequin.skin.mesh, clearance=0.004, solid=True)
+        return ClothMesh(vertices, cloth.faces, mannequin.trunk_weights(vertices))
+
+    return Garment("string of beads", "upper", make, "trunk at the same height and azimuth", loose=True)
 
 
 def tied_and_short_hair(mannequin: Mannequin) -> list[Garment]:

@@ -47,7 +47,7 @@ def loose_garments(mannequin: Mannequin) -> list[Garment]:
 
 
 def layered_garments(mannequin: Mannequin) -> list[Garment]:
-    """Return a one-shoulder dress, a skirt over trousers, an apron and a tutu."""
+    """Return a one-shoulder dress, a skirt over trousers, an apron, a tutu."""
     trunk = "trunk at the same height and azimuth, below the hips as a skirt"
     return [
         Garment(
@@ -61,6 +61,13 @@ def layered_garments(mannequin: Mannequin) -> list[Garment]:
             "tutu", "lower", partial(_tutu, mannequin), "pelvis, 0.15 of the thighs", loose=True, beside_hands=True
         ),
     ]
+
+
+def peplum_blouse(mannequin: Mannequin) -> Garment:
+    """Return a blouse without sleeves that falls wide from the waist and ends above the crotch."""
+    hip, chest = mannequin.joints["left_hip"][1], mannequin.joints["spine3"][1] + 0.09
+    cut = partial(hung, mannequin, chest, hip - 0.09, legs=0.5, shins=0.0, flare=0.5, pleats=(10, 0.03))
+    return Garment("peplum blouse", "upper", cut, _SKIRT.format(legs=0.5, shins=0.0), loose=True)
 
 
 def hung(

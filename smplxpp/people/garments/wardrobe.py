@@ -13,10 +13,10 @@ from smplxpp.body import BodyModel
 from smplxpp.clean.simplify import simplify
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.people.garments.cut import Garment
-from smplxpp.people.garments.draped import draped_garments
+from smplxpp.people.garments.draped import draped_garments, hooded_cape
 from smplxpp.people.garments.fitted import bottoms, fitted_garments, tops, worn_things
-from smplxpp.people.garments.hair import beards, hairstyles, tied_and_short_hair
-from smplxpp.people.garments.loose import layered_garments, loose_garments
+from smplxpp.people.garments.hair import beads, beards, hairstyles, tied_and_short_hair
+from smplxpp.people.garments.loose import layered_garments, loose_garments, peplum_blouse
 from smplxpp.people.garments.mannequin import ARMS_DOWN, HAND_JOINTS, Mannequin, lowered, shares
 from smplxpp.people.patterns import smooth_noise
 from smplxpp.skinning import skin
@@ -70,6 +70,9 @@ def garments_of(mannequin: Mannequin) -> list[Garment]:
         *layered_garments(mannequin),
         *worn_things(mannequin),
         *beards(mannequin),
+        peplum_blouse(mannequin),
+        hooded_cape(mannequin),
+        beads(mannequin),
     ]
 
 
