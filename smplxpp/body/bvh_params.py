@@ -30,6 +30,7 @@ from smplxpp.body.rest_pose import (
 from smplxpp.body.retarget import FEET, Skeleton, held_feet
 from smplxpp.body.skeleton_match import SIDES, Tree, match_joints, spine_of
 from smplxpp.core import BodyParams, GeometryWarning, InputError, rotvec_from_matrix
+from smplxpp.core.errors import warn_of_left_out
 from smplxpp.core.files.json_file import as_object, as_text, read_json
 
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
@@ -38,7 +39,6 @@ NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in
 _NEXT = {**CHILD, "collar": "shoulder", "ankle": "foot", "neck": "head"}
 _STRETCH = 0.02  # largest change of a bone's length, as a share: the rounding of files is below
 _TURNS = np.radians(2.0)  # a joint that turns less in its parent's frame, over all frames, is still
-_NAMED = 12  # joints that a warning names
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,7 @@ def load_bvh(
     joints = named_joints(motion, joint_map, subject=f"motion {path}")
     found = matched_skeleton(motion, joints, up=up)
     warn_of_stretching(motion, joints, str(path))
-    if found.left_out:
-        more = f" and {len(found.left_out) - _NAMED} more" if len(found.left_out) > _NAMED else ""
-        warnings.warn(
-            f"{path}: joints that turn and that the body has not are left out: "
-            f"{', '.join(found.left_out[:_NAMED])}{more}",
-            GeometryWarning,
-            stacklevel=2,
-        )
+    warn_of_left_out(str(path), found.left_out, reason="joints that turn and that the body has not are left out")
     if up is None and (other := lies_along(reference_pose(motion, joints), joints)):
         warnings.warn(
             f"{path}: the skeleton stands along {found.up} at rest, and along {other} in its frames: if that is no "

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from smplxpp.core import GeometryWarning
+from smplxpp.core.errors import warn_of_left_out
 
 # Parts of `poses` that AMASS writes a second time, under names of their own, and what fits write of the posed body,
 # which follows from the parameters.
@@ -19,7 +18,13 @@ _COPIES = frozenset({"root_orient", "pose_body", "pose_hand", "pose_jaw", "pose_
 
 
 class NotedReads(dict[str, Any]):
-    """A record of a file that notes which of its entries a reader looked at, so that the others can be named."""
+    """A record of a file that notes which of its entries a reader looked at, so that the others can be named.
+
+    Example:
+        >>> record = NotedReads({"poses": np.ones(3), "contacts": np.ones(4), "fps": 30})
+        >>> record["poses"].sum(), record.keys_left()
+        (3.0, ['contacts'])
+    """
 
     def __init__(self, record: Mapping[str, Any]) -> None:
         super().__init__({str(key): value for key, value in record.items()})
@@ -55,10 +60,6 @@ class NotedReads(dict[str, Any]):
 def warn_of_unread(records: Any, layout: str, source: str) -> None:
     """Name the arrays of a file that are not zero and that its layout's reader does not read."""
     left = sorted({key for one in records if isinstance(one, NotedReads) for key in one.keys_left()})
-    if left:
-        # Files of frames get one text, so that it is shown once.
-        warnings.warn(
-            f"{re.sub(r'[0-9]{4,}', '#', source)}: not read in the layout {layout}: {', '.join(left[:12])}",
-            GeometryWarning,
-            stacklevel=5,
-        )
+    # Files of frames get one text, so that it is shown once.
+    source = re.sub(r"[0-9]{4,}", "#", source)
+    warn_of_left_out(source, left, reason=f"not read in the layout {layout}", stacklevel=5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
@@ -49,6 +50,33 @@ class GeometryWarning(UserWarning):
         ...     warnings.simplefilter("error", smplxpp.GeometryWarning)  # a repair is an error here
         ...     scan = smplxpp.read_scan("data/fixtures/person/scans/scan_000000.ply")
     """
+
+
+_NAMED = 12  # things that a warning names; the rest is counted
+
+
+def warn_of_left_out(source: str, names: Sequence[str], *, reason: str, stacklevel: int = 2) -> None:
+    """Name once what a file has and its reader does not take; nothing where it takes all.
+
+    Args:
+        source: the file.
+        names: of what is left out.
+        reason: what they are and why they are not taken.
+        stacklevel: of the warning, as for `warnings.warn` in the caller.
+
+    Warns:
+        GeometryWarning: the names, the first dozen of them.
+
+    Example:
+        >>> with warnings.catch_warnings(record=True) as caught:
+        ...     warn_of_left_out("file a.npz", ["contacts"], reason="not read in the layout amass")
+        >>> print(caught[0].message)
+        file a.npz: not read in the layout amass: contacts
+    """
+    if names:
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        text = f"{source}: {reason}: {', '.join(names[:_NAMED])}{more}"
+        warnings.warn(text, GeometryWarning, stacklevel=stacklevel + 1)
 
 
 class MissingExtraError(ImportError):

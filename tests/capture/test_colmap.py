@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 
 import numpy as np
@@ -10,7 +11,9 @@ from PIL import Image
 
 from smplxpp.capture import open_capture
 from smplxpp.capture.readers.colmap import MODELS
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import GeometryWarning, InputError
+from tests.capture.scene import make_scene
+from tests.capture.writers import write_colmap_binary
 
 F, FY, CX, CY = 50.0, 52.0, 41.5, 29.25
 X, Y = 0.4, -0.7
@@ -183,3 +186,20 @@ def test_a_fisheye_reconstruction_gives_pinhole_images_and_keypoints(tmp_path):
     found = open_capture(root, keypoints=root / "keypoints").keypoints("a")
     np.testing.assert_allclose(found.points[0, 0], (0.3 * F + CX, 0.2 * FY + CY), atol=1e-9)
     assert found.confidence[0].tolist() == [1.0, 0.0] and camera.width == 80
+
+
+def test_what_a_reconstruction_leaves_out_is_named(tmp_path):
+    """A second model, and photographs that no camera registers, were passed over without a word."""
+    root = write_colmap_binary(make_scene(square_pixels=True), tmp_path / "set")
+    for number in ("0", "1"):
+        shutil.copytree(root / "sparse", tmp_path / number, ignore=shutil.ignore_patterns("[01]"))
+        shutil.move(tmp_path / number, root / "sparse" / number)
+    for k in range(14):
+        (root / "images" / "lost").mkdir(exist_ok=True)
+        (root / "images" / "lost" / f"{k:03d}.JPG").write_bytes(b"")
+    with pytest.warns(GeometryWarning) as caught:
+        open_capture(root)
+    words = [str(one.message).partition(": ")[2] for one in caught]
+    assert words[0] == "models that are not taken beside 0: 1"
+    assert words[1].startswith("14 images that no camera registers: lost/000.JPG, ") and words[1].endswith("and 2 more")
+    assert len(words) == 2

@@ -16,10 +16,10 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from smplxpp.capture.distortion import FISHEYE, FOV, OPENCV, Distortion
-from smplxpp.capture.files import FileSeries, image_name
+from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, image_name
 from smplxpp.capture.readers.common import ReaderOptions, camera_names, chosen_params, number_at_end, pinhole
 from smplxpp.capture.recording import Recording
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, warn_of_left_out
 from smplxpp.core.files import as_numbers, regular_file
 from smplxpp.core.files.paths import path_inside
 
@@ -112,9 +112,13 @@ class ColmapImage:
 def model_folder(root: Path) -> Path | None:
     """Return the folder of the model (`sparse/0`, `sparse` or the folder itself); None without one."""
     for folder in (root / "sparse" / "0", root / "sparse", root):
-        if any((folder / f"cameras.{s}").is_file() and (folder / f"images.{s}").is_file() for s in ("bin", "txt")):
+        if _is_model(folder):
             return folder
     return None
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / f"cameras.{s}").is_file() and (folder / f"images.{s}").is_file() for s in ("bin", "txt"))
 
 
 def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
@@ -246,6 +250,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     lenses, images = read_model(folder)
     paths = [_path_of(root, image, folder) for image in images]
     rig = _is_rig(paths)
+    _name_left_out(root, folder, paths, rig=rig)
     names = camera_names((path.parent if rig else path for path in paths), subject=f"file {folder}")
     # A camera for each registered image, with its own files or, in a rig, those of its folder.
     cameras, distortions = {}, {}
@@ -276,6 +281,21 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         files={kind: {name: s for name, s in series.items() if len(s)} for kind, series in files.items()},
         params=chosen_params(options),
     )
+
+
+def _name_left_out(root: Path, folder: Path, paths: Sequence[PurePosixPath], *, rig: bool) -> None:
+    """Name other models of the reconstruction, and images that this one does not register."""
+    models = sorted(one.name for one in (root / "sparse").glob("*") if one != folder and _is_model(one))
+    warn_of_left_out(f"capture {root}", models, reason=f"models that are not taken beside {folder.name}", stacklevel=3)
+    known = {path.parent if rig else path for path in paths}
+    images = root / "images"
+    found = (PurePosixPath(path.relative_to(images)) for path in images.rglob("*") if _is_image(path))
+    others = sorted(str(path) for path in found if (path.parent if rig else path) not in known)
+    warn_of_left_out(f"capture {root}", others, reason=f"{len(others)} images that no camera registers", stacklevel=3)
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
 
 
 def _path_of(root: Path, image: ColmapImage, folder: Path) -> PurePosixPath:
