@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -59,7 +60,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Take what was imported and collected out of the garbage collector's rounds: it stays until the end."""
+    """Spare each test work that grows with what is imported: the collector's rounds, and handlers of logs."""
+    # pytest gives each logger that keeps its messages to itself, some forty of torch, a handler three times a test.
+    for name, logger in logging.root.manager.loggerDict.items():
+        if name.partition(".")[0] == "torch" and isinstance(logger, logging.Logger):
+            logger.propagate = True
     gc.collect()
     gc.freeze()
     gc.enable()
