@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipelines.synth.motion import Motion, Performance
+from pipelines.synth.motion import Motion, Performance, Turntable
 from pipelines.synth.simulate import SimulationConfig
 from pipelines.synth.talking import Talking
-from pipelines.synth.turntable import Turntable
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core.errors import require_at_least, require_choice, require_positive
 from smplxpp.people.fixture_person import CLOTHES

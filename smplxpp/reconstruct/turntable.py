@@ -7,7 +7,7 @@ inside its silhouette, and what colour it has. Hull and colours are those of `re
 points that are carried.
 
 Eight silhouettes leave wedges of air between them. The surface is therefore bounded by the distance of clothes from the
-body, measured where they are seen from the side (`clothing`).
+body, measured where they are seen from the side (`clothing_limits`).
 
 Poses are wrong by some degrees, and each wrong one cuts into the surface. So a share of the frames may reject a point,
 and the surface is smoothed. It is not swept along its normals to where photographs agree: at poses that are off by
@@ -25,8 +25,7 @@ from jaxtyping import Float64
 
 from smplxpp.core import InputError, ProgressCallback, TriangleMesh, ignore_progress, spread
 from smplxpp.raster import rasterize_mesh
-from smplxpp.reconstruct.carried import CarriedPyramids, PosedPerson
-from smplxpp.reconstruct.clothing import REACH_M, clothing_limits
+from smplxpp.reconstruct.carried import REACH_M, CarriedPyramids, PosedPerson, clothing_limits
 from smplxpp.reconstruct.hull import Field, main_body, zero_surface
 from smplxpp.reconstruct.reconstruct import ReconstructConfig, Reconstruction, cell_size, refined
 from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette, least_shown

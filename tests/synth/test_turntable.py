@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.synth.motion import relaxed_pose
-from pipelines.synth.turntable import Turntable
+from pipelines.synth.motion import Turntable, relaxed_pose
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core import matrix_from_rotvec
 
