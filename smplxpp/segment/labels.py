@@ -12,8 +12,7 @@ from smplxpp.core import LABELS, InputError
 from smplxpp.core.errors import did_you_mean
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.files.yaml_file import read_yaml
-from smplxpp.segment.label_set_file import label_set_of
-from smplxpp.segment.label_sets import LABEL_SETS, LabelSet
+from smplxpp.segment.label_sets import LABEL_SETS, LabelSet, label_set_of
 
 
 def find_label_set(name: str | Path | LabelSet) -> LabelSet:

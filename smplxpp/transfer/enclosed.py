@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.transfer.config import TransferConfig
+from smplxpp.transfer.rings import Ring, of_two_tubes, rings_around
 
 _SPACING = 0.01
 """Distance of the planes along a limb, as a share of the body's extent: less than a ring of a coarse garment."""
 _BEYOND = 0.1
 """How far a limb's axis continues past ankle and wrist, as a share of the body's extent: hems reach lower."""
-_CLOSED = 0.99
-"""Least share of a turn about the axis that a ring has to make: a plane that leaves through a hem makes no ring."""
 _KERNEL = 0.006
 """Standard deviation of the mean of weights along a limb, as a share of the body's extent (1 cm)."""
 
@@ -119,13 +116,18 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         side = axis.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", axis.tangents, axis.points)[:, None]
         count = sum((side > 0)[:, mesh.faces[:, c]].astype(np.int8) for c in range(3))
         cut = (count > 0) & (count < 3)
+        found: list[tuple[int, Ring]] = []
         for i in np.flatnonzero(cut.sum(axis=1) > 2):
-            for corners, single in rings_about(mesh, np.flatnonzero(cut[i]), side[i], axis, int(i), others):
+            found += [
+                (int(i), ring) for ring in rings_around(mesh, np.flatnonzero(cut[i]), side[i], axis, int(i), others)
+            ]
+        for plane, corners, single in of_two_tubes(mesh, found):
+            if len(corners):
                 # A vertex of a cut face counts the more, the nearer it lies to the plane.
-                near = step / (np.abs(side[i, corners]) + 0.05 * step)
+                near = step / (np.abs(side[plane, corners]) + 0.05 * step)
                 (alone if single else other)[k, corners] += near
                 if single:
-                    place[k, corners] += near * (i + side[i, corners] / step)
+                    place[k, corners] += near * (plane + side[plane, corners] / step)
     share, at, limb = np.zeros(n), np.zeros(n), np.full(n, -1)
     for k in range(len(axes) - 1):
         seen = alone[k] > 0
@@ -157,8 +159,16 @@ def _continue_to_hems(
 
     Near a slanted or jagged hem planes across the limb leave the cloth, so that they make no ring. Only vertices from
     eight planes before the last ring on count, and none much farther off the axis than rings are: the side of an open
-    coat below the armpit makes no ring either.
+    coat below the armpit makes no ring either. A scan goes round the edge of a hem and some way up inside: on legs
+    whatever is within two planes of a ring there follows it, too.
     """
+    rings = share > 0.5
+    reach = 2.0 * float(np.linalg.norm(axes[0].points[1] - axes[0].points[0]))
+    lining = np.zeros(mesh.vertex_count, dtype=bool)
+    if rings.any():
+        lining = (share == 0) & (
+            cKDTree(mesh.vertices[rings]).query(mesh.vertices, distance_upper_bound=reach)[0] < reach
+        )
     last, widest = np.zeros(len(axes)), np.zeros(len(axes))
     for k, axis in enumerate(axes[:-1]):
         rows = np.flatnonzero(limb == k)
@@ -167,9 +177,10 @@ def _continue_to_hems(
             last[k] = at[rows].max()
             widest[k] = 1.2 * row_lengths(mesh.vertices[rows] - axis.points[index]).max()
     ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
-    # Hems are seldom more slanted than 16 vertices are high.
+    # Hems are seldom more slanted, and linings seldom deeper, than 16 vertices are high.
     for _ in range(16):
-        pairs = ends[(share[ends[:, 0]] > 0) & open_rows[ends[:, 1]]]
+        legs = lining[ends[:, 1]] & (limb[ends[:, 0]] >= 0) & (limb[ends[:, 0]] < 2)
+        pairs = ends[(share[ends[:, 0]] > 0) & (share[ends[:, 1]] == 0) & (open_rows[ends[:, 1]] | legs)]
         if not len(pairs):
             return
         origin, next_one = pairs.T
@@ -186,82 +197,13 @@ def _continue_to_hems(
         along = np.einsum("ij,ij->i", mesh.vertices[next_one] - mesh.vertices[origin], tangent)
         # Only outwards: upwards cloth that makes no ring is an open jacket's shoulder.
         outwards = along > -0.3 * row_lengths(mesh.vertices[next_one] - mesh.vertices[origin])
+        outwards |= lining[next_one] & (limb[origin] < 2)
         outwards &= at[origin] > last[limb[origin]] - 8.0
         outwards &= off < widest[limb[origin]]
         origin, next_one, along, step = (values[outwards] for values in (origin, next_one, along, step))
         share[next_one], limb[next_one] = share[origin], limb[origin]
         at[next_one] = at[origin] + along / step
         open_rows = open_rows & (share == 0)
-
-
-def rings_about(
-    mesh: TriangleMesh,
-    cut: np.ndarray,
-    side: np.ndarray,
-    axis: LimbAxis,
-    index: int,
-    others: list[LimbAxis],
-    *,
-    closed: float = _CLOSED,
-) -> Iterator[tuple[np.ndarray, bool]]:
-    """Yield the vertices (n,) of faces of each ring that goes around an axis, and whether it goes around it alone.
-
-    Args:
-        mesh: the part.
-        cut: faces that the plane across the axis at point `index` cuts.
-        side: height of each vertex over that plane.
-        axis: the limb's.
-        index: of the axis' point.
-        others: axes of other limbs and of the trunk.
-        closed: least share of a turn about the axis that a ring makes.
-    """
-    point, tangent = axis.points[index], axis.tangents[index]
-    faces, above = mesh.faces[cut], side[mesh.faces[cut]] > 0
-    # The two edges of each face that cross the plane: those at the corner that is alone on its side.
-    odd = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    rows = np.arange(len(cut))
-    a, b, c = faces[rows, odd], faces[rows, (odd + 1) % 3], faces[rows, (odd + 2) % 3]
-    flip = above[rows, odd]
-    p, q = _crossing(mesh.vertices, side, a, b), _crossing(mesh.vertices, side, a, c)
-    # Segments hang together where they share a crossed edge.
-    key = np.sort(np.stack([np.stack([a, b], 1), np.stack([a, c], 1)], 1), axis=2) @ [mesh.vertex_count, 1]
-    edges, node = np.unique(key, return_inverse=True)
-    node = node.reshape(-1, 2)
-    count, ring = connected_components(coo_matrix((np.ones(len(cut)), node.T), shape=(len(edges),) * 2), directed=False)
-    ring = ring[node[:, 0]]
-    # The angle of every ring as seen from the axis, wound the same way all around.
-    start, end = np.where(flip[:, None], p, q), np.where(flip[:, None], q, p)
-    turn = np.abs(np.bincount(ring, _angle(start - point, end - point, tangent), minlength=count))
-    around = turn > closed * 2 * np.pi
-    if not around.any():
-        return
-    # Another axis is within the ring if that goes around it, too, be it with a gap where the plane grazes a hem.
-    shared = np.zeros(count, dtype=bool)
-    for other in others:
-        for at in piercings(other.whole, point, tangent):
-            turn = np.abs(np.bincount(ring, _angle(start - at, end - at, tangent), minlength=count))
-            shared |= turn > np.pi
-    for k in np.flatnonzero(around):
-        yield np.unique(faces[ring == k]), not shared[k]
-
-
-def _crossing(vertices: np.ndarray, side: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return where the edges from a to b cross the plane."""
-    t = side[a] / (side[a] - side[b])
-    return vertices[a] + t[:, None] * (vertices[b] - vertices[a])
-
-
-def piercings(points: np.ndarray, point: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    """Return where a polyline crosses the plane."""
-    side = (points - point) @ tangent
-    k = np.flatnonzero((side[:-1] > 0) != (side[1:] > 0))
-    t = side[k] / (side[k] - side[k + 1])
-    return points[k] + t[:, None] * (points[k + 1] - points[k])
-
-
-def _angle(u: np.ndarray, v: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return the signed angle from u to v about the axis, both across it."""
-    return np.arctan2(np.cross(u, v) @ axis, np.einsum("ij,ij->i", u, v))
 
 
 def _mean(vertices: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -11,7 +11,8 @@ from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.core.topology import border_loops, manifold_corners
 from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.enclosed import Enclosure, LimbAxis, piercings, rings_about
+from smplxpp.transfer.enclosed import Enclosure, LimbAxis
+from smplxpp.transfer.rings import piercings, rings_around
 
 _LEAST_TUBE = 0.1
 """Length of the border of the narrowest empty tube, as a share of the body's extent; of the widest, three times it."""
@@ -84,8 +85,8 @@ def _covers(mesh: TriangleMesh, trunk: LimbAxis, arm: LimbAxis) -> bool:
     both = 0
     for i in np.flatnonzero(cut.sum(axis=1) > 2):
         both += any(
-            not alone
-            for _, alone in rings_about(mesh, np.flatnonzero(cut[i]), side[i], trunk, int(i), [arm], closed=_OPEN)
+            not ring.single
+            for ring in rings_around(mesh, np.flatnonzero(cut[i]), side[i], trunk, int(i), [arm], closed=_OPEN)
         )
     return both >= _COVERED
 

@@ -109,6 +109,35 @@ def test_a_hole_in_a_leg_and_a_torn_hem_change_only_their_own_rings(mannequin, w
     assert np.abs(holed.weights - whole.weights[used])[far].max() < 0.05
 
 
+def test_legs_that_a_scan_has_fused_are_told_by_their_necks_and_a_skirt_has_none(mannequin, worn):
+    """Rings of the shape of an eight: each half is its own leg's; about an oval of the same size nothing is."""
+    case = worn("wide trousers, hem 24 cm")
+    legs = limb_axes(case.source, mannequin.body.weights, extent(case.source), TransferConfig())[:2]
+    heights = np.linspace(legs[0].points[2, 1], legs[0].points[-10, 1], 40)
+    turns = np.linspace(0.0, 2 * np.pi, 96, endpoint=False)
+    ways = np.stack([np.cos(turns), 0 * turns, np.sin(turns)], axis=1)
+    rows = {"eight": [], "oval": []}
+    for y in heights:
+        at = np.array([leg.points[np.abs(leg.points[:, 1] - y).argmin()] for leg in legs])
+        middle, half = at.mean(axis=0), 0.5 * np.linalg.norm(at[0] - at[1])
+        middle[1], along = y, half * np.abs(ways[:, 0])
+        # The union of two circles about the legs, and the ellipse around it.
+        radius = 1.15 * half
+        eight = along + np.sqrt(radius**2 - half**2 + along**2)
+        oval = 1.0 / np.hypot(ways[:, 0] / (half + radius), ways[:, 2] / radius)
+        rows["eight"].append(middle + eight[:, None] * ways)
+        rows["oval"].append(middle + oval[:, None] * ways)
+    index = np.arange(40 * 96).reshape(40, 96)
+    a, b = index[:-1], index[1:]
+    quads = np.stack([a, np.roll(a, -1, 1), np.roll(b, -1, 1), b], axis=-1).reshape(-1, 4)
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    found = {name: enclosure(mannequin, case, TriangleMesh(np.concatenate(p), faces)) for name, p in rows.items()}
+    assert (found["oval"].limb == -1).all()
+    left = np.concatenate(rows["eight"])[:, 0] > 0
+    limb = found["eight"].limb
+    assert (limb[left] == 0).mean() > 0.9 and (limb[~left] == 1).mean() > 0.9
+
+
 def test_axes_run_through_the_joints(mannequin, worn):
     """They are found from the weights alone; the skeleton's joints are the reference."""
     body = mannequin.body
