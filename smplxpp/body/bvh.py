@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,7 +71,8 @@ class _Reader:
     """A recursive-descent reader of the words of one file."""
 
     def __init__(self, text: str, subject: str) -> None:
-        head, found, self._motion = text.partition("MOTION")
+        # The word on a line of its own: joints may be named after it.
+        head, found, self._motion = re.sub(r"(?m)^[ \t]*MOTION[ \t\r]*$", "\0", text, count=1).partition("\0")
         self._words, self._at, self._subject = head.split(), 0, subject
         self._names: list[str] = []
         self._parents: list[int] = []
@@ -141,7 +143,9 @@ class _Reader:
                     self._tips[joints[-1]] = np.array(offset)
             elif word == "CHANNELS" and current is not None:
                 count = self._next()
+                # "ZPosition" of some writers.
                 names = [self._next() for _ in range(int(count))] if count in "0123456" else [count]
+                names = [name[:1].upper() + name[1:].lower() for name in names]
                 rotating = [name for name in names if name.endswith("rotation")]
                 if (
                     not set(names) <= set(_CHANNELS)

@@ -49,6 +49,14 @@ def test_smpl_names_are_joints_and_not_their_neighbours(tmp_path, text):
     np.testing.assert_allclose(joints(params), joints(walk(None)), atol=1e-5)
 
 
+def test_words_of_the_format_in_other_letters_and_as_names(tmp_path, text):
+    """`ZPosition`, and a joint named after the word that begins the numbers."""
+    changed = text.replace("Yposition", "YPosition").replace(" jaw\n", " MOTION_jaw\n")
+    (tmp_path / "a.bvh").write_text(changed)
+    assert changed != text
+    np.testing.assert_allclose(joints(load_bvh(tmp_path / "a.bvh", shaped(None))), joints(walk(None)), atol=1e-5)
+
+
 def test_spines_of_five_joints_keep_the_turn_of_the_last(tmp_path, text):
     """A chain of more than three: the last one below the neck carries shoulders, whatever its name is."""
     lines = text.splitlines()
