@@ -95,7 +95,7 @@ def choose_device(name: str) -> str:
         if not torch.cuda.is_available():
             return "cpu"
         if find_spec("gsplat") is None:
-            log.warning("there is a GPU, but gsplat is not installed: training on the CPU (smplxpp[cuda] has it)")
+            log.warning("there is a GPU, but gsplat is not installed: training on the CPU (pip install '.[cuda]' in the checkout)")
             return "cpu"
         return "cuda"
     if name == "cuda" and not torch.cuda.is_available():
