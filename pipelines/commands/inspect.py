@@ -11,12 +11,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from pipelines.commands.file_kinds import print_kind, shown_bytes
 from pipelines.report.model import CheckRow, Step, count_statuses, worst_status
 from pipelines.report.words import next_steps
 from pipelines.runs.layout import (
     ALL_STAGES,
     EVALUATE_STAGE,
     FIT_STAGE,
+    METRICS_FILE,
     REFINE_STAGE,
     RELIGHT_STAGE,
     TEMPLATE_GLB,
@@ -43,8 +45,8 @@ _STATES = {
 class Inspect:
     """Options of `smplxpp inspect`."""
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `smplxpp build` wrote."""
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
+    """Folder that `smplxpp build` wrote; or any file or folder, of which it is said what it is."""
     all: bool = False
     """List every check; by default those that pass are only counted."""
     strict: bool = False
@@ -53,7 +55,11 @@ class Inspect:
     """Print the summary as JSON."""
 
     def run(self) -> dict:
-        """Summarise the run; prints tables unless `json`."""
+        """Summarise the run, or say what a file is; prints tables unless `json`."""
+        path = self.run_folder
+        holds_a_run = (path / METRICS_FILE).is_file() or any(path.glob("[0-9][0-9]_*/manifest.json"))
+        if path.exists() and not holds_a_run:
+            return print_kind(path, console=None if self.json else Console())
         summary, checks = summarise_run(self.run_folder)
         if not self.json:
             _print_summary(summary, checks, show_all=self.all)
@@ -215,12 +221,12 @@ def _print_summary(summary: dict[str, Any], checks: list[CheckRow], *, show_all:
             stage["stage"],
             Text(stage["state"], style=_STATES[stage["state"]]),
             f"{stage['seconds']:.2f}" if done else "",
-            _size(stage["bytes"]) if done else "",
+            shown_bytes(stage["bytes"]) if done else "",
             str(stage["files"]) if done else "",
             _counts(stage["counts"]),
         )
     table.add_row(
-        "all", "", f"{summary['seconds']:.2f}", _size(sum(s["bytes"] for s in summary["stages"])), style="bold"
+        "all", "", f"{summary['seconds']:.2f}", shown_bytes(sum(s["bytes"] for s in summary["stages"])), style="bold"
     )
     console.print(table)
     for stage in summary["stages"]:
@@ -264,7 +270,3 @@ def _counts(counts: dict[str, int], *, zeros: bool = False) -> Text:
         Text(f"{counts[status]} {status}", style=style) for status, style in _STYLES.items() if zeros or counts[status]
     ]
     return Text("  ").join(parts)
-
-
-def _size(count: int) -> str:
-    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"

@@ -1,6 +1,7 @@
 """`smplxpp inspect` on whole, partial and damaged runs."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +10,7 @@ from pipelines.commands.inspect import Inspect, summarise_run
 from pipelines.runs.layout import BUILD_STAGES, TEMPLATE_STAGES
 from pipelines.runs.stage import StageOutput, run_stage
 from smplxpp.core import Check, InputError
+from tests.dolls.standing import dressed
 from tests.runs.stages import stage_of
 
 
@@ -154,3 +156,27 @@ def test_metrics_of_another_kind_are_none(metrics, tmp_path):
     (tmp_path / "metrics.json").write_text(json.dumps(metrics))
     summary, checks = summarise_run(tmp_path)
     assert summary["subject"] is None and checks == []
+
+
+def test_any_file_is_said_what_it_is(tmp_path, capsys):
+    """Every file was answered with a folder "which does not exist"."""
+    fixture = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
+    (tmp_path / "broken.glb").write_text("hello")
+    (tmp_path / "film.mp4").write_bytes(b"....ftyp")
+    (tmp_path / "words.json").write_text('{"a": 1}')
+    dressed().save(tmp_path / "smplxpp.npz")
+    for path, kind, fact in (
+        (fixture, "capture", "8 cameras, 16 frames"),
+        (fixture / "scans" / "scan_000000.ply", "mesh", "80,000 faces"),
+        (fixture / "params" / "params.npz", "body parameters", "16 frames at 10 a second"),
+        (tmp_path / "smplxpp.npz", "template", "parts by faces: body"),
+        (tmp_path / "words.json", "JSON", "keys: a"),
+        (tmp_path / "film.mp4", "film", "0.0 kB"),
+        (tmp_path / "broken.glb", "nothing that is known here", "damaged: mesh file"),
+    ):
+        assert main(["inspect", str(path), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["kind"] == kind and any(fact in line for line in found["facts"]), found
+        assert all(str(path) in step["command"] for step in found["next"])
+    assert main(["inspect", str(fixture)]) == 0
+    assert f"smplxpp build RUN --capture {fixture}" in capsys.readouterr().out

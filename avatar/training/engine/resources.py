@@ -95,7 +95,9 @@ def choose_device(name: str) -> str:
         if not torch.cuda.is_available():
             return "cpu"
         if find_spec("gsplat") is None:
-            log.warning("there is a GPU, but gsplat is not installed: training on the CPU (pip install '.[cuda]' in the checkout)")
+            log.warning(
+                "there is a GPU, but gsplat is not installed: training on the CPU (pip install '.[cuda]' in the checkout)"
+            )
             return "cpu"
         return "cuda"
     if name == "cuda" and not torch.cuda.is_available():
