@@ -96,7 +96,7 @@ def choose_device(name: str) -> str:
             return "cpu"
         if find_spec("gsplat") is None:
             log.warning(
-                "there is a GPU, but gsplat is not installed: training on the CPU (pip install '.[cuda]' in the checkout)"
+                "there is a GPU, but gsplat is not installed: training on the CPU (install '.[cuda]' in the checkout)"
             )
             return "cpu"
         return "cuda"
