@@ -29,7 +29,7 @@ _LOG = logging.getLogger(__name__)
 # Below what the small scan has, so that simplification has something to do.
 BUDGETS = {"upper": 8_000, "lower": 8_000}
 NAME, LICENCE = "The embedded person", "CC0-1.0"
-SAID = (
+SPEECH = (
     "Hello! I was made from one scan and a few photographs. Nobody has ever filmed me talking: "
     "my voice, my mouth and my hands all come from this text. Type one of your own, and I will say it."
 )
@@ -105,7 +105,7 @@ class Demo:
         export_bundle(self.run_folder, avatar, name=NAME, licence=LICENCE, params=params, exact=False)
         page = self.run_folder / "talking.html"
         try:
-            Talk(avatar, self.run_folder / TALKING_FILM, web=page, text=SAID, view="front", height=540).run()
+            Talk(avatar, self.run_folder / TALKING_FILM, web=page, text=SPEECH, view="front", height=540).run()
         except MissingExtraError as error:
             console.print(f"she does not talk: {error}", markup=False, highlight=False)
             return {"avatar": avatar}

@@ -94,9 +94,9 @@ def _surfaces(request: FileRequest, template: Template, params: BodyParams | Non
             received="one of --params, whose clothes have all their faces",
         )
     rows = request.chosen(len(params), moves=request.is_series)
-    said: list[str] = []
+    notes: list[str] = []
     surfaces = track(
-        _posed(request, template, params, rows, said),
+        _posed(request, template, params, rows, notes),
         total=len(rows),
         description="frames",
         console=Console(stderr=True),
@@ -104,7 +104,7 @@ def _surfaces(request: FileRequest, template: Template, params: BodyParams | Non
     )
     # The generator poses one frame at a time while files are written, so that a long motion needs little memory.
     files = ((1, partial(write_obj, template=replace(template, vertices=surface))) for surface in surfaces)
-    return request.rate(params) if request.is_series else None, files, said
+    return request.rate(params) if request.is_series else None, files, notes
 
 
 def _posed(

@@ -44,7 +44,7 @@ _MIDDLE = {
 _FINGER_WORDS = {"middle": "middle mid", "pinky": "pinky little", "thumb": "thumb", "index": "index", "ring": "ring"}
 # Bones of a finger by their names; 0 lies in the hand.
 _BONES = {"metacarpal": 0, "inhand": 0, "root": 0, "proximal": 1, "base": 1, "intermediate": 2, "distal": 3}
-_END = 9  # beyond every bone
+_END = 9  # after every bone
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class JointWords:
     """What a name says.
 
     Attributes:
-        side: of the body; None: in the middle, or not said.
+        side: of the body; None: in the middle, or not stated.
         part: word of a limb or of the trunk; "finger", "other" (eyes, twists, ends), or "" for an unknown name.
         finger: of `FINGERS`, or the number of an unnamed finger as text.
-        bone: number of the finger's bone from the hand, 0 in the hand; None if not said.
+        bone: number of the finger's bone from the hand, 0 in the hand; None if not stated.
     """
 
     side: Side | None = None

@@ -45,7 +45,7 @@ class MotionFacts:
         up: axis that points up in the file, as "y".
         skeleton: for a .bvh, the file's joints for each of ours, and what is missing; else empty.
         left_out: what the file has and is not read.
-        ranges: extents of the way and heights in metres, speeds in metres a second, turns in degrees.
+        ranges: extents of the travel and heights in metres, speeds in metres a second, turns in degrees.
         mistakes: sentences on what is likely wrong, with remedies.
     """
 

@@ -34,7 +34,7 @@ class Reference:
 
     Attributes:
         rest: places of the J joints: the file's rest pose, or those of a frame.
-        tips: places of the ends of bones beyond the last joint, by its index.
+        tips: places of the ends of bones after the last joint, by its index.
         turns: rotations of the joints in the world, relative to that pose.
         places: of the joints in the world.
         frame: the frame that stands for the rest pose; None: the rest pose does.
@@ -65,7 +65,7 @@ def reference_pose(motion: BvhMotion, joints: Mapping[str, int]) -> Reference:
 
 
 def sides_are_exchanged(pose: Reference, joints: Mapping[str, int]) -> bool:
-    """Whether feet point to where left and right are the other way round."""
+    """Whether feet point to where left and right are interchanged."""
     rest = pose.rest
     lateral = rest[joints["left_hip"]] - rest[joints["right_hip"]]
     up = sum(rest[joints[f"{side}_shoulder"]] - rest[joints[f"{side}_hip"]] for side in SIDES)

@@ -123,7 +123,7 @@ def spine_of(tree: Tree, found: Mapping[str, int]) -> list[int]:
     """Return the joints between the pelvis and the neck or, without a neck, up to the joint that the arms hang on."""
     chest = tree.meet(found["left_shoulder"], found["right_shoulder"])
     top = int(tree.parents[found["neck"]]) if "neck" in found else chest
-    # Where the trunk does not hang on the pelvis, both hang on a joint above: the way goes over it.
+    # Where the trunk does not hang on the pelvis, both hang on a joint above, and the path leads over it.
     meet = tree.meet(found["pelvis"], top)
     return [joint for joint in tree.below(meet, top) if joint != found["pelvis"]]
 
@@ -170,7 +170,7 @@ def _ends_by_shape(tree: Tree) -> tuple[tuple[int, int] | None, tuple[int, int] 
     if len(pairs) < 2:
         return None, None
     (hips, *legs), (_, *arms) = pairs[0], pairs[-1]
-    # Left is where the feet's direction and the way up put it; without toes, the skeleton looks along +z or, with z
+    # Left is where the feet's direction and the vertical put it; without toes, the skeleton looks along +z or, with z
     # up, along -y, as files without names do.
     up = tree.places[pairs[-1][0]] - tree.places[hips]
     front = _toes(tree, [int(end[joint]) for joint in legs], up)
@@ -186,7 +186,7 @@ def _ends_by_shape(tree: Tree) -> tuple[tuple[int, int] | None, tuple[int, int] 
 
 
 def _toes(tree: Tree, ends: list[int], up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"] | None:
-    """Return the direction of the last bones of both legs across the way up; None where they lie along it."""
+    """Return the direction of the last bones of both legs across the vertical; None where they lie along it."""
     across = np.zeros(3)
     for joint in ends:
         bone = tree.places[joint] - tree.places[tree.parents[joint]]
@@ -255,19 +255,19 @@ def _pelvis(tree: Tree, words: list[JointWords], meet: int, found: Mapping[str, 
 
 
 def _neck_and_head(tree: Tree, words: list[JointWords], chest: int, limbs: set[int]) -> dict[str, int]:
-    """Return the neck and the head: on the way from the chest to the joint that is named the head, or to the top."""
+    """Return the neck and the head: on the path from the chest to the joint that is named the head, or to the top."""
     under = [joint for joint in range(len(tree.names)) if chest in tree.above(joint) and joint != chest]
     heads = [joint for joint in under if words[joint].part == "head"]
     necks = [joint for joint in under if words[joint].part == "neck"]
     if heads or necks:
         head = min(heads, key=lambda joint: len(tree.above(joint))) if heads else None
-        way = tree.below(chest, necks[0] if head is None else head)
+        path = tree.below(chest, necks[0] if head is None else head)
         # A chest that is called neck carries the shoulders, too.
-        neck = next((joint for joint in way if words[joint].part == "neck"), None)
+        neck = next((joint for joint in path if words[joint].part == "neck"), None)
         if neck is None and words[chest].part == "neck":
             neck = chest
-        if neck is None and head is not None and len(way) > 1:
-            neck = way[-2]
+        if neck is None and head is not None and len(path) > 1:
+            neck = path[-2]
     else:
         # Without names: the branch of the chest that holds neither arm.
         free = [joint for joint in under if not any(joint in tree.above(end) for end in limbs)]

@@ -56,13 +56,13 @@ class _Places:
 
 
 def simplified_template(template: Template, faces: int) -> Template:
-    """Return the template with about so many faces.
+    """Return the template with about a given number of faces.
 
     Skin under clothes is left out but for a margin (`covered_faces`). Large parts give up more of their faces than
     small ones (`simplify`: edges collapsed by quadric error, borders and their vertices kept; head and hands count as
     larger than they are). A vertex of the result takes weights, expressions, and shape and pose bases of the nearest
     place on the source's faces that collapsed into it, so that upper and lower lip, or two fingers, cannot exchange
-    theirs; its colour is their mean. A texture is painted anew from the source's. Joints stay where they are and follow expressions as before.
+    theirs; its colour is their mean. A texture is painted again from the source's. Joints stay where they are and follow expressions as before.
 
     A template within the number is returned as it is.
 
@@ -142,7 +142,7 @@ def _simplified_part(
     budget: int,
     space: tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, " V"]],
 ) -> _Places:
-    """Simplify faces to so many; `space` is what `_emphasised` returns."""
+    """Simplify faces to a number of them; `space` is what `_emphasised` returns."""
     places, scale = space
     mesh, kept = TriangleMesh(places, template.faces).submesh(faces)
     if not mesh.face_count:
@@ -168,7 +168,7 @@ def _simplified_part(
     total = np.zeros((int(small.new_from_old.max()) + 1, 4))
     colors = np.pad(template.vertex_colors[kept[used]].astype(np.float64), ((0, 0), (0, 1)), constant_values=1.0)
     np.add.at(total, small.new_from_old[used], colors)
-    # Back from the enlarged space: the place on the source, and the way from there at the person's own size.
+    # Back from the enlarged space: the place on the source, and the offset from there at the person's own size.
     corners, shares = kept[mesh.faces[face[best]]], shares[best]
     away = small.mesh.vertices - _mixed(shares, places[corners])
     vertices = _mixed(shares, template.vertices[corners]) + away / _mixed(shares, scale[corners])[:, None]

@@ -151,11 +151,11 @@ def write_fbx(
         except subprocess.TimeoutExpired:
             raise InputError(command[0], expected=f"an end within {_TIMEOUT} s", received="none") from None
         if done.returncode or not fbx.is_file():
-            said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
+            last_line = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
             raise InputError(
                 f"{command[0]} on the rigged GLB",
                 expected="an FBX",
-                received=f"exit status {done.returncode}: {said}"[:600],
+                received=f"exit status {done.returncode}: {last_line}"[:600],
                 remedy="Blender 4.2 and later and bpy 5.0 are known to work; a Python needs bpy",
             )
         shutil.copyfile(fbx, written)

@@ -14,7 +14,7 @@ from smplxpp.core.topology import component_labels
 from smplxpp.raster import rasterize_triangles
 from smplxpp.template.template import BODY_PART, Template
 
-# Charts are packed on a grid of so many cells a side, whatever the pictures' size, and stand this many cells apart:
+# Charts are packed on a grid of this many cells a side, whatever the pictures' size, and stand this many cells apart:
 # two texels of the smallest picture, which bilinear filtering needs, and four and eight of the larger ones.
 _GRID, _APART = 1024, 2
 # How much finer than the whole body a part of it may lie in its file's own layout, as faces do.
@@ -91,7 +91,7 @@ def _charts(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     used, corners = np.unique(mesh.faces, return_inverse=True)
     atlas, options, packing = xatlas.Atlas(), xatlas.ChartOptions(), xatlas.PackOptions()
     options.max_chart_area = largest_chart
-    # A coarse packing that nobody sees: the charts are packed together with all others afterwards.
+    # A coarse packing, which no file holds: the charts are packed together with all others afterwards.
     packing.texels_per_unit = 200.0
     faces = corners.reshape(mesh.faces.shape)
     atlas.add_mesh(mesh.vertices[used].astype(np.float32), faces.astype(np.uint32))

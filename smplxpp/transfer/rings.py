@@ -27,13 +27,13 @@ class Neck:
     """The narrowest place of a ring between two axes.
 
     Attributes:
-        point: on the way from the limb's axis to the other one.
-        way: unit vector along it.
+        point: on the line from the limb's axis to the other one.
+        direction: unit vector along it.
         width: over that of the narrower lobe, on the side where it is less narrow.
     """
 
     point: np.ndarray
-    way: np.ndarray
+    direction: np.ndarray
     width: float
 
 
@@ -81,7 +81,7 @@ def rings_around(
     node = node.reshape(-1, 2)
     count, ring = connected_components(coo_matrix((np.ones(len(cut)), node.T), shape=(len(edges),) * 2), directed=False)
     ring = ring[node[:, 0]]
-    # The angle of every ring as seen from the axis, wound the same way all around.
+    # The angle of every ring as seen from the axis, wound in one sense all around.
     start, end = np.where(flip[:, None], p, q), np.where(flip[:, None], q, p)
     turn = np.abs(np.bincount(ring, _angle(start - point, end - point, tangent), minlength=count))
     around = turn > closed * 2 * np.pi
@@ -103,9 +103,10 @@ def rings_around(
 
 def _neck(points: np.ndarray, own: np.ndarray, other: np.ndarray, tangent: np.ndarray) -> Neck | None:
     """Return the neck of a ring around two axes, None where it has none between them."""
-    way = (other - own) / np.linalg.norm(other - own)
-    place, side = (points - own) @ way / np.linalg.norm(other - own), (points - own) @ np.cross(tangent, way)
-    # How far the ring reaches to either side of the line through both axes, in slices of a tenth of the way.
+    distance = np.linalg.norm(other - own)
+    direction = (other - own) / distance
+    place, side = (points - own) @ direction / distance, (points - own) @ np.cross(tangent, direction)
+    # How far the ring reaches to either side of the line through both axes, in slices of a tenth of the distance.
     slices = np.floor(10.0 * place).astype(int)
     reach: dict[int, np.ndarray] = {}
     for k in np.unique(slices).tolist():
@@ -120,7 +121,7 @@ def _neck(points: np.ndarray, own: np.ndarray, other: np.ndarray, tangent: np.nd
     if not all(lobes):
         return None
     width = (reach[at] / np.minimum(*(np.max(lobe, axis=0) for lobe in lobes))).max()
-    return Neck(own + 0.1 * (at + 0.5) * (other - own), way, float(width))
+    return Neck(own + 0.1 * (at + 0.5) * (other - own), direction, float(width))
 
 
 def of_two_tubes(mesh: TriangleMesh, rings: list[tuple[int, Ring]]) -> Iterator[tuple[int, np.ndarray, bool]]:
@@ -137,7 +138,7 @@ def of_two_tubes(mesh: TriangleMesh, rings: list[tuple[int, Ring]]) -> Iterator[
             yield i, ring.corners, ring.single
             continue
         # This limb's are the vertices on its axis' side of the neck.
-        yield i, ring.corners[(mesh.vertices[ring.corners] - neck.point) @ neck.way < 0], True
+        yield i, ring.corners[(mesh.vertices[ring.corners] - neck.point) @ neck.direction < 0], True
 
 
 def _crossing(vertices: np.ndarray, side: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ def read_yaml(path: str | Path, *, subject: str = "file", remedy: str = "") -> A
     """Read the content of a YAML file of at most 256 kibibytes as dictionaries, lists, texts, numbers, bools and None.
 
     Raises:
-        InputError: missing, no text, too large, or beyond the part of YAML that is read; the message names the line.
+        InputError: missing, no text, too large, or outside the part of YAML that is read; the message names the line.
 
     Example:
         >>> import tempfile
@@ -148,7 +148,7 @@ class _Parser:
     def _value(self, line: _Line, text: str) -> Any:
         if text[0] not in "[{":
             return self._scalar(line, text)
-        # A flow collection goes on until its brackets are closed.
+        # A flow collection continues until its brackets are closed.
         opened, rows = _open_brackets(text), [text]
         while opened > 0 and self.at < len(self.lines):
             rows.append(self.lines[self.at].text)
