@@ -2,14 +2,16 @@
 
 python -m benchmarks exports bundles --run RUN --capture DIR [--frames 6] [--no-store]
 python -m benchmarks exports splats --source ME.avatar [--frame 3] [--pictures DIR]
+python -m benchmarks exports texture --runs RUN ... [--pictures DIR] [--no-store]
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import mean
 from typing import Annotated
@@ -35,11 +37,22 @@ from benchmarks.support.results import store_results
 from pipelines.commands.export import Export
 from pipelines.figures import VIEWS, fit_cameras
 from pipelines.runs import layout
-from smplxpp.body import load_params
+from pipelines.runs.artefacts import load_params_of_run, load_prepared_scan, load_scan_labels
+from pipelines.stages.build_config import load_build
+from smplxpp.body import load_body, load_params
+from smplxpp.build.assemble import add_texture
+from smplxpp.build.scan import raw_scan
 from smplxpp.capture import open_capture
 from smplxpp.cloth.garment_file import load_garments
+from smplxpp.core import Camera, TriangleMesh
+from smplxpp.core.colors import linear_from_srgb, srgb_from_linear
 from smplxpp.core.spread import spread
-from smplxpp.template.template import Template
+from smplxpp.raster import rasterize_mesh
+from smplxpp.raster.viewpoints import turntable_cameras
+from smplxpp.template.template import BODY_PART, Template
+from smplxpp.template.texture import texture_paint
+from smplxpp.texture.painted_scan import PaintedScan, pictures_of
+from smplxpp.texture.photographs import Painter
 from tests.formats.foreign import as_world, gsply_splats, pygltflib_splats, usd_splats, webavatar_splats
 
 WAYS = {
@@ -220,6 +233,95 @@ class ExportsBenchmark:
             print(f"webavatar {name:4} {path.stat().st_size / 1e6:5.2f} MB  {psnr:6.1f} dB  {half:.1f}, {most:.1f} mm")
 
 
+@dataclass(frozen=True)
+class TextureBenchmark:
+    """Measure textures of templates: decibels against the scan in its own colours, stretch, texels, time and bytes.
+
+    Template and scan are drawn without light in the scan's pose, in 12 views around the person 640 pixels high, four
+    samples a pixel. PSNR is over the pixels that the scan covers, of all views together and of the worst. Beside it
+    the template in the colours of its vertices. `lost`: the share of texels of clothes, hair and shoes, the mean over
+    these parts, that take their colour from neighbours.
+    """
+
+    runs: tuple[Path, ...]
+    """Runs of builds."""
+    sizes: tuple[int, ...] = (1024, 2048, 4096)
+    """Texels a side."""
+    pictures: Path | None = None
+    """Folder for pictures: the scan, the texture, the vertices."""
+    store: bool = True
+    """Store the figures."""
+
+    def run(self) -> None:
+        """Print and store a row a run and size."""
+        rows = {f"{run.name}, {size}": self._row(run, size) for run in self.runs for size in self.sizes}
+        print(json.dumps(rows, indent=1))
+        if self.store:
+            names = " ".join(run.name for run in self.runs)
+            store_results("textures", f"python -m benchmarks exports texture --runs {names}", rows)
+
+    def _row(self, run: Path, size: int) -> dict[str, object]:
+        built = load_build(run)
+        assert built is not None, "a run keeps its inputs"
+        inputs, config = built[0], replace(built[1], texture_size=size)
+        scan, params = load_prepared_scan(run), load_params_of_run(run)
+        labels = load_scan_labels(run, scan.mesh.face_count)
+        plain = replace(Template.load(run / layout.TEMPLATE), texture=None)
+        begin = time.process_time()
+        template, numbers = add_texture(plain, params, scan, labels, inputs, config, load_body(inputs.body))
+        seconds = time.process_time() - begin
+        assert template.texture is not None, numbers["texture"]
+        raw = None if inputs.scan is None else raw_scan(inputs.scan)
+        pictures = None if raw is None else pictures_of(raw, scan.mesh, scan.source_vertex, scan.source_face)
+        painted = PaintedScan(scan.mesh, scan.colors, labels, pictures)
+        posed = TriangleMesh(template.pose(params)[0], template.faces)
+        textured = texture_paint(template)
+        assert textured is not None
+        paints = {"texture": textured, "vertices": _vertex_paint(template)}
+        errors: dict[str, list[float]] = {name: [] for name in paints}
+        shown = []
+        for camera in turntable_cameras(scan.mesh.vertices, count=12, height=1280):
+            whole = camera.cropped((0, 0, camera.width - camera.width % 2, camera.height))
+            truth, mask = _unlit(scan.mesh, whole, painted.colors_at)
+            images = {name: _unlit(posed, whole, paint)[0] for name, paint in paints.items()}
+            for name, image in images.items():
+                errors[name].append(float(np.square(image - truth)[mask].mean()))
+            shown.append(np.hstack([truth, *images.values()]))
+        if self.pictures is not None:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            sheet = (255 * np.vstack([shown[0], shown[5]])).clip(0, 255).astype(np.uint8)
+            Image.fromarray(sheet).save(self.pictures / f"{run.name}_{size}.png")
+        figures = {f"{name}, psnr": psnr_from_mse(mean(values)) for name, values in errors.items()}
+        figures |= {f"{name}, worst view": psnr_from_mse(max(values)) for name, values in errors.items()}
+        seen = numbers["texture_seen"]
+        clothed = [share for name, share in seen.items() if name != BODY_PART]
+        return {
+            "size": size,
+            "from": numbers["texture"],
+            **figures,
+            "stretch": numbers["texture_stretch"],
+            "lost": 1.0 - mean(clothed) if clothed else 0.0,
+            "skin seen": seen[BODY_PART],
+            "cpu seconds": seconds,
+            "megabytes": numbers["texture_bytes"] / 1e6,
+        }
+
+
+def _unlit(mesh: TriangleMesh, camera: Camera, paint: Painter) -> tuple[np.ndarray, np.ndarray]:
+    """Draw sRGB in [0, 1] on white, averaged over 2 x 2 samples in linear light; and the pixels that are covered."""
+    maps = rasterize_mesh(mesh, camera)
+    image = np.ones((camera.height, camera.width, 3), np.float32)
+    image[maps.mask] = linear_from_srgb(paint(maps.face_id[maps.mask], maps.barycentric[maps.mask].astype(np.float64)))
+    small = image.reshape(camera.height // 2, 2, camera.width // 2, 2, 3).mean(axis=(1, 3))
+    covered = maps.mask.reshape(camera.height // 2, 2, camera.width // 2, 2).all(axis=(1, 3))
+    return srgb_from_linear(small), covered
+
+
+def _vertex_paint(template: Template) -> Painter:
+    scan = PaintedScan(template.mesh, template.vertex_colors, template.vertex_labels[template.faces[:, 0]])
+    return scan.colors_at
+
+
 def _psnr(image: np.ndarray, other: np.ndarray, alpha: np.ndarray) -> float:
     """PSNR where the person is."""
     difference = np.clip(image, 0.0, 1.0) - np.clip(other, 0.0, 1.0)
@@ -227,4 +329,6 @@ def _psnr(image: np.ndarray, other: np.ndarray, alpha: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"bundles": BundleBenchmark, "splats": ExportsBenchmark}).run()
+    tyro.extras.subcommand_cli_from_dict(
+        {"bundles": BundleBenchmark, "splats": ExportsBenchmark, "texture": TextureBenchmark}
+    ).run()

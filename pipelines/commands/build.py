@@ -111,8 +111,8 @@ class Build:
     coloured instead."""
     texture_layout: Literal["one", "part"] = "one"
     """One picture for all parts, or one a part; then the body lies as in its own file."""
-    normal_map: bool = True
-    """Paint the scan's normals onto the simplified parts, too."""
+    normal_map: bool = False
+    """Paint the scan's normals onto the parts, too: for small budgets of faces."""
     samples: int = 100_000
     """Surface samples of the validation."""
     seed: int = 0

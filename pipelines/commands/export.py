@@ -151,6 +151,8 @@ class Export:
     max_influences: OptionalInt = None
     """Most joints that move a vertex of a rigged template, such as the 4 or 8 of an engine; the largest weights stay.
     By default as many as the format holds, 8 in a GLB."""
+    texture_size: Annotated[Literal[0, 1024, 2048, 4096] | None, tyro.conf.arg(metavar="TEXELS")] = None
+    """Texels a side of a template's texture, at most what the build made; 0: colours of vertices."""
     faces: tuple[int, ...] = ()
     """Faces of a coarser template, such as 10000; several numbers make a file each: NAME_LOD0, NAME_LOD1 and so on."""
     blender: OptionalPath = None
@@ -227,6 +229,7 @@ class Export:
             rigged=ExportOptions(
                 joint_names=self.joint_names,
                 max_influences=self.max_influences,
+                texture_size=self.texture_size,
                 blender=self.blender,
                 meta=self._meta() if name == "vrm" else None,
             ),

@@ -23,7 +23,7 @@ from smplxpp.cloth.play import play
 from smplxpp.core import BodyParams, InputError
 from smplxpp.export.amass import write_amass
 from smplxpp.export.bvh import write_bvh
-from smplxpp.export.by_suffix import export_template, pruning_error
+from smplxpp.export.by_suffix import export_template, pruning_error, with_texture_size
 from smplxpp.template.template import Template
 
 Writers = tuple[float | None, Iterator[tuple[int, Callable[[Path], object]]], list[str]]
@@ -41,7 +41,7 @@ def template_writers(request: FileRequest) -> Writers:
     # A motion places the person by itself; in the T-pose she stands on the floor.
     template = template.on_floor() if params is None else template
     if request.format == "obj":
-        return _surfaces(request, template, params)
+        return _surfaces(request, with_texture_size(template, request.rigged.texture_size), params)
     if request.is_series:
         raise InputError(
             f"output {request.out}",

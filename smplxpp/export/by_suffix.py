@@ -19,6 +19,7 @@ from smplxpp.export.obj import write_obj
 from smplxpp.export.usd import write_usd
 from smplxpp.export.vrm import checked_meta, write_vrm
 from smplxpp.template.template import Template
+from smplxpp.template.texture import TEXTURE_SIZES
 
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 RIGGED = (".glb", ".fbx", ".vrm", *_USD)
@@ -35,6 +36,8 @@ class ExportOptions:
     Attributes:
         joint_names: whose names the joints have: one of `smplxpp.body.layout.NAME_SCHEMES`.
         max_influences: most joints of a vertex, 1 to 8; None: as many as the format holds.
+        texture_size: texels a side of the pictures, at most as many as the build made; 0: the colours of the vertices
+            alone. None: as the build made them.
         blender: Blender, or a Python with bpy, which writes FBX; None: as `smplxpp.export.fbx.blender_command` finds
             it.
         meta: of a VRM, name, authors, licence and terms by VRM's own names: `smplxpp.export.vrm.checked_meta`.
@@ -45,6 +48,7 @@ class ExportOptions:
 
     joint_names: str = OWN_NAMES
     max_influences: int | None = None
+    texture_size: int | None = None
     blender: str | Path | None = None
     meta: Mapping[str, Any] | None = None
 
@@ -52,11 +56,14 @@ class ExportOptions:
         require_choice("option joint_names", self.joint_names, NAME_SCHEMES)
         if self.max_influences is not None:
             require_between("option max_influences", self.max_influences, 1, MAX_INFLUENCES)
+        if self.texture_size is not None:
+            require_choice("option texture_size", str(self.texture_size), [str(size) for size in TEXTURE_SIZES])
         checked_meta(self.meta, name="me")
 
     def check(self, suffix: str) -> None:
         """Raise `InputError` for an option that has no effect on files of a suffix."""
         effects = {"joint_names": (*RIGGED, ".bvh"), "max_influences": RIGGED, "blender": (".fbx",), "meta": (".vrm",)}
+        effects["texture_size"] = SUFFIXES
         for name, suffixes in effects.items():
             if getattr(self, name) != getattr(ExportOptions, name) and suffix not in suffixes:
                 raise InputError(f"option {name}", expected=f"a file {', '.join(suffixes)}", received=suffix)
@@ -99,7 +106,7 @@ def export_template(
         )
     options = options or ExportOptions()
     options.check(suffix)
-    template = with_influences(template, options.max_influences)
+    template = with_texture_size(with_influences(template, options.max_influences), options.texture_size)
     # A VRM's bones are found by our names, before they get others.
     if suffix != ".vrm":
         template = with_joint_names(template, options.joint_names)
@@ -122,6 +129,13 @@ def export_template(
     else:
         template.save(path)
     return path
+
+
+def with_texture_size(template: Template, size: int | None) -> Template:
+    """Return the template with pictures of at most so many texels a side; 0 leaves none, None changes nothing."""
+    if size is None or template.texture is None:
+        return template
+    return replace(template, texture=template.texture.resized(size) if size else None)
 
 
 def with_influences(template: Template, max_influences: int | None) -> Template:

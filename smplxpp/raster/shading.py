@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, UInt8
 
 from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb, srgb8_from_linear
@@ -18,6 +18,8 @@ from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh
 _KEY_DIRECTION = np.array([-0.42076, -0.62112, -0.66119], dtype=np.float32)
 _HALF_DIRECTION = np.array([-0.23084, -0.34076, -0.91137], dtype=np.float32)  # between the key and the viewer
 _BACK_SIDE = np.array([0.42, 0.46, 0.54], dtype=np.float32)  # inside of open surfaces: darker and cooler
+
+Paint = Callable[[Int64[np.ndarray, " P"], Float64[np.ndarray, "P 3"]], UInt8[np.ndarray, "P 3"]]
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ def render_shaded(
     *,
     vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
     face_colors: UInt8[np.ndarray, "M 3"] | None = None,
+    paint: Paint | None = None,
     style: ShadeStyle | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw a lit picture of a mesh.
@@ -77,10 +80,11 @@ def render_shaded(
         camera: the camera.
         vertex_colors: sRGB, interpolated in linear light.
         face_colors: sRGB, one for each face.
+        paint: returns the sRGB of points, given as faces and barycentric coordinates, such as those of a texture.
         style: options.
     """
     style = style or ShadeStyle()
-    layer = shade_layer(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors, style=style)
+    layer = shade_layer(mesh, camera, vertex_colors=vertex_colors, face_colors=face_colors, paint=paint, style=style)
     return resolve(layer.color, layer.mask, style=style)
 
 
@@ -90,9 +94,10 @@ def shade_layer(
     *,
     vertex_colors: UInt8[np.ndarray, "N 3"] | None = None,
     face_colors: UInt8[np.ndarray, "M 3"] | None = None,
+    paint: Paint | None = None,
     style: ShadeStyle,
 ) -> Layer:
-    """Rasterise and shade a mesh, with colours of either vertices or faces."""
+    """Rasterise and shade a mesh, with colours of either vertices or faces, or of every point."""
     # Colours are bytes of one kind.
     for name, colors, count in (
         ("vertex colours", vertex_colors, mesh.vertex_count),
@@ -122,6 +127,7 @@ def shade_layer(
         normals=_camera_normals(mesh, camera, smooth=style.smooth),
         vertex_albedo=None if vertex_colors is None else linear_from_srgb(np.asarray(vertex_colors)),
         face_albedo=base[None] if face_colors is None else linear_from_srgb(np.asarray(face_colors)),
+        paint=paint,
         edge_heights=_edge_heights(mesh, fine) if style.wireframe else None,
         style=style,
     )
@@ -169,6 +175,7 @@ class _Surface:
         normals: normals of vertices or faces, in camera axes.
         vertex_albedo: linear colours of vertices.
         face_albedo: linear colours of faces, or one for all.
+        paint: colours of points, in the place of both.
         edge_heights: heights of the faces over their edges, pixels.
         style: options.
     """
@@ -180,6 +187,7 @@ class _Surface:
     normals: Float32[np.ndarray, "K 3"]
     vertex_albedo: Float32[np.ndarray, "N 3"] | None
     face_albedo: Float32[np.ndarray, "L 3"]
+    paint: Paint | None
     edge_heights: Float32[np.ndarray, "M 3"] | None
     style: ShadeStyle
 
@@ -195,7 +203,9 @@ class _Surface:
         # Albedo from vertices, one colour, or faces.
         face, bary, corners = self._gather(pixels)
         normal = self._normals(face, bary, corners)
-        if self.vertex_albedo is not None:
+        if self.paint is not None:
+            color = linear_from_srgb(self.paint(face.astype(np.int64), bary.astype(np.float64)))
+        elif self.vertex_albedo is not None:
             color = _interpolate(self.vertex_albedo, corners, bary)
         elif len(self.face_albedo) == 1:
             color = np.repeat(self.face_albedo, len(pixels), axis=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 from smplxpp.core import InputError, TriangleMesh, normalize_rows, row_lengths
 from smplxpp.core.files.image_file import decode_image
+from smplxpp.core.mesh_files.texture import CLAMP, sample_bilinear
 
 if TYPE_CHECKING:
     from smplxpp.template.template import Template
@@ -224,6 +225,31 @@ def corner_tangents(
     tangent[weak] = np.where(row_lengths(across)[:, None] > 0, across, [1.0, 0.0, 0.0])
     out = np.concatenate([normalize_rows(tangent), np.repeat(sign, 3)[:, None]], axis=1)
     return out.reshape(-1, 3, 4)
+
+
+def texture_paint(
+    template: Template,
+) -> Callable[[Int64[np.ndarray, " T"], Float64[np.ndarray, "T 3"]], UInt8[np.ndarray, "T 3"]] | None:
+    """Return what gives the sRGB of points on a template, as faces and barycentric coordinates; None without texture.
+
+    Example:
+        >>> paint = texture_paint(template)  # doctest: +SKIP
+        >>> picture = render_shaded(template.mesh, camera, paint=paint)  # doctest: +SKIP
+    """
+    texture = template.texture
+    if texture is None:
+        return None
+    images = [texture.color_image(k) for k in range(len(texture.colors))]
+
+    def paint(face: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+        uv = np.einsum("tk,tkd->td", barycentric, texture.uv[texture.face_uv[face]])
+        picture = texture.picture[template.vertex_part[template.faces[face, 0]]]
+        out = np.zeros((len(face), 3), np.uint8)
+        for k, image in enumerate(images):
+            out[picture == k] = sample_bilinear(image, uv[picture == k], wrap=(CLAMP, CLAMP))
+        return out
+
+    return paint
 
 
 def texture_arrays(texture: Texture) -> dict[str, np.ndarray]:

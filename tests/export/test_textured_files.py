@@ -150,3 +150,15 @@ def test_a_template_keeps_its_texture_in_its_file_and_undressed(tmp_path, textur
     assert small.size == 16 and back.texture.resized(4096) is back.texture
     mean = np.mean(PIL.Image.open(io.BytesIO(small.colors[0])))
     assert abs(mean - np.mean(back.texture.color_image(0))) < 2
+
+
+def test_an_export_may_have_smaller_pictures_or_the_colours_of_vertices_alone(tmp_path, textured):
+    textured.export(tmp_path / "small.obj", texture_size=1024)
+    with PIL.Image.open(tmp_path / "small_color_0.jpg") as image:
+        assert image.size == (64, 64), "pictures are not made larger"
+    textured.export(tmp_path / "plain.glb", texture_size=0)
+    reader = GlbReader(tmp_path / "plain.glb")
+    assert "images" not in reader.json or not reader.json["images"]
+    assert "COLOR_0" in reader.mesh("upper")[1]["attributes"]
+    with pytest.raises(InputError, match="texture_size.*1024"):
+        textured.export(tmp_path / "x.glb", texture_size=1000)

@@ -127,6 +127,15 @@ def test_flat_colours_come_out_as_they_went_in(ball, front):
     np.testing.assert_array_equal(picture[60, front.width // 2], (200, 40, 90))
     np.testing.assert_array_equal(picture[0, 0], (255, 255, 255))
 
+    # Points painted one by one, as those of a texture: left half one colour, right half another, within a face, too.
+    def halves(face, barycentric):
+        x = np.einsum("nk,nk->n", barycentric, ball.triangles[face][:, :, 0])
+        return np.where(x[:, None] > 0, (10, 20, 30), (200, 40, 90)).astype(np.uint8)
+
+    painted = render_shaded(ball, front, paint=halves, style=FLAT)
+    np.testing.assert_array_equal(painted[60, front.width // 2 + 3], (10, 20, 30))
+    np.testing.assert_array_equal(painted[60, front.width // 2 - 3], (200, 40, 90))
+
 
 def test_silhouettes_are_blended(ball, front):
     style = ShadeStyle(relief=0.0, occlusion=0.0, base_color=(0, 0, 0))

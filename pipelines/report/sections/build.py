@@ -65,6 +65,7 @@ from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.template.template import Template
+from smplxpp.template.texture import texture_paint
 
 HEIGHT = 640
 
@@ -165,6 +166,9 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
     ]
     inputs_of = {k: v for r in records.values() for k, v in r.manifest["inputs"].items()}
     front = body_cameras(posed, views=("front",), height=HEIGHT)[0]
+    # In its texture, or without one in the colours of its vertices.
+    paint = texture_paint(template)
+    plain = template.vertex_colors if paint is None else None
     report = Report(
         subject=inputs.subject,
         summary="A personalised clothed template (SMPLX++) from one scan, measured at every stage.",
@@ -173,7 +177,7 @@ def write_build_report(run: Path, inputs: BuildInputs, config: BuildConfig, reco
         hero=(
             Picture(
                 "the template in the reference pose",
-                encode_jpeg(render_shaded(posed, front, vertex_colors=template.vertex_colors)),
+                encode_jpeg(render_shaded(posed, front, vertex_colors=plain, paint=paint)),
             ),
             *(() if evaluation is None else _hero(evaluation)),
         ),
