@@ -1,4 +1,4 @@
-"""Fill the tables of docs/benchmarks.md and docs/real.md from the stored results.
+"""Fill the tables of docs/benchmarks.md, docs/real.md and docs/exports.md from the stored results.
 
     python -m benchmarks.support.page [--check]
 
@@ -28,7 +28,7 @@ from benchmarks.support.results import RESULTS, ROOT
 from smplxpp.core.files.atomic import atomic_write_text
 
 PAGE = ROOT / "docs" / "benchmarks.md"
-PAGES = (PAGE, ROOT / "docs" / "real.md")
+PAGES = (PAGE, ROOT / "docs" / "real.md", ROOT / "docs" / "exports.md")
 DIRECTIVE = re.compile(r"^<!-- table \| (.*) -->$")
 
 

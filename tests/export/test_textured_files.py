@@ -160,5 +160,5 @@ def test_an_export_may_have_smaller_pictures_or_the_colours_of_vertices_alone(tm
     reader = GlbReader(tmp_path / "plain.glb")
     assert "images" not in reader.json or not reader.json["images"]
     assert "COLOR_0" in reader.mesh("upper")[1]["attributes"]
-    with pytest.raises(InputError, match="texture_size.*1024"):
+    with pytest.raises(InputError, match=r"texture_size.*1024"):
         textured.export(tmp_path / "x.glb", texture_size=1000)
