@@ -13,13 +13,13 @@ from smplxpp.core import BodyParams
 
 Tensors = dict[str, np.ndarray]
 _LARGEST = 127
-_MOST_HALF = 65504.0
 
 
 def halves(tensors: Mapping[str, np.ndarray]) -> Tensors:
     """Return tensors in float16, or in float32 where values exceed its range."""
+    most_half = 65504.0
     return {
-        name: value.astype(np.float16 if np.abs(value).max(initial=0.0) < _MOST_HALF else np.float32)
+        name: value.astype(np.float16 if np.abs(value).max(initial=0.0) < most_half else np.float32)
         for name, value in tensors.items()
     }
 

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 SHAPES = "blend_shapes."
-_LAST_FRAME = 1 << 53
 Config = TypeVar("Config", bound="DataclassInstance")
 
 
@@ -61,7 +60,8 @@ class StoredModel:
     def frames(self) -> tuple[int, ...]:
         """Read the frames that have a code."""
         values = as_list(self.about.get("frames"), subject="frames")
-        return tuple(as_integer(value, subject="frame of a code", least=0, most=_LAST_FRAME) for value in values)
+        last_frame = 1 << 53
+        return tuple(as_integer(value, subject="frame of a code", least=0, most=last_frame) for value in values)
 
     def require(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
         """Return a tensor, checked for shape and type.

@@ -15,7 +15,6 @@ from smplxpp.native import OverLimitError, address, check_size, native_library
 
 STAGES = ("project", "sort", "bin", "blend")
 """Stages of drawing whose seconds can be measured."""
-_MAX_ENTRIES = (1 << 30) // 24  # of the lists of Gaussians by tile: one GiB while they are built
 
 
 class SceneCall(ctypes.Structure):
@@ -135,20 +134,22 @@ class Splatter:
         # The kernel also writes projected centres, radii and depths, which a player does not need.
         image, alpha = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
         scratch = tuple(np.empty(shape, np.float32) for shape in ((count, 2), (count, 2), (count,)))
+        # Of the lists of Gaussians by tile: one GiB while they are built.
+        max_entries = (1 << 30) // 24
         try:
             self._library.gaussian_forward(
                 self._handle,
                 ctypes.byref(scene),
                 ctypes.byref(call),
                 *(address(array) for array in (image, alpha, *scratch)),
-                ctypes.c_int64(_MAX_ENTRIES),
+                ctypes.c_int64(max_entries),
                 ctypes.c_int32(threads),
                 address(seconds, "float64"),
             )
         except OverLimitError:
             raise InputError(
                 "Gaussians to draw",
-                expected=f"at most {_MAX_ENTRIES:,} entries of Gaussians in tiles of the picture",
+                expected=f"at most {max_entries:,} entries of Gaussians in tiles of the picture",
                 received="more: they are too large for it",
                 remedy="draw a smaller picture, or from farther away",
             ) from None

@@ -125,7 +125,6 @@ class Curves:
         return Speech(tuple(out), self.seconds)
 
 
-_MAX_ROWS = 200_000  # of a table: 55 minutes at 60 frames a second
 _TIMECODE_RATES = (24, 25, 30, 50, 60)  # frames that the second of a timecode counts
 _INDEX_OF_NAME = {name.lower(): k for k, name in enumerate(ARKIT)}
 
@@ -162,8 +161,10 @@ def _csv(path: Path, fps: float) -> Curves:
     except csv.Error as error:
         raise InputError(subject, expected="comma-separated values", received=str(error)) from None
     rows = [row for row in rows if row]
-    if not 2 <= len(rows) <= _MAX_ROWS:
-        expected = f"a row of names and up to {_MAX_ROWS} of numbers"
+    # Of a table: 55 minutes at 60 frames a second.
+    max_rows = 200_000
+    if not 2 <= len(rows) <= max_rows:
+        expected = f"a row of names and up to {max_rows} of numbers"
         raise InputError(subject, expected=expected, received=f"{len(rows)} rows")
     # Columns of ARKit's blendshapes, whatever else the program writes beside them.
     names = [name.strip().rsplit(".", 1)[-1].lower() for name in rows[0]]

@@ -25,8 +25,6 @@ MIN_SCORE_OF_WORDS = -0.35
 MIN_ENGLISH = 0.605
 """Recognised words with a lower `Recognition.score` belong to another language, music or noise. Chosen on recordings of
 people in seven languages; `python -m benchmarks aligner_gates languages` measures it."""
-_AGREEMENT = 0.25  # weight of the agreement, nats a row, beside the words' probability
-_SHORT = 0.12  # seconds; over the length of the words it is what a short recording scores less, as chance varies more
 
 
 class NotEnglishError(InputError):
@@ -70,7 +68,11 @@ class Recognition:
         few words that it is sure of and that do not agree.
         """
         seconds = sum(one.end - one.start for one in self.speech.words)
-        return self.confidence + _AGREEMENT * self.agreement - _SHORT / max(seconds, 0.1)
+        # Weight of the agreement, nats a row, beside the words' probability.
+        agreement = 0.25
+        # Seconds; over the length of the words it is what a short recording scores less, as chance varies more.
+        short = 0.12
+        return self.confidence + agreement * self.agreement - short / max(seconds, 0.1)
 
     @property
     def english(self) -> bool:

@@ -23,7 +23,6 @@ LOCAL_PARTS = 256
 # Of the fit to a turn, chosen among five settings by two held-out photographs of a real person and what they look like:
 # slower rates along the normal blur the silhouette, those of a rig leave spots on sides that one view shows.
 _TURN_RATES = LearningRates(offset=5e-3, log_scales=1e-3, quats=2e-4, opacity_logits=3e-3)
-_STILL = 1e-9  # learning rate of what stays as it starts; at usual rates six steps cost held-out views 0.3 dB
 
 
 def with_local_shapes(shapes: BlendShapeConfig) -> BlendShapeConfig:
@@ -84,9 +83,11 @@ class TrainingPreset:
         turn_steps_a_view = 25  # 50 gain nothing on held-out views
         sampling = replace(self.fit.sampling, touch=0.8, opacity=0.95, sh_degree=0)
         fit = replace(self.fit, sampling=sampling, rates=_TURN_RATES, iterations=turn_steps_a_view * views)
-        bake = replace(self.bake, iterations=1, pretrain=None, attributes=0.0, views=1, lr=_STILL)
-        compensate = replace(self.compensate, iterations=1, attributes=0.0, views=1, lr=_STILL)
-        compensate = replace(compensate, position_lr=_STILL, color_lr=_STILL)
+        # Learning rate of what stays as it starts; at usual rates six steps cost held-out views 0.3 dB.
+        still = 1e-9
+        bake = replace(self.bake, iterations=1, pretrain=None, attributes=0.0, views=1, lr=still)
+        compensate = replace(self.compensate, iterations=1, attributes=0.0, views=1, lr=still)
+        compensate = replace(compensate, position_lr=still, color_lr=still)
         return replace(self, fit=fit, bake=bake, compensate=compensate)
 
     def shortened(self, share: float) -> TrainingPreset:

@@ -23,9 +23,7 @@ from smplxpp.core import InputError, spread
 from smplxpp.core.files.image_file import open_image
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-_PHONE_MM = 27.0  # main cameras of phones, filming: 24 to 30 mm
 _UNKNOWN_LENS, _STATED_LENS = 0.25, 0.03  # standard deviations of log f
-_FFMPEG_SECONDS = 900
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,8 @@ def _ffmpeg(program: str, video: Path, filters: str, *output: str) -> bytes:
         InputError: a file that is no video.
     """
     command = [program, "-nostdin", "-v", "error", "-i", str(video), "-vf", filters, "-fps_mode", "passthrough"]
-    done = subprocess.run([*command, *output], capture_output=True, timeout=_FFMPEG_SECONDS, check=False)
+    ffmpeg_seconds = 900
+    done = subprocess.run([*command, *output], capture_output=True, timeout=ffmpeg_seconds, check=False)
     if done.returncode:
         message = done.stderr.decode(errors="replace").strip().splitlines()
         raise InputError(
@@ -188,4 +187,6 @@ def lens_of(path: Path, size: tuple[int, int], focal_mm: float | None) -> Lens:
     recorded = exif.get(ExifTags.Base.FocalLengthIn35mmFilm)
     if isinstance(recorded, int) and 5 <= recorded <= 500:
         return Lens(recorded * pixels_a_mm, 2 * _STATED_LENS, f"recorded in the photograph, {recorded} mm")
-    return Lens(_PHONE_MM * pixels_a_mm, _UNKNOWN_LENS, f"not known, {_PHONE_MM:g} mm expected of a phone")
+    # Main cameras of phones, filming: 24 to 30 mm.
+    phone_mm = 27.0
+    return Lens(phone_mm * pixels_a_mm, _UNKNOWN_LENS, f"not known, {phone_mm:g} mm expected of a phone")

@@ -38,7 +38,6 @@ _RULES: tuple[tuple[str, tuple[str, ...]], ...] = (
     (r"\?\s*$|^(?:what|why|who|where|when|how)\b", ("That is a good question. What do you think?", "Why do you ask?")),
 )
 _ELSE = ("Please tell me more about that.", "I see. And then?", "You said: {}. How does that make you feel?")
-_MOST_REPEATED = 12  # words; longer echoes sound mechanical
 
 
 class RulePartner:
@@ -74,7 +73,9 @@ class RulePartner:
 
 def _exchange_pronouns(text: str) -> str:
     """Return the words with first and second person exchanged."""
-    words = text.strip(" .!?").split()[:_MOST_REPEATED]
+    # Words; longer echoes sound mechanical.
+    most_repeated = 12
+    words = text.strip(" .!?").split()[:most_repeated]
     return " ".join(_PRONOUNS.get(word.lower(), word) for word in words)
 
 

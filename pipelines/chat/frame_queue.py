@@ -21,7 +21,6 @@ AHEAD = 1.0
 """Length of the queue: a page that misses messages for less than this keeps moving."""
 LEAD_TIME = 0.12
 """Minimum lead time of a change. It covers the latency of a message until the page shows it."""
-_REFILL = 0.25  # share of the queue that may be missing before it is refilled, so that messages stay few
 
 
 @dataclass(frozen=True)
@@ -83,9 +82,11 @@ class FrameQueue:
 
     def keep_ahead(self) -> None:
         """Add idle or listening frames until the queue reaches `AHEAD` from the present."""
+        # Share of the queue that may be missing before it is refilled, so that messages stay few.
+        refill = 0.25
         with self._lock:
             missing = self.now + AHEAD - self._animator.seconds
-            if missing > _REFILL * AHEAD:
+            if missing > refill * AHEAD:
                 self._idle(missing)
 
     def listen(self, listening: bool) -> None:

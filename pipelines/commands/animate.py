@@ -30,9 +30,7 @@ from smplxpp.core.camera import Camera
 from smplxpp.raster.shading import ShadeStyle
 from smplxpp.template.template import Template
 
-_FRAMING_POSES = 24  # poses that the camera is fitted to
 _BLOCK = 16  # frames posed at a time
-_SMALLEST = 16  # pixels of a picture
 
 
 @dataclass(frozen=True)
@@ -221,9 +219,11 @@ class Animate:
                 expected=".mp4, .gif, .glb, or no suffix for a folder of PNG pictures",
                 received=suffix,
             )
-        require_at_least("option height", self.height, _SMALLEST)
+        # Pixels of a picture.
+        smallest = 16
+        require_at_least("option height", self.height, smallest)
         if self.width is not None:
-            require_at_least("option width", self.width, _SMALLEST)
+            require_at_least("option width", self.width, smallest)
         require_at_least("option step", self.step, 1)
         if self.fps is not None:
             require_positive("option fps", self.fps)
@@ -283,8 +283,10 @@ class Animate:
 
     def _cameras(self, template: Template, params: BodyParams) -> list[Camera]:
         """Place a camera a frame; it stands still, unless on a turntable, and sees the whole motion."""
+        # Poses that the camera is fitted to.
+        framing_poses = 24
         # Frame the camera by a sample of the poses, since posing all of a long motion is slow.
-        some = spread(range(len(params)), _FRAMING_POSES)
+        some = spread(range(len(params)), framing_poses)
         points = template.pose(params.select(some)).reshape(-1, 3)
         height = self.height + self.height % 2  # h264 with 4:2:0 colour takes even sizes
         width = None if self.width is None else self.width + self.width % 2

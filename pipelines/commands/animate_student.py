@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle, AvatarPlayer
 
 _BACKGROUND = (1.0, 1.0, 1.0)
-_FRAMING_POSES = 36
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +89,9 @@ def student_frames(
 
 
 def _cameras(player: AvatarPlayer, params: BodyParams, film: StudentFilm) -> list[Camera]:
+    framing_poses = 36
     # Frame the camera by the Gaussians of a sample of poses.
-    some = spread(range(len(params)), _FRAMING_POSES)
+    some = spread(range(len(params)), framing_poses)
     points = np.concatenate([player.pose(params.frame(k)).means.astype(np.float64) for k in some])
     if film.below is not None:
         points = points[points[:, 1] > points[:, 1].max() - film.below]

@@ -22,8 +22,6 @@ from smplxpp.metrics import self_intersections
 from smplxpp.metrics.comparison import MM
 from smplxpp.template.template import BODY_PART, Template
 
-_GAP_MM = 10.0  # gap between body and cloth that is filled by default, mm of the person
-
 
 @dataclass(frozen=True)
 class SolidRequest:
@@ -56,8 +54,10 @@ def export_solid(run: Path, solid: Path, request: SolidRequest) -> dict[str, Any
         scale = request.height_mm / MM / float(np.ptp(posed.vertices[np.unique(posed.faces), 1]))
     posed = posed.with_vertices(posed.vertices * scale)
     parts = {name: posed.submesh(template.part_faces(name))[0] for name in template.part_names}
+    # Gap between body and cloth that is filled by default, mm of the person.
+    gap_mm = 10.0
     # The default gap is in the person's size and shrinks with it; thickness is in the size of the print.
-    gap = _GAP_MM * scale if request.gap_mm is None else request.gap_mm
+    gap = gap_mm * scale if request.gap_mm is None else request.gap_mm
     config = SolidConfig(thickness=request.thickness_mm / MM, gap=gap / MM)
     made = solid_of_parts(parts.pop(BODY_PART), parts, config=config)
     volume = write_solid(solid, made.mesh, units=request.units)

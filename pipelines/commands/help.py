@@ -43,11 +43,9 @@ EXPERT_OPTIONS = frozenset(
 _NAMED = {NEED: NEEDED_OPTIONS, INPUTS: INPUT_OPTIONS, EXPERT: EXPERT_OPTIONS}
 _MANY = "NAME"
 """Stands for one of more choices than a line shows."""
-_COLUMN = 22
 _WIDTHS = (60, 100)
 _ALIKE = 0.6
 """Similarity from which on a word is offered for another (`difflib`): a letter or two of a short word may differ."""
-_LONGEST_CHOICES = 34
 
 
 @dataclass(frozen=True)
@@ -165,10 +163,11 @@ def _entry(option: Option, width: int) -> list[str]:
     words = " ".join(option.words.split())
     if option.default:
         words += f" (default: {option.default})"
-    text = textwrap.wrap(words, width - _COLUMN, break_on_hyphens=False) or [""]
+    column = 22
+    text = textwrap.wrap(words, width - column, break_on_hyphens=False) or [""]
     # A name that does not fit beside the text has a line of its own.
-    first = [left] if len(left) > _COLUMN - 2 else [left.ljust(_COLUMN) + text.pop(0)]
-    return [*first, *(" " * _COLUMN + line for line in text)]
+    first = [left] if len(left) > column - 2 else [left.ljust(column) + text.pop(0)]
+    return [*first, *(" " * column + line for line in text)]
 
 
 def _words(command: type) -> dict[str, str]:
@@ -202,9 +201,10 @@ def _value(hint: Any) -> str:
     """Return what stands for a value of a type in the help."""
     if get_origin(hint) in (Union, UnionType):
         return _value(next(one for one in get_args(hint) if one is not type(None)))
+    longest_choices = 34
     if get_origin(hint) is Literal:
         choices = f"{{{','.join(map(str, _choices(hint)))}}}"
-        return choices if len(choices) <= _LONGEST_CHOICES else _MANY
+        return choices if len(choices) <= longest_choices else _MANY
     if get_origin(hint) in (tuple, list):
         return f"{_value(get_args(hint)[0])} ..."
     return {Path: "PATH", str: "TEXT", int: "INT", float: "FLOAT", bool: "{True,False}"}.get(hint, "VALUE")

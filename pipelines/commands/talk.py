@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 FILM, MOTION = ".mp4", ".npz"
 _PORTRAIT = 0.55  # metres below the highest point that a portrait shows
-_SMALLEST = 16  # pixels, least height of a picture
 
 
 @dataclass(frozen=True)
@@ -176,7 +175,9 @@ class Talk:
             )
         if self.sound_out is not None and self.sound_out.suffix.lower() != ".wav":
             raise InputError(f"output {self.sound_out}", expected=".wav", received=self.sound_out.suffix or "no suffix")
-        require_at_least("height", self.height, _SMALLEST)
+        # Pixels, least height of a picture.
+        smallest = 16
+        require_at_least("height", self.height, smallest)
         require_at_least("seed", self.seed, 0)
         # The text is checked last, because its check imports the speech package.
         if self.text is not None:

@@ -117,7 +117,6 @@ def color_bar(
 
 
 _ROW, _TEXT = 18, 14
-_WIDTH = 720
 
 
 def heat_strip(
@@ -135,8 +134,9 @@ def heat_strip(
     """
     font = ImageFont.load_default(_TEXT)
     count = len(columns)
+    width = 720
     # A cell is a whole number of pixels wide, so that columns do not blur into each other.
-    cell = max(1, _WIDTH // count)
+    cell = max(1, width // count)
     colors = heat_colors(np.asarray(values, dtype=np.float64).ravel(), cmap=cmap, limits=limits)
     cells = colors.reshape(len(rows), count, 3).repeat(_ROW, axis=0).repeat(cell, axis=1)
     left = round(max(font.getlength(name) for name in rows)) + 10
@@ -146,7 +146,7 @@ def heat_strip(
     for k, name in enumerate(rows):
         draw.text((left - 6, (k + 0.5) * _ROW), name, fill=INK, font=font, anchor="rm")
     # A number takes about 40 pixels: label every n-th column, so that numbers do not overlap.
-    apart = max(1, -(-count * 40 // _WIDTH))
+    apart = max(1, -(-count * 40 // width))
     for k in range(0, count, apart):
         draw.text((left + (k + 0.5) * cell, cells.shape[0] + 4), str(columns[k]), fill=INK, font=font, anchor="mt")
     picture = np.asarray(whole)

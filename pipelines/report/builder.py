@@ -34,7 +34,6 @@ from pipelines.runs.stage import StageRecord
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.atomic import atomic_write_text
 
-_BINS = 64
 _WIDTH, _HEIGHT = 560, 250
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 14, 44, 40
 
@@ -68,7 +67,8 @@ def histogram_svg(histogram: Histogram) -> str:
     values = np.asarray(histogram.values, dtype=np.float64).ravel()
     values = values[np.isfinite(values)]
     low, high = _range(histogram, values)
-    counts, edges = np.histogram(np.clip(values, low, high), bins=_BINS, range=(low, high))
+    bins = 64
+    counts, edges = np.histogram(np.clip(values, low, high), bins=bins, range=(low, high))
     share = 100.0 * counts / len(values)
     top = max(float(share.max()), 1e-9)
     plot_width, plot_height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
@@ -90,11 +90,11 @@ def histogram_svg(histogram: Histogram) -> str:
     cut_off = values > high
     for k in np.flatnonzero(counts):
         height = plot_height * share[k] / top
-        last = k == _BINS - 1 and cut_off.any()
+        last = k == bins - 1 and cut_off.any()
         label = f"{format_value(float(edges[k]))} to {'more' if last else format_value(float(edges[k + 1]))}{unit}"
         out.append(
             f'<rect class="{"bar beyond" if last else "bar"}" x="{x(edges[k]) + 0.5:.1f}" y="{base - height:.2f}" '
-            f'width="{plot_width / _BINS - 1:.2f}" height="{height:.2f}">'
+            f'width="{plot_width / bins - 1:.2f}" height="{height:.2f}">'
             f"<title>{escape(label)}: {share[k]:.3g} %</title></rect>"
         )
     out.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{base}" y2="{base}"/>')

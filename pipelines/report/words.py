@@ -24,7 +24,6 @@ from pipelines.runs.layout import (
 )
 
 _COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-_MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -207,11 +206,12 @@ def glossary_of(report: Report) -> dict[str, str]:
 def _found(checks: Sequence[CheckRow]) -> str:
     """Word what checks found: those that failed or warned by name, with value and gate."""
     out = []
+    most_named = 3
     for status, verb in (("fail", "failed"), ("warn", "warns")):
         bad = [check for check in checks if check.status == status]
         if bad:
-            named = [f"{check.name} is {check.shown}, the limit {check.gate}" for check in bad[:_MOST_NAMED]]
-            more = f"; and {len(bad) - _MOST_NAMED} more" if len(bad) > _MOST_NAMED else ""
+            named = [f"{check.name} is {check.shown}, the limit {check.gate}" for check in bad[:most_named]]
+            more = f"; and {len(bad) - most_named} more" if len(bad) > most_named else ""
             out.append(f"{_count(len(bad), 'check')} {verb}: {'; '.join(named)}{more}.")
     count = len(checks)
     return " ".join(out) or ("the one check passes." if count == 1 else f"all {_count(count, 'check')} pass.")

@@ -18,7 +18,6 @@ SCHEMA = 2
 STATUSES = ("fail", "warn", "pass")  # worst first
 _OBJECTS = ("inputs", "config", "code", "versions", "numbers", "files")
 _DIGESTS = ("inputs", "files")
-_MOST_SECONDS = 1e12
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -40,7 +39,8 @@ def read_record(path: Path) -> dict[str, Any]:
     # Names of files have to stay inside of the stage, because they are opened later.
     for file in content["files"]:
         path_inside("stage", file, subject=f"{subject}: files")
-    as_number(content.setdefault("seconds", 0.0), subject=f"{subject}: seconds", least=0.0, most=_MOST_SECONDS)
+    most_seconds = 1e12
+    as_number(content.setdefault("seconds", 0.0), subject=f"{subject}: seconds", least=0.0, most=most_seconds)
     for check in as_list(content.setdefault("checks", []), subject=f"{subject}: checks"):
         require_check(check, subject=f"{subject}: check")
     return content

@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 _WORK = "_work"
 _STATE = "state.safetensors"
-_OLD = 120.0
 _SHOWN = {"psnr_crop": "PSNR {:.1f} dB", "loss": "loss {:.4g}"}
 
 
@@ -69,7 +68,8 @@ class TrainingNow:
 
     def __str__(self) -> str:
         """Return one line of text for the window."""
-        still = "" if self.age < _OLD else f", and nothing for {self.age / 60:.0f} minutes: it may have been stopped"
+        old = 120.0
+        still = "" if self.age < old else f", and nothing for {self.age / 60:.0f} minutes: it may have been stopped"
         return f"training `{self.stage}`: {self.words}{still}"
 
 
@@ -124,7 +124,6 @@ def _words(log: Path, folder: Path) -> str:
 
 log = logging.getLogger(__name__)
 _NEWEST_FIRST = (STUDENT, BAKED, GAUSSIANS)
-_FEWEST = 1e-6
 Surface = Callable[[int, BodyParams], Float[np.ndarray, "V 3"] | None]
 """Returns the vertices in the world, metres, of a frame and its parameters; None for a frame that was not tracked."""
 
@@ -252,8 +251,9 @@ def tracked_surface(run: Path, template: Template) -> Surface | None:
 
 def covariances(quats: Float[np.ndarray, "N 4"], scales: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3 3"]:
     """Return `R S S R^T` of rotations wxyz and standard deviations, metres."""
+    fewest = 1e-6
     # Columns of R are the axes of the ellipsoid, in the usual form of a unit quaternion.
-    w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), _FEWEST)).T
+    w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), fewest)).T
     R = np.stack(
         [
             np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),

@@ -103,7 +103,6 @@ def uncertain_regions(
     return out
 
 
-_MOST_UNDONE = 200
 Line = tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]
 """Points and normals of a piece of a stroke."""
 
@@ -294,5 +293,6 @@ class LabelSession:
         return len(np.unique(np.concatenate(faces))) if faces else 0
 
     def _now(self, state: _State) -> None:
-        self._before = [*self._before[-_MOST_UNDONE + 1 :], self._state]
+        most_undone = 200
+        self._before = [*self._before[-most_undone + 1 :], self._state]
         self._state = state

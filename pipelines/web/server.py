@@ -15,7 +15,6 @@ from smplxpp.core.errors import InputError
 
 T = TypeVar("T")
 HOST = "127.0.0.1"
-_TRIES = 32
 _TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".wav": "audio/wav"}
 _HEADERS = {
     # A page isolated from others may use threads and exact clocks.
@@ -39,7 +38,8 @@ def at_free_port(make: Callable[[int], T], port: int) -> T:
     Raises:
         InputError: no port is free.
     """
-    for one in range(port, port + _TRIES if port else 1):
+    tries = 32
+    for one in range(port, port + tries if port else 1):
         try:
             return make(one)
         except OSError as error:

@@ -37,7 +37,6 @@ _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
 NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in _LIMBS))
 # The joint of ours up to which a joint moves the file's bones.
 _NEXT = {**CHILD, "collar": "shoulder", "ankle": "foot", "neck": "head"}
-_STRETCH = 0.02  # largest change of a bone's length, as a share: the rounding of files is below
 _TURNS = np.radians(2.0)  # a joint that turns less in its parent's frame, over all frames, is still
 
 
@@ -151,10 +150,12 @@ def warn_of_stretching(motion: BvhMotion, joints: Mapping[str, int], source: str
         above.add(joint)
         joint = int(motion.parents[joint])
     changed = {}
+    # Largest change of a bone's length, as a share: the rounding of files is below.
+    stretch = 0.02
     for joint, place in motion.positions.items():
         length = float(np.linalg.norm(motion.offsets[joint]))
         most = float(np.linalg.norm(place - motion.offsets[joint], axis=1).max())
-        if joint not in above and most > _STRETCH * length:
+        if joint not in above and most > stretch * length:
             changed[motion.names[joint]] = 100.0 * most / max(length, 1e-9)
     if changed:
         worst = max(changed, key=lambda name: changed[name])

@@ -12,7 +12,6 @@ from jaxtyping import Float64, Int64
 from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, GeometryWarning, matrix_from_rotvec, rotvec_from_matrix
 
 _ROTATIONS = frozenset(name for name, _ in POSE_BLOCKS)
-_NAMED = 6  # frames that a warning names
 
 
 def without_gaps(content: Any, *, source: str) -> Any:
@@ -53,7 +52,9 @@ def without_gaps(content: Any, *, source: str) -> Any:
     if not empty.any() or not len(known):
         return content
     gaps = np.flatnonzero(empty)
-    shown = ", ".join(map(str, gaps[:_NAMED])) + (f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else "")
+    # Frames that a warning names.
+    named = 6
+    shown = ", ".join(map(str, gaps[:named])) + (f" and {len(gaps) - named} more" if len(gaps) > named else "")
     warnings.warn(
         f"{source}: {len(gaps)} of {count} frames hold nothing ({shown}): filled from the frames around them",
         GeometryWarning,

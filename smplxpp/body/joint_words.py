@@ -44,7 +44,6 @@ _MIDDLE = {
 _FINGER_WORDS = {"middle": "middle mid", "pinky": "pinky little", "thumb": "thumb", "index": "index", "ring": "ring"}
 # Bones of a finger by their names; 0 lies in the hand.
 _BONES = {"metacarpal": 0, "inhand": 0, "root": 0, "proximal": 1, "base": 1, "intermediate": 2, "distal": 3}
-_END = 9  # after every bone
 
 
 @dataclass(frozen=True)
@@ -129,8 +128,10 @@ def _finger(name: str, plain: str, letters: list[str]) -> tuple[str, int | None]
         # Biped: Finger01 is the second bone of finger 0.
         digits = numbers.pop(0)
         finger, numbers = digits[0], [str(int(digits[1:]) + 1)] if len(digits) > 1 else numbers
+    # After every bone.
+    end = 9
     if {"end", "nub"} & set(letters):
-        return finger, _END
+        return finger, end
     bone = next((number for word, number in _BONES.items() if word in plain), None)
     if bone is None and finger != "middle" and "mid" in letters:
         bone = 2

@@ -22,14 +22,11 @@ from smplxpp.core import DEFAULT_FPS, BodyParams, GeometryWarning, InputError, m
 # Metres of the units that files are written in; CMU's library counts in 0.45 of an inch, by 25.4 mm / 0.45.
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "CMU's unit (56.4 mm)": 0.0254 / 0.45}
 _LEG = (0.55, 1.1)  # metres from hip to ankle of people from a child of ten years on
-_LOOKED_AT = 3000  # frames, spread over the motion, that ranges are taken from
 # Bounds of what people and their recordings do; farther means a wrong unit or rate.
 _RATES = (5.0, 300.0)  # frames a second
 _SPAN, _FASTEST = 100.0, 20.0  # metres that a take spans, metres a second of a joint
 _WHOLE_TURN = 2.0 * np.pi + 0.1  # radians of a joint's rotation, and rounding
-_JUMP = 0.5  # metres of the pelvis in one frame, at more than _TIMES its usual step
 _TIMES = 20.0
-_LIES = 0.8  # share of frames in which the trunk lies nearer to another axis than to the vertical
 
 
 @dataclass(frozen=True)
@@ -150,8 +147,10 @@ def _looked_at(params: BodyParams, body: Skeleton) -> tuple[dict[str, Any], tupl
     turns = np.linalg.norm(np.concatenate([*blocks.values()], axis=1).reshape(len(params), -1, 3), axis=2)
     names = [*body.names[:22], "jaw"]
     most = turns.max(axis=0)
+    # Frames, spread over the motion, that ranges are taken from.
+    looked_at = 3000
     # Steps are taken between neighbours; only the frames looked at are posed, in runs of two.
-    first = np.unique(np.linspace(0, max(len(params) - 2, 0), min(len(params), _LOOKED_AT)).astype(int))
+    first = np.unique(np.linspace(0, max(len(params) - 2, 0), min(len(params), looked_at)).astype(int))
     second = np.minimum(first + 1, len(params) - 1)
     here, there = (body.pose(params.select(rows)) for rows in (first, second))
     speed = np.linalg.norm(there - here, axis=2) * rate
@@ -182,7 +181,9 @@ def _looked_at(params: BodyParams, body: Skeleton) -> tuple[dict[str, Any], tupl
         mistakes.append(f"a way of {span:.0f} m: {unit}, to be converted to metres")
     elif speed.max() > _FASTEST and most.max() <= _WHOLE_TURN:
         mistakes.append(f"a joint at {speed.max():.0f} m a second: the rate is too high, or frames are missing")
-    jumps = np.flatnonzero((step > _JUMP) & (step > _TIMES * np.median(step))) if len(step) else np.zeros(0, int)
+    # Metres of the pelvis in one frame, at more than _TIMES its usual step.
+    jump = 0.5
+    jumps = np.flatnonzero((step > jump) & (step > _TIMES * np.median(step))) if len(step) else np.zeros(0, int)
     if len(jumps) and span <= _SPAN:
         mistakes.append(f"the person jumps {step[jumps].max():.1f} m from frame {jumps[0]} to the next")
     if (other := _lies(params)) is not None:
@@ -210,4 +211,6 @@ def _lies(params: BodyParams) -> str | None:
     names = np.array([f"{'-' if below else ''}{'xyz'[k]}" for k, below in zip(axis, sign, strict=True)])
     found, count = np.unique(names, return_counts=True)
     common = str(found[count.argmax()])
-    return common if common != "y" and count.max() > _LIES * len(params) else None
+    # Share of frames in which the trunk lies nearer to another axis than to the vertical.
+    lies = 0.8
+    return common if common != "y" and count.max() > lies * len(params) else None

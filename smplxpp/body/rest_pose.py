@@ -23,7 +23,6 @@ CHILD |= {f"{finger}{bone}": f"{finger}{bone + 1}" for finger in FINGERS for bon
 """The joint at the end of the bone that a joint moves, for bones whose direction tells the joint's rotation."""
 _FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
 _STANDS = 0.5  # least cosine of a pose that stands: limbs within 60 degrees of a person who stands upright
-_CLEARLY = 0.5  # least cosine of feet that point backwards, so that sides are exchanged
 _UPRIGHT, _NEARLY_ALL = 0.8, 0.9  # least cosine of a trunk along an axis, and least share of such frames
 _TRIED = 400  # frames among which one that stands is looked for
 
@@ -79,7 +78,9 @@ def sides_are_exchanged(pose: Reference, joints: Mapping[str, int]) -> bool:
         if toes is None or not np.linalg.norm(toes) > 0.0:
             return False
         cosines.append(float(toes @ front) / float(np.linalg.norm(toes)))
-    return max(cosines) < -_CLEARLY and bool(_stance(rest[None], joints)[0] > _STANDS)
+    # Least cosine of feet that point backwards, so that sides are exchanged.
+    clearly = 0.5
+    return max(cosines) < -clearly and bool(_stance(rest[None], joints)[0] > _STANDS)
 
 
 def trunk_rotations(

@@ -33,11 +33,7 @@ _LEG_WORDS = frozenset(word for part in LEG for word in _WEIGHTS[part])
 _ARM_WORDS = frozenset(word for part in ARM for word in _WEIGHTS[part])
 # Weight of equal bones above and below the knee or elbow, and of bones that fill the chain: less than one word's.
 _EQUAL, _LONG = 2.0, 1.5
-_LONGEST_CHAIN = 14  # joints of a chain that are tried: four of 14 are 1001 choices
 _PAIR = 0.85  # least ratio of the lengths of two branches that are a pair of legs or arms
-_BRANCH = 0.15  # of the longest path: shorter branches (fingers, toes, faces) are no limbs
-_FAR = 0.5  # of a leg: farthest pelvis from the middle between the hips
-_HAND = 4  # joints of fingers that make a hand; fewer are markers
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +153,10 @@ def _ends_by_shape(tree: Tree) -> tuple[tuple[int, int] | None, tuple[int, int] 
         if above >= 0 and reach[joint] + bone[joint] >= reach[above]:
             reach[above], end[above] = reach[joint] + bone[joint], end[joint]
     pairs = []
+    # Of the longest path: shorter branches (fingers, toes, faces) are no limbs.
+    branch = 0.15
     for joint in range(count):
-        own = [k for k in np.flatnonzero(tree.parents == joint) if reach[k] + bone[k] > _BRANCH * reach.max()]
+        own = [k for k in np.flatnonzero(tree.parents == joint) if reach[k] + bone[k] > branch * reach.max()]
         length = {int(k): float(reach[k] + bone[k]) for k in own}
         fitting = [
             (min(length[a], length[b]) / max(length[a], length[b]), a, b)
@@ -204,7 +202,9 @@ def _limb(
         chain: joints from the trunk on.
         parts: the joints along the limb, of which the `optional` ones may be missing.
     """
-    chain = chain[:_LONGEST_CHAIN]
+    # Joints of a chain that are tried: four of 14 are 1001 choices.
+    longest_chain = 14
+    chain = chain[:longest_chain]
     choices = [[f"{side}_{part}" for part in parts if part not in gone] for gone in _subsets(optional)]
     best: tuple[float, dict[str, int]] = (-np.inf, {})
     for chosen in choices:
@@ -249,7 +249,9 @@ def _pelvis(tree: Tree, words: list[JointWords], meet: int, found: Mapping[str, 
     leg = tree.length([found["left_hip"], *tree.below(found["left_hip"], found["left_ankle"])])
     distance = np.linalg.norm(tree.places - middle, axis=1)
     named = [joint for joint, word in enumerate(words) if word.part == "pelvis" and word.side is None]
-    if distance[meet] > _FAR * leg and named:
+    # Of a leg: farthest pelvis from the middle between the hips.
+    far = 0.5
+    if distance[meet] > far * leg and named:
         return min(named, key=lambda joint: float(distance[joint]))
     return meet
 
@@ -286,9 +288,11 @@ def _neck_and_head(tree: Tree, words: list[JointWords], chest: int, limbs: set[i
 def _fingers(tree: Tree, words: list[JointWords], found: Mapping[str, int]) -> dict[str, int]:
     """Return the three bones of each finger, by the fingers' names or their numbers from the thumb on."""
     out: dict[str, int] = {}
+    # Joints of fingers that make a hand; fewer are markers.
+    hand = 4
     for side in SIDES:
         own = [joint for joint, word in enumerate(words) if word.part == "finger" and word.side == side]
-        if len(own) < _HAND:
+        if len(own) < hand:
             continue
         first = 0 if any(words[joint].finger == "0" for joint in own) else 1
         chains: dict[str, list[int]] = {}

@@ -37,15 +37,14 @@ OFFSETS_MM: dict[str, tuple[float, float, float]] = {
 }
 """SMPL's joint less the open body's own, millimetres of the mean body in the T-pose: x to the left, y up, z forward. Of
 joints with two sides the left one's; x of the right one has the other sign."""
-_OPEN_VERTICES = 13_886
-_SKIN_VERTICES = 13_380  # before tongue, eyes and teeth
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "neck", "head", "left_collar", "right_collar")
 
 
 def is_open_body(body: BodyModel) -> bool:
     """Return whether a body is the open body, in any shape: of its vertices and joints, without PCA of hands."""
     counts = (body.vertex_count, body.joint_count)
-    return counts == (_OPEN_VERTICES, len(SMPLX_JOINTS)) and body.left_hand_components is None
+    open_vertices = 13_886
+    return counts == (open_vertices, len(SMPLX_JOINTS)) and body.left_hand_components is None
 
 
 def smpl_offsets() -> Float64[np.ndarray, "22 3"]:
@@ -92,7 +91,9 @@ def _regressor() -> Float64[np.ndarray, "22 V"]:
 
     # The mean body decides, so that templates, whose mean shape is a person's, share the weights.
     body = load_body()
-    vertices, weights = body.v_template[:_SKIN_VERTICES], body.weights[:_SKIN_VERTICES]
+    # Before tongue, eyes and teeth.
+    skin_vertices = 13_380
+    vertices, weights = body.v_template[:skin_vertices], body.weights[:skin_vertices]
     own = (body.joint_regressor @ body.v_template)[: len(BODY_JOINTS)]
     trunk = weights[:, [body.joint_names.index(name) for name in _TRUNK]].sum(axis=1)
     rows, offsets = np.zeros((len(BODY_JOINTS), body.vertex_count)), smpl_offsets()

@@ -31,7 +31,6 @@ from smplxpp.reconstruct.views import PhotoView, silhouette_agreement, usable_vi
 
 Maker = Callable[..., Reconstruction]
 """`make(views, progress=...)`: reconstructs the surface of a moment."""
-_NAMED = 6  # frames named in an error
 
 
 def open_photographs(inputs: ReconstructInputs) -> Capture:
@@ -87,12 +86,14 @@ def usable_frames(capture: Capture, frames: tuple[int, ...] | None) -> tuple[int
             raise InputError(f"capture {capture.name}", expected="training frames with images", received="none")
         return frames
     unknown = sorted(set(frames) - set(capture.frames))
+    # Frames named in an error.
+    named = 6
     if unknown:
         have = f"{capture.frames[0]} to {capture.frames[-1]}" if capture.frames else "none"
         raise InputError(
             "--frame",
             expected=f"frames that capture {capture.name} has ({have})",
-            received=", ".join(map(str, unknown[:_NAMED])),
+            received=", ".join(map(str, unknown[:named])),
         )
     # A surface from a held-out frame would show the avatar what it is tested on.
     held_out = sorted(set(frames) & set(splits.novel_pose_frames))
@@ -100,7 +101,7 @@ def usable_frames(capture: Capture, frames: tuple[int, ...] | None) -> tuple[int
         raise InputError(
             "--frame",
             expected="frames that are trained on",
-            received=f"held-out {', '.join(map(str, held_out[:_NAMED]))}",
+            received=f"held-out {', '.join(map(str, held_out[:named]))}",
             remedy="choose others, or hold out other frames in the capture's split",
         )
     return tuple(sorted(set(frames)))

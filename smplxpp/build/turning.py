@@ -15,7 +15,6 @@ from smplxpp.register.kinematics import BodyState
 from smplxpp.register.landmarks import visible_vertices
 
 _SPREAD_DEGREES = 12.0  # of each leg, which takes knees that touch some 20 cm apart
-_BODY_JOINTS = 22  # joints that carry the space around a body; fingers and face follow wrists and head
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +78,12 @@ def posed_person(body: BodyModel, params: BodyParams) -> PosedPerson:
     from_reference = np.linalg.inv(np.asarray(reference.posed_from_rest[0], dtype=np.float64))
     # Joints that the body lacks follow their nearest ancestor that it has.
     carrier = np.arange(body.joint_count)
+    # Joints that carry the space around a body; fingers and face follow wrists and head.
+    body_joints = 22
     for joint in range(body.joint_count):
-        while carrier[joint] >= _BODY_JOINTS:
+        while carrier[joint] >= body_joints:
             carrier[joint] = body.parents[carrier[joint]]
-    weights = np.zeros((min(_BODY_JOINTS, body.joint_count), body.vertex_count))
+    weights = np.zeros((min(body_joints, body.joint_count), body.vertex_count))
     np.add.at(weights, carrier, body.weights.T)
     moved = (transforms @ from_reference)[:, : len(weights)]
     mesh = body.mesh(np.asarray(reference.vertices[0], dtype=np.float64))

@@ -40,7 +40,6 @@ _MIDWAY, _MOST_EVIDENCE = 0.08, 1.5
 _DECISIVE = 1.3
 # Points of a face and limbs that have to be seen, and confidence from which a point counts.
 _LEAST_POINTS, _LEAST_LIMBS, _LEAST_CONFIDENCE = 3, 4, 0.05
-_MOST_PEOPLE = 400  # people that are looked at; the median over them decides
 
 Body25 = Literal["openpose", "openpose-25b", "unclear", "none"]
 """The order of 25 points: the name of its format; "unclear" where both orders make people of like sizes; "none" without
@@ -59,6 +58,8 @@ def body_25_order(people: Iterable[Any]) -> Body25:
             length are ignored.
     """
     ratios: list[float] = []
+    # People that are looked at; the median over them decides.
+    most_people = 400
     for numbers in people:
         points = np.asarray(numbers, dtype=np.float64).reshape(-1)
         if points.size != 75 or not np.isfinite(points).all():
@@ -66,7 +67,7 @@ def body_25_order(people: Iterable[Any]) -> Body25:
         ratio = _size_ratio(points.reshape(25, 3))
         if ratio is not None:
             ratios.append(ratio)
-        if len(ratios) >= _MOST_PEOPLE:
+        if len(ratios) >= most_people:
             break
     if not ratios:
         return "none"

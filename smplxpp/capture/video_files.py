@@ -19,7 +19,6 @@ _STREAM = re.compile(r"Stream #\d+:\d+.*?: Video: .*?(?<![\dx])(\d{2,5})x(\d{2,5
 _RATE = re.compile(r"Stream #\d+:\d+.*?: Video: .*?([\d.]+) fps")
 _TURN = re.compile(r"rotation of (-?[\d.]+) degrees")
 _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
-_SIDE = 1 << 14  # pixels of the longest side that is decoded
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,10 @@ def probe_video(path: str | Path) -> Video:
     turn = _TURN.search(text)
     turned = turn is not None and round(float(turn[1]) / 90.0) % 2 == 1
     width, height = (int(size[k]) for k in ((2, 1) if turned else (1, 2)))
-    if max(width, height) > _SIDE:
-        raise InputError(f"video {path}", expected=f"frames of at most {_SIDE} pixels", received=f"{width} x {height}")
+    # Pixels of the longest side that is decoded.
+    side = 1 << 14
+    if max(width, height) > side:
+        raise InputError(f"video {path}", expected=f"frames of at most {side} pixels", received=f"{width} x {height}")
     return Video(
         path, width, height, float(rate[1]), 3600 * hours + 60 * minutes + seconds, turned, ": Audio: " in text
     )

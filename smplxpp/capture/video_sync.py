@@ -16,9 +16,7 @@ from jaxtyping import Float64, Int64
 from smplxpp.capture.video_files import Video, video_frames, video_sound
 from smplxpp.core.errors import InputError
 
-_SOUND_RATE = 8000  # samples a second: speech and claps
 _RATE = 200  # values a second of both kinds of signals, which bounds the precision to 5 ms
-_SMALL = 64  # pixels of the longer side of pictures that are compared
 # The best lag must have `_CLEARLY` times the correlation of any lag at least `_APART` seconds away from it, and exceed
 # 0 by `_DEVIATIONS` standard deviations of a chance correlation.
 _CLEARLY, _APART, _DEVIATIONS = 1.15, 0.15, 3.0
@@ -163,8 +161,10 @@ def _correlation_length(signal: Float64[np.ndarray, " N"]) -> float:
 
 def _sound(video: Video) -> Float64[np.ndarray, " N"]:
     """Return the rise of the sound's loudness, 200 values a second."""
-    samples = video_sound(video, _SOUND_RATE)
-    step = _SOUND_RATE // _RATE
+    # Samples a second: speech and claps.
+    sound_rate = 8000
+    samples = video_sound(video, sound_rate)
+    step = sound_rate // _RATE
     loud = np.abs(samples[: len(samples) // step * step]).reshape(-1, step).mean(axis=1)
     if len(loud) < 2:
         return np.zeros(0)
@@ -175,7 +175,9 @@ def _sound(video: Video) -> Float64[np.ndarray, " N"]:
 
 def _motion(video: Video) -> Float64[np.ndarray, " N"]:
     """Return the mean change of brightness from frame to frame, interpolated to 200 values a second."""
-    scale = _SMALL / max(video.width, video.height)
+    # Pixels of the longer side of pictures that are compared.
+    small = 64
+    scale = small / max(video.width, video.height)
     size = (max(2, round(video.width * scale)), max(2, round(video.height * scale)))
     before, change, times = None, [], []
     for number, frame in video_frames(video, range(video.count), size):

@@ -30,8 +30,6 @@ from smplxpp.core.topology import component_labels, face_components
 
 # Edges shorter than this fraction of the size are collapsed: 17 um on an adult, 2 um on a figure of 180 mm.
 _SHORT = 1e-5
-# Separate pieces below this fraction of a part's volume are crumbs, which are removed.
-_CRUMB = 0.05
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,9 @@ def solid_of_parts(body: MeshLike, parts: Mapping[str, MeshLike], *, config: Sol
     body = as_mesh(body, subject="body")
     config = config or SolidConfig()
     pieces = [_body_solid(body)]
-    if len(_separate_pieces(pieces[0], least=_CRUMB * pieces[0].volume())) > 1:
+    # Separate pieces below this fraction of a part's volume are crumbs, which are removed.
+    crumb = 0.05
+    if len(_separate_pieces(pieces[0], least=crumb * pieces[0].volume())) > 1:
         raise InputError("body", expected="a body of one piece", received="pieces that do not touch")
     # Add part after part; the gap is doubled until the union is one piece.
     gaps = {}
@@ -134,7 +134,7 @@ def solid_of_parts(body: MeshLike, parts: Mapping[str, MeshLike], *, config: Sol
         for wider in multiples:
             made = _cloth(part, body, config, wider * config.gap)
             union = manifold3d.Manifold.batch_boolean([*pieces, made], manifold3d.OpType.Add)
-            apart = len(_separate_pieces(union, least=_CRUMB * made.volume()))
+            apart = len(_separate_pieces(union, least=crumb * made.volume()))
             if apart == 1:
                 break
         else:

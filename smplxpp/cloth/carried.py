@@ -13,9 +13,6 @@ from smplxpp.cloth.solver import Collider
 from smplxpp.core.skin_weights import SkinWeights
 from smplxpp.native import address, native_library
 
-# Of a blend of rotations; below, its inverse blows up what the cloth did.
-_LEAST_DETERMINANT = 0.2
-
 
 class _Carried(ctypes.Structure):
     _fields_ = [
@@ -127,9 +124,11 @@ class SkinnedRows:
         """
         assert places.shape == (self._count, 3)
         out = np.empty((self._count, 3), dtype=np.float32)
+        # Of a blend of rotations; below, its inverse blows up what the cloth did.
+        least_determinant = 0.2
         native_library().smplxpp_cloth_unposed(
             *(ctypes.byref(self._native), address(self._transforms(body, origin)), address(rest), address(places)),
-            *(ctypes.c_float(_LEAST_DETERMINANT), address(out)),
+            *(ctypes.c_float(least_determinant), address(out)),
         )
         return out
 

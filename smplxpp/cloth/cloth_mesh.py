@@ -13,8 +13,6 @@ from smplxpp.core.topology import face_components
 
 # Metres: shorter borders are holes.
 SHORTEST_OPENING = 0.15
-# Samples of faces whose orientation is tested.
-_LOOKS = 2000
 
 
 def opening_axis(mesh: TriangleMesh, loop: Int[np.ndarray, " n"]) -> Float[np.ndarray, " 3"]:
@@ -54,7 +52,9 @@ def edge_graph(mesh: TriangleMesh, lengths: Float[np.ndarray, " E"] | None = Non
 
 def looks_inwards(mesh: TriangleMesh, body: TriangleMesh) -> bool:
     """Whether cloth lies on a body with its faces turned inside out: most of its area looks against the skin's side."""
-    every = max(1, mesh.face_count // _LOOKS)
+    # Samples of faces whose orientation is tested.
+    looks = 2000
+    every = max(1, mesh.face_count // looks)
     face = igl.point_mesh_squared_distance(mesh.face_centers[::every], body.vertices, body.faces)[1]
     alike = np.einsum("mi,mi->m", mesh.face_normals[::every], body.face_normals[face])
     return bool((mesh.face_areas[::every] * alike).sum() < 0)

@@ -20,10 +20,6 @@ from smplxpp.template.template import Template
 
 # Longest step that is simulated; a longer one is a cut.
 LONGEST_STEP = 0.26
-# Step of the ramp of a cold start.
-_RAMP_STEP = 1.0 / 30.0
-# Distance, in metres, of the root from the origin of the particles' places above which the origin follows it.
-_FAR = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +177,9 @@ class ClothDriver:
         """Come to a first pose from the reference pose, where the cloth hangs as it was scanned."""
         # The reference is turned to face as the first pose does, so that the ramp does not whirl the cloth around.
         start = reference_facing_as(self._threads[0].garment.reference, params)
-        steps, still = (round(t / _RAMP_STEP) for t in (self.config.ramp, self.config.hold))
+        # Step of the ramp of a cold start.
+        ramp_step = 1.0 / 30.0
+        steps, still = (round(t / ramp_step) for t in (self.config.ramp, self.config.hold))
         self._origin = np.array(posed.joints[0, 0])
         places = self._places(self.template.posed_body(start) if steps else posed)
         for thread in self._threads:
@@ -190,10 +188,10 @@ class ClothDriver:
             t = k / steps
             # The smoothstep 3 t^2 - 2 t^3 starts and ends without velocity, so the ramp gives the cloth no jolt.
             between = pose_between(start, params, t * t * (3.0 - 2.0 * t))
-            self._advance(self.template.posed_body(between), _RAMP_STEP, at_any_speed=True)
+            self._advance(self.template.posed_body(between), ramp_step, at_any_speed=True)
         # Hold the first pose until the swing of the ramp has died down.
         for _ in range(still + min(steps, 1)):
-            self._advance(posed, _RAMP_STEP, at_any_speed=True)
+            self._advance(posed, ramp_step, at_any_speed=True)
         # Contact cannot push out particles that start too deep; report them instead of failing.
         for thread in self._threads:
             if buried := thread.buried():
@@ -207,7 +205,9 @@ class ClothDriver:
         """Move all garments on to a pose; False, and nothing moved, where what holds them went too fast."""
         # Keep the origin near the person: float32 coordinates lose precision with their distance from it.
         away = posed.joints[0, 0] - self._origin
-        if np.abs(away).max() > _FAR:
+        # Distance, in metres, of the root from the origin of the particles' places above which the origin follows it.
+        far = 4.0
+        if np.abs(away).max() > far:
             self._origin = self._origin + away
             for thread in self._threads:
                 thread.shift(-away.astype(np.float32))

@@ -21,8 +21,6 @@ from smplxpp.template.template import Template
 SCHEMA = 1
 _ABOUT = "smplxpp_garments"
 _REMEDY = "train again, or take the file as `smplxpp train` wrote it"
-# Metres: as near are vertices that were posed on two machines.
-_SAME = 1e-4
 # Arrays of a garment by name: type and shape, whose letters are sizes.
 _ARRAYS: Mapping[str, tuple[type, str]] = {
     "particles": (np.int64, "n"),
@@ -127,7 +125,9 @@ def _garment(
         raise InputError(subject, expected="one reference pose", received=f"{len(reference)}", remedy=_REMEDY)
     # Another template may have as many vertices and more: particles are vertices, in the reference pose.
     off = float(row_lengths(template.pose(reference)[0][own["particles"]] - rest.vertices).max())
-    if not off < _SAME:
+    # Metres: as near are vertices that were posed on two machines.
+    same = 1e-4
+    if not off < same:
         raise InputError(
             subject,
             expected="particles that are vertices of the template",

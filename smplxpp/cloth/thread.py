@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 # Metres that what is carried keeps from the skin.
 _FINE_MARGIN = 0.002
-# Metres inside what it touches from which a particle counts as buried.
-_BURIED = 0.005
 
 
 class GarmentThread:
@@ -111,7 +109,9 @@ class GarmentThread:
         coarse = self.garment.rest.with_vertices(self._state.position)
         normals, loose = coarse.vertex_normals, ~self.garment.pinned
         out = move_before_collider(self._state.position, normals, self._surfaces[-1], self._solver.collider, margin=0.0)
-        return int((row_lengths(out - self._state.position)[loose] > _BURIED).sum())
+        # Metres inside what it touches from which a particle counts as buried.
+        buried = 0.005
+        return int((row_lengths(out - self._state.position)[loose] > buried).sum())
 
     def laid_over(
         self, vertices: Int64[np.ndarray, " c"], surface: Float32[np.ndarray, "c 3"]

@@ -52,9 +52,6 @@ class GeometryWarning(UserWarning):
     """
 
 
-_NAMED = 12  # things that a warning names; the rest is counted
-
-
 def warn_of_left_out(source: str, names: Sequence[str], *, reason: str, stacklevel: int = 2) -> None:
     """Name once what a file has and its reader does not take; nothing where it takes all.
 
@@ -73,9 +70,11 @@ def warn_of_left_out(source: str, names: Sequence[str], *, reason: str, stacklev
         >>> print(caught[0].message)
         file a.npz: not read in the layout amass: contacts
     """
+    # Things that a warning names; the rest is counted.
+    named = 12
     if names:
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        text = f"{source}: {reason}: {', '.join(names[:_NAMED])}{more}"
+        more = f" and {len(names) - named} more" if len(names) > named else ""
+        text = f"{source}: {reason}: {', '.join(names[:named])}{more}"
         warnings.warn(text, GeometryWarning, stacklevel=stacklevel + 1)
 
 

@@ -14,8 +14,6 @@ from smplxpp.core.files.atomic import atomic_write_text
 UNITS_A_METRE = 100.0
 """BVH has no unit of its own; animation programs take it as centimetres."""
 _PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Xrotation Yrotation"
-# Of the bone that a joint without children ends: as long as so much of the one before it.
-_END = 0.6
 
 
 def write_bvh(
@@ -93,8 +91,10 @@ def _node(body: BodyModel, offsets: Float[np.ndarray, "J 3"], joint: int, indent
     lines.append(f"{inner}CHANNELS {channels}")
     for child in children:
         lines += _node(body, offsets, child, inner)
+    # Of the bone that a joint without children ends: as long as so much of the one before it.
+    end = 0.6
     if not children:
-        lines += [f"{inner}End Site", f"{inner}{{", f"{inner}  {_offset(_END * offsets[joint])}", f"{inner}}}"]
+        lines += [f"{inner}End Site", f"{inner}{{", f"{inner}  {_offset(end * offsets[joint])}", f"{inner}}}"]
     return [*lines, f"{indent}}}"]
 
 

@@ -25,7 +25,6 @@ UNITS_A_METRE = 100.0
 """FBX counts in centimetres: with a unit scale of 1 neither Unity nor Unreal scales what it reads."""
 ROOT = "Armature"
 """Name of the skeleton's node; of this name Unreal makes no bone of it."""
-_TIMEOUT = 1800  # seconds that Blender may take, for a motion of many thousand frames on a slow machine
 _REMEDY = (
     "install Blender (blender.org) or `pip install bpy` (its version fits one version of Python), or name either by "
     f"--blender PATH or the variable {VARIABLE}; a .glb opens in Blender, Unity and Unreal without it"
@@ -130,6 +129,8 @@ def write_fbx(
     command = blender_command(blender)
     fps = DEFAULT_FPS if animation is None else animation.fps or DEFAULT_FPS
     require_positive("frames a second of the animation", fps)
+    # Seconds that Blender may take, for a motion of many thousand frames on a slow machine.
+    timeout = 1800
     with tempfile.TemporaryDirectory() as folder, atomic_path(path) as written:
         # The file says where it was first written: under its own name, not the temporary one beside the target.
         glb, script, fbx = Path(folder) / "template.glb", Path(folder) / "to_fbx.py", Path(folder) / Path(path).name
@@ -146,10 +147,10 @@ def write_fbx(
         line = [*command, str(script), "--", json.dumps(asked)]
         try:
             done = subprocess.run(
-                line, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, check=False, cwd=folder
+                line, capture_output=True, text=True, errors="replace", timeout=timeout, check=False, cwd=folder
             )
         except subprocess.TimeoutExpired:
-            raise InputError(command[0], expected=f"an end within {_TIMEOUT} s", received="none") from None
+            raise InputError(command[0], expected=f"an end within {timeout} s", received="none") from None
         if done.returncode or not fbx.is_file():
             last_line = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
             raise InputError(

@@ -20,10 +20,6 @@ from smplxpp.export.gltf_skin import add_skin, influence_sets, quantized_influen
 from smplxpp.template.template import BODY_PART, Template
 from smplxpp.template.texture import Texture, part_surface
 
-# A vertex that an expression of one unit moves by less, in metres, is left out of that morph target.
-_STILL = 1e-6
-
-
 MorphTargets = Mapping[str, Float64[np.ndarray, "V 3"]]
 """Displacements of a template's vertices by name, metres."""
 
@@ -112,7 +108,9 @@ def linear_rgba16(colors: UInt8[np.ndarray, "N 3"]) -> UInt16[np.ndarray, "N 4"]
 def _add_expressions(buffers: BufferBuilder, template: Template, mesh: pygltflib.Mesh, rows: np.ndarray) -> None:
     # (E, n, 3): each target's rows lie together.
     offsets = np.ascontiguousarray(np.moveaxis(template.body.exprdirs[rows], 2, 0), dtype=np.float32)
-    moved = np.einsum("evc,evc->ev", offsets, offsets) > _STILL**2
+    # A vertex that an expression of one unit moves by less, in metres, is left out of that morph target.
+    still = 1e-6
+    moved = np.einsum("evc,evc->ev", offsets, offsets) > still**2
     mesh.primitives[0].targets = [
         {"POSITION": buffers.add_sparse(target, np.flatnonzero(rows))}
         for target, rows in zip(offsets, moved, strict=True)

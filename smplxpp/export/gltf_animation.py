@@ -17,9 +17,6 @@ from smplxpp.export.gltf_buffers import BufferBuilder
 from smplxpp.export.gltf_skin import rest_offsets
 from smplxpp.template.template import Template
 
-# A joint that expressions move by less, in metres, keeps its place at rest.
-_STILL = 1e-6
-
 
 def joint_motion(
     template: Template, params: BodyParams
@@ -110,9 +107,11 @@ def add_animation(
         output = buffers.add(values.astype(np.float32))
         animation.samplers.append(pygltflib.AnimationSampler(input=clock, output=output, interpolation="LINEAR"))
 
+    # A joint that expressions move by less, in metres, keeps its place at rest.
+    still = 1e-6
     # Every joint turns, but few translate: a translation channel is written for roots and for joints that leave their
     # rest offset in some frame, which keeps the file small.
-    moved = np.abs(translations - rest_offsets(template)).max(axis=(0, 2)) > _STILL
+    moved = np.abs(translations - rest_offsets(template)).max(axis=(0, 2)) > still
     for j, (node, quaternions) in enumerate(zip(joint_nodes, _quaternions(rotations), strict=True)):
         add_channel(node, "rotation", quaternions)
         if moved[j] or template.body.parents[j] < 0:

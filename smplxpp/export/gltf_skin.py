@@ -16,8 +16,6 @@ from smplxpp.template.template import Template
 # glTF names influences four at a time; two sets are what engines that read more than one take.
 SET_SIZE = 4
 MAX_INFLUENCES = 8
-# Weights are multiples of this: each is exact in float32, and so is any sum of a row.
-_WEIGHT_STEP = 2.0**-24
 
 
 def quantized_influences(weights: SkinWeights) -> tuple[Integer[np.ndarray, "N K"], Float32[np.ndarray, "N K"]]:
@@ -33,13 +31,15 @@ def quantized_influences(weights: SkinWeights) -> tuple[Integer[np.ndarray, "N K
         (N, K) uint8, or uint16 from 257 joints on, and (N, K) float32; K is the most influences any vertex has.
     """
     strongest = SkinWeights.from_dense(weights.dense(), max_influences=MAX_INFLUENCES)
-    steps = np.rint(strongest.joint_weights / _WEIGHT_STEP).astype(np.int64)
-    steps[:, 0] += round(1 / _WEIGHT_STEP) - steps.sum(axis=1)
+    # Weights are multiples of this: each is exact in float32, and so is any sum of a row.
+    weight_step = 2.0**-24
+    steps = np.rint(strongest.joint_weights / weight_step).astype(np.int64)
+    steps[:, 0] += round(1 / weight_step) - steps.sum(axis=1)
     used = max(1, int((steps > 0).sum(axis=1).max(initial=0)))
     steps = steps[:, :used]
     joints = np.where(steps > 0, strongest.joint_indices[:, :used], 0)
     dtype = np.uint8 if weights.joint_count <= 256 else np.uint16
-    return joints.astype(dtype), (steps * _WEIGHT_STEP).astype(np.float32)
+    return joints.astype(dtype), (steps * weight_step).astype(np.float32)
 
 
 def influence_sets(

@@ -20,8 +20,6 @@ from smplxpp.export.gltf_buffers import BufferBuilder
 
 MODEL = "3D/3dmodel.model"
 """The member of a 3MF package that has the surface."""
-# Of the volume: single precision and six digits lose far less, a piece that is gone or turned over is more.
-_TOLERANCE = 1e-3
 
 
 def check_written(path: Path, mesh: TriangleMesh, *, per_metre: float) -> float:
@@ -40,7 +38,9 @@ def check_written(path: Path, mesh: TriangleMesh, *, per_metre: float) -> float:
     vertices, faces = _read(path)
     problems = _problems(faces, len(vertices))
     volume, meant = _volume(vertices / per_metre, faces), _volume(mesh.vertices, mesh.faces)
-    if not abs(volume - meant) <= _TOLERANCE * abs(meant):
+    # Of the volume: single precision and six digits lose far less, a piece that is gone or turned over is more.
+    tolerance = 1e-3
+    if not abs(volume - meant) <= tolerance * abs(meant):
         problems.append(f"{volume * 1e6:.6g} cm3")
     if problems:
         raise InputError(

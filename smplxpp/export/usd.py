@@ -19,8 +19,6 @@ from smplxpp.template.template import BODY_PART, Template
 from smplxpp.template.texture import part_surface, picture_files
 
 _ROOT = "template"
-# A vertex that an expression of one unit moves by less, in metres, is left out of that blend shape.
-_STILL = 1e-6
 
 
 def write_usd(path: str | Path, template: Template, *, animation: BodyParams | None = None) -> None:
@@ -121,10 +119,12 @@ def _add_parts(
 
 def _add_expressions(pxr: SimpleNamespace, stage: Any, template: Template, mesh: Any, used: np.ndarray) -> list[str]:
     names, targets = [], []
+    # A vertex that an expression of one unit moves by less, in metres, is left out of that blend shape.
+    still = 1e-6
     for k, expression in enumerate(template.body.expression_names):
         offsets = np.ascontiguousarray(template.body.exprdirs[used, :, k], np.float32)
         # Blend shapes are sparse: only vertices that an expression moves are stored.
-        rows = np.flatnonzero(np.square(offsets).sum(axis=1) > _STILL**2)
+        rows = np.flatnonzero(np.square(offsets).sum(axis=1) > still**2)
         shape = pxr.UsdSkel.BlendShape.Define(stage, mesh.GetPath().AppendChild(_identifier(expression)))
         shape.CreateOffsetsAttr(pxr.Vt.Vec3fArray.FromNumpy(offsets[rows]))
         shape.CreatePointIndicesAttr(pxr.Vt.IntArray.FromNumpy(rows.astype(np.int32)))

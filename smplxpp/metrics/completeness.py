@@ -27,8 +27,6 @@ _REGION_OF_JOINT = {
 # A point counts as seen by a view that it faces within 60 degrees and in which the body has nothing before it.
 _FACING = 0.5
 _BEFORE = 3e-3
-# A scan's face that looks down closes a skirt from below: no view shows it.
-_LOOKS_DOWN = -0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +117,9 @@ def far_patches(scan: MeshLike, chosen: Bool[np.ndarray, " M"], body: MeshLike, 
     """
     scan = as_mesh(scan, subject="scan")
     body = as_mesh(body, subject="body")
-    index = np.flatnonzero(chosen & (scan.face_normals[:, 1] > _LOOKS_DOWN))
+    # A scan's face that looks down closes a skirt from below: no view shows it.
+    looks_down = -0.5
+    index = np.flatnonzero(chosen & (scan.face_normals[:, 1] > looks_down))
     centers = scan.face_centers[index]
     off = point_to_surface(centers, body)[0] > far
     index, centers = index[off], centers[off]

@@ -19,7 +19,6 @@ from smplxpp.core import BodyParams, require_at_least, require_between
 from smplxpp.people.cloth_mesh import ClothMesh
 from smplxpp.people.patterns import ramp, smooth_noise
 
-_LEVER = 0.155  # metres; what the heel rises by over the ball of the foot, over the sine of the pitch
 _FINE = {"head": 0.4, "jaw": 0.4, "neck": 0.6, "wrist": 0.3, "ankle": 0.4, "foot": 0.25}
 """Share of the noise on small parts, which 10 mm would make unrecognisable."""
 
@@ -54,7 +53,9 @@ class Outside:
     @property
     def pitch(self) -> float:
         """Pitch of the feet on their heels, radians."""
-        return float(np.arcsin(min(self.heels / _LEVER, 0.8)))
+        # Metres; what the heel rises by over the ball of the foot, over the sine of the pitch.
+        lever = 0.155
+        return float(np.arcsin(min(self.heels / lever, 0.8)))
 
     def turns(self) -> dict[str, np.ndarray]:
         """Return the rotations (3, 3) that heels and fists add to a stance, by joint."""

@@ -186,8 +186,6 @@ class CarriedPyramids(Pyramids):
 
 REACH_M = 0.25
 """Distance from the body's surface to its farthest clothes and hair."""
-_RIM_COSINE = 0.15  # between normal and ray
-_THIN_M = 0.02  # gaps below it are no limb's
 _NEAR_M, _MOST_NEAR, _LEAST_NEAR = 0.2, 48, 8
 # Added to the median: folds, and errors of body and poses. Where no rim is near, what most clothes keep to.
 _SLACK_M, _UNKNOWN_M = 0.008, 0.08
@@ -206,13 +204,17 @@ def clothing_limits(silhouettes: Sequence[Silhouette], person: PosedPerson) -> F
     weights = np.asarray(person.weights, np.float32)[rows]
     features = carrier.features(person.vertices[rows], weights)
     least = np.full(len(rows), np.inf)
+    # Between normal and ray.
+    rim_cosine = 0.15
+    # Gaps below it are no limb's.
+    thin_m = 0.02
     for frame, silhouette in enumerate(silhouettes):
         points = carrier.carried(features, frame)
         flat = person.transforms[frame, :, :3, :3].reshape(-1, 9)
         normals = np.einsum("nij,nj->ni", (weights @ flat).reshape(-1, 3, 3), person.normals[rows])
         rays = points - silhouette.camera.position
         cosine = np.einsum("nx,nx->n", rays, normals) / np.linalg.norm(rays, axis=1)
-        rim = np.flatnonzero(np.abs(cosine) < _RIM_COSINE)
+        rim = np.flatnonzero(np.abs(cosine) < rim_cosine)
         depth = silhouette.depth(points[rim].astype(np.float32))
         shown = depth < UNSEEN
         depth = np.maximum(depth, 0.0)
@@ -220,7 +222,7 @@ def clothing_limits(silhouettes: Sequence[Silhouette], person: PosedPerson) -> F
         outward = points[rim] + np.where(shown, 0.5 * depth, 0.0)[:, None] * normals[rim]
         own, screen = (silhouette.camera.screen_from_world(place) for place in (points, outward))
         away = cKDTree(own[:, :2]).query(screen[:, :2])[0] * silhouette.pixel * screen[:, 2]
-        reached = (away > 0.3 * depth) | (depth < _THIN_M)
+        reached = (away > 0.3 * depth) | (depth < thin_m)
         least[rim] = np.minimum(least[rim], np.where(shown & reached, depth, np.inf))
     # The median over the rims that lie near in the reference pose.
     seen = np.flatnonzero(np.isfinite(least))

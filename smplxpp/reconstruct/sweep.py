@@ -27,8 +27,6 @@ LEAST_COSINE = 0.3
 """Cosine between normal and ray below which a view is too oblique to be compared."""
 LEAST_OPACITY = 0.99
 """Opacity from which a pixel shows the person alone."""
-# Confidence of a vertex that no view sees, which lets its neighbours move it.
-_LOOSE = 0.02
 
 
 @dataclass(frozen=True)
@@ -218,9 +216,11 @@ def _best_places(
     confidence[~watched] = 0.0
     # Vertices without a better place stay: watched ones are anchored, the others follow their neighbours.
     here = scores[:, int(np.abs(offsets).argmin())]
-    stays = (best - here < level.gain) | (confidence < _LOOSE)
+    # Confidence of a vertex that no view sees, which lets its neighbours move it.
+    loose = 0.02
+    stays = (best - here < level.gain) | (confidence < loose)
     displacement = np.where(stays, 0.0, displacement)
-    confidence = np.where(stays, np.where(watched, anchor, _LOOSE), confidence)
+    confidence = np.where(stays, np.where(watched, anchor, loose), confidence)
     return displacement, confidence, np.where(stays, here, best)
 
 

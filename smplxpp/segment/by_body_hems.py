@@ -20,7 +20,6 @@ from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.segment.by_body_chart import FOOT, LEG, BodyChart, chart_of_body
 from smplxpp.segment.by_body_rings import STEP
 
-_SECTORS = 12
 _UNEVEN = 1
 """Largest difference in rings between the heights of a hem in two sectors."""
 _LEAST_ROUGHNESS = 0.0008
@@ -88,14 +87,15 @@ def _cells(
 ) -> tuple[Float64[np.ndarray, "R S"], Bool[np.ndarray, "R S"]]:
     """Return the mean distance in each ring and sector, between known rings interpolated, and where it is known."""
     ring = np.floor((place - start) / STEP).astype(np.int64)
-    sector = np.floor((turn / (2.0 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS
+    sectors = 12
+    sector = np.floor((turn / (2.0 * np.pi) + 0.5) * sectors).astype(np.int64) % sectors
     inside = (ring >= 0) & (ring < count) & (area > 0)
-    cell = ring[inside] * _SECTORS + sector[inside]
-    total = np.bincount(cell, area[inside], minlength=count * _SECTORS)
+    cell = ring[inside] * sectors + sector[inside]
+    total = np.bincount(cell, area[inside], minlength=count * sectors)
     # Distances are bounded, because 6 cm off the body is a skirt however far it stands out.
-    summed = np.bincount(cell, area[inside] * np.clip(distance[inside], -0.03, 0.06), minlength=count * _SECTORS)
-    mean = (summed / np.maximum(total, 1e-12)).reshape(count, _SECTORS)
-    known = (total > 0).reshape(count, _SECTORS)
+    summed = np.bincount(cell, area[inside] * np.clip(distance[inside], -0.03, 0.06), minlength=count * sectors)
+    mean = (summed / np.maximum(total, 1e-12)).reshape(count, sectors)
+    known = (total > 0).reshape(count, sectors)
     for column, there in zip(mean.T, known.T, strict=True):
         at = np.flatnonzero(there)
         column[:] = np.interp(np.arange(count), at, column[at]) if len(at) else np.nan

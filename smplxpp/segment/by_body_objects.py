@@ -45,7 +45,6 @@ _BOARD_REACH = 0.6
 """Metres from a hand within which boards are looked for, the diagonal of a large folder."""
 _HANGS, _LOOKS_OUT = 0.09, 0.5
 """Metres within which a shirt or skirt hangs off trunk and legs, and the cosine between its normal and theirs."""
-_WAIST = 1.05  # height of the standard person above which no cloth stands far off the trunk, metres
 _LENGTH_COST = 2.0  # square centimetres of evidence for one centimetre of a cut through smooth, plain surface
 
 
@@ -90,7 +89,9 @@ def find_objects(
     distance, nearest = cKDTree(posed.vertices).query(mesh.face_centers)
     to_hand = cKDTree(posed.vertices[hand]).query(mesh.face_centers)[0]
     region = own.region[nearest]
-    chest = (region == TRUNK) & (own.height[nearest] > _WAIST)
+    # Height of the standard person above which no cloth stands far off the trunk, metres.
+    waist = 1.05
+    chest = (region == TRUNK) & (own.height[nearest] > waist)
     evidence = _evidence(distance, region, chest)
     # Below a hand clothes hang off the trunk: they look the way that it looks there.
     clothed = np.isin(own.region, (TRUNK, LEG))

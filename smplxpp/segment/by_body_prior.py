@@ -21,10 +21,7 @@ _ELSE: dict[int, dict[int, float]] = {
     LEG: {SKIN.id: 0.04, SHOE.id: 0.01, UPPER.id: 0.02, LOWER.id: 0.04, OUTER.id: 0.003},
     FOOT: {SKIN.id: 0.03, SHOE.id: 0.06, LOWER.id: 0.02, UPPER.id: 0.001},
 }
-_NEVER = 1e-6  # probability of labels that do not occur in a region; keeps logarithms finite
 _BEYOND = 1e-3  # probability that a garment goes on beyond a border that the surface shows
-_SHARP = 0.4  # softness of such a border, as a share of a ring's
-_UNLAYERED = 0.2  # probability that a layer that was found is none
 
 
 def place_prior(
@@ -46,8 +43,10 @@ def place_prior(
         body_softness: standard deviation of the body's place at head and hands, metres.
         waist: border of upper and lower garment that the surface shows, which goes before the outline's.
     """
+    # Probability of labels that do not occur in a region; keeps logarithms finite.
+    never = 1e-6
     # Exceptions first; the outline shares out the rest.
-    out = np.full((len(chart.region), len(LABELS)), _NEVER)
+    out = np.full((len(chart.region), len(LABELS)), never)
     for region, shares in _ELSE.items():
         here = chart.region == region
         for label, share in shares.items():
@@ -83,8 +82,10 @@ def place_prior(
     if layers.bib:
         front = top & (np.abs(chart.azimuth) < 1.2)
         out[front] = 0.6 * out[front] + 0.4 * _only(LOWER.id)
+    # Probability that a layer that was found is none.
+    unlayered = 0.2
     for mask, worn in ((layers.hair, HAIR), (layers.coat, OUTER)):
-        out[mask] = _UNLAYERED * out[mask] + (1.0 - _UNLAYERED) * _only(worn.id)
+        out[mask] = unlayered * out[mask] + (1.0 - unlayered) * _only(worn.id)
     return out / out.sum(axis=1, keepdims=True)
 
 
@@ -92,7 +93,9 @@ def _cut_at(waist: Waist, out: np.ndarray, softness: float) -> None:
     """Share the probability of upper and lower garment on each side of a border, by the distance to it."""
     at = waist.faces
     both = out[at, UPPER.id] + out[at, LOWER.id]
-    upper = _above(np.where(waist.upper[at], 1.0, -1.0) * waist.away[at], 0.0, _SHARP * softness)
+    # Softness of such a border, as a share of a ring's.
+    sharp = 0.4
+    upper = _above(np.where(waist.upper[at], 1.0, -1.0) * waist.away[at], 0.0, sharp * softness)
     upper = _BEYOND + (1.0 - 2.0 * _BEYOND) * upper
     out[at, UPPER.id], out[at, LOWER.id] = both * upper, both * (1.0 - upper)
 

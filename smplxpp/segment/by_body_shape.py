@@ -65,7 +65,6 @@ _STEPS_OUT_IN = {
 }
 _TUCKED, _FLUSH = 0.25, 0.15
 """Shares of shirts tucked into trousers, and of borders without any step; the other shirts hang over trousers."""
-_CUFF_STEPS = 0.93
 _AT_WRIST = 1.5
 """Nats of a step at the wrist, at most."""
 _DISTANCE, _ON_TRUNK = 0.035, 0.25
@@ -226,7 +225,8 @@ def _arm_costs(seen: ShapeEvidence) -> tuple[Float64[np.ndarray, " R1"], float]:
     usual = _usual(place, ((0.5, 0.49, 0.03), (0.35, 0.15, 0.07), (0.1, ARM_START, 0.03), (0.05, 0.35, 0.1)))
     # At the wrist the surface steps, too, where the fit has the hand bent otherwise.
     steps = np.where(np.abs(place - WRIST) < 0.04, np.minimum(seen.arm_hems.inwards, _AT_WRIST), seen.arm_hems.inwards)
-    sleeve = cost - usual - _mixture(np.zeros(len(place)), steps, (0.0, _CUFF_STEPS))
+    cuff_steps = 0.93
+    sleeve = cost - usual - _mixture(np.zeros(len(place)), steps, (0.0, cuff_steps))
     # Without sleeves there is no cuff.
     none = place < 0.0
     sleeve[none] = (cost - usual)[none]

@@ -19,8 +19,6 @@ from smplxpp.template.template import BODY_PART, Template
 _GRID, _APART = 1024, 2
 # How much finer than the whole body a part of it may lie in its file's own layout, as faces do.
 _FINER = 2.0
-# Texels a side of the tiles in which pictures are made, which bounds the memory: 512 x 512 take 80 MB at most.
-_TILE = 512
 
 BodyUV = tuple[Float64[np.ndarray, "U 2"], Int64[np.ndarray, "F 3"]]
 
@@ -194,9 +192,11 @@ def texels_of(atlas: Atlas, faces: Bool[np.ndarray, " F"], size: int) -> Iterato
     corners = np.arange(len(places)).reshape(-1, 3)
     low = places[:, :2].reshape(-1, 3, 2).min(axis=1)
     high = places[:, :2].reshape(-1, 3, 2).max(axis=1)
-    for top in range(0, size, _TILE):
-        for left in range(0, size, _TILE):
-            side = min(_TILE, size)
+    # Texels a side of the tiles in which pictures are made, which bounds the memory: 512 x 512 take 80 MB at most.
+    tile = 512
+    for top in range(0, size, tile):
+        for left in range(0, size, tile):
+            side = min(tile, size)
             # A parallel view whose pixels are the texels of the tile.
             K = np.array([[1.0, 0, -left], [0, 1.0, -top], [0, 0, 1]])
             camera = Camera(K, np.eye(4), side, side, orthographic=True)

@@ -13,7 +13,6 @@ from smplxpp.core.files import as_integer, as_object, as_text, atomic_write_text
 from smplxpp.core.lazy import import_extra
 
 log = logging.getLogger(__name__)
-_MOST_BYTES = 1 << 30  # 1 GiB; the lines of a million steps have some hundred megabytes
 
 
 def append_metrics(path: str | Path, entry: Mapping[str, Any]) -> None:
@@ -30,8 +29,10 @@ def read_metrics(path: str | Path) -> list[dict[str, Any]]:
     """
     if not Path(path).exists():
         return []
+    # 1 GiB; the lines of a million steps have some hundred megabytes.
+    most_bytes = 1 << 30
     try:
-        lines = read_bytes(path, subject="log", most=_MOST_BYTES).split(b"\n")
+        lines = read_bytes(path, subject="log", most=most_bytes).split(b"\n")
     except InputError as error:
         log.warning("%s", error)
         return []

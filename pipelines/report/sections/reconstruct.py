@@ -25,9 +25,6 @@ from smplxpp.metrics.comparison import MM
 from smplxpp.raster import rasterize_mesh
 
 HEIGHT = 560
-_PHOTOGRAPHS = 4
-_MOVED_MM = 20.0
-_OUTLINE = 2
 _MARGIN = 0.06
 _SURFACE_COLOR, _MASK_COLOR = (255, 90, 40), (40, 200, 255)
 
@@ -127,10 +124,11 @@ def _surfaces(
         Picture("colours from the photographs; confidence: 0 where no photographs agree", encode_jpeg(row(panels)))
     )
     panels = []
+    moved_mm = 20.0
     # The distance moved exists only if the surface has the hull's vertices, not for a mesh of another program.
     if len(hull.vertices) == len(mesh.vertices):
         moved = MM * np.linalg.norm(mesh.vertices - hull.vertices, axis=1)
-        panels = [caption(render_heat(mesh, one, moved, limits=(0, _MOVED_MM), unit="mm"), "moved") for one in cameras]
+        panels = [caption(render_heat(mesh, one, moved, limits=(0, moved_mm), unit="mm"), "moved") for one in cameras]
     # Fewer than two cameras cannot triangulate a point.
     unseen = np.where(seen < 2, 1.0, 0.0)
     below = body_cameras(mesh, views=("front", "side"), height=HEIGHT)
@@ -150,7 +148,8 @@ def _on_photographs(
     # others evenly spread, and at most two of those that were left out.
     agreement = numbers["silhouettes"]
     worst = min(agreement, key=agreement.get)
-    names = list(dict.fromkeys([worst, *spread(list(agreement), _PHOTOGRAPHS - 1)]))
+    photographs = 4
+    names = list(dict.fromkeys([worst, *spread(list(agreement), photographs - 1)]))
     panels = []
     for name in [*names, *list(numbers["left_out"])[:2]]:
         photograph, mask, camera = capture.image(name, frame), capture.mask(name, frame), capture.cameras[name]
@@ -175,7 +174,8 @@ def _on_photographs(
 
 
 def _outline(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    width = max(1, round(_OUTLINE * len(mask) / 1000))
+    outline = 2
+    width = max(1, round(outline * len(mask) / 1000))
     return ndimage.binary_dilation(mask, iterations=width) & ~mask
 
 

@@ -79,7 +79,6 @@ FORMATS: tuple[CalibrationFormat, ...] = (
 """All formats; of two that tell a file the first is taken."""
 # Files of these names are settings of the same tools.
 _NOT_CALIBRATIONS = ("config.toml", "charuco.toml", "project_settings.toml", "pyproject.toml")
-_MOST_BYTES = 16 << 20  # of a candidate: 500 cameras of the Panoptic studio take 250 kB
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +164,9 @@ def find_calibration(folder: Path) -> Path | None:
     most_candidates = 200  # files of a folder that are opened in the search for a calibration
     suffixes = {suffix for own, _ in _LOADERS.values() for suffix in own}
     files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in suffixes and path.is_file()]
-    files = [p for p in files if p.name.lower() not in _NOT_CALIBRATIONS and p.stat().st_size <= _MOST_BYTES]
+    # Of a candidate: 500 cameras of the Panoptic studio take 250 kB.
+    most_bytes = 16 << 20
+    files = [p for p in files if p.name.lower() not in _NOT_CALIBRATIONS and p.stat().st_size <= most_bytes]
     files.sort(key=lambda path: ("calib" not in path.name.lower(), "cam" not in path.name.lower(), path.name))
     return next((path for path in files[:most_candidates] if format_of(path) is not None), None)
 

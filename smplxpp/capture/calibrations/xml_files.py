@@ -14,8 +14,6 @@ from scipy.spatial.transform import Rotation
 from smplxpp.capture.calibrations.file_camera import FileCamera, RigFile, file_camera, numbers_of
 from smplxpp.core.errors import InputError
 
-# Qualisys counts 64 subpixels a pixel.
-_SUBPIXELS = 64.0
 # From axes with y up and z backwards (OpenGL's) to those of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -64,12 +62,14 @@ def _qualisys_camera(path: Path, camera: Element) -> FileCamera:
     if shown is None:
         raise InputError(f"{source}: camera {name}", expected="an element fov_video", received="none")
     left, top, right, bottom = (_number(shown, key, source, name) for key in ("left", "top", "right", "bottom"))
+    # Qualisys counts 64 subpixels a pixel.
+    subpixels = 64.0
     fu, fv, cu, cv = (
-        _number(inside, key, source, name) / _SUBPIXELS
+        _number(inside, key, source, name) / subpixels
         for key in ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
     )
     k1, k2, p1, p2 = (
-        _number(inside, key, source, name) / _SUBPIXELS
+        _number(inside, key, source, name) / subpixels
         for key in ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
     )
     R = _FLIP @ np.array([[_number(pose, f"r{i}{j}", source, name) for j in (1, 2, 3)] for i in (1, 2, 3)])

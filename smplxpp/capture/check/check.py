@@ -26,9 +26,6 @@ from smplxpp.capture.check.views import OPAQUE, ViewCheck, check_view
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, matrix_from_rotvec, spread
 from smplxpp.core.errors import one_line
 
-# Number of posed bodies that are kept in memory.
-_KEPT = 32
-
 
 @dataclass(frozen=True)
 class CheckConfig:
@@ -144,9 +141,11 @@ class _Poser:
 
     def vertices(self, frame: int) -> Float[np.ndarray, "V 3"] | None:
         """Pose the body as in a frame; None without usable parameters. The last few are kept."""
+        # Number of posed bodies that are kept in memory.
+        kept = 32
         if frame not in self._posed:
             self._posed[frame] = self._pose(frame)
-            if len(self._posed) > _KEPT:
+            if len(self._posed) > kept:
                 self._posed.popitem(last=False)
         return self._posed[frame]
 

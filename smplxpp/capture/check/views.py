@@ -21,8 +21,6 @@ OPAQUE = 127
 # Of 255. The median of what lies outside the mask may differ this much from the declared colour (JPEG's is about 1);
 # a pixel that differs by more than the second shows something.
 _BACKGROUND_TOLERANCE, _SHOWS_SOMETHING = 16, 48
-# Area outside the mask that shows something, as a share of the mask's.
-_MISMATCH = 0.05
 # A photograph is on a plain colour if the 95th percentile of the difference from the median colour outside the mask
 # is at most this, of 255. Lenses and walls vary more, a JPEG of one colour does not.
 _PLAIN = 2
@@ -166,7 +164,9 @@ def _against_background(
     # Each sampled pixel stands for `_STEP` squared pixels of the image.
     shown = int((np.abs(outside - colour).max(axis=1) > _SHOWS_SOMETHING).sum()) * _STEP**2
     area = int((alpha > OPAQUE).sum())
-    if shown > _MISMATCH * area and shown > MIN_SHARE * alpha.size:
+    # Area outside the mask that shows something, as a share of the mask's.
+    mismatch = 0.05
+    if shown > mismatch * area and shown > MIN_SHARE * alpha.size:
         yield "mask-mismatch", f"shows something outside its mask, {shown / max(area, 1):.0%} of the mask's area"
 
 

@@ -13,8 +13,6 @@ from smplxpp.core.files.paths import read_bytes, read_text
 
 # Calibrations have some kilobytes a camera; rigs have at most some hundred cameras.
 _MOST_BYTES = 64 << 20
-# Elements within elements, as in JSON.
-_MAX_LEVELS = 64
 # Marks of UTF-16 at the start of a file, which OptiTrack writes, with or without a declaration.
 _UTF_16 = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"<\0": "utf-16-le", b"\0<": "utf-16-be"}
 
@@ -55,8 +53,10 @@ def read_xml(path: str | Path, *, subject: str = "file", remedy: str = "") -> El
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
         raise InputError(name, expected="XML", received=str(error)[:200], remedy=remedy) from None
     level = [root]
-    for _ in range(_MAX_LEVELS):
+    # Elements within elements, as in JSON.
+    max_levels = 64
+    for _ in range(max_levels):
         level = [child for element in level for child in element]
     if level:
-        raise InputError(name, expected=f"XML of at most {_MAX_LEVELS} levels", received="more", remedy=remedy)
+        raise InputError(name, expected=f"XML of at most {max_levels} levels", received="more", remedy=remedy)
     return root

@@ -170,9 +170,6 @@ def _numbers(raw: UInt8[np.ndarray, " B"], kind: int, bits: int) -> np.ndarray:
     return raw.view(f"<i{bits // 8}").astype(np.float64) / 2.0 ** (bits - 1)
 
 
-_TIMEOUT = 900  # seconds that ffmpeg may take
-
-
 def read_sound(path: str | Path) -> Sound:
     """Read a sound file and average its channels.
 
@@ -203,8 +200,10 @@ def read_sound(path: str | Path) -> Sound:
     command += ["-i", f"file:{Path(path).absolute()}", "-map", "0:a:0", "-t", str(_LONGEST + 1)]
     command += ["-bitexact", "-c:a", "pcm_s16le", "-f", "wav", "pipe:1"]
     subject = f"sound {path}"
+    # Seconds that ffmpeg may take.
+    timeout = 900
     try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=_TIMEOUT)
+        done = subprocess.run(command, capture_output=True, check=False, timeout=timeout)
     except subprocess.TimeoutExpired:
         raise InputError(subject, expected=f"{name} that decodes in 15 minutes", received="more") from None
     words = done.stderr.decode(errors="replace").strip().splitlines()

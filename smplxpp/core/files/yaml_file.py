@@ -16,7 +16,6 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import parse_json
 from smplxpp.core.files.paths import read_text
 
-_MOST_BYTES = 1 << 18  # a file written by hand has some kilobytes
 _MOST_LEVELS = 16
 _QUOTED = r""""(?:[^"\\]|\\.)*"|'(?:[^']|'')*'"""
 _KEY = re.compile(rf"""(?P<key>{_QUOTED}|[^\s\[\]{{}},"'#&*!|>%@`-][^#]*?|-[^\s#][^#]*?):(?=\s|$)""")
@@ -58,7 +57,9 @@ def read_yaml(path: str | Path, *, subject: str = "file", remedy: str = "") -> A
         ...     read_yaml(file.name)
         {'names': ['hat', 'bag']}
     """
-    text = read_text(path, subject=subject, most=_MOST_BYTES, remedy=remedy)
+    # A file written by hand has some kilobytes.
+    most_bytes = 1 << 18
+    text = read_text(path, subject=subject, most=most_bytes, remedy=remedy)
     return _Parser(text, f"{subject} {path}", remedy).document()
 
 

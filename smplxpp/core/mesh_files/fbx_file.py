@@ -21,10 +21,7 @@ from smplxpp.core.lazy import import_extra
 from smplxpp.core.mesh_files.raw_mesh import RawMesh, warn
 from smplxpp.core.mesh_files.texture import MISSING_GRAY, TextureCache, sample_texture
 
-_MOST_BYTES = 1 << 31
 _BINARY = b"Kaydara FBX Binary"
-_METRES_PER_CENTIMETRE = 0.01
-_DEEPEST = 200  # nodes above one another; skeletons have fewer than 50
 _DIFFUSE, _BASE_COLOR = 1, 12  # assimp's types of textures
 
 
@@ -38,7 +35,8 @@ def read_fbx(path: Path) -> RawMesh:
     purpose = f"reading {path.name} (or convert it to GLB with a 3D program)"
     assimp_py = import_extra("assimp_py", extra="fbx", purpose=purpose, named="assimp-py")
     subject = f"mesh file {path}"
-    data = read_bytes(path, subject="mesh file", most=_MOST_BYTES)
+    most_bytes = 1 << 31
+    data = read_bytes(path, subject="mesh file", most=most_bytes)
     if not (data.startswith(_BINARY) or b"FBXHeaderExtension" in data[:4096]):
         raise InputError(subject, expected="an FBX file", received=f"{data[:20]!r}")
     flags = assimp_py.Process_Triangulate | assimp_py.Process_JoinIdenticalVertices
@@ -51,8 +49,9 @@ def read_fbx(path: Path) -> RawMesh:
             received=str(error)[:200] or type(error).__name__,
             remedy="export it again, as FBX 7.4 or as GLB",
         ) from None
+    metres_per_centimetre = 0.01
     # File to metres, +Y up; the scene's root holds assimp's own idea of the axes, which differs between its versions.
-    to_metres = _axes(data) * _number(data, b"UnitScaleFactor", 1.0) * _METRES_PER_CENTIMETRE
+    to_metres = _axes(data) * _number(data, b"UnitScaleFactor", 1.0) * metres_per_centimetre
     pictures = TextureCache(subject)
     vertices, faces, colors, count = [], [], [], 0
     for index, placed in _instances(scene.root_node):
@@ -78,13 +77,15 @@ def read_fbx(path: Path) -> RawMesh:
 def _instances(root: Any) -> Iterator[tuple[int, Float64[np.ndarray, "4 4"]]]:
     """Yield every mesh of the scene by its index, with the transform of its node, without the root's own."""
     stack = [(root, np.eye(4), 0)]
+    # Nodes above one another; skeletons have fewer than 50.
+    deepest = 200
     while stack:
         node, above, depth = stack.pop()
         own = np.array(node.transformation, dtype=np.float64).reshape(4, 4)
         placed = above if depth == 0 else above @ own
         for index in node.mesh_indices:
             yield index, placed
-        if depth < _DEEPEST:
+        if depth < deepest:
             stack.extend((child, placed, depth + 1) for child in node.children)
 
 

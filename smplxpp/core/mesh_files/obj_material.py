@@ -15,7 +15,6 @@ from smplxpp.core.mesh_files.texture import file_beside
 
 # Options before the name of a texture, with the number of their arguments; vectors have one to three.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-cc": 1}
-_MOST_LIBRARIES = 1000  # material files that are looked for: scenes have a few
 _VECTORS = ("-mm", "-o", "-s", "-t")
 
 
@@ -50,12 +49,14 @@ def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
     out: dict[str, Material] = {}
     seen: set[Path] = set()
     names: list[str] = []
-    for entry in list(dict.fromkeys(libraries))[:_MOST_LIBRARIES]:
+    # Material files that are looked for: scenes have a few.
+    most_libraries = 1000
+    for entry in list(dict.fromkeys(libraries))[:most_libraries]:
         # A name may contain blanks; only if no such file exists does the line list several libraries.
         names += [entry] if file_beside(path, entry) is not None else entry.split()
     names = list(dict.fromkeys(names))
-    missing = names[_MOST_LIBRARIES:]
-    for name in names[:_MOST_LIBRARIES]:
+    missing = names[most_libraries:]
+    for name in names[:most_libraries]:
         found = file_beside(path, name)
         if found is None:
             missing.append(name)

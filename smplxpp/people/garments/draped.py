@@ -24,7 +24,6 @@ from smplxpp.people.patterns import ramp
 from smplxpp.skinning import unpose
 
 _LEGS = "the trunk down to the crotch; below it the mean of the leg's skin at the same height, however far off it is"
-_COLUMNS = 96  # around the trunk, half of them on each leg
 
 
 def draped_garments(mannequin: Mannequin) -> list[Garment]:
@@ -96,8 +95,10 @@ def _trousers(mannequin: Mannequin, *, hem: float, above: float = 0.0, pleats: f
     """
     j = mannequin.joints
     top, crotch, low = j["spine1"][1] + 0.04 + above, j["left_hip"][1] - 0.125, j["left_ankle"][1] + 0.03
+    # Around the trunk, half of them on each leg.
+    columns = 96
     # The trunk: a closed ring of columns that starts at the back.
-    azimuths = 2 * np.pi * np.arange(_COLUMNS) / _COLUMNS - np.pi / 2
+    azimuths = 2 * np.pi * np.arange(columns) / columns - np.pi / 2
     heights = np.linspace(top, crotch, int((top - crotch) / 0.014) + 2)
     points, faces = hang(mannequin, heights, azimuths, closed=True, stand_off=0.014)
     points = np.array(
@@ -108,10 +109,10 @@ def _trousers(mannequin: Mannequin, *, hem: float, above: float = 0.0, pleats: f
             solid=True,
         )
     )
-    half = _COLUMNS // 2
+    half = columns // 2
     # The ends of the seam between the legs lie on the middle plane.
-    points[-_COLUMNS::half, 0] = 0.0
-    ring = points[-_COLUMNS:]
+    points[-columns::half, 0] = 0.0
+    ring = points[-columns:]
     pieces = [mannequin.unweighted(points, faces)]
     inside = [mannequin.inner_points(points)]
     for side, sign, outer in (

@@ -43,7 +43,6 @@ HELD_DEGREES = (
     ("ankle", 5.0),
     ("foot", 3.0),
 )
-_FINGER_DEGREES = 5.0
 _PELVIS_HEIGHT_M, _PLACE_M = 0.015, 0.3
 
 
@@ -261,7 +260,8 @@ def cross_matrix(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"
 
 
 def _held_degrees(name: str) -> float:
-    return next((degrees for part, degrees in HELD_DEGREES if part in name), _FINGER_DEGREES)
+    finger_degrees = 5.0
+    return next((degrees for part, degrees in HELD_DEGREES if part in name), finger_degrees)
 
 
 def stature_of(body: BodyModel) -> tuple[float, Float64[np.ndarray, " B"]]:

@@ -12,9 +12,6 @@ from smplxpp.core import BodyParams, Camera, matrix_from_rotvec
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.turntable.fit import TurntableFit
 
-_WIDE_GAP = 75.0  # degrees between neighbouring views from which a side of the person is not seen well
-_LOOSE_LIMB = 15.0  # degrees that a joint may depart from the mean pose without a note
-
 
 def leveled(found: TurntableFit, body: BodyModel) -> tuple[BodyParams, Camera]:
     """Return poses and camera in a world with +Y up, the floor at y = 0 and the person about the vertical axis.
@@ -68,14 +65,18 @@ def turn_notes(found: TurntableFit, body: BodyModel, *, stature: float | None) -
     state = BodyState.of_params(body, found.fit.params)
     root = int(np.flatnonzero(body.parents < 0)[0])
     gap = widest_unseen(state.rotations[:, root], found.up)
-    if gap > _WIDE_GAP:
+    # Degrees between neighbouring views from which a side of the person is not seen well.
+    wide_gap = 75.0
+    if gap > wide_gap:
         out.append(f"neighbouring views are up to {gap:.0f} degrees apart: turn all around, with more frames")
     # Limbs that moved against the mean pose: their frames tell little about the others.
     mean = state.rotations.mean(axis=0)
     cosine = (np.einsum("tjxy,jxy->tj", state.rotations, mean) - 1.0) / 2.0
     away = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     away[:, root] = 0.0
-    loose = [(int(row), int(joint)) for row, joint in np.argwhere(away > _LOOSE_LIMB) if joint < 22]
+    # Degrees that a joint may depart from the mean pose without a note.
+    loose_limb = 15.0
+    loose = [(int(row), int(joint)) for row, joint in np.argwhere(away > loose_limb) if joint < 22]
     if loose:
         names = sorted({body.joint_names[joint] for _, joint in loose})
         frames = sorted({found.fit.frames[row] for row, _ in loose})

@@ -35,7 +35,6 @@ _STEADY = (
     "heel",
 )
 _FACE = ("nose", "left_eye", "right_eye", "face_30")
-_SEEN = 0.3  # confidence from which a point counts as detected
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +170,9 @@ def _face_cost(facing: np.ndarray, names: tuple[str, ...], confidence: np.ndarra
     rows = [k for k, name in enumerate(names) if name in _FACE]
     if not rows:
         return np.zeros(len(facing))
-    share = float(np.mean(confidence[rows] > _SEEN))
+    # Confidence from which a point counts as detected.
+    seen = 0.3
+    share = float(np.mean(confidence[rows] > seen))
     return 0.5 * (share * np.clip(-facing - 0.2, 0.0, 0.5) + (1.0 - share) * np.clip(facing - 0.2, 0.0, 0.5)) / 0.5
 
 
