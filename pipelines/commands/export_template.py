@@ -85,8 +85,8 @@ def _surfaces(request: FileRequest, template: Template, params: BodyParams | Non
     if params is None:
         if request.is_series:
             raise InputError("option params", expected="a motion, for a file a frame", received="none")
-        levels, notes = _levels(request, template)
-        return None, iter([(1, partial(write_obj, template=level)) for level in levels]), notes
+        levels, coarser = _levels(request, template)
+        return None, iter([(1, partial(write_obj, template=level)) for level in levels]), coarser
     if request.faces:
         raise InputError(
             "option faces",

@@ -124,8 +124,14 @@ def render_heat(
             received=f"shape {values.shape}",
         )
     colors = heat_colors(values, cmap=cmap, limits=limits)
-    key = "vertex_colors" if len(values) == mesh.vertex_count else "face_colors"
-    picture = render_shaded(mesh, camera, style=replace(style), **{key: colors})
+    of_vertices = len(values) == mesh.vertex_count
+    picture = render_shaded(
+        mesh,
+        camera,
+        style=replace(style),
+        vertex_colors=colors if of_vertices else None,
+        face_colors=None if of_vertices else colors,
+    )
     if not bar:
         return picture
     side = color_bar(cmap=cmap, limits=limits, unit=unit, height=len(picture), background=style.background)
