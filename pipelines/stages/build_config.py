@@ -82,7 +82,9 @@ def load_register(run: Path) -> RegisterInputs | None:
 
     def parsed(values: Mapping[str, Any]) -> RegisterInputs:
         require_plain_fields(RegisterInputs, values, subject=REGISTER_FILE)
-        return RegisterInputs(**{**values, **_paths(values, _REGISTER_PATHS), **_frames_and_cameras(values)})
+        return RegisterInputs(
+            **{**values, **_label_set(values), **_paths(values, _REGISTER_PATHS), **_frames_and_cameras(values)}
+        )
 
     warning = "%s is treated as a run without a registration by `smplxpp register`: %s"
     return _load(run / REGISTER_FILE, parsed, warning)
@@ -172,6 +174,11 @@ def _paths(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Path]
     return {name: Path(values[name]) for name in names if values.get(name) is not None}
 
 
+def _label_set(values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the name or the file of the label set; records of earlier versions may have none."""
+    return {"label_set": as_text(values["label_set"], subject="label_set")} if "label_set" in values else {}
+
+
 def _frames_and_cameras(values: Mapping[str, Any]) -> dict[str, Any]:
     """Parse the numbers of frames (None for all) and the names of held-out cameras."""
     frames = values["frames"]
@@ -190,7 +197,7 @@ def _build_config(values: Mapping[str, Any]) -> BuildConfig:
     require_plain_fields(BridgeConfig, bridges, subject=BUILD_FILE)
     require_plain_fields(FillHolesConfig, holes, subject=BUILD_FILE)
     made = {"bridges": BridgeConfig(**bridges), "fill_holes": FillHolesConfig(**holes)}
-    return BuildConfig(**{**values, **_paths(values, _CHOICE_PATHS), **made})
+    return BuildConfig(**{**values, **_label_set(values), **_paths(values, _CHOICE_PATHS), **made})
 
 
 def _build_inputs(written: Mapping[str, Any]) -> BuildInputs:
@@ -215,4 +222,4 @@ def _build_inputs(written: Mapping[str, Any]) -> BuildInputs:
             found[name] = None
     for kind in ("label_maps", "photographs"):
         found[kind] = {name: Path(path) for name, path in values[kind].items()}
-    return BuildInputs(**found)
+    return BuildInputs(**found | _label_set(values))

@@ -53,7 +53,7 @@ def run(tmp_path_factory):
     return folder
 
 
-def motion(expressions=10, fps=None):
+def motion(expressions=10, fps=30.0):
     """The left arm goes up."""
     pose = np.zeros((FRAMES, 63))
     pose[:, 3 * LEFT_SHOULDER + 2] = np.linspace(0, 1.2, FRAMES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,7 +34,8 @@ def run(tmp_path_factory):
 
 @pytest.fixture
 def params(tmp_path):
-    BodyParams.concatenate([pose(frame) for frame in range(FRAMES)]).save(tmp_path / "walk.npz")
+    motion = BodyParams.concatenate([pose(frame) for frame in range(FRAMES)])
+    replace(motion, fps=30.0).save(tmp_path / "walk.npz")
     return tmp_path / "walk.npz"
 
 

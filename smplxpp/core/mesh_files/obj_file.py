@@ -45,6 +45,9 @@ from smplxpp.core.mesh_files.texture import (
     sample_texture,
 )
 
+# Bytes of lines that are parsed at once, which bounds the work space.
+_BLOCK = 1 << 24
+
 
 def read_obj(path: Path) -> RawMesh:
     """Read the vertices, faces and colours of an OBJ file.
@@ -123,9 +126,7 @@ class _Lines:
         if not len(chosen):
             return out
         size = np.cumsum(self.ends[chosen] - self.starts[chosen])
-        # Bytes of lines that are parsed at once, which bounds the work space.
-        block = 1 << 24
-        for rows in np.split(chosen, np.flatnonzero(np.diff(size // block)) + 1):
+        for rows in np.split(chosen, np.flatnonzero(np.diff(size // _BLOCK)) + 1):
             # Consecutive lines are copied as one run of bytes.
             breaks = np.flatnonzero(np.diff(rows) > 1)
             first, last = rows[np.concatenate([[0], breaks + 1])], rows[np.append(breaks, len(rows) - 1)]
