@@ -24,6 +24,8 @@ from smplxpp.core.errors import InputError
 # Limits of a conversation: characters of one message, characters of one answer (some five minutes of speech), and turns
 # that a language model gets as context.
 MOST_TYPED = 2000
+_MOST_ANSWERED = 4000
+_REMEMBERED = 12
 LONGEST_SENTENCE = 240
 """Characters after which a sentence is cut at a pause or between words, because a voice is synthesised by sentences."""
 # Not behind a title, an abbreviation that a word follows, or several initials.
@@ -211,8 +213,7 @@ class Conversation:
             turn.marks["pause"] = pause
             turn.mark("recognised")
         self._turn = turn
-        remembered = 12
-        self._turns = [*self._turns, turn][-remembered:]
+        self._turns = [*self._turns, turn][-_REMEMBERED:]
         self._tell({"kind": "heard", "text": text, "turn": number, "spoken": spoken})
         self._answering = threading.Thread(target=self._answer, args=(turn,), daemon=True)
         self._answering.start()
@@ -239,15 +240,14 @@ class Conversation:
 
     def _words(self, turn: Turn) -> Iterator[str]:
         count = 0
-        most_answered = 4000
         try:
             for piece in self._parts.partner.answer(history(self._turns)):
                 if turn.cancelled:
                     return
                 turn.mark("first words")
-                yield piece[: most_answered - count]
+                yield piece[: _MOST_ANSWERED - count]
                 count += len(piece)
-                if count >= most_answered:
+                if count >= _MOST_ANSWERED:
                     self._note("The answer was too long and is cut here.")
                     return
         except InputError as error:

@@ -72,8 +72,8 @@ class Demo:
     capture: OptionalPath = None
     """Capture to build; by default the embedded person."""
 
-    def run(self) -> None:
-        """Build, train, evaluate, animate, write the pages and print where they are.
+    def run(self) -> dict[str, int]:
+        """Build, train, evaluate, animate, write the pages and print where they are; failed gates give a status of 1.
 
         Raises:
             InputError: the embedded person is not there and no capture is given.
@@ -82,7 +82,7 @@ class Demo:
         console = Console(stderr=True)
         out, capture = self.run_folder, self.capture or embedded_capture()
         started = perf_counter()
-        Build(run_folder=out, capture=capture, protocol=TRACKED, budgets=BUDGETS).run()
+        built = Build(run_folder=out, capture=capture, protocol=TRACKED, budgets=BUDGETS).run()
         _LOG.info(
             "demo: the template stands after %.0f s: open %s while the student is trained (a few minutes more)",
             perf_counter() - started,
@@ -97,6 +97,7 @@ class Demo:
         where = {"report": out / "report.html", "film": film, "player": page, **self._talk(console)}
         lines = [f"{name:7} {path.resolve()}" for name, path in where.items()]
         console.print("\n" + "\n".join(lines), highlight=False, soft_wrap=True, markup=False)
+        return {"exit_status": built["exit_status"]}
 
     def _talk(self, console: Console) -> dict[str, Path]:
         """Let the student speak, in the report and in a page; where the extra is not installed, print how to get it."""

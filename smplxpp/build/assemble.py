@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Integer
 
 from smplxpp.assemble import FilledHoles, FillHolesConfig, body_colors_from_scan, cut_holes, cut_slits, fill_holes
-from smplxpp.assemble.drape import drape_patches
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
+from smplxpp.assemble.drape import drape_patches
 from smplxpp.body import BodyModel
 from smplxpp.build.completeness import photograph_views
 from smplxpp.build.config import BuildConfig, BuildInputs

@@ -183,9 +183,7 @@ def photograph_checks(
     return [check], numbers
 
 
-def photograph_views(
-    inputs: BuildInputs, *, longer_side: int
-) -> tuple[list[tuple[Camera, np.ndarray]], list[str]]:
+def photograph_views(inputs: BuildInputs, *, longer_side: int) -> tuple[list[tuple[Camera, np.ndarray]], list[str]]:
     """Return photographs (H, W, 3) uint8, no longer than a side, with their cameras; notes on those not to be read."""
     if inputs.cameras is None:
         return [], ["no camera file"]

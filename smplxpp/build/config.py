@@ -51,8 +51,8 @@ class BuildConfig:
         up: upward axis of the scan, one of `UP_AXES`. "auto": found where the scan comes alone, else +Y.
         height: the person's stature in metres, standing upright, for a scan that comes alone and has no unit. The scan
             is scaled until the body that is found in it, in whatever pose, has it. None: units tell the size.
-        whose: whose parameters are given with a scan, one of `WHOSE`. "auto": as their file tells. Those of a family are a
-            start for the search where the body is the open body, because their shape is not its.
+        whose: whose parameters are given with a scan, one of `WHOSE`. "auto": as their file tells. Those of a family
+            are a start for the search where the body is the open body, because their shape is not its.
         frame: number of the reference frame, near the T-pose.
         protocol: the capture's protocol, which names the files that are read. None: without one.
         keypoints: folder of keypoints that replaces the capture's own.
@@ -70,8 +70,8 @@ class BuildConfig:
             file. None: the surface alone decides.
         budgets: number of faces kept by part name; others keep what their label says.
         rules: how a part follows the skeleton by its name, or a piece of it by name and number ("upper/1"; 0 is the
-            largest in area): "auto", "rigid:JOINT", "chain:JOINT,JOINT,..." or "isolate", see `TransferConfig`. They come
-            before the rules of the labels.
+            largest in area): "auto", "rigid:JOINT", "chain:JOINT,JOINT,..." or "isolate", see `TransferConfig`. They
+            come before the rules of the labels.
         remesh: method that makes the parts' faces, "quadric" or "isotropic".
         clearance_mm: distance kept between layers, millimetres, 0.1 to 10.
         max_influences: joints that a vertex may follow.
@@ -80,8 +80,8 @@ class BuildConfig:
         method: skin-weight transfer, "ours", or "paper" for robust transfer as published.
         texture_size: texels a side of the template's pictures, one of `TEXTURE_SIZES`; 0: no texture.
         texture_layout: "one" picture for all parts, or one a "part"; then the body lies as in its own file.
-        normal_map: paint the scan's normals onto the parts, too. Of parts with the default budgets they differ by 1 to 3
-            degrees from the parts' own, so that it shows with small budgets alone.
+        normal_map: paint the scan's normals onto the parts, too. Of parts with the default budgets they differ by 1 to
+            3 degrees from the parts' own, so that it shows with small budgets alone.
         samples: surface samples of the validation.
         seed: of the samples.
         accept_failures: build on a body that was found with too little confidence; the command then ends with status 0

@@ -30,9 +30,11 @@ _EMPHASIS = {"head": 2.0, "left_wrist": 1.5, "right_wrist": 1.5, "left_ankle": 0
 # Skin is covered by parallel cloth (cosine of the normals) so far in front of it, or so far sunk into it, in metres. It
 # stays within the margin of skin that shows: as far as a sleeve or a hem moves in motion.
 _PARALLEL, _IN_FRONT, _SUNK = 0.5, 0.03, 0.005
-# Parts share faces by this power of their own. Chosen with the emphasis: at 1 hair and trousers of 2,500 faces are torn,
-# at 0.5 the face has none left at 5,000.
+_MARGIN = 0.03
+# Parts share faces by this power of their own. Chosen with the emphasis: at 1 hair and trousers of 2,500 faces are
+# torn, at 0.5 the face has none left at 5,000.
 _SHARE = 0.7
+_TEXELS = 1024  # a side of a level's texture; half of a template's own, as a level has half of its size on the screen
 _DIRECTIONS = ("shapedirs", "exprdirs", "posedirs")
 
 
@@ -60,7 +62,8 @@ def simplified_template(template: Template, faces: int) -> Template:
     small ones (`simplify`: edges collapsed by quadric error, borders and their vertices kept; head and hands count as
     larger than they are). A vertex of the result takes weights, expressions, and shape and pose bases of the nearest
     place on the source's faces that collapsed into it, so that upper and lower lip, or two fingers, cannot exchange
-    theirs; its colour is their mean. A texture is painted again from the source's. Joints stay where they are and follow expressions as before.
+    theirs; its colour is their mean. A texture is painted again from the source's. Joints stay where they are and
+    follow expressions as before.
 
     A template within the number is returned as it is.
 
@@ -79,9 +82,7 @@ def simplified_template(template: Template, faces: int) -> Template:
     faces_of = [template.part_faces(name) & shown for name in template.part_names]
     budgets = _shares(np.array([int(one.sum()) for one in faces_of]), faces)
     parts = [_simplified_part(template, *one, space) for one in zip(faces_of, budgets.tolist(), strict=True)]
-    # A side of a level's texture; half of a template's own, as a level has half of its size on the screen.
-    texels = 1024
-    return repainted(_joined(template, parts), template, size=texels)
+    return repainted(_joined(template, parts), template, size=_TEXELS)
 
 
 def _shares(counts: Int64[np.ndarray, " P"], faces: int) -> Int64[np.ndarray, " P"]:
@@ -114,8 +115,7 @@ def covered_faces(template: Template) -> Bool[np.ndarray, " F"]:
     hidden = parallel & ~found.on_border & (found.distance > -_IN_FRONT) & (found.distance < _SUNK)
     if hidden.all() or not hidden.any():
         return out
-    margin = 0.03
-    far = cKDTree(centers[~hidden]).query(centers, distance_upper_bound=margin)[0] > margin
+    far = cKDTree(centers[~hidden]).query(centers, distance_upper_bound=_MARGIN)[0] > _MARGIN
     out[np.flatnonzero(body)] = hidden & far
     return out
 

@@ -55,7 +55,7 @@ def locate_in_scan(
         scan: repaired.
         body: the model.
         landmarks: points placed by hand, which are trusted.
-        detector: keypoint model that is asked for the front and for limbs; see `BuildConfig`. Not used beside landmarks.
+        detector: keypoint model that is asked for the front and for limbs; see `BuildConfig`. Unused beside landmarks.
         height: the person's stature, metres; None: the scan has its size.
         start: one frame of a body of another shape in the scan, whose limbs and front are proposed as a detector's
             keypoints are; it takes the place of the detector.

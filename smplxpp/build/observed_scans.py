@@ -72,7 +72,7 @@ def observed_scans(
 
 
 def _given_labels(given: Path | np.ndarray, scan: ScanFile, label_set: str | LabelSet) -> Int64[np.ndarray, " V"]:
-    """The labels of a file or an array, one a vertex of the repaired scan, as the built-in ones that they behave like."""
+    """Return labels of a file or an array, one a vertex of the repaired scan, as the built-in ones they behave like."""
     labels, of_faces = scan_file_labels(given, scan.raw, label_set=label_set)
     labels = find_label_set(label_set).labels.kind_ids(labels)
     clean = scan.clean

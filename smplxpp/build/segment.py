@@ -57,9 +57,7 @@ def label_source(inputs: BuildInputs) -> str:
     if inputs.labels is not None:
         return "file"
     scan = inputs.scan
-    of_scan = (
-        isinstance(scan, Path) and not inputs.reconstructs and holds_labels(scan, labels=inputs.labels_used)
-    )
+    of_scan = isinstance(scan, Path) and not inputs.reconstructs and holds_labels(scan, labels=inputs.labels_used)
     return "file" if of_scan else "body"
 
 

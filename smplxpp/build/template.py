@@ -136,7 +136,9 @@ class _Build:
         require_remesher(config.remesh)
         if config.detector is not None:
             load_detector(config.detector)
-        corrections = None if config.corrections is None else Corrections.load(config.corrections, labels=inputs.labels_used)
+        corrections = (
+            None if config.corrections is None else Corrections.load(config.corrections, labels=inputs.labels_used)
+        )
 
         # Make what is not given: the scan, the body in it, the parameters of the capture's frames.
         if self.plan.reconstruction is not None:

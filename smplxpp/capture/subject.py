@@ -28,7 +28,12 @@ MaskReader = Callable[[str, int], "np.ndarray | None"]
 
 # A person moves at most so far between two frames, metres, and is taken up again within the larger one after a gap.
 _STEP, _REACH = 0.6, 2.0
+# Distance of rays, metres, up to which a view joins a person known from the other views or frames.
+_JOINS = 0.35
 # Share of a person's frames below which a camera that never agrees counts as misplaced: its nearest person is kept.
+_DISAGREES = 0.1
+_MASKED_FRAMES = 5  # frames whose masks are read
+_MOST_FRAMES = 300  # frames in which people of all views are compared, 25 ms each with four cameras
 _NAMED = 4  # people that a note describes
 
 
@@ -133,10 +138,8 @@ def choose_subject(
     names = [name for name in cameras if name in people]
     frames = sorted({frame for name in names for frame in people[name]})
     views = Views.of(people, {name: cameras[name] for name in names}, distortions, frames)
-    # Frames in which people of all views are compared, 25 ms each with four cameras.
-    most_frames = 300
     # A long take is compared at evenly spread frames; between these, positions are interpolated.
-    compared = frames[:: max(1, len(frames) // most_frames)]
+    compared = frames[:: max(1, len(frames) // _MOST_FRAMES)]
     found = {frame: people_in_space(views.sighted[frame]) for frame in compared}
     tracks = sorted(_scored(_followed(found), views, mask, len(found)), key=lambda track: -track.score)
     if not tracks:
@@ -197,9 +200,7 @@ def _scored(tracks: Sequence[Track], views: Views, mask: MaskReader | None, comp
 def _inside(track: Track, views: Views, mask: MaskReader) -> float:
     """Return the share of a person's points inside the masks of a few frames; 0.5 without any mask."""
     inside, count = 0, 0
-    # Frames whose masks are read.
-    masked_frames = 5
-    for frame in list(track.places)[:: max(1, len(track.places) // masked_frames)][:masked_frames]:
+    for frame in list(track.places)[:: max(1, len(track.places) // _MASKED_FRAMES)][:_MASKED_FRAMES]:
         for row in track.places[frame].members:
             shown = mask(views.names[int(views.sighted[frame].camera[row])], frame)
             if shown is None:
@@ -216,11 +217,8 @@ def _members(track: Track, tracks: Sequence[Track], views: Views) -> dict[str, d
     agreeing = np.zeros(len(views.names))
     for frame, place in track.places.items():
         agreeing[views.sighted[frame].camera[list(place.members)]] += 1
-    disagrees = 0.1
-    misplaced: Bool[np.ndarray, " C"] = agreeing < disagrees * len(track.places)
+    misplaced: Bool[np.ndarray, " C"] = agreeing < _DISAGREES * len(track.places)
     out: dict[str, dict[int, int]] = {name: {} for name in views.names}
-    # Distance of rays, metres, up to which a view joins a person known from the other views or frames.
-    joins = 0.35
     for frame, seen in views.sighted.items():
         own = track.places[frame].members if frame in track.places else ()
         others = {row for t in tracks if t is not track and frame in t.places for row in t.places[frame].members}
@@ -232,7 +230,7 @@ def _members(track: Track, tracks: Sequence[Track], views: Views) -> dict[str, d
                 costs = [typical_distance(seen, row, points) for row in rows]
                 best = int(np.argmin(costs))
                 # A camera that agrees in no frame may be misplaced, which triangulation then names.
-                if costs[best] < (np.inf if misplaced[c] else joins):
+                if costs[best] < (np.inf if misplaced[c] else _JOINS):
                     mine = rows[best]
             if mine is not None:
                 out[name][frame] = views.place[frame][mine]

@@ -187,6 +187,7 @@ def _is_person(points: Float64[np.ndarray, "K 3"]) -> bool:
 
 # Points that are compared: the body's and the feet's. Fingers and points of the face are many and small.
 _PARTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe", "heel", "nose", "eye", "ear")
+_LEAST_CONFIDENCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,8 +270,7 @@ def _table(people: Sequence[Person]) -> Float64[np.ndarray, "D K 3"]:
     for row, one in enumerate(people):
         for column, name in enumerate(names):
             table[row, column] = one.points.get(name, 0.0)
-    least_confidence = 0.05
-    table[table[..., 2] < least_confidence] = 0.0
+    table[table[..., 2] < _LEAST_CONFIDENCE] = 0.0
     return table
 
 

@@ -20,6 +20,7 @@ C0 = 0.28209479177387814
 """1 / (2 sqrt(pi)), the harmonic of degree 0."""
 MAX_DEGREE = 3
 # Normalisation constants of degrees 1 to 3, which make the harmonics orthonormal over the sphere.
+_C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
@@ -64,11 +65,10 @@ def sh_basis(directions: Float[Array, "*B 3"], degree: int) -> Float[Array, "*B 
 def _terms(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
     """Return the polynomials of degrees 1 to `degree` in the coordinates of a unit vector."""
     terms: list[Any] = []
-    c1 = 0.4886025119029199
     if degree > 0:
         # The Condon-Shortley signs and the order -m..m are those of the reference implementation of Gaussian
         # splatting.
-        terms += [-c1 * y, c1 * z, -c1 * x]
+        terms += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree > 1:
         xx, yy, zz = x * x, y * y, z * z
         terms += [_C2[0] * x * y, -_C2[0] * y * z, _C2[1] * (2 * zz - xx - yy), -_C2[0] * x * z, _C2[2] * (xx - yy)]

@@ -15,14 +15,23 @@ from smplxpp.core import Camera, MeshLike, PointsLike, TriangleMesh, as_mesh, as
 from smplxpp.core.rotations import rotation_between
 from smplxpp.raster import rasterize_mesh
 
+_STEPS = 15
 # Farther points are capped: a coat's hem must not outvote the hands.
 _CAP = 0.03
 # Pixels of a view that colours are averaged over, and that a silhouette is drawn in by: sampling, mixed edges.
 _BLUR = 3
 _INSIDE = 2
+_LEAST_PIXELS = 200
 # Largest shift of a view as a share of an image's longer side, the step of the search, and the pixels it looks at.
 _REACH = 0.03
+_STEP = 3
+_SEARCHED = 3_000
 _ALIGNED = 3_000
+# Largest local shift of colours in pixels, and the window in which the smallest difference is searched.
+_LOCAL = 2
+_WINDOW = 25
+# Share of that variance below which the two look the same.
+_SAME = 1e-3
 
 
 def mirrored_by_views(
@@ -77,9 +86,7 @@ def mirrored_by_views(
         along += float(((one.photograph[both] - here[both]) * direction).sum())
         length += float((direction**2).sum())
         variance += one.variance
-    # Share of that variance below which the two look the same.
-    same = 1e-3
-    return 0.5 if length <= same * variance else along / length
+    return 0.5 if length <= _SAME * variance else along / length
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +126,7 @@ def _view(mesh: TriangleMesh, colors: np.ndarray, camera: Camera, photograph: np
     maps = rasterize_mesh(mesh, camera)
     # Pixels well inside the silhouette, because its border mixes person and background.
     row, col = np.nonzero(binary_erosion(maps.mask, iterations=_INSIDE))
-    least_pixels = 200
-    if len(row) < least_pixels:
+    if len(row) < _LEAST_PIXELS:
         return None
     drawn = _blurred(maps.interpolate(mesh.faces, colors))
     # Normalised convolution: blur the colours and the mask, and divide, so that the background does not darken borders.
@@ -143,8 +149,7 @@ def _view(mesh: TriangleMesh, colors: np.ndarray, camera: Camera, photograph: np
 def _offset(drawn: np.ndarray, photograph: np.ndarray, row: np.ndarray, col: np.ndarray) -> tuple[int, int]:
     """Return the shift, in pixels down and to the right, that fits drawn colours best to a photograph."""
     height, width = photograph.shape[:2]
-    searched = 3_000
-    chosen = np.array(spread(range(len(row)), searched))
+    chosen = np.array(spread(range(len(row)), _SEARCHED))
     drawn, row, col = drawn[chosen], row[chosen], col[chosen]
 
     def unexplained(move: tuple[int, int]) -> float:
@@ -152,9 +157,8 @@ def _offset(drawn: np.ndarray, photograph: np.ndarray, row: np.ndarray, col: np.
         return _gain(drawn, there)[1]
 
     reach = int(_REACH * max(height, width))
-    step = 3
     # The middle first: of equals it is the one.
-    steps = sorted(range(-(reach // step) * step, reach + 1, step), key=abs)
+    steps = sorted(range(-(reach // _STEP) * _STEP, reach + 1, _STEP), key=abs)
     down, right = min(((i, j) for i in steps for j in steps), key=unexplained)
     return min(((down + i, right + j) for i in (0, -1, 1) for j in (0, -1, 1)), key=unexplained)
 
@@ -168,16 +172,13 @@ def _locally_moved(view: _View) -> np.ndarray:
     box = (slice(row.min(), row.max() + 1), slice(col.min(), col.max() + 1))
     drawn, photograph = view.drawn[box].astype(np.float32), view.photograph[box].astype(np.float32)
     best, least = drawn.copy(), np.full(drawn.shape[:2], np.inf, dtype=np.float32)
-    local = 2
-    # Largest local shift of colours in pixels, and the window in which the smallest difference is searched.
-    window = 25
     # Try zero offset first, so that ties keep it.
     # Block matching: the squared difference, averaged over a window, decides for each pixel.
-    for move in sorted(product(range(-local, local + 1), repeat=2), key=lambda move: max(map(abs, move))):
+    for move in sorted(product(range(-_LOCAL, _LOCAL + 1), repeat=2), key=lambda move: max(map(abs, move))):
         moved = np.roll(drawn, move, (0, 1))
         covered = np.isfinite(moved[..., 0])
         rest = np.where(covered, ((moved - photograph) ** 2).sum(axis=-1), 0.0)
-        rest = uniform_filter(rest, window) / np.maximum(uniform_filter(covered.astype(np.float32), window), 1e-3)
+        rest = uniform_filter(rest, _WINDOW) / np.maximum(uniform_filter(covered.astype(np.float32), _WINDOW), 1e-3)
         better = covered & (rest < least)
         least[better], best[better] = rest[better], moved[better]
     best[np.isnan(drawn[..., 0])] = np.nan
@@ -253,8 +254,7 @@ def _aligned_distance(points: np.ndarray, body: TriangleMesh, tree: igl.AABB) ->
 
 def aligned(points: Float64[np.ndarray, "P 3"], body: TriangleMesh, tree: igl.AABB) -> Float64[np.ndarray, "P 3"]:
     """Points after rigid steps towards the closest ones of a mesh (Besl and McKay 1992); `tree` is the mesh's."""
-    steps = 15
-    for _ in range(steps):
+    for _ in range(_STEPS):
         squared, _, closest = tree.squared_distance(body.vertices, body.faces, points)
         distance = np.sqrt(squared)
         used = distance <= max(_CAP, 2.0 * float(np.median(distance)))

@@ -35,6 +35,12 @@ from smplxpp.reconstruct.views import INSIDE, LEAST_VIEWS, Box, PhotoView, mask_
 # Share of the frames that may reject a point of the surface, and of the first hull, which a wrong frame must not spoil.
 # It trades thin limbs, which wrong poses cut off, against fat ones.
 _DISSENT, _FIRST_DISSENT = 0.03, 0.15
+_SMOOTHING = 40  # Taubin steps, against the edges that few silhouettes leave
+# Frames of whose mask the surface covers less than of the median frame's, by this share, were posed wrongly.
+_LESS_COVERED = 0.06
+_COARSE_M = 0.012  # cells of the first hull
+_COARSEST_M = 0.08  # cells with which a hull is begun: the box around spread arms is mostly air
+_MOST_FRAMES = 60  # more, evenly spread, add minutes and no side
 
 
 def reconstruct_turntable(
@@ -66,11 +72,8 @@ def reconstruct_turntable(
     progress("hull", 0.0)
     # A coarse hull shows which frames do not fit; the fine one is made of the others.
     first = max(1, round(_FIRST_DISSENT * len(views)))
-    # Cells of the first hull.
-    coarse_m = 0.012
-    shares = coverage(_hull(views, person, box, cell=coarse_m, dissent=first)[0], views, person)
-    less_covered = 0.06
-    kept = np.flatnonzero(shares[:, 0] >= np.median(shares[:, 0]) - less_covered)
+    shares = coverage(_hull(views, person, box, cell=_COARSE_M, dissent=first)[0], views, person)
+    kept = np.flatnonzero(shares[:, 0] >= np.median(shares[:, 0]) - _LESS_COVERED)
     for row in np.setdiff1d(np.arange(len(views)), kept):
         faults[views[row].name] = f"the surface of the others covers {100 * shares[row, 0]:.0f} % of its mask"
         notes.append(f"frame {views[row].name} left out: {faults[views[row].name]}, probably a wrong pose")
@@ -80,9 +83,7 @@ def reconstruct_turntable(
     hull, inside = _hull(views, person, box, cell=cell, dissent=config.dissent + int(_DISSENT * len(views)))
     hull, more = main_body(hull)
     notes += more
-    # Taubin steps, against the edges that few silhouettes leave.
-    smoothing = 40
-    hull = taubin(hull, mean_of_neighbours(hull), steps=smoothing)
+    hull = taubin(hull, mean_of_neighbours(hull), steps=_SMOOTHING)
     numbers: dict[str, Any] = {
         "views": [view.name for view in views],
         "left_out": faults,
@@ -104,10 +105,7 @@ def _usable(views: Sequence[PhotoView], person: PosedPerson) -> tuple[list[Photo
         InputError: fewer than four of them.
     """
     faults = {view.name: fault for view in views if (fault := mask_fault(view))}
-    # Frames of whose mask the surface covers less than of the median frame's, by this share, were posed wrongly.
-    # More, evenly spread, add minutes and no side.
-    most_frames = 60
-    rows = spread([k for k, view in enumerate(views) if view.name not in faults], most_frames)
+    rows = spread([k for k, view in enumerate(views) if view.name not in faults], _MOST_FRAMES)
     if len(rows) < LEAST_VIEWS:
         raise InputError(
             "frames to reconstruct from",
@@ -143,9 +141,7 @@ def _hull(
             out[first + rows] = np.minimum(out[first + rows], depth)
         return out
 
-    # Cells with which a hull is begun: the box around spread arms is mostly air.
-    coarsest_m = 0.08
-    return zero_surface(inside, box, cell=cell, coarsest=coarsest_m), inside
+    return zero_surface(inside, box, cell=cell, coarsest=_COARSEST_M), inside
 
 
 def coverage(surface: TriangleMesh, views: Sequence[PhotoView], person: PosedPerson) -> Float64[np.ndarray, "T 2"]:

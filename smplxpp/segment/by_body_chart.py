@@ -23,6 +23,7 @@ SOLE, ANKLE, KNEE, HIP, NECK_BASE, HEAD_BASE, TOP = 0.0, 0.08, 0.48, 0.90, 1.45,
 ELBOW, WRIST, FINGERTIP = 0.26, 0.50, 0.68
 # Weight of normals in the search for the nearest body vertex, metres: opposite normals count as 12 cm of distance, so
 # that an arm beside the trunk is not taken for it.
+_NORMAL_WEIGHT = 0.06
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb", "_hand")
 
 
@@ -158,10 +159,9 @@ def chart_of_scan(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> Bo
     own = chart_of_body(body, params)
     posed = body.mesh(body.forward(params).vertices[0])
     normals = posed.vertex_normals
-    normal_weight = 0.06
-    tree = cKDTree(np.concatenate([posed.vertices, normal_weight * normals], axis=1))
+    tree = cKDTree(np.concatenate([posed.vertices, _NORMAL_WEIGHT * normals], axis=1))
     points = mesh.face_centers
-    _, nearest = tree.query(np.concatenate([points, normal_weight * mesh.face_normals], axis=1))
+    _, nearest = tree.query(np.concatenate([points, _NORMAL_WEIGHT * mesh.face_normals], axis=1))
     offset = points - posed.vertices[nearest]
     along = np.einsum("ij,ij->i", offset, normals[nearest])
     # Near the body the distance is that to the vertex's tangent plane, farther than 4 cm that to the vertex.

@@ -25,10 +25,12 @@ from smplxpp.segment.by_body_chart import HIP, KNEE, WRIST
 from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, Rings
 
 # Height of the usual waist, standard metres.
+_WAIST = 0.98
 NAT = 8.0
 """Nats of an outline's cost for one nat of its probability, because rings are not independent and clothes vary (6 to 8
 for 36 of 38 people)."""
 RUNS = (SHOE, SKIN, LOWER, SKIN, UPPER)
+_NO_SHOE = 200.0  # nats of no shoe under a heel, more than colours can bring
 
 
 @dataclass(frozen=True)
@@ -204,16 +206,13 @@ def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: b
     middle = 0.5 * (place[1:] + place[:-1])
     on_foot = _between(8.0 * (middle < 0.045))  # nats of a ring of the foot in trousers or a dress
     skin = runs.skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
-    # Nats of no shoe under a heel, more than colours can bring.
-    no_shoe = 200.0
     # Priors on the place and length of each run: linear penalties outside of the usual range, and a waist at its
     # height.
-    bare_feet = no_shoe if heels else 2.0
+    bare_feet = _NO_SHOE if heels else 2.0
     shoe = (runs.worn if heels else runs.shoe) + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, bare_feet, 0.0)
     usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
     usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
-    waist = 0.98
-    at_waist = 0.5 * np.minimum(((place[j] - waist) / 0.06) ** 2, 16.0)
+    at_waist = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0)
     # Visible legs: cloth within 25 mm of the thighs on average, where a skirt hangs farther.
     legs_show = float(rings.distance[(middle > 0.5) & (middle < 0.75)].mean()) < 0.025
     split = at_waist + config.split_at_legs if legs_show else config.split

@@ -20,10 +20,14 @@ _FEATHER = 6.0
 _BEHIND = 0.006
 # Metres between the depths of neighbouring pixels from which they belong to two surfaces.
 _STEP = 0.02
+_LEAST_COSINE = 0.15  # between the surface and the view: flatter views smear a pixel over centimetres
 # Weights are raised to this power: at 1 four views blur each other, at 8 seams show; by eye on two captures.
 _SHARPNESS = 3
 # Weight of all views together below which the scan's own colour comes in.
+_ENOUGH = 0.02
 _BEST = 4  # views of a face that are blended
+_ROUNDS = 30  # of alternating least squares between gains and colours
+_MOST_VERTICES = 20_000  # whose colours decide the gains
 
 Painter = Callable[[Int64[np.ndarray, " T"], Float64[np.ndarray, "T 3"]], UInt8[np.ndarray, "T 3"]]
 
@@ -75,9 +79,7 @@ class PhotographPainter:
         best = weights[mesh.faces].max(axis=1)
         least = np.sort(best, axis=1)[:, -min(_BEST, best.shape[1])]
         self._views = (best > 0) & (best >= least[:, None])
-        # Whose colours decide the gains.
-        most_vertices = 20_000
-        rows = np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, most_vertices)).astype(np.int64)
+        rows = np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, _MOST_VERTICES)).astype(np.int64)
         samples, weights = samples[rows], weights[rows]
         # Without the power: where one view decides, the others tell nothing of its exposure.
         self.gains = _gains(samples, weights ** (1.0 / _SHARPNESS))
@@ -91,9 +93,8 @@ class PhotographPainter:
         samples, weights = self._sampled(points, normals, self._views[face])
         total = weights.sum(axis=1, keepdims=True)
         blended = np.einsum("tv,tvc->tc", weights, samples) / np.maximum(total, 1e-12)
-        enough = 0.02
         # Between photographs and the scan's own colour there is no step either.
-        share = np.clip(total / enough, 0.0, 1.0)
+        share = np.clip(total / _ENOUGH, 0.0, 1.0)
         own = self._otherwise(face, barycentric).astype(np.float32)
         return np.rint(np.clip(share * blended + (1.0 - share) * own, 0, 255)).astype(np.uint8)
 
@@ -106,8 +107,6 @@ class PhotographPainter:
         """Sample every view bilinearly, gains applied, and weigh it; a view that does not see a point weighs 0."""
         samples = np.zeros((len(points), len(self._photographs), 3), np.float32)
         weights = np.zeros((len(points), len(self._photographs)))
-        # Between the surface and the view: flatter views smear a pixel over centimetres.
-        least_cosine = 0.15
         for k, photo in enumerate(self._photographs):
             camera, depth = photo.camera, self._depths[k]
             tried = np.arange(len(points)) if views is None else np.flatnonzero(views[:, k])
@@ -122,7 +121,7 @@ class PhotographPainter:
             near = np.rint(y).astype(np.int64), np.rint(x).astype(np.int64)
             view = camera.position - points[rows]
             cosine = np.einsum("td,td->t", normals[rows], view) / np.maximum(np.linalg.norm(view, axis=1), 1e-9)
-            seen = (cosine > least_cosine) & (z < depth[near] + _BEHIND / np.maximum(cosine, least_cosine))
+            seen = (cosine > _LEAST_COSINE) & (z < depth[near] + _BEHIND / np.maximum(cosine, _LEAST_COSINE))
             rows, column, row, near = rows[seen], column[seen], row[seen], (near[0][seen], near[1][seen])
             du, dv = (x[seen] - column)[:, None], (y[seen] - row)[:, None]
             above = photo.color[row, column] * (1 - du) + photo.color[row, column + 1] * du
@@ -156,9 +155,7 @@ def _gains(samples: Float32[np.ndarray, "T N 3"], weights: Float64[np.ndarray, "
         return gains
     # With colours m fixed, a gain is sum w s m / sum w s^2; with gains fixed, m is the weighted mean of g s.
     squares = np.einsum("tn,tnc->nc", weights, samples.astype(np.float64) ** 2)
-    # Of alternating least squares between gains and colours.
-    rounds = 30
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         mean = np.einsum("tn,tnc,nc->tc", weights, samples, gains) / weights.sum(axis=1)[:, None]
         products = np.einsum("tn,tnc,tc->nc", weights, samples, mean)
         gains = np.clip(np.divide(products, squares, out=np.ones_like(products), where=squares > 0), 0.5, 2.0)

@@ -66,9 +66,7 @@ def _sock(mannequin: Mannequin, side: str) -> ClothMesh:
     mesh, knee, ankle = mannequin.skin.mesh, mannequin.joints[f"{side}_knee"], mannequin.joints[f"{side}_ankle"]
     own = (mesh.vertices[:, 1] < 0.5 * (knee + ankle)[1]) & (np.sign(mesh.vertices[:, 0]) == np.sign(ankle[0]))
     part, used = mesh.submesh(own[mesh.faces].all(axis=1))
-    return ClothMesh(
-        part.vertices + 0.003 * mesh.vertex_normals[used], part.faces, mannequin.skin.weights[used]
-    )
+    return ClothMesh(part.vertices + 0.003 * mesh.vertex_normals[used], part.faces, mannequin.skin.weights[used])
 
 
 def _grid(points: np.ndarray, *, closed: bool = True) -> TriangleMesh:
@@ -97,10 +95,14 @@ def _head(mannequin: Mannequin) -> tuple[np.ndarray, np.ndarray]:
 
 def _glasses(mannequin: Mannequin) -> TriangleMesh:
     """Two rings in front of the eyes and a bar between them, three closed pieces."""
-    eyes = [mannequin.joints[f"{side}_eye_smplhf"] for side in ("left", "right") if f"{side}_eye_smplhf" in mannequin.joints]
+    eyes = [
+        mannequin.joints[f"{side}_eye_smplhf"] for side in ("left", "right") if f"{side}_eye_smplhf" in mannequin.joints
+    ]
     eyes = eyes or [mannequin.joints[name] for name in ("left_eye", "right_eye")]
     front = mannequin.skin.vertices[:, 2].max() if not eyes else max(eye[2] for eye in eyes) + 0.03
-    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 28, endpoint=False), np.linspace(0, 2 * np.pi, 8, endpoint=False), indexing="ij")
+    u, v = np.meshgrid(
+        np.linspace(0, 2 * np.pi, 28, endpoint=False), np.linspace(0, 2 * np.pi, 8, endpoint=False), indexing="ij"
+    )
 
     def ring(centre: np.ndarray, radius: float, thick: float) -> TriangleMesh:
         r = radius + thick * np.cos(v)
@@ -118,7 +120,14 @@ def _hat(mannequin: Mannequin) -> TriangleMesh:
     turns = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     profile = [(1.9, 0.0), (1.3, 0.0), (1.22, 0.2), (1.2, 0.7), (1.1, 1.0), (0.5, 1.1), (0.02, 1.12)]
     rings = [
-        np.stack([centre[0] + k * half[0] * np.cos(turns), 0 * turns + height + up * half[1], centre[2] + k * half[2] * np.sin(turns)], axis=-1)
+        np.stack(
+            [
+                centre[0] + k * half[0] * np.cos(turns),
+                0 * turns + height + up * half[1],
+                centre[2] + k * half[2] * np.sin(turns),
+            ],
+            axis=-1,
+        )
         for k, up in profile
     ]
     mesh = _grid(np.stack(rings), closed=False)
@@ -131,7 +140,9 @@ def bag_on_the_back(mannequin: Mannequin) -> TriangleMesh:
     spine, points = mannequin.joints["spine3"], mannequin.skin.vertices
     near = (np.abs(points[:, 0]) < 0.05) & (np.abs(points[:, 1] - spine[1]) < 0.05)
     back = points[near, 2].min()
-    u, v = np.meshgrid(np.linspace(0.04, np.pi - 0.04, 14), np.linspace(0, 2 * np.pi, 24, endpoint=False), indexing="ij")
+    u, v = np.meshgrid(
+        np.linspace(0.04, np.pi - 0.04, 14), np.linspace(0, 2 * np.pi, 24, endpoint=False), indexing="ij"
+    )
     ball = np.stack([np.sin(u) * np.cos(v), np.cos(u), np.sin(u) * np.sin(v)], axis=-1)
     box = np.sign(ball) * np.abs(ball) ** 0.5 * [0.14, 0.17, 0.06]
     mesh = _grid(box + [0.0, spine[1] - 0.05, back - 0.085], closed=False)
@@ -139,5 +150,8 @@ def bag_on_the_back(mannequin: Mannequin) -> TriangleMesh:
     count = mesh.vertex_count
     poles = np.array([[0.0, spine[1] - 0.05 + 0.17, back - 0.085], [0.0, spine[1] - 0.05 - 0.17, back - 0.085]])
     first, last = np.arange(24), count - 24 + np.arange(24)
-    fans = [np.stack([np.roll(first, -1), first, np.full(24, count)], axis=1), np.stack([last, np.roll(last, -1), np.full(24, count + 1)], axis=1)]
+    fans = [
+        np.stack([np.roll(first, -1), first, np.full(24, count)], axis=1),
+        np.stack([last, np.roll(last, -1), np.full(24, count + 1)], axis=1),
+    ]
     return _outward(TriangleMesh(np.concatenate([mesh.vertices, poles]), np.concatenate([mesh.faces, *fans])))

@@ -38,7 +38,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     params.save(folder / "params.npz")
     lines = ["classes:  # from the skin outwards"]
     for row in CLASSES:
-        lines += [f"  {'- ' if k == 0 else '  '}{name}: {json.dumps(value)}" for k, (name, value) in enumerate(row.items())]
+        lines += [
+            f"  {'- ' if k == 0 else '  '}{name}: {json.dumps(value)}" for k, (name, value) in enumerate(row.items())
+        ]
     (folder / "labels.yaml").write_text("\n".join(lines) + "\n")
     return folder
 
@@ -64,7 +66,11 @@ def test_parts_keep_names_layers_and_colours_in_template_glb_report_and_viewer(r
     template = Template.load(folder / TEMPLATE)
     assert set(template.part_names) == {"body", *PARTS} and template.labels == many_classes().labels
     assert template.cloth_parts == template.loose_parts == ("dress", "coat")  # what may be simulated
-    nodes = [node.name for node in pygltflib.GLTF2().load(str(folder / ASSEMBLE_STAGE / "template.glb")).nodes if node.mesh is not None]
+    nodes = [
+        node.name
+        for node in pygltflib.GLTF2().load(str(folder / ASSEMBLE_STAGE / "template.glb")).nodes
+        if node.mesh is not None
+    ]
     assert nodes == list(template.part_names)
     # Layers: socks under all, the hat over the hair; a bag is no layer. A colour of one's own is shown.
     assert _layers_under(template, "coat") == ["socks", "dress"]

@@ -16,6 +16,7 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 # Distances of cameras from the middle of a rig for one person, in metres: from a closet of phones to a hall.
 _NEAREST, _FARTHEST = 0.6, 30.0
 # A world whose vertical is within this angle of an axis, in degrees, has this axis up: cameras tell it by some degrees.
+_SNAP = 25.0
 _EPS = 1e-9
 
 
@@ -72,8 +73,7 @@ def upright_from_world(rig: RigFile, up: str | None, *, source: str) -> tuple[Fl
             source, expected="cameras that tell where up is", received="none", remedy="name the axis: --up z"
         )
     axis = max(AXES, key=lambda name: float(np.dot(seen, AXES[name])))
-    snap = 25.0
-    if float(np.dot(seen, AXES[axis])) > np.cos(np.radians(snap)):
+    if float(np.dot(seen, AXES[axis])) > np.cos(np.radians(_SNAP)):
         return _turn(np.array(AXES[axis], dtype=np.float64)), [
             f"{axis} taken for up, as the pictures say (--up names it)"
         ]

@@ -12,9 +12,14 @@ from smplxpp.capture.check.findings import Finding
 from smplxpp.core import POSE_BLOCKS, BodyParams, InputError
 
 BETA_LIMIT = 5.0
+_BETAS_VARY = 0.01
 # Coefficients of learned expressions, and weights of named blend shapes, whose own range is 0 to 1.
 _EXPRESSION_LIMITS = (-8.0, 8.0)
 _BLEND_SHAPE_LIMITS = (-1.0, 2.0)
+# Radians. A longer rotation vector is more than a full turn; in degrees 7 would be common.
+_ANGLE_LIMIT = 7.0
+_SPEED_LIMIT = 12.0
+_STEP_LIMIT = 0.5
 # A person farther from the rig than 4 times its radius plus 10 m is outside of any room.
 _FAR, _FAR_METRES = 4.0, 10.0
 _UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (100.0, "hectometres"))
@@ -62,18 +67,16 @@ def _out_of_range(frame: int, p: BodyParams, body: BodyModel) -> Iterator[Findin
     blocks = {name: getattr(p, name) for name, joints in POSE_BLOCKS if getattr(p, name).shape[1] == 3 * joints}
     # A rotation vector of more than 2 pi is legal but never written by a fit; degrees exceed it at once.
     name, angle = max(((n, float(np.abs(v).max(initial=0.0))) for n, v in blocks.items()), key=lambda item: item[1])
-    angle_limit = 7.0
-    if angle > angle_limit:
+    if angle > _ANGLE_LIMIT:
         unit = ", as degrees would" if angle > 30 else ""
         yield Finding("params-angles", f"frame {frame}: {name} reaches {angle:.3g} radians{unit}", None, frame)
 
 
 def _varying_betas(params: dict[int, BodyParams]) -> Iterator[Finding]:
-    betas_vary = 0.01
     if len({p.betas.shape for p in params.values()}) == 1 and len(params) > 1:
         betas = np.concatenate([p.betas for p in params.values()])
         spread = float(np.ptp(betas, axis=0).max(initial=0.0))
-        if spread > betas_vary:
+        if spread > _BETAS_VARY:
             yield Finding("params-betas-vary", f"betas differ by up to {spread:.3g} between frames")
 
 
@@ -108,10 +111,7 @@ def _jumps(capture: Capture, params: dict[int, BodyParams]) -> Iterator[Finding]
     frames = np.array(sorted(params))
     transl = np.concatenate([params[int(frame)].transl for frame in frames])
     steps = np.linalg.norm(np.diff(transl, axis=0), axis=1)
-    speed_limit = 12.0
-    # Radians. A longer rotation vector is more than a full turn; in degrees 7 would be common.
-    step_limit = 0.5
-    limit = speed_limit / capture.fps if capture.fps else step_limit
+    limit = _SPEED_LIMIT / capture.fps if capture.fps else _STEP_LIMIT
     for k in np.flatnonzero((np.diff(frames) == 1) & (steps > limit)):
         message = f"frame {frames[k + 1]}: transl jumps by {steps[k]:.3g} m from frame {frames[k]}"
         speed = f", {steps[k] * capture.fps:.3g} m/s" if capture.fps else ""

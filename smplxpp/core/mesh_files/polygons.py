@@ -9,7 +9,10 @@ from jaxtyping import Float64, Int64, Integer
 
 from smplxpp.core.mesh_files.raw_mesh import warn
 
+_SHARE = 1e-9  # of a polygon's area: triangles may be turned over by so little, which is rounding
+_STARTS = 64  # polygons of more corners are not tried as fans about each of them
 # Corners squared, summed over the polygons that lose ears, as their time grows; half a minute where all are spirals.
+_MOST_WORK = 1 << 25
 _AT_ONCE = 1 << 20  # corners that are looked at together, which bounds the work space
 
 
@@ -65,9 +68,8 @@ def cut_polygons(
     polygons = np.repeat(np.arange(len(sizes), dtype=np.int64), count)
     step = np.arange(len(polygons), dtype=np.int64) - np.repeat(np.cumsum(count) - count, count)
     local = np.stack([np.zeros_like(step), step + 1, step + 2], axis=1)
-    most_work = 1 << 25
     # Polygons that their first corner does not see whole are cut otherwise, size by size.
-    begin, crossing, work = np.cumsum(count) - count, 0, most_work
+    begin, crossing, work = np.cumsum(count) - count, 0, _MOST_WORK
     for size in np.unique(sizes[sizes > 3]):
         rows = np.flatnonzero(sizes == size)
         index = corners[first[rows][:, None] + np.arange(size)].astype(np.int64)
@@ -93,10 +95,6 @@ def _concave(
         (Q, n - 2, 3) local corners of their triangles, which of the P polygons they are, and how many could not be cut.
     """
     size = points.shape[1]
-    # Of a polygon's area: triangles may be turned over by so little, which is rounding.
-    share = 1e-9
-    # Polygons of more corners are not tried as fans about each of them.
-    starts = 64
     with np.errstate(all="ignore"):
         # Newell: the sum of cross products of neighbours is twice the area along the normal, also where it bends.
         relative = points - points[:, :1]
@@ -113,11 +111,11 @@ def _concave(
             return doubled.min(axis=1) / area[rows]
 
         every = np.arange(len(points))
-        left = every[seen(np.zeros(len(points), np.int64), every) < -share]  # false for NaN, which the repair removes
+        left = every[seen(np.zeros(len(points), np.int64), every) < -_SHARE]  # false for NaN, which the repair removes
         chosen, cut = [], []
         fan = np.stack([np.zeros(size - 2, np.int64), np.arange(1, size - 1), np.arange(2, size)], axis=1)
-        for start in range(1, size if size <= starts else 1):
-            whole = seen(np.full(len(left), start), left) >= -share
+        for start in range(1, size if size <= _STARTS else 1):
+            whole = seen(np.full(len(left), start), left) >= -_SHARE
             chosen.append(left[whole])
             cut.append(np.repeat((fan[None] + start) % size, int(whole.sum()), axis=0))
             left = left[~whole]

@@ -23,6 +23,7 @@ from smplxpp.register.priors import Anatomy, Priors
 # Joints of the SMPL body without hands and face; they come first.
 _BODY_JOINTS = 22
 # Largest increase of cost during a fit, millimetres; known bare skin raises the weights.
+_DIVERGED = 3.0
 _Ranked = tuple[float, str, BodyState]
 """Distance to the surface, metres; name of the pose of the start; the body."""
 
@@ -195,9 +196,8 @@ class Search:
         # Hands from a grid first, then the whole body.
         state = try_hands(self.kinematics, self.many, self.fine, found.state)
         out = self.polished(found.name, state, skin, steps=self.config.finish_steps)
-        diverged = 3.0
         # A fit that diverges, as through a second person's arms, is worth less than its start.
-        return out if out.cost < found.cost + diverged else found
+        return out if out.cost < found.cost + _DIVERGED else found
 
     def polished(self, name: str, state: BodyState, skin: np.ndarray | None, *, steps: int) -> Found:
         """Fit a state with its fingers to all points; the reach of skin falls from 30 to 15 mm.

@@ -34,6 +34,7 @@ _JOINTS = {"arm": ("shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle"
 # and feet; skirts hide lower legs, and so .2 of them are enough.
 _PARTS = {"arm": {"hand": 0.5, "forearm": 0.5}, "leg": {"foot": 0.5, "lower leg": 0.2}}
 # Share of the surface without explanation from which an arm may lie there, although the present one fits.
+_UNEXPLAINED = 0.06
 _CAP = 0.10
 """Metres, at which distances of a limb saturate: half a limb's length off is as wrong as a whole one."""
 _REACH = {"arm": 0.95, "leg": 1.15}
@@ -156,7 +157,6 @@ def doubtful_limbs(
     posture = search.kinematics.posture(found.state, 0)
     place = {name: k for k, name in enumerate(search.kinematics.body.joint_names)}
     shown: dict[str, float] = {}
-    unexplained = 0.06
     for side, kind in product(("left", "right"), _JOINTS):
         shares = {part: found.misfit.parts[f"{side} {part}"] for part in _PARTS[kind]}
         off = [
@@ -164,7 +164,7 @@ def doubtful_limbs(
             for joint, point in _hints_of(side, kind, hints).items()
         ]
         hidden = any(share < _PARTS[kind][part] for part, share in shares.items())
-        strays = kind == "arm" and found.misfit.covered < 1.0 - unexplained
+        strays = kind == "arm" and found.misfit.covered < 1.0 - _UNEXPLAINED
         if hidden or strays or max(off, default=0.0) > _HINT_OFF:
             shown[f"{side} {kind}"] = min(shares.values())
     return sorted(shown, key=shown.__getitem__)
