@@ -19,7 +19,7 @@ from pipelines.commands.options import OptionalPath
 from pipelines.synth.config import SynthConfig
 from pipelines.synth.make_capture import add_tracked_inputs, make_capture
 from smplxpp.body import BodyModel, load_body
-from smplxpp.capture.writers.arrays import save_compact
+from smplxpp.capture.writers.frame_files import save_compact
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.people.fixture_person import (

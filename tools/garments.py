@@ -10,7 +10,7 @@ from jaxtyping import Float
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import face_components
 from smplxpp.people.cloth_mesh import ClothMesh, clip, diffuse, lift_outside, loop_subdivide, smooth, submesh
-from smplxpp.people.patterns import ramp, smooth_noise
+from smplxpp.people.textures import ramp, smooth_noise
 from tools.anny_base import JOINT_NAMES, BaseMesh
 
 

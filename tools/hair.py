@@ -9,7 +9,7 @@ from jaxtyping import Float
 from smplxpp.core.mesh import TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 from smplxpp.people.cloth_mesh import ClothMesh, clip, diffuse, smooth, submesh
-from smplxpp.people.patterns import smooth_noise
+from smplxpp.people.textures import smooth_noise
 from tools.garments import DressForm, largest_component, with_clean_weights
 
 

@@ -8,10 +8,10 @@ from avatar.gaussians.binding import (
     world_from_frames,
     world_from_local,
 )
-from avatar.gaussians.bound_file import load_bound, save_bound
 from avatar.gaussians.colors import view_colors
 from avatar.gaussians.frames import TriangleFrames, triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, head_faces, sample_on_mesh
+from avatar.gaussians.tensor_file import load_bound, save_bound
 
 __all__ = [
     "BoundGaussians",

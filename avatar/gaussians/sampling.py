@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
 from avatar.gaussians.frames import MIN_EDGE
-from smplxpp.cloth.opening_bridges import find_opening_bridges
+from smplxpp.cloth.cloth_mesh import find_opening_bridges
 from smplxpp.core import TriangleMesh, require_at_least, require_between, require_choice, require_positive, row_lengths
 from smplxpp.core.errors import InputError
 from smplxpp.core.spherical_harmonics import coefficient_count

@@ -14,8 +14,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from avatar.gaussians.binding import BoundGaussians, topology_digest
-from avatar.gaussians.bound_file import bound_from_tensors
-from avatar.gaussians.tensor_file import open_tensor_file, require_finite, require_like
+from avatar.gaussians.tensor_file import bound_from_tensors, open_tensor_file, require_finite, require_like
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes, mapping_networks
 from avatar.models.networks.config_dict import config_from_dict, config_to_dict
 from avatar.models.networks.deformation_field import FieldConfig, FieldNetwork, show_null_code

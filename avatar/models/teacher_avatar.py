@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
 from avatar.gaussians.binding import on_triangles
 from avatar.models.learned_gaussians import LearnedGaussians
-from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.networks.sparse_lookups import MapSampler
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
 from avatar.models.tracked_surface import Track
 from avatar.rendering.mesh_maps import MapFrame, front_back_maps, vertex_normals

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from avatar.gaussians import BoundGaussians, triangle_frames, view_colors, world_from_frames
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.control_points import template_control_points
-from avatar.models.networks.sparse_rows import SparseRows
+from avatar.models.networks.sparse_lookups import SparseRows
 from avatar.rig.rig import Pose, PosedAvatar, Rig
 from smplxpp.core.errors import one_line
 from smplxpp.template.template import Template

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.rendering.reference import camera_depths, rasterize_reference
-from avatar.rendering.settings import RasterMeta, RasterSettings
-from avatar.rendering.validation import check_layout, check_values, checked_settings
+from avatar.rendering.settings import RasterMeta, RasterSettings, check_layout, check_values, checked_settings
 from smplxpp.core.errors import InputError
 
 BACKENDS = ("cpu", "gsplat", "reference")

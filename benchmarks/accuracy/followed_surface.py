@@ -28,7 +28,7 @@ from scipy.stats import spearmanr
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.gaussians.binding import BoundGaussians
-from avatar.gaussians.bound_file import load_bound
+from avatar.gaussians.tensor_file import load_bound
 from avatar.metrics.surface_quality import mean_surface, surface_quality
 from avatar.metrics.view_quality import view_quality
 from avatar.models.tracked_surface import Track, TrackedAvatar

@@ -28,7 +28,7 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.core import LABELS, BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.people import CAST, OUTSIDERS, PersonScan, person
 from smplxpp.people.outside import reachable
-from smplxpp.people.patterns import smooth_noise
+from smplxpp.people.textures import smooth_noise
 from smplxpp.segment import label_by_body
 
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)

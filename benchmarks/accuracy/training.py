@@ -20,7 +20,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.report import EvalReport
-from avatar.gaussians.bound_file import load_bound
+from avatar.gaussians.tensor_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.tracked_surface import TrackedAvatar
 from avatar.training.presets import TrainingPreset, training_preset

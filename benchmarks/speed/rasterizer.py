@@ -22,7 +22,7 @@ import tyro
 
 from avatar.gaussians.tensor_operations import matrix_from_quat
 from avatar.rendering import rasterize
-from avatar.rendering.native import STAGES, CameraCall, Workspace
+from avatar.rendering.cpu import STAGES, CameraCall, Workspace
 from avatar.rendering.reference import rasterize_reference
 from avatar.rendering.settings import RasterSettings
 from benchmarks.peers.rasterizer_peers import (

@@ -18,10 +18,10 @@ from pipelines.figures import caption, contact_sheet, encode_jpeg, encode_png, r
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.runs.code import versions
 from smplxpp.capture.check.check import CaptureCheck
-from smplxpp.capture.check.files import in_ranges
 from smplxpp.capture.check.findings import AREAS, Finding, grouped
 from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary, body_silhouette
 from smplxpp.capture.check.views import OPAQUE, ViewCheck
+from smplxpp.capture.check.without_images import in_ranges
 from smplxpp.core import InputError, spread
 from smplxpp.core.files import atomic_write_bytes, atomic_write_text, jsonable
 

@@ -20,7 +20,7 @@ from pipelines.figures.body_drawings import draw_keypoints
 from smplxpp.capture import Capture
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color
-from smplxpp.capture.writers.arrays import write_keypoints
+from smplxpp.capture.writers.frame_files import write_keypoints
 from smplxpp.core import InputError, Keypoints2D, ProgressCallback, ignore_progress
 from smplxpp.core.files import read_arrays, read_bytes
 from smplxpp.detect import Box, DetectedPerson, Detector, mask_box

@@ -18,8 +18,7 @@ from smplxpp.capture.files import IMAGE_SUFFIXES
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.capture.views import read_alpha
-from smplxpp.capture.writers.arrays import write_keypoints
-from smplxpp.capture.writers.images import JPEG_SUFFIXES, view_path, write_gray_png, write_jpeg
+from smplxpp.capture.writers.frame_files import JPEG_SUFFIXES, view_path, write_gray_png, write_jpeg, write_keypoints
 from smplxpp.capture.writers.metadata import write_plain_cameras_json
 from smplxpp.core import (
     Camera,

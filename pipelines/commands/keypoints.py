@@ -42,7 +42,7 @@ class KeypointsConvert:
         from smplxpp.capture import open_capture
         from smplxpp.capture.keypoint_files import KeypointOptions
         from smplxpp.capture.keypoints import KeypointFiles, find_places
-        from smplxpp.capture.writers.arrays import write_keypoints
+        from smplxpp.capture.writers.frame_files import write_keypoints
 
         if not self.input.is_dir():
             raise InputError("keypoints", expected="an existing folder", received=str(self.input))

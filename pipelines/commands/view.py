@@ -36,7 +36,7 @@ class Label:
 
     def run(self) -> dict:
         """Serve the window until Ctrl-C, then write unsaved changes."""
-        from pipelines.viewer.run_scan import open_session
+        from pipelines.viewer.run_scene import open_session
         from pipelines.viewer.window import open_window
 
         require_between("option port", self.port, 1, LARGEST_PORT)

@@ -13,7 +13,7 @@ from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_mo
 from avatar.evaluation.protocol import SETS, measured_splits, view_sets, with_people
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, ModelFigures, view_key
 from avatar.evaluation.summary import evaluation_tables, garments, summary_figures
-from avatar.gaussians.bound_file import load_bound
+from avatar.gaussians.tensor_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import AvatarModel, Rig

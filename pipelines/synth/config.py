@@ -12,7 +12,7 @@ from pipelines.synth.talking import Talking
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core.errors import require_at_least, require_choice, require_positive
 from smplxpp.people.fixture_person import CLOTHES
-from smplxpp.people.patterns import SKIRT_PATTERNS
+from smplxpp.people.textures import SKIRT_PATTERNS
 from smplxpp.raster.soft_light import LightConfig
 
 

@@ -20,8 +20,14 @@ from pipelines.synth.tracker import tracker_noise
 from pipelines.synth.views import Atlas, LitFrame, RenderedView, hidden_faces, normal_map, paint_atlas, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
-from smplxpp.capture.writers.arrays import rounded, save_compact
-from smplxpp.capture.writers.images import view_path, write_gray_png, write_jpeg, write_normal_png
+from smplxpp.capture.writers.frame_files import (
+    rounded,
+    save_compact,
+    view_path,
+    write_gray_png,
+    write_jpeg,
+    write_normal_png,
+)
 from smplxpp.capture.writers.metadata import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.core import ProgressCallback, TriangleMesh, ignore_progress, write_ply
 from smplxpp.core.files import atomic_folder, atomic_write_text, read_json

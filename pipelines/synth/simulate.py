@@ -13,7 +13,7 @@ from pipelines.synth.motion import Motion
 from smplxpp.core import BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.fixture_person import PART_NAMES, Person, rest_joints
-from smplxpp.people.patterns import ramp
+from smplxpp.people.textures import ramp
 
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
 

@@ -18,8 +18,7 @@ from smplxpp.capture import Capture
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.keypoints import moved_keypoints
 from smplxpp.capture.views import read_labels
-from smplxpp.capture.writers.arrays import write_keypoints
-from smplxpp.capture.writers.images import write_gray_png
+from smplxpp.capture.writers.frame_files import write_gray_png, write_keypoints
 from smplxpp.core import BACKGROUND, BodyParams, Camera
 from smplxpp.raster import rasterize_mesh
 from smplxpp.segment.labels import find_label_set

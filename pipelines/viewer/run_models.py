@@ -185,7 +185,7 @@ def open_player(run: Path, template: Template, source: SplatSource) -> AvatarPla
 
 
 def _student(rig: Rig, source: SplatSource) -> Student:
-    from avatar.gaussians.bound_file import load_bound
+    from avatar.gaussians.tensor_file import load_bound
     from avatar.models.model_file import load_avatar
     from avatar.models.student import Student, StudentConfig
 

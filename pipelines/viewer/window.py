@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from pipelines.viewer.picking import first_hit, line_under, middle_of_limb
-from pipelines.viewer.run_scan import label_again
+from pipelines.viewer.run_scene import label_again
 from pipelines.viewer.scene import MODES, ScanScene, legend
 from pipelines.viewer.server import address_of, one_at_a_time, plain_markdown, start_server, stop_server
 from pipelines.viewer.session import CHOICE, LabelSession, UncertainRegion, lies_within, uncertain_regions

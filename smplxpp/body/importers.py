@@ -12,11 +12,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.body.frame_gaps import without_gaps
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
-from smplxpp.body.noted_reads import NotedReads, warn_of_unread
 from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, with_valid_frames
+from smplxpp.body.param_records import NotedReads, warn_of_unread, without_gaps
 from smplxpp.body.retarget import Skeleton
 from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.body.smpl_params import FAMILY_NAMES, from_smpl, rests_like_smpl, smpl_skeleton

@@ -15,7 +15,7 @@ from smplxpp.build.config import RegisterInputs
 from smplxpp.build.data import LocatedInScan
 from smplxpp.build.locate import landmark_points
 from smplxpp.build.observed_scans import observed_scans
-from smplxpp.build.opened import opened
+from smplxpp.build.request import opened
 from smplxpp.capture import Capture, find_scans, scans_in
 from smplxpp.core import BACKGROUND, BodyParams, InputError, Keypoints2D, MeshLike
 from smplxpp.register import LandmarkModel, Observations

@@ -15,7 +15,7 @@ import numpy as np
 from smplxpp.body import BodyModel, load_body
 from smplxpp.build.config import ReconstructInputs
 from smplxpp.build.limits import MASKS_LEFT_OUT, SILHOUETTE, UNSEEN_SURFACE
-from smplxpp.build.opened import opened
+from smplxpp.build.request import opened
 from smplxpp.build.turning import turning_person
 from smplxpp.capture import Capture
 from smplxpp.capture.recording import TURNTABLE

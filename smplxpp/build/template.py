@@ -19,7 +19,6 @@ from smplxpp.build.data import LocatedInScan, RestPart
 from smplxpp.build.inputs import check_inputs, given_motion, plan_build
 from smplxpp.build.locate import locate_in_scan
 from smplxpp.build.observe import observe
-from smplxpp.build.opened import opened, with_params
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
 from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
 from smplxpp.build.reconstruct import (
@@ -34,7 +33,7 @@ from smplxpp.build.reconstruct import (
 )
 from smplxpp.build.register import Registration, register_observed
 from smplxpp.build.report import BuildReport, BuildResult
-from smplxpp.build.request import BuildRequest
+from smplxpp.build.request import BuildRequest, opened, with_params
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces
 from smplxpp.build.validate import validate_template

@@ -33,7 +33,7 @@ from smplxpp.core.topology import border_loops
 from smplxpp.metrics import CompareConfig, DirectedDistances, directed_distances, point_to_surface, summarize
 from smplxpp.metrics.comparison import MM
 from smplxpp.metrics.conventions import convention_named
-from smplxpp.metrics.intersection import interpenetration
+from smplxpp.metrics.intersections import interpenetration
 from smplxpp.metrics.quality import mesh_quality
 from smplxpp.metrics.stretch import stretch_report
 from smplxpp.skinning import skin

@@ -17,7 +17,7 @@ from typing import Literal
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.convert_views import ViewOutcome, ViewWriter
 from smplxpp.capture.sources import PosedTopology
-from smplxpp.capture.writers.arrays import save_params_by_row, write_keypoints
+from smplxpp.capture.writers.frame_files import save_params_by_row, write_keypoints
 from smplxpp.capture.writers.metadata import (
     RigCamera,
     write_calibration_csv,

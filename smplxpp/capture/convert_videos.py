@@ -14,7 +14,7 @@ from smplxpp.capture.capture import Capture
 from smplxpp.capture.convert import Conversion, claim_folder
 from smplxpp.capture.video_files import Video, probe_video, video_frames
 from smplxpp.capture.video_sync import Timeline, found_offsets, timeline
-from smplxpp.capture.writers.arrays import write_keypoints
+from smplxpp.capture.writers.frame_files import write_keypoints
 from smplxpp.capture.writers.metadata import camera_entry, lens_entry
 from smplxpp.core import Camera, Keypoints2D
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress, require_between, require_choice

@@ -1,8 +1,15 @@
 """Clean raw scans to manifold meshes, and labelled scans to loose parts within a face budget."""
 
 from smplxpp.clean.bridges import BridgeConfig, cut_bridges, find_bridges, find_tears
-from smplxpp.clean.components import drop_specks, fill_pinholes, loop_lengths
-from smplxpp.clean.parts import CleanedPart, PartReport, PartsConfig, clean_parts
+from smplxpp.clean.parts import (
+    CleanedPart,
+    PartReport,
+    PartsConfig,
+    clean_parts,
+    drop_specks,
+    fill_pinholes,
+    loop_lengths,
+)
 from smplxpp.clean.poisson import PointSurface, PoissonConfig, estimate_normals, surface_from_points
 from smplxpp.clean.remesh import remesh
 from smplxpp.clean.repair import CleanReport, Sanitized, sanitize

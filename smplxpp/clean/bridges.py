@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from smplxpp.clean.components import drop_specks
+from smplxpp.clean.parts import drop_specks
 from smplxpp.core import MeshLike, TriangleMesh, as_mesh, require_at_least, row_lengths
 from smplxpp.core.topology import manifold_corners
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from smplxpp.clean.components import drop_specks
+from smplxpp.clean.parts import drop_specks
 from smplxpp.core import TriangleMesh, normalize_rows, require_at_least, row_lengths
 from smplxpp.core.errors import GeometryWarning, InputError, one_line
 from smplxpp.core.foreign import PointsLike, as_array, point_arrays

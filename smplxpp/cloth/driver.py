@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from smplxpp.body.model import PosedBody
-from smplxpp.cloth.carried import SkinnedRows
+from smplxpp.cloth.embedding import SkinnedRows
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.model import SolverConfig
 from smplxpp.cloth.poses import pose_between, reference_facing_as

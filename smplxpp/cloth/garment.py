@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from smplxpp.cloth.cloth_mesh import (
     SHORTEST_OPENING,
     coarsen,
+    find_opening_bridges,
     geodesics,
     largest_piece,
     lengths_along,
@@ -22,7 +23,6 @@ from smplxpp.cloth.cloth_mesh import (
 from smplxpp.cloth.collider import ColliderMesh, collider_of
 from smplxpp.cloth.embedding import Embedding, embed
 from smplxpp.cloth.model import ClothModel, Fabric, build_model
-from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core import BodyParams, TriangleMesh, require_at_least, require_choice, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError, one_line
 from smplxpp.core.signed_distance import SignedDistanceField

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from smplxpp.cloth.carried import CarriedVertices
+from smplxpp.cloth.embedding import CarriedVertices
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.solver import ClothSolver, ClothState, move_before_collider
 from smplxpp.core.mesh import row_lengths

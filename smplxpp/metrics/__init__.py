@@ -12,18 +12,18 @@ from smplxpp.metrics.completeness import Patch, Uncovered, body_regions, far_pat
 from smplxpp.metrics.conventions import Convention, presets
 from smplxpp.metrics.distance import compare, directed_distances, point_to_surface
 from smplxpp.metrics.hausdorff import DirectedHausdorff, HausdorffBounds, hausdorff
-from smplxpp.metrics.intersection import (
+from smplxpp.metrics.intersections import (
     Interpenetration,
     PenetrationReport,
     interpenetration,
     penetration,
+    self_intersections,
     signed_distance,
 )
 from smplxpp.metrics.mirror import mirror_ratio, mirrored_by_views
 from smplxpp.metrics.pose_error import PoseError, mean_pose_error, pose_error
 from smplxpp.metrics.quality import MeshQuality, doubtful_pair, faulty_faces, mesh_quality
 from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
-from smplxpp.metrics.self_intersection import self_intersections
 from smplxpp.metrics.stretch import StretchReport, edge_stretch, flipped_faces, stretch_report
 from smplxpp.metrics.weights import VariationStats, WeightReport, total_variation, weight_report
 

@@ -13,8 +13,8 @@ from smplxpp.core.errors import GeometryWarning
 from smplxpp.core.foreign import MeshLike, as_mesh
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.topology import component_labels, edge_groups
+from smplxpp.metrics.intersections import self_intersections
 from smplxpp.metrics.sampling import require_surface
-from smplxpp.metrics.self_intersection import self_intersections
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.people import textures
 from smplxpp.people.cloth_mesh import ClothMesh, clip, lift_outside, loop_subdivide, outer_faces, smooth, submesh
-from smplxpp.people.patterns import skirt_colors
+from smplxpp.people.textures import skirt_colors
 from smplxpp.skinning import skin
 
 PART_NAMES = ("body", "upper", "lower", "shoes", "hair")

@@ -20,9 +20,9 @@ from smplxpp.people.garments.mannequin import ARM_JOINTS, HAND_JOINTS, shares
 from smplxpp.people.garments.wardrobe import all_garments
 from smplxpp.people.outside import heel_blocks, outside_body, seed_of
 from smplxpp.people.paint import cloth_paint, hair_paint, photographed, skin_paint
-from smplxpp.people.patterns import smooth_noise
 from smplxpp.people.person_scan import PersonScan, face_majority
 from smplxpp.people.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
+from smplxpp.people.textures import smooth_noise
 from smplxpp.people.things import Thing, thing_mesh
 from smplxpp.skinning import skin
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from smplxpp.body import BodyModel, PosedBody
 from smplxpp.core import BodyParams, require_at_least, require_between
 from smplxpp.people.cloth_mesh import ClothMesh
-from smplxpp.people.patterns import ramp, smooth_noise
+from smplxpp.people.textures import ramp, smooth_noise
 
 _FINE = {"head": 0.4, "jaw": 0.4, "neck": 0.6, "wrist": 0.3, "ankle": 0.4, "foot": 0.25}
 """Share of the noise on small parts, which 10 mm would make unrecognisable."""

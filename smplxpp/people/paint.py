@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.people import textures
 from smplxpp.people.fixture_person import face_landmarks, face_marks
-from smplxpp.people.patterns import Color, band, mix, smooth_noise
+from smplxpp.people.textures import Color, band, mix, smooth_noise
 from smplxpp.raster.soft_light import LightConfig, bounced, vertex_light
 
 SKIN_TONES: dict[str, Color] = {

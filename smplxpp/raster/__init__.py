@@ -1,8 +1,7 @@
 """Rasterise meshes into a z-buffer without a GPU or a screen, and find visibility and draw shaded pictures from it."""
 
-from smplxpp.raster.overlay import render_overlay, render_within
 from smplxpp.raster.shading import ShadeStyle, render_shaded
-from smplxpp.raster.viewpoints import VIEWS, body_cameras, fit_cameras, turntable_cameras
+from smplxpp.raster.viewpoints import VIEWS, body_cameras, fit_cameras, render_overlay, render_within, turntable_cameras
 from smplxpp.raster.visibility import outer_visible_faces, outer_visible_points, outside_views, view_directions
 from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh, rasterize_triangles
 

@@ -15,7 +15,7 @@ from pipelines.report.sections.template import scan_section, weights_section
 from pipelines.runs.artefacts import load_scan
 from pipelines.runs.layout import ASSEMBLE_STAGE, SEGMENT_STAGE, TEMPLATE, TRANSFER_STAGE
 from pipelines.stages.build import build
-from pipelines.viewer.run_scan import open_session
+from pipelines.viewer.run_scene import open_session
 from smplxpp.body.named_poses import worn_poses
 from smplxpp.build import BuildConfig, build_template
 from smplxpp.cloth.collider import _layers_under

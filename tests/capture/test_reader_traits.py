@@ -11,7 +11,7 @@ import pytest
 from pipelines.cli import main
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.files import FileSeries
-from smplxpp.capture.writers.arrays import save_params_by_row
+from smplxpp.capture.writers.frame_files import save_params_by_row
 from smplxpp.core.errors import InputError
 from tests.capture.scene import make_scene
 from tests.capture.writers import (

@@ -13,7 +13,7 @@ import pytest
 from smplxpp.body import load_body
 from smplxpp.body.layout import BODY_25, BODY_25B
 from smplxpp.capture import open_capture
-from smplxpp.capture.check.files import missing_findings
+from smplxpp.capture.check.without_images import missing_findings
 from smplxpp.capture.keypoint_files import KeypointOptions, read_keypoints
 from smplxpp.capture.keypoint_people import body_25_order
 from smplxpp.core import BodyParams, Camera, InputError

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smplxpp.cloth.carried import CarriedVertices, SkinnedRows
-from smplxpp.cloth.embedding import embed
+from smplxpp.cloth.embedding import CarriedVertices, SkinnedRows, embed
 from smplxpp.cloth.solver import Collider, move_before_collider
 from smplxpp.core import InputError, TriangleMesh
 from tests.cloth.persons import person, standing

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
+from smplxpp.cloth.cloth_mesh import find_opening_bridges
 from smplxpp.cloth.garment import find_carriers
-from smplxpp.cloth.opening_bridges import find_opening_bridges
 from smplxpp.core import GeometryWarning, InputError, TriangleMesh
 from smplxpp.template.template import BODY_PART
 from tests.cloth.persons import HEM, PART, WAIST, person, standing

@@ -11,7 +11,7 @@ import numpy as np
 
 from avatar.evaluation.report import EvalReport, ModelFigures
 from avatar.formats.ply import read_splat_ply, write_splat_ply
-from avatar.gaussians.bound_file import load_bound, save_bound
+from avatar.gaussians.tensor_file import load_bound, save_bound
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from avatar.gaussians.bound_file import load_bound, save_bound
+from avatar.gaussians.tensor_file import load_bound, save_bound
 from smplxpp.core.errors import InputError
 from tests.gaussians.bound_scenes import random_bound, sphere
 

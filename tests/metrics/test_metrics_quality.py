@@ -87,7 +87,7 @@ def test_two_overlapping_spheres_cut_each_other_and_chunks_do_not_matter(sphere,
     pairs = self_intersections(both)
     assert len(pairs) > 20
     assert (pairs[:, 0] < ball.face_count).all() and (pairs[:, 1] >= ball.face_count).all()
-    monkeypatch.setattr("smplxpp.metrics.self_intersection.PAIRS_AT_ONCE", 1_000)
+    monkeypatch.setattr("smplxpp.metrics.intersections.PAIRS_AT_ONCE", 1_000)
     np.testing.assert_array_equal(self_intersections(both), pairs)
 
 

@@ -15,8 +15,8 @@ from PIL import Image
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.protocol import ProtocolConfig
 from avatar.evaluation.report import EvalReport
-from avatar.gaussians.bound_file import save_bound
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.gaussians.tensor_file import save_bound
 from avatar.models.model_file import save_avatar
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from avatar.formats.ply import read_splat_ply
-from avatar.gaussians.bound_file import load_bound
+from avatar.gaussians.tensor_file import load_bound
 from avatar.training.engine.resources import choose_device
 from pipelines.cli import main
 from pipelines.commands import inspect, options

@@ -8,7 +8,7 @@ import threading
 import pytest
 import torch
 
-from avatar.rendering import memory, native, rasterize
+from avatar.rendering import cpu, memory, rasterize
 from avatar.rendering.cpu import rasterize_cpu
 from avatar.rendering.settings import RasterSettings
 from smplxpp.core.errors import InputError
@@ -125,21 +125,21 @@ def test_memory_goes_back_to_the_pool_and_is_used_again(scene):
     for _ in range(3):
         rasterize(**vars(leaves_of(scene)))[0].sum().backward()
         rasterize(**vars(leaves_of(scene)))  # never walked back
-    before = len(native._POOL._idle)
+    before = len(cpu._POOL._idle)
     kept = [rasterize(**vars(leaves_of(scene)))[0] for _ in range(2)]
-    assert len(native._POOL._idle) <= max(0, before - 2)
+    assert len(cpu._POOL._idle) <= max(0, before - 2)
     del kept
-    assert len(native._POOL._idle) >= before
+    assert len(cpu._POOL._idle) >= before
     for _ in range(4):
         rasterize(**vars(leaves_of(scene)))[0].sum().backward()
-    assert len(native._POOL._idle) <= max(before, 4)
+    assert len(cpu._POOL._idle) <= max(before, 4)
 
 
 def test_the_pool_frees_what_is_beyond_its_limit(scene, monkeypatch):
-    monkeypatch.setattr(native, "IDLE_BYTES", 0)
-    before = len(native._POOL._idle)
+    monkeypatch.setattr(cpu, "IDLE_BYTES", 0)
+    before = len(cpu._POOL._idle)
     rasterize(**vars(scene))
-    assert len(native._POOL._idle) <= before
+    assert len(cpu._POOL._idle) <= before
 
 
 def test_memory_of_large_pictures_is_used_again_but_never_while_it_is_seen(monkeypatch):

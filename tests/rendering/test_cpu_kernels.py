@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from avatar.rendering import cpu, rasterize
-from avatar.rendering.native import Workspace
+from avatar.rendering.cpu import Workspace
 from smplxpp import native
 from tests.rendering.scenes import Scene, draw, facing_scene, gradients, random_scene
 

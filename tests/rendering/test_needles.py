@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from avatar.rendering import cpu
-from avatar.rendering.native import Workspace
+from avatar.rendering.cpu import Workspace
 from smplxpp import native
 from tests.rendering.scenes import Scene, away_from_thresholds, draw, gradients, look_at
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.people.fixture_person import load_person
-from smplxpp.people.patterns import SKIRT_GIRTH, SKIRT_PATTERNS, SKIRT_RADIUS, around_and_along, skirt_colors
+from smplxpp.people.textures import SKIRT_GIRTH, SKIRT_PATTERNS, SKIRT_RADIUS, around_and_along, skirt_colors
 
 TOPOLOGY = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person" / "geometry" / "topology.npz"
 

@@ -20,8 +20,7 @@ from pipelines.synth.views import LitFrame, normal_map, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
 from smplxpp.capture.cameras import read_cameras
-from smplxpp.capture.writers.arrays import save_compact
-from smplxpp.capture.writers.images import png16, write_normal_png
+from smplxpp.capture.writers.frame_files import png16, save_compact, write_normal_png
 from smplxpp.capture.writers.metadata import FACE, write_calibration_csv, write_cameras_json
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.people.fixture_person import load_person

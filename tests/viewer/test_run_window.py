@@ -16,7 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
-from avatar.gaussians.bound_file import save_bound
+from avatar.gaussians.tensor_file import save_bound
 from avatar.models.model_file import save_avatar
 from avatar.training.engine.loop import Checkpoint, save_checkpoint
 from pipelines.cli import main

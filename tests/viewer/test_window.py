@@ -15,7 +15,7 @@ from pipelines.cli import main
 from pipelines.commands import view as label_command
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, RegisterInputs, save_build
-from pipelines.viewer.run_scan import label_again, open_session
+from pipelines.viewer.run_scene import label_again, open_session
 from pipelines.viewer.server import plain_markdown
 from pipelines.viewer.session import LabelledScan, LabelSession
 from pipelines.viewer.window import LabelWindow, open_window

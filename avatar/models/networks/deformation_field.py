@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from avatar.models.networks.config_dict import MOST_LAYERS
 from avatar.models.networks.control_points import ControlPoints
-from avatar.models.networks.sparse_rows import SparseRows
+from avatar.models.networks.sparse_lookups import SparseRows
 from smplxpp.core import InputError, require_at_least, require_between
 
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.networks.sparse_lookups import MapSampler
 from avatar.models.networks.styleunet import Head, StyleUNet, StyleUNetConfig
 from smplxpp.core import InputError, require_between, require_choice, require_positive
 

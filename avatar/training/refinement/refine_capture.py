@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from avatar.data.sequence import AvatarSequence, SequenceConfig
-from avatar.gaussians.bound_file import save_bound
+from avatar.gaussians.tensor_file import save_bound
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.refine import Refinement, refine_held_out, refine_poses
 from avatar.training.scene import TrainScene, with_cameras

@@ -12,7 +12,7 @@ from torch import Tensor
 from avatar.data.byte_cache import ByteCache
 from avatar.data.sequence import AvatarSequence
 from avatar.models.networks.deformation_field import show_null_code
-from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.networks.sparse_lookups import MapSampler
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar, assign_front_back
 from avatar.rendering.mesh_maps import vertex_normals

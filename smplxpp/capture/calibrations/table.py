@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from smplxpp.capture.calibrations import camera_files, json_files, toml_files, xml_files
+from smplxpp.capture.calibrations import camera_files, data_set_files, xml_files
 from smplxpp.capture.calibrations.camera_files import read_opencv_yaml
 from smplxpp.capture.calibrations.file_camera import AXES, FileCamera, RigFile, scaled_intrinsics
 from smplxpp.capture.calibrations.names import matched_names
@@ -55,19 +55,23 @@ _LOADERS: Mapping[str, tuple[tuple[str, ...], Callable[[Path], Any]]] = {
     "yaml": ((".yml", ".yaml"), read_opencv_yaml),
 }
 FORMATS: tuple[CalibrationFormat, ...] = (
-    CalibrationFormat("caliscope", "toml", toml_files.is_caliscope, toml_files.read_caliscope, "camera_array.toml"),
     CalibrationFormat(
-        "freemocap", "toml", toml_files.is_freemocap, toml_files.read_freemocap, "*_camera_calibration.toml"
+        "caliscope", "toml", data_set_files.is_caliscope, data_set_files.read_caliscope, "camera_array.toml"
     ),
-    CalibrationFormat("pose2sim", "toml", toml_files.is_pose2sim, toml_files.read_pose2sim, "Calib*.toml"),
-    CalibrationFormat("anipose", "toml", toml_files.is_anipose, toml_files.read_anipose, "calibration.toml"),
+    CalibrationFormat(
+        "freemocap", "toml", data_set_files.is_freemocap, data_set_files.read_freemocap, "*_camera_calibration.toml"
+    ),
+    CalibrationFormat("pose2sim", "toml", data_set_files.is_pose2sim, data_set_files.read_pose2sim, "Calib*.toml"),
+    CalibrationFormat("anipose", "toml", data_set_files.is_anipose, data_set_files.read_anipose, "calibration.toml"),
     CalibrationFormat("qualisys", "xml", xml_files.is_qualisys, xml_files.read_qualisys, "*.qca.txt"),
     CalibrationFormat("vicon", "xml", xml_files.is_vicon, xml_files.read_vicon, "*.xcp"),
     CalibrationFormat("optitrack", "xml", xml_files.is_optitrack, xml_files.read_optitrack, "*.mcal"),
-    CalibrationFormat("panoptic", "json", json_files.is_panoptic, json_files.read_panoptic, "calibration_*.json"),
-    CalibrationFormat("shelf", "json", json_files.is_shelf, json_files.read_shelf, "calibration_shelf.json"),
     CalibrationFormat(
-        "mvhumannet", "json", json_files.is_mvhumannet, json_files.read_mvhumannet, "camera_extrinsics.json"
+        "panoptic", "json", data_set_files.is_panoptic, data_set_files.read_panoptic, "calibration_*.json"
+    ),
+    CalibrationFormat("shelf", "json", data_set_files.is_shelf, data_set_files.read_shelf, "calibration_shelf.json"),
+    CalibrationFormat(
+        "mvhumannet", "json", data_set_files.is_mvhumannet, data_set_files.read_mvhumannet, "camera_extrinsics.json"
     ),
     CalibrationFormat(
         "opencap", "pickle", camera_files.is_opencap, camera_files.read_opencap, "cameraIntrinsicsExtrinsics.pickle"

@@ -17,7 +17,7 @@ using smplxpp::Surface;
 using smplxpp::Vec3;
 
 // N vertices in the frames of t triangles of n particles with m faces, and a collider of c vertices and d faces.
-// smplxpp/cloth/carried.py says the same.
+// smplxpp/cloth/embedding.py says the same.
 struct Carried {
     int64_t vertices, triangles, particles, faces, collider_vertices, collider_faces;
     const int32_t* triangle;       // 3 t: particles
@@ -29,7 +29,7 @@ struct Carried {
     const float* deepest;          // c: metres; deeper cloth is on the other side
 };
 
-// Skinning weights of V vertices over J joints, and the R of them that are meant. smplxpp/cloth/carried.py says the same.
+// Skinning weights of V vertices over J joints, and the R of them that are meant. smplxpp/cloth/embedding.py says the same.
 struct Skinned {
     int64_t rows, vertices, joints, influences;
     const int32_t* row;    // R

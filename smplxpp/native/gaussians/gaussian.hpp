@@ -28,7 +28,7 @@ constexpr float LOG2_ALPHA_MIN = -7.99435344f;
 constexpr float ALPHA_MAX = 0.999f;
 constexpr float TRANSMITTANCE_MIN = 1e-4f;
 
-// Fields are mirrored by ctypes structures in avatar/rendering/native.py.
+// Fields are mirrored by ctypes structures in avatar/rendering/cpu.py.
 struct Scene {
     int64_t count;
     int32_t channels;

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from smplxpp.core.topology import face_components
 from smplxpp.people.cloth_mesh import ClothMesh, clip, lift_outside, smooth, submesh
 from smplxpp.people.garments.mannequin import Mannequin
-from smplxpp.people.patterns import ramp
+from smplxpp.people.textures import ramp
 
 Level = Callable[[np.ndarray], np.ndarray]
 """Maps points (N, 3) to a level (N,) that is positive where the garment is, in metres from its hem."""

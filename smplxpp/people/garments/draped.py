@@ -20,7 +20,7 @@ from smplxpp.people.garments.cut import (
 )
 from smplxpp.people.garments.loose import hung
 from smplxpp.people.garments.mannequin import ARMS_DOWN, Mannequin, lowered, outlines_of, shares
-from smplxpp.people.patterns import ramp
+from smplxpp.people.textures import ramp
 from smplxpp.skinning import unpose
 
 _LEGS = "the trunk down to the crotch; below it the mean of the leg's skin at the same height, however far off it is"

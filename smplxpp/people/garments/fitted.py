@@ -10,7 +10,7 @@ import numpy as np
 from smplxpp.people.cloth_mesh import ClothMesh, lift_outside, smooth
 from smplxpp.people.garments.cut import Garment, Level, around, facing_out, grid_faces, joined, layer, tube_along
 from smplxpp.people.garments.mannequin import Mannequin
-from smplxpp.people.patterns import ramp
+from smplxpp.people.textures import ramp
 
 _HOOD_UP = "the head from the chin up, from the neck's base down the shoulders' skin straight below, smooth between"
 _HOOD_DOWN = "shirt: as grown; the hood's roll: spine3, at its sides half the collar bone"

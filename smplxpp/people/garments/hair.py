@@ -9,7 +9,7 @@ import numpy as np
 from smplxpp.people.cloth_mesh import ClothMesh, lift_outside, smooth
 from smplxpp.people.garments.cut import Garment, facing_out, grid_faces, joined, layer, tube_along
 from smplxpp.people.garments.mannequin import Mannequin
-from smplxpp.people.patterns import ramp
+from smplxpp.people.textures import ramp
 
 
 def hairstyles(mannequin: Mannequin) -> list[Garment]:

@@ -9,7 +9,7 @@ import numpy as np
 from smplxpp.people.cloth_mesh import ClothMesh, lift_outside
 from smplxpp.people.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
 from smplxpp.people.garments.mannequin import Mannequin
-from smplxpp.people.patterns import ramp
+from smplxpp.people.textures import ramp
 
 _SKIRT = (
     "trunk at the same height and azimuth down to the hips; from there to 22 cm below the thighs grow to {legs}, the "

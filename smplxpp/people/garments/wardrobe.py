@@ -18,7 +18,7 @@ from smplxpp.people.garments.fitted import bottoms, fitted_garments, tops, worn_
 from smplxpp.people.garments.hair import beads, beards, hairstyles, tied_and_short_hair
 from smplxpp.people.garments.loose import layered_garments, loose_garments, peplum_blouse
 from smplxpp.people.garments.mannequin import ARMS_DOWN, HAND_JOINTS, Mannequin, lowered, shares
-from smplxpp.people.patterns import smooth_noise
+from smplxpp.people.textures import smooth_noise
 from smplxpp.skinning import skin
 
 SHAPES = ("mean", "heavy and tall", "slight")

@@ -16,8 +16,7 @@
 Every step minimises a weighted sum of squares by damped Gauss-Newton on the normal equations of `smplxpp.register`.
 """
 
-from smplxpp.register.locate.locate import Labeller, locate_body
-from smplxpp.register.locate.located import BodyNotFoundError, Candidate, LocatedBody
+from smplxpp.register.locate.locate import BodyNotFoundError, Candidate, Labeller, LocatedBody, locate_body
 from smplxpp.register.locate.search import LocateConfig
 
 __all__ = ["BodyNotFoundError", "Candidate", "Labeller", "LocateConfig", "LocatedBody", "locate_body"]

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 import trimesh
 
-from avatar.models.networks.map_sampling import MapSampler
+from avatar.models.networks.sparse_lookups import MapSampler
 from avatar.rendering.mesh_maps import MapFrame
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.raster import rasterize_mesh

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from avatar.models.networks.sparse_rows import SparseRows
+from avatar.models.networks.sparse_lookups import SparseRows
 
 COUNT, CHANNELS = 17, 5
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from avatar.models.networks.map_sampling import MapSampler
 from avatar.models.networks.presets import NETWORK_PRESETS, network_preset
+from avatar.models.networks.sparse_lookups import MapSampler
 from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
 from avatar.rendering.mesh_maps import MapFrame
 from smplxpp.core.errors import InputError

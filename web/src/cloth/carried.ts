@@ -1,4 +1,4 @@
-/** Kernels of what cloth carries (`smplxpp/cloth/carried.py`): fine vertices over particles, and vertices to the T-pose. */
+/** Kernels of what cloth carries (`smplxpp/cloth/embedding.py`): fine vertices over particles, and vertices to the T-pose. */
 
 import type { Deformer } from "../avatar/deform.ts";
 import type { Block, Native } from "../native/memory.ts";
