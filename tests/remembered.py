@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.raster import visibility
+from smplxpp.raster import zbuffer
 
 
 def install() -> None:
     """Remember what is seen of a mesh from outside; before a module that imports the functions by name."""
     from smplxpp import raster
 
-    raster.outer_visible_faces = visibility.outer_visible_faces = of_a_mesh(visibility.outer_visible_faces)
-    raster.outer_visible_points = visibility.outer_visible_points = of_a_mesh(visibility.outer_visible_points)
+    raster.outer_visible_faces = zbuffer.outer_visible_faces = of_a_mesh(zbuffer.outer_visible_faces)
+    raster.outer_visible_points = zbuffer.outer_visible_points = of_a_mesh(zbuffer.outer_visible_points)
 
 
 def of_a_mesh(function: Any) -> Any:

@@ -2,8 +2,15 @@
 
 from smplxpp.raster.shading import ShadeStyle, render_shaded
 from smplxpp.raster.viewpoints import VIEWS, body_cameras, fit_cameras, render_overlay, render_within, turntable_cameras
-from smplxpp.raster.visibility import outer_visible_faces, outer_visible_points, outside_views, view_directions
-from smplxpp.raster.zbuffer import MeshMaps, rasterize_mesh, rasterize_triangles
+from smplxpp.raster.zbuffer import (
+    MeshMaps,
+    outer_visible_faces,
+    outer_visible_points,
+    outside_views,
+    rasterize_mesh,
+    rasterize_triangles,
+    view_directions,
+)
 
 __all__ = [
     "VIEWS",

@@ -15,8 +15,7 @@ from jaxtyping import Float, Float32, Float64
 
 from smplxpp.core import Camera, TriangleMesh, require_positive
 from smplxpp.core.light import Irradiance, panorama_directions
-from smplxpp.raster.visibility import view_directions
-from smplxpp.raster.zbuffer import rasterize_mesh
+from smplxpp.raster.zbuffer import rasterize_mesh, view_directions
 
 # Radiance of the stage from above and from below: brighter above, as lit stages are.
 _SKY, _GROUND = 1.16, 0.68

@@ -66,9 +66,9 @@ def test_kernels_belong_to_what_calls_them():
     ],
 )
 def test_what_does_nothing_or_is_elsewhere_changes_nothing(copy, path, old, new):
-    before = code_of("smplxpp.raster.visibility", POSE_BODY)
+    before = code_of("smplxpp.raster.zbuffer", POSE_BODY)
     copy(path, old, new)
-    assert code_of("smplxpp.raster.visibility", POSE_BODY) == before
+    assert code_of("smplxpp.raster.zbuffer", POSE_BODY) == before
 
 
 @pytest.mark.parametrize(
@@ -80,9 +80,9 @@ def test_what_does_nothing_or_is_elsewhere_changes_nothing(copy, path, old, new)
     ],
 )
 def test_what_is_run_is_named_when_it_changes(copy, path, old, new, named):
-    before = code_of("smplxpp.raster.visibility")
+    before = code_of("smplxpp.raster.zbuffer")
     copy(path, old, new)
-    after = code_of("smplxpp.raster.visibility")
+    after = code_of("smplxpp.raster.zbuffer")
     assert {name for name in after if after[name] != before[name]} == {named}
 
 
