@@ -1,4 +1,4 @@
-"""`smplxpp check`: a verdict on any mesh or template, with the region of each fault in a coloured PLY."""
+"""`smplxpp check`: a verdict on any mesh, rigged file or template, with each fault's region in a coloured PLY."""
 
 from __future__ import annotations
 
@@ -9,15 +9,33 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from rich.console import Console
 from rich.table import Table
 
 from pipelines.commands.options import OptionalPath
 from pipelines.commands.templates import load_params_for, load_run_template
+from smplxpp.body import load_body
+from smplxpp.body.bvh import BvhMotion
+from smplxpp.body.bvh_params import named_joints
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
-from smplxpp.core import BodyParams, Check, InputError, SkinWeights, TriangleMesh, as_mesh, read_mesh, write_ply
+from smplxpp.body.rest_pose import turned_rig
+from smplxpp.body.retarget import Skeleton
+from smplxpp.body.skeleton_match import Tree
+from smplxpp.core import (
+    BodyParams,
+    Check,
+    InputError,
+    SkinWeights,
+    TriangleMesh,
+    as_mesh,
+    matrix_from_rotvec,
+    read_mesh,
+    write_ply,
+)
 from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.mesh_files.raw_mesh import FileRig
+from smplxpp.core.topology import component_labels
 from smplxpp.metrics import (
     CompareConfig,
     compare,
@@ -27,23 +45,35 @@ from smplxpp.metrics import (
     mesh_quality,
     penetration,
     point_to_surface,
+    rig_report,
     weight_report,
 )
+from smplxpp.skinning import forward_kinematics
 from smplxpp.template.template import BODY_PART, Template
+from smplxpp.transfer.checks import welded
 
 # Shares of a part's faces or vertices, %, at which a fault warns and fails; any other fault fails from the first face.
 # Chosen on templates of two real scans: a right shirt has 0.2 % of cut faces, one that is torn 2 %.
 _SHARES = {"faces that cut another": (0.0, 1.0), "needles": (0.1, 5.0)}
 _INSIDE_REST, _INSIDE_POSED, _STRETCH = (0.0, 1.0), (2.0, 10.0), (3.0, 10.0)
+_SEAM = (1.0, 5.0)  # mm between copies of a vertex: a slit of one is seen at arm's length
+_OFF = "weights off a sum of 1"
+# Rounding to bytes leaves 0.01, and some engines do not divide by the sum; a joint twice is moved right by most.
+_RIG = {_OFF: (0.01, 0.1), "a joint twice at a vertex": (0.0, np.inf)}
 # Colours of regions, the later over the earlier where both are; grey is fine.
 _GREY = (190, 190, 190)
 _PALETTE = {
     "off the scan": (80, 120, 255),
+    "a joint twice at a vertex": (200, 200, 120),
+    "weights off a sum of 1": (180, 255, 180),
     "needles": (240, 220, 90),
     "stretched": (255, 170, 0),
+    "seams that open": (120, 220, 60),
+    "stretched as shown": (255, 110, 0),
     "inside the body in a pose": (255, 120, 160),
     "inside the body": (230, 30, 30),
     "faces that cut another": (150, 60, 200),
+    "negative weights": (110, 0, 60),
     "vertices without weights": (255, 255, 255),
     "faces without area": (0, 0, 0),
     "faces wound the other way": (0, 160, 90),
@@ -57,7 +87,7 @@ class CheckMesh:
     """Options of `smplxpp check`."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MESH|TEMPLATE|RUN")]
-    """A mesh in any format that is read, a template (`smplxpp.npz`), or the folder of a run."""
+    """A mesh in any format that is read, rigged or not, a template (`smplxpp.npz`), or the folder of a run."""
     scan: OptionalPath = None
     """A scan to compare with, in the pose of `params` for a template."""
     params: OptionalPath = None
@@ -79,13 +109,15 @@ class CheckMesh:
         Raises:
             InputError: a file that is not read, or options that do not fit it.
         """
-        found = _Verdict(*self._subject())
-        # The body of a template is the model's own: eyes and teeth cut its skin.
+        found = self._subject()
+        # The body of a template is the model's own.
         for name in found.parts:
             if found.template is None or name != BODY_PART:
                 found.check_surface(name)
         if found.template is not None:
             found.check_template(found.template)
+        if found.rig is not None:
+            found.check_rig(found.rig, {"m": 1.0, "cm": 0.01, "mm": 0.001}[self.units])
         if self.weights is not None:
             found.check_weights(SkinWeights.load(self.weights)[0])
         if self.scan is not None:
@@ -99,15 +131,27 @@ class CheckMesh:
             _print(report, Console())
         return {**report, "exit_status": int(self.strict and report["verdict"] == "fail")}
 
-    def _subject(self) -> tuple[TriangleMesh, Template | None]:
+    def _subject(self) -> _Verdict:
         if self.path.is_dir() or self.path.suffix.lower() == ".npz":
             if self.weights is not None:
                 raise InputError("option weights", expected="a mesh", received="a template, which has its own weights")
             template = load_run_template(self.path) if self.path.is_dir() else Template.load(self.path)
-            return template.mesh, template
+            parts = {name: template.part_faces(name) for name in template.part_names}
+            return _Verdict(template.mesh, {name: chosen for name, chosen in parts.items() if chosen.any()}, template)
         if self.params is not None:
             raise InputError("option params", expected="a template or a run", received=f"the mesh {self.path.name}")
-        return as_mesh(read_mesh(self.path).mesh, unit=self.units), None
+        file = read_mesh(self.path)
+        mesh = as_mesh(file.mesh, unit=self.units)
+        parts = {"mesh": np.ones(mesh.face_count, dtype=bool)}
+        if file.face_part is not None and len(np.unique(file.face_part)) > 1:
+            # Meshes of one name are told apart by their numbers.
+            names = [
+                name if file.part_names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(file.part_names)
+            ]
+            parts = {names[k]: file.face_part == k for k in np.unique(file.face_part)}
+        # glTF and STL cannot say that faces share a vertex where texture, normal or weights differ.
+        copies = self.path.suffix.lower() in (".glb", ".gltf", ".vrm", ".stl")
+        return _Verdict(mesh, parts, rig=file.rig, copies=copies)
 
     def _pose(self, found: _Verdict) -> TriangleMesh:
         """The subject in the scan's pose."""
@@ -124,25 +168,26 @@ class _Verdict:
     """What was found on a mesh: checks, and the faces of each kind of fault."""
 
     mesh: TriangleMesh
-    template: Template | None
+    parts: dict[str, Bool[np.ndarray, " M"]]
+    template: Template | None = None
+    rig: FileRig | None = None
+    copies: bool = False
     checks: list[tuple[str, Check]] = field(default_factory=list)
     regions: dict[str, Bool[np.ndarray, " M"]] = field(default_factory=dict)
     numbers: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def parts(self) -> dict[str, Bool[np.ndarray, " M"]]:
-        """Faces of each part; a mesh is one."""
-        if self.template is None:
-            return {"mesh": np.ones(self.mesh.face_count, dtype=bool)}
-        faces = {name: self.template.part_faces(name) for name in self.template.part_names}
-        return {name: chosen for name, chosen in faces.items() if chosen.any()}
-
     def check_surface(self, name: str) -> None:
         """Faults of a part's faces; borders are counted, because clothes have them."""
         chosen = np.flatnonzero(self.parts[name])
-        part, _ = self.mesh.submesh(chosen)
+        part, pieces = self.mesh.submesh(chosen)[0], None
+        if self.copies:
+            once, index = welded(part)
+            part = TriangleMesh(once.vertices, index[part.faces])
+        # Of a character eyes, teeth and buttons cut the skin; a surface must not cut itself.
+        if self.rig is not None or len(self.parts) > 1:
+            pieces = component_labels(part.edges, part.vertex_count)[part.faces[:, 0]]
         self.numbers.setdefault("quality", {})[name] = mesh_quality(part).as_dict()
-        for fault, faces in faulty_faces(part).items():
+        for fault, faces in faulty_faces(part, pieces=pieces).items():
             gate = _SHARES.get(fault)
             value, unit = (100 * float(faces.mean()), "%") if gate else (int(faces.sum()), "")
             self._add(name, fault, value, unit, gate or (0.0, 0.0), chosen[faces])
@@ -160,33 +205,87 @@ class _Verdict:
 
     def check_template(self, template: Template) -> None:
         """Parts inside the body, at rest and in hard poses, stretched edges, and parts within each other."""
-        params = stress_poses(BodyParams.rest(betas=len(template.betas)))
-        posed, body = template.pose(params), template.part_mesh(BODY_PART)
-        members = {name: np.unique(self.mesh.faces[faces]) for name, faces in self.parts.items()}
-        for name, used in members.items():
-            if name == BODY_PART:
-                continue
-            part, _ = self.mesh.submesh(self.parts[name])
-            ever, worst, stretched = np.zeros(len(used), dtype=bool), 0.0, np.zeros(part.face_count, dtype=bool)
-            for k in range(len(STRESS_POSES)):
-                skin = body.with_vertices(posed[k][members[BODY_PART]])
-                ever |= penetration(posed[k][used], skin, clearance=0.0).penetrating
-                ratio = np.nan_to_num(edge_stretch(part, part.with_vertices(posed[k][used])), nan=1.0)
-                worst = max(worst, float(np.percentile(ratio, 99.9)))
-                longer = np.zeros(part.vertex_count, dtype=bool)
-                longer[part.edges[ratio > _STRETCH[0]]] = True
-                stretched |= longer[part.faces].all(axis=1)
-            inside = penetration(part.vertices, body).penetrating
-            chosen = np.flatnonzero(self.parts[name])
-            for fault, vertices, gate in (
-                ("inside the body", inside, _INSIDE_REST),
-                ("inside the body in a pose", ever, _INSIDE_POSED),
-            ):
-                faces = chosen[vertices[part.faces].any(axis=1)]
-                self._add(name, fault, 100 * float(vertices.mean()), "%", gate, faces)
-            self._add(name, "stretched", worst, "x", _STRETCH, chosen[stretched])
-        self._check_solids(members)
+        posed = template.pose(stress_poses(BodyParams.rest(betas=len(template.betas))))
+        for name in self.parts:
+            if name != BODY_PART:
+                self._check_inside(name, BODY_PART, posed)
+                self._check_stretch(name, self.mesh, posed, "stretched")
+        self._check_solids({name: np.unique(self.mesh.faces[faces]) for name, faces in self.parts.items()})
         self.numbers["weights"] = weight_report(template.weights, edges=self.mesh.edges).as_dict()
+
+    def check_rig(self, rig: FileRig, unit: float) -> None:
+        """Weights and bind matrices of a file, and what stress poses make of its surface.
+
+        Args:
+            rig: as the file has it.
+            unit: metres in the mesh for one unit of the file.
+        """
+        report, faults = rig_report(rig)
+        self.numbers["rig"] = report
+        self._add("rig", "bind matrices without an inverse", report["singular_binds"], "", (0, 0), None)
+        for fault, vertices in faults.items():
+            value = report["sum_error"] if fault == _OFF else int(vertices.sum())
+            self._add("rig", fault, value, "", _RIG.get(fault, (0.0, 0.0)), self._at(vertices))
+        if report["singular_binds"]:
+            return
+        # Files may show another pose than the one they are bound in; their scales may differ by a unit.
+        for name in self.parts:
+            self._check_stretch(
+                name, self.mesh.with_vertices(rig.bound), self.mesh.vertices[None], "stretched as shown"
+            )
+        try:
+            posed = unit * stress_posed_rig(rig)
+        except InputError as error:
+            report["not_posed"] = str(error)
+            return
+        report["poses"] = list(STRESS_POSES)
+        body = next((name for name in self.parts if name.lower() == BODY_PART), None)
+        for name in self.parts:
+            if body is not None and name != body:
+                self._check_inside(name, body, posed)
+            self._check_stretch(name, self.mesh, posed, "stretched")
+            self._check_seams(name, posed)
+
+    def _check_inside(self, name: str, body: str, posed: Float64[np.ndarray, "T V 3"]) -> None:
+        """Vertices of a part inside the body, at rest and in poses."""
+        chosen = np.flatnonzero(self.parts[name])
+        part, used = self.mesh.submesh(chosen)
+        skin, skin_used = self.mesh.submesh(self.parts[body])
+        ever = np.zeros(len(used), dtype=bool)
+        for vertices in posed:
+            ever |= penetration(vertices[used], skin.with_vertices(vertices[skin_used]), clearance=0.0).penetrating
+        inside = penetration(part.vertices, skin).penetrating
+        for fault, where, gate in (
+            ("inside the body", inside, _INSIDE_REST),
+            ("inside the body in a pose", ever, _INSIDE_POSED),
+        ):
+            faces = chosen[where[part.faces].any(axis=1)]
+            self._add(name, fault, 100 * float(where.mean()), "%", gate, faces)
+
+    def _check_stretch(self, name: str, rest: TriangleMesh, posed: Float64[np.ndarray, "T V 3"], fault: str) -> None:
+        """Edges of a part that poses lengthen, against the part's own scale: 99.9th percentile, the worst pose."""
+        chosen = np.flatnonzero(self.parts[name])
+        part, used = rest.submesh(chosen)
+        worst, stretched = 0.0, np.zeros(part.face_count, dtype=bool)
+        for vertices in posed:
+            ratio = np.nan_to_num(edge_stretch(part, part.with_vertices(vertices[used])), nan=1.0)
+            # A file's bind pose may be in another unit; a pose changes the length of few edges.
+            ratio /= float(np.median(ratio)) or 1.0
+            worst = max(worst, float(np.percentile(ratio, 99.9)))
+            longer = np.zeros(part.vertex_count, dtype=bool)
+            longer[part.edges[ratio > _STRETCH[0]]] = True
+            stretched |= longer[part.faces].all(axis=1)
+        self._add(name, fault, worst, "x", _STRETCH, chosen[stretched])
+
+    def _check_seams(self, name: str, posed: Float64[np.ndarray, "T V 3"]) -> None:
+        """Copies of a vertex, as files have them along seams of their texture, that poses move apart."""
+        part, used = self.mesh.submesh(self.parts[name])
+        _, index = welded(part)
+        first = used[np.unique(index, return_index=True)[1]][index]
+        apart = np.linalg.norm(posed[:, used] - posed[:, first], axis=2).max(axis=0) * 1e3
+        wide = np.zeros(self.mesh.vertex_count, dtype=bool)
+        wide[used[apart > _SEAM[0]]] = True
+        self._add(name, "seams that open", float(apart.max()), "mm", _SEAM, self._at(wide))
 
     def _check_solids(self, members: dict[str, np.ndarray]) -> None:
         """Volumes that closed parts share; open ones have none."""
@@ -242,6 +341,28 @@ class _Verdict:
         return {**counts, "verdict": verdict, "checks": rows, **self.numbers}
 
 
+def stress_posed_rig(rig: FileRig) -> Float64[np.ndarray, "T V 3"]:
+    """Return a file's vertices in the poses of `STRESS_POSES`, in its own unit.
+
+    Raises:
+        InputError: joints that are no person's.
+    """
+    body = Skeleton.of(load_body())
+    places = rig.world[:, :3, 3]
+    has = rig.parents >= 0
+    offsets = places - np.where(has[:, None], places[rig.parents], 0.0)
+    still = np.tile(np.eye(3), (1, len(rig.names), 1, 1))
+    joints = named_joints(BvhMotion(rig.names, rig.parents, offsets, still, places[:1], 1.0), subject="rig")
+    # Turns of our joints in the world, then what they move the file's joints by.
+    local = matrix_from_rotvec(stress_poses(BodyParams.rest()).full_pose)
+    count = len(body.names)
+    rest = np.repeat(body.places[None], len(local), axis=0)
+    whole = forward_kinematics(rest, body.parents, local[:, :count])[0][..., :3, :3]
+    turns = {name: whole[:, k] for k, name in enumerate(body.names)}
+    moved = turned_rig(Tree(rig.names, rig.parents, places), joints, body, turns)
+    return np.stack([rig.posed(step @ rig.world) for step in moved])
+
+
 def _print(report: dict[str, Any], console: Console) -> None:
     """Print the faults, and of parts without any one line."""
     styles = {"pass": "green", "warn": "yellow", "fail": "red"}
@@ -258,5 +379,7 @@ def _print(report: dict[str, Any], console: Console) -> None:
         table.add_row(row["part"], row["name"], value, row["gate"], row["status"], style=styles[row["status"]])
     if table.row_count:
         console.print(table)
+    if "not_posed" in report.get("rig", {}):
+        console.print(f"no stress poses: {report['rig']['not_posed']}", style="yellow", markup=False)
     verdict = report["verdict"]
     console.print(f"[{styles[verdict]}]{verdict}[/]: {passed} of {len(report['checks'])} checks pass; {size}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from smplxpp.body.bvh import BvhMotion
 from smplxpp.body.joint_words import FINGERS
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.retarget import Skeleton
-from smplxpp.body.skeleton_match import SIDES
+from smplxpp.body.skeleton_match import SIDES, Tree, spine_of
 from smplxpp.core import matrix_from_rotvec, rotvec_from_matrix
 
 FINGER_JOINTS = SMPLX_JOINTS[25:]
@@ -22,6 +22,7 @@ CHILD = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 CHILD |= {f"{finger}{bone}": f"{finger}{bone + 1}" for finger in FINGERS for bone in (1, 2)}
 """The joint at the end of the bone that a joint moves, for bones whose direction tells the joint's rotation."""
 _FRAME = ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "neck")
+_SHOULDERS = ("left_shoulder", "right_shoulder")
 _STANDS = 0.5  # least cosine of a pose that stands: limbs within 60 degrees of a person who stands upright
 _UPRIGHT, _NEARLY_ALL = 0.8, 0.9  # least cosine of a trunk along an axis, and least share of such frames
 _TRIED = 400  # frames among which one that stands is looked for
@@ -154,6 +155,75 @@ def turned_to(a: Float64[np.ndarray, "T 3"], b: Float64[np.ndarray, "T 3"]) -> F
     K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
     rotation = np.eye(3) + K + K @ K / np.where(opposite, 1.0, 1.0 + cosine)[:, None, None]
     return np.where(opposite[:, None, None], out, rotation)
+
+
+def turned_rig(
+    tree: Tree,
+    joints: Mapping[str, int],
+    body: Skeleton,
+    whole: Mapping[str, Float64[np.ndarray, "T 3 3"]],
+) -> Float64[np.ndarray, "T J 4 4"]:
+    """Return what moves each joint of another program's skeleton from its rest to poses of our body.
+
+    Its bones then point where ours do, as far as both have them: a joint turns by `Q W A^-1`, with W our joint's turn,
+    Q the rotation of our trunk to the file's, and A that of the joint from our rest pose to the file's
+    (`rest_rotation`). Joints of the spine take the turns of ours at their height, all others follow the joint that they
+    hang on. The pelvis stays where it is.
+
+    Args:
+        tree: the file's skeleton, in the pose that the turns start from; any unit.
+        joints: index of its joint for each of ours (`smplxpp.body.bvh_params.named_joints`).
+        body: our skeleton at rest.
+        whole: turns of our joints in the world.
+
+    Returns:
+        (T, J, 4, 4) transforms from the file's rest to each pose, in its unit.
+    """
+    count = len(next(iter(whole.values())))
+    trunk = _trunk(tree.places, joints, body)
+    away: dict[str, Float64[np.ndarray, "3 3"]] = {}
+    turns: dict[int, Float64[np.ndarray, "T 3 3"]] = {}
+    for name in OURS:
+        if name not in joints:
+            continue
+        above = away.get(body.names[body.parents[body.at(name)[0]]], trunk) if name in FINGER_JOINTS else trunk
+        away[name] = rest_rotation(name, tree.places, joints, body, above)
+        turns[joints[name]] = trunk @ whole[name] @ away[name].T
+    # How far up the trunk joints lie, from the pelvis (0) to the shoulders (1): ours turn all that is above them.
+    ours = [name for name in ("spine1", "spine2", "spine3") if name in whole]
+    if not any(name in joints for name in ours):
+        spine = spine_of(tree, joints)
+        own = _heights(body.places, body.at("pelvis", *_SHOULDERS), body.at(*ours))
+        theirs = _heights(tree.places, [joints[name] for name in ("pelvis", *_SHOULDERS)], spine)
+        near = 0.1  # of the trunk: joints that much below one of ours still stand for it
+        for joint, height in zip(spine, theirs, strict=True):
+            under = [name for name, low in zip(ours, own, strict=True) if low <= height + near]
+            if under:
+                turns[joint] = trunk @ whole[under[-1]] @ trunk.T
+    # Parents before children.
+    out = np.tile(np.eye(4), (count, len(tree.names), 1, 1))
+    for joint, parent in enumerate(tree.parents):
+        still = out[:, parent, :3, :3] if parent >= 0 else np.tile(np.eye(3), (count, 1, 1))
+        turn = turns.get(joint, still)
+        place = tree.places[joint]
+        moved = place if parent < 0 else out[:, parent, :3, :3] @ place + out[:, parent, :3, 3]
+        out[:, joint, :3, :3], out[:, joint, :3, 3] = turn, moved - turn @ place
+    return out
+
+
+def _heights(
+    places: Float64[np.ndarray, "J 3"], ends: Sequence[int], joints: Sequence[int]
+) -> Float64[np.ndarray, " K"]:
+    """Return how far up the trunk joints lie, from the pelvis (0) to the middle between the shoulders (1).
+
+    Args:
+        places: of all joints.
+        ends: indices of the pelvis and of both shoulders.
+        joints: indices of those asked for.
+    """
+    base = places[ends[0]]
+    up = places[list(ends[1:])].mean(axis=0) - base
+    return (places[list(joints)] - base) @ up / max(float(up @ up), 1e-12)
 
 
 def _between(a: Float64[np.ndarray, " 3"], b: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:

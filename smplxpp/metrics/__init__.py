@@ -25,7 +25,7 @@ from smplxpp.metrics.pose_error import PoseError, mean_pose_error, pose_error
 from smplxpp.metrics.quality import MeshQuality, doubtful_pair, faulty_faces, mesh_quality
 from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
 from smplxpp.metrics.stretch import StretchReport, edge_stretch, flipped_faces, stretch_report
-from smplxpp.metrics.weights import VariationStats, WeightReport, total_variation, weight_report
+from smplxpp.metrics.weights import VariationStats, WeightReport, rig_report, total_variation, weight_report
 
 __all__ = [
     "CompareConfig",
@@ -71,5 +71,6 @@ __all__ = [
     "summarize",
     "total_variation",
     "uncovered_body",
+    "rig_report",
     "weight_report",
 ]

@@ -123,10 +123,16 @@ def mesh_quality(mesh: MeshLike, *, self_intersection: bool = False) -> MeshQual
     )
 
 
-def faulty_faces(mesh: MeshLike) -> dict[str, Bool[np.ndarray, " M"]]:
+def faulty_faces(
+    mesh: MeshLike, *, pieces: Integer[np.ndarray, " M"] | None = None
+) -> dict[str, Bool[np.ndarray, " M"]]:
     """Return which faces have each fault that a mesh can have, by the fault's name, worst first.
 
     A needle has a circumradius over 200 times its inradius; a face that cuts another does so away from common vertices.
+
+    Args:
+        mesh: of M faces.
+        pieces: number of the piece that each face belongs to; pieces may cut each other, as eyes and teeth do a face.
 
     Example:
         >>> faults = faulty_faces(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [1, 0, 2]]))
@@ -140,7 +146,8 @@ def faulty_faces(mesh: MeshLike) -> dict[str, Bool[np.ndarray, " M"]]:
     crowded[order[np.repeat(count > 2, count)] // 3] = True
     # Winding means something where every edge has at most two faces.
     wound = flipped_against_majority(mesh) if inconsistent_edges(mesh).any() else np.zeros_like(crowded)
-    cutting[self_intersections(mesh).ravel()] = True
+    cuts = self_intersections(mesh)
+    cutting[cuts[pieces[cuts[:, 0]] == pieces[cuts[:, 1]]].ravel() if pieces is not None else cuts.ravel()] = True
     corners = np.sort(mesh.faces, axis=1)
     by_corners = np.lexsort(corners.T[::-1])
     repeats = np.zeros_like(crowded)

@@ -1,13 +1,15 @@
-"""Skinning weights: are they weights at all, how many joints a vertex, how far from a reference, how smooth."""
+"""Skinning weights: are they weights at all, how many joints a vertex, how far from a reference, how smooth; rigs."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Integer
+from jaxtyping import Bool, Float64, Integer
 
 from smplxpp.core import InputError, WeightsLike, dense_weights
+from smplxpp.core.mesh_files.raw_mesh import FileRig
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,63 @@ def weight_report(
         reference=variation,
         edges=along,
     )
+
+
+def rig_report(rig: FileRig) -> tuple[dict[str, Any], dict[str, Bool[np.ndarray, " N"]]]:
+    """Check the skeleton and the skin weights of a file, as it stores them.
+
+    Returns:
+        Figures: `joints`, `roots` (joints without one above), `moving` (joints with a weight), `influences` (most
+        joints of a vertex), `sum_error` (largest |sum of a vertex's weights - 1|, of vertices with any),
+        `singular_binds` (inverse bind matrices without an inverse, with NaN, or with a last row that is not 0 0 0 1).
+        The vertices with each fault, by its name.
+
+    Example:
+        >>> from smplxpp.core.mesh_files.raw_mesh import FileRig
+        >>> one, columns = np.eye(4)[None], np.zeros((2, 1), dtype=np.int64)
+        >>> rig = FileRig(
+        ...     names=("root",),
+        ...     parents=np.array([-1]),
+        ...     world=one,
+        ...     column_joint=np.zeros(1, dtype=np.int64),
+        ...     inverse_bind=one,
+        ...     columns=columns,
+        ...     weights=np.array([[1.0], [0.0]]),
+        ...     bound=np.zeros((2, 3)),
+        ... )
+        >>> figures, faults = rig_report(rig)
+        >>> figures["joints"], faults["vertices without weights"].tolist()
+        (1, [False, True])
+    """
+    weights, held = rig.weights, rig.weights != 0
+    total = weights.sum(axis=1)
+    # Columns of one vertex in order; what follows itself with a weight is there twice.
+    joint = np.where(held, rig.column_joint[rig.columns], -1)
+    ordered = np.sort(joint, axis=1)
+    twice = ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any(axis=1)
+    moved = held.any(axis=1)
+    finite = np.isfinite(rig.inverse_bind).all(axis=(1, 2))
+    binds = np.where(finite[:, None, None], rig.inverse_bind, 0.0)
+    # Relative to the size of the matrix, because bones of a file in millimetres are scaled by a thousandth.
+    size = np.abs(binds[:, :3, :3]).max(axis=(1, 2))
+    flat = np.abs(np.linalg.det(binds[:, :3, :3])) <= 1e-9 * size**3
+    affine = np.abs(binds[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < 1e-4
+    off = np.where(moved, np.abs(total - 1.0), 0.0)
+    faults = {
+        "vertices without weights": ~moved | ~(total > 0),
+        "negative weights": (weights < 0).any(axis=1),
+        "weights off a sum of 1": off > 0.01,
+        "a joint twice at a vertex": twice,
+    }
+    figures = {
+        "joints": len(rig.names),
+        "roots": int((rig.parents < 0).sum()),
+        "moving": len(np.unique(joint[held])),
+        "influences": int(held.sum(axis=1).max(initial=0)),
+        "sum_error": float(off.max(initial=0.0)),
+        "singular_binds": int((~finite | flat | ~affine).sum()),
+    }
+    return figures, faults
 
 
 def _dense(weights: WeightsLike, name: str) -> np.ndarray:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int64, UInt8
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import as_numbers, atomic_write_bytes, read_arrays, regular_file
@@ -23,18 +23,21 @@ from smplxpp.core.mesh_files.fbx_file import read_fbx
 from smplxpp.core.mesh_files.gltf_file import read_gltf
 from smplxpp.core.mesh_files.obj_file import read_obj
 from smplxpp.core.mesh_files.ply_file import read_ply
-from smplxpp.core.mesh_files.raw_mesh import RawMesh, color_bytes, require_coordinate_range
+from smplxpp.core.mesh_files.raw_mesh import FileRig, RawMesh, color_bytes, require_coordinate_range
 from smplxpp.core.mesh_files.stl_off_files import read_off, read_stl
 
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """A checked mesh with the colours and properties of its file; see `RawMesh` for the shapes."""
+    """A checked mesh with the colours, properties, parts and rig of its file; see `RawMesh` for the shapes."""
 
     mesh: TriangleMesh
     vertex_colors: UInt8[np.ndarray, "N 3"] | None = None
     vertex_properties: dict[str, np.ndarray] = field(default_factory=dict)
     face_properties: dict[str, np.ndarray] = field(default_factory=dict)
+    part_names: tuple[str, ...] = ()
+    face_part: Int64[np.ndarray, " M"] | None = None
+    rig: FileRig | None = None
 
 
 def read_mesh(path: str | Path) -> MeshFile:
@@ -54,7 +57,8 @@ def read_mesh(path: str | Path) -> MeshFile:
         raise InputError(
             f"{path}: {error.subject}", expected=error.expected, received=error.received, remedy=error.remedy
         ) from None
-    return MeshFile(mesh, raw.vertex_colors, raw.vertex_properties, raw.face_properties)
+    found = MeshFile(mesh, raw.vertex_colors, raw.vertex_properties, raw.face_properties)
+    return replace(found, part_names=raw.part_names, face_part=raw.face_part, rig=raw.rig)
 
 
 def read_raw_mesh(path: str | Path, *, clouds: bool = False) -> RawMesh:
@@ -131,6 +135,7 @@ _READERS = {
     ".obj": read_obj,
     ".glb": read_gltf,
     ".gltf": read_gltf,
+    ".vrm": read_gltf,
     ".stl": read_stl,
     ".off": read_off,
     ".fbx": read_fbx,

@@ -31,6 +31,35 @@ class FacePictures:
 
 
 @dataclass(frozen=True, eq=False)
+class FileRig:
+    """The skeleton of a mesh file and its skin weights as they are stored, before any check.
+
+    Attributes:
+        names: of the J joints, parents before children.
+        parents: index of the nearest joint above, -1 without one.
+        world: transform of each joint to the world, in the pose that the file shows.
+        column_joint: joint of each column of the weights; skins may bind one joint differently.
+        inverse_bind: inverse bind matrix of each column.
+        columns: (N, K) columns that move each vertex.
+        weights: (N, K) their weights, 0 where a vertex has fewer; neither checked nor divided by their sum.
+        bound: (N, 3) vertices before they are skinned.
+    """
+
+    names: tuple[str, ...]
+    parents: Int64[np.ndarray, " J"]
+    world: Float64[np.ndarray, "J 4 4"]
+    column_joint: Int64[np.ndarray, " C"]
+    inverse_bind: Float64[np.ndarray, "C 4 4"]
+    columns: Int64[np.ndarray, "N K"]
+    weights: Float64[np.ndarray, "N K"]
+    bound: Float64[np.ndarray, "N 3"]
+
+    def posed(self, world: Float64[np.ndarray, "J 4 4"]) -> Float64[np.ndarray, "N 3"]:
+        """Return the vertices for other transforms of the joints; those without weights stay where they are stored."""
+        return blended(self.bound, self.columns, self.weights, world[self.column_joint] @ self.inverse_bind)
+
+
+@dataclass(frozen=True, eq=False)
 class RawMesh:
     """The arrays of a mesh file before any check.
 
@@ -43,6 +72,9 @@ class RawMesh:
         source_faces: (M,) int64, the file's face of each triangle; None if all are triangles.
         vertex_normals: (N, 3) float64 of a file without faces (PLY, npz); else None.
         pictures: the textures that colour the faces (OBJ, glTF); None without any.
+        part_names: of the file's meshes (glTF).
+        face_part: (M,) the mesh of each face; None for files that do not name any.
+        rig: skeleton and skin weights (glTF); None without any.
     """
 
     vertices: Float64[np.ndarray, "N 3"]
@@ -53,11 +85,32 @@ class RawMesh:
     source_faces: Int64[np.ndarray, " M"] | None = None
     vertex_normals: Float64[np.ndarray, "N 3"] | None = None
     pictures: FacePictures | None = None
+    part_names: tuple[str, ...] = ()
+    face_part: Int64[np.ndarray, " M"] | None = None
+    rig: FileRig | None = None
 
     @property
     def is_cloud(self) -> bool:
         """Whether the file has points but no faces."""
         return not len(self.faces)
+
+
+def blended(
+    points: Float64[np.ndarray, "n 3"],
+    columns: Int64[np.ndarray, "n k"],
+    weights: Float64[np.ndarray, "n k"],
+    matrices: Float64[np.ndarray, "C 4 4"],
+) -> Float64[np.ndarray, "n 3"]:
+    """Pose points by linear blend skinning; weights are divided by their sum, because quantised ones do not sum to one.
+
+    Points whose weights sum to 0 or less stay.
+    """
+    out = np.zeros_like(points)
+    for column, weight in zip(columns.T, weights.T, strict=True):
+        moved = np.einsum("nij,nj->ni", matrices[column, :3, :3], points) + matrices[column, :3, 3]
+        out += weight[:, None] * moved
+    total = weights.sum(axis=1, keepdims=True)
+    return np.divide(out, total, out=points.copy(), where=total > 0)
 
 
 def require_indices(faces: Integer[np.ndarray, "*n"], count: int, *, subject: str, kind: str = "faces") -> None:

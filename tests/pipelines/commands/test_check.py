@@ -6,12 +6,16 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pygltflib
 import pytest
 import trimesh
 
 from pipelines.commands.check import CheckMesh
-from smplxpp.core import InputError, SkinWeights, TriangleMesh, read_mesh, write_ply
-from smplxpp.metrics import faulty_faces
+from smplxpp.body.named_poses import stress_poses
+from smplxpp.core import BodyParams, InputError, SkinWeights, TriangleMesh, read_mesh, write_ply
+from smplxpp.export.gltf import write_glb
+from smplxpp.export.gltf_skin import with_joint_names
+from smplxpp.metrics import edge_stretch, faulty_faces
 from smplxpp.template.template import Template
 from tests.export.templates import open_body_template
 
@@ -101,3 +105,63 @@ def test_a_template_is_driven_and_its_parts_held_against_the_body(tmp_path):
     # Red is on the right side alone, but for the faces across the middle.
     red = (read_mesh(tmp_path / "out" / "faults.ply").vertex_colors == (230, 30, 30)).all(axis=1)
     assert red.sum() > 0.9 * (shirt.vertices[:, 0] < 0).sum() and worn.vertices[red][:, 0].max() < 0.03
+
+
+def accessor_bytes(gltf: pygltflib.GLTF2, index: int, dtype: str) -> np.ndarray:
+    """A writable view of the values of an accessor in the blob of a file, whose blob was made a bytearray."""
+    accessor = gltf.accessors[index]
+    view = gltf.bufferViews[accessor.bufferView]
+    width = {"VEC4": 4, "MAT4": 16}[accessor.type]
+    start = view.byteOffset + (accessor.byteOffset or 0)
+    return np.frombuffer(gltf._glb_data, dtype, accessor.count * width, start).reshape(-1, width)
+
+
+def test_a_rigged_file_is_driven_by_its_own_joints_and_its_planted_faults_are_found(tmp_path):
+    worn = in_a_shirt(open_body_template())
+    path, names = tmp_path / "worn.glb", worn.body.joint_names
+    write_glb(path, with_joint_names(worn, "mixamo"), morph_targets=False)
+    whole = CheckMesh(path, json=True).run()
+    assert not [row for row in whole["checks"] if row["part"] == "rig" and row["status"] != "pass"]
+    assert whole["rig"]["joints"] == len(names) and whole["rig"]["roots"] == 1 and len(whole["rig"]["poses"]) == 4
+    # Its joints are found by other names, and pose it as the template poses itself, but for correctives of poses.
+    (theirs,) = [row for row in found(whole, "stretched") if row["part"] == "upper"]
+    shirt, used = worn.mesh.submesh(worn.part_faces("upper"))
+    posed = worn.pose(stress_poses(BodyParams.rest(betas=len(worn.betas))))[:, used]
+    own = [np.percentile(edge_stretch(shirt, shirt.with_vertices(one)), 99.9) for one in posed]
+    assert theirs["value"] == pytest.approx(max(own), rel=0.03)
+    # Weights of 40 vertices of the shirt go to a foot, one vertex loses its own, one has half, a bind matrix is flat.
+    gltf = pygltflib.GLTF2().load(path)
+    gltf._glb_data = bytearray(gltf.binary_blob())
+    attributes = gltf.meshes[1].primitives[0].attributes
+    next(node for node in gltf.nodes if node.name == "body").name = "skin"  # so that nothing is inside a body
+    joints = accessor_bytes(gltf, attributes.JOINTS_0, "u1")
+    weights = accessor_bytes(gltf, attributes.WEIGHTS_0, "<f4")
+    joints[:40], weights[:40] = names.index("left_ankle"), [1, 0, 0, 0]
+    weights[50], weights[51] = 0, [0.5, 0, 0, 0]
+    joints[52], weights[52] = 3, [0.5, 0.5, 0, 0]
+    gltf.save(tmp_path / "faulty.glb")
+    report = CheckMesh(tmp_path / "faulty.glb", json=True, out=tmp_path / "out").run()
+    assert found(report, "vertices without weights")[0]["value"] == 1
+    assert found(report, "weights off a sum of 1")[0]["value"] == pytest.approx(0.5, abs=0.01)
+    assert found(report, "a joint twice at a vertex")[0]["status"] == "warn"
+    (torn,) = [row for row in found(report, "stretched") if row["part"] == "upper"]
+    assert torn["status"] == "fail" and torn["value"] > 5.0 * theirs["value"]
+    marked = (read_mesh(tmp_path / "out" / "faults.ply").vertex_colors == torn["color"]).all(axis=1)
+    assert marked.any() and not marked[: worn.part_mesh("body").vertex_count].any()
+    accessor_bytes(gltf, gltf.skins[0].inverseBindMatrices, "<f4")[3] = 0.0
+    gltf.save(tmp_path / "flat.glb")
+    report = CheckMesh(tmp_path / "flat.glb", json=True).run()
+    assert found(report, "bind matrices without an inverse")[0]["value"] == 1 and not found(report, "stretched")
+
+
+def test_a_rig_that_is_no_person_is_checked_without_poses(tmp_path, capsys):
+    worn = in_a_shirt(open_body_template())
+    keep = ("pelvis", "spine1", "left_hip")
+    names = tuple(name if name in keep else f"bone{k}" for k, name in enumerate(worn.body.joint_names))
+    # A chain instead of a tree has no limbs.
+    parents = np.arange(len(names)) - 1
+    body = replace(worn.body, joint_names=names, parents=parents)
+    write_glb(tmp_path / "chain.glb", replace(worn, body=body), morph_targets=False)
+    report = CheckMesh(tmp_path / "chain.glb").run()
+    assert "poses" not in report["rig"] and not found(report, "stretched")
+    assert "no stress poses" in capsys.readouterr().out
