@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import http.client
 import json
 import re
@@ -64,6 +65,10 @@ class RulePartner:
 
     def cancel(self) -> None:
         """Do nothing, because rules never wait."""
+
+    def another(self) -> RulePartner:
+        """Return one that has said nothing yet."""
+        return RulePartner()
 
     def _next(self, answers: tuple[str, ...]) -> str:
         used = self._used.get(answers, 0)
@@ -213,6 +218,12 @@ class Endpoint:
             return
         new = "max_completion_tokens"
         raise _OtherBoundError(new if self._bound != new and new in words else "")
+
+    def another(self) -> Endpoint:
+        """Return one that shares what was learned of the model's thoughts and is cancelled on its own."""
+        other = copy.copy(self)
+        other._waiting = set()
+        return other
 
     def cancel(self) -> None:
         """Close the connections that wait for an answer; their readers get an error."""

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from jaxtyping import Int16
@@ -16,15 +16,16 @@ from jaxtyping import Int16
 from avatar.speech import SpeechAnimator
 from avatar.speech.voice import PiperVoice
 from pipelines.chat.frame_queue import FrameQueue, Line
-from pipelines.chat.hearing import Activity, Listener, Recogniser, UtterancePart
+from pipelines.chat.hearing import Activity, Listener, Recogniser, Recognisers, UtterancePart
 from pipelines.chat.spoken_answer import MarkdownReader
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 
-# Limits of a conversation: characters of one message, characters of one answer (some five minutes of speech), and turns
-# that a language model gets as context.
+# Limits of a conversation: characters of one message, characters and seconds of speech of one answer (digits are spoken
+# five times as long as letters), and turns that a language model gets as context.
 MOST_TYPED = 2000
 _MOST_ANSWERED = 4000
+_MOST_SPOKEN = 300.0
 _REMEMBERED = 12
 LONGEST_SENTENCE = 240
 """Characters after which a sentence is cut at a pause or between words, because a voice is synthesised by sentences."""
@@ -47,10 +48,14 @@ class Partner(Protocol):
     def cancel(self) -> None:
         """Stop waiting for the current answer."""
 
+    def another(self) -> Partner:
+        """Return a partner for another conversation, so that `cancel` stops the answers of one alone."""
+        ...
+
 
 @dataclass(frozen=True)
 class ChatParts:
-    """Engines that a conversation is made of.
+    """Engines that conversations are made of; several at a time share them.
 
     Attributes:
         voice: synthesises speech.
@@ -58,7 +63,7 @@ class ChatParts:
         animator: returns a new generator of motion.
         body: joints of the avatar.
         activity: returns a new detector of voice activity.
-        recogniser: recognises words; None allows typing alone.
+        recognisers: lend what recognises words; None allows typing alone.
     """
 
     voice: PiperVoice
@@ -66,7 +71,7 @@ class ChatParts:
     animator: Callable[[], SpeechAnimator]
     body: BodyModel
     activity: Callable[[], Activity]
-    recogniser: Recogniser | None
+    recognisers: Recognisers | None
 
 
 @dataclass
@@ -80,6 +85,7 @@ class Turn:
         spoken: whether the words were spoken and not typed.
         answered: sentences of the answer so far.
         marks: seconds from `began` to each part of the answer, in order.
+        seconds: of speech so far.
         cancelled: whether a newer message has interrupted the turn.
     """
 
@@ -89,6 +95,7 @@ class Turn:
     spoken: bool
     answered: list[str] = field(default_factory=list)
     marks: dict[str, float] = field(default_factory=dict)
+    seconds: float = 0.0
     cancelled: bool = False
 
     def mark(self, part: str) -> None:
@@ -104,6 +111,8 @@ class Conversation:
         tell: called with messages for the page, objects with `kind`.
         show: called with the messages of the `FrameQueue`.
         report: called with a turn once its answer is heard and seen.
+        wait_for_room: called before each sentence with a function that tells whether it is still wanted; returns once
+            the page has taken most of what was sent.
     """
 
     def __init__(
@@ -112,8 +121,10 @@ class Conversation:
         tell: Callable[[dict[str, Any]], None],
         show: Callable[[bytes], None],
         report: Callable[[Turn], None] = lambda _: None,
+        wait_for_room: Callable[[Callable[[], bool]], None] = lambda _: None,
     ) -> None:
-        self._parts, self._tell, self._report = parts, tell, report
+        self._parts, self._tell, self._report, self._wait_for_room = parts, tell, report, wait_for_room
+        self._partner, self._recogniser = parts.partner.another(), cast("Recogniser | None", None)
         self.frames = FrameQueue(parts.animator(), parts.body, show)
         self._listener = Listener(parts.activity())
         self._turns: list[Turn] = []
@@ -139,10 +150,11 @@ class Conversation:
 
     def heard(self, samples: Int16[np.ndarray, " N"]) -> None:
         """Take sound of the microphone at 16 kHz; the beginning of speech interrupts the answer."""
-        if self._parts.recogniser is None:
+        if self._parts.recognisers is None:
             raise InputError("sound", expected="text, because no recogniser is installed", received="sound")
+        self._recogniser = self._recogniser or self._parts.recognisers.take()
         for part in self._listener.hear(samples):
-            self._take(part, self._parts.recogniser)
+            self._take(part, self._recogniser)
 
     def mute(self) -> None:
         """Drop an utterance that was begun, because the microphone is off."""
@@ -155,7 +167,7 @@ class Conversation:
         if turn is not None:
             turn.cancelled = True
             self._turn = None
-            self._parts.partner.cancel()
+            self._partner.cancel()
         self.frames.interrupt()
         if turn is not None:
             # After the frames of the interruption, so that the page does not wait for the rest of the sentence.
@@ -173,14 +185,16 @@ class Conversation:
             self._report(turn)
 
     def close(self) -> None:
-        """End the conversation and its threads."""
+        """End the conversation and its threads; a voice within a sentence is left to itself after a second."""
         self._closed.set()
         if self._turn is not None:
             self._turn.cancelled = True
-            self._parts.partner.cancel()
+            self._partner.cancel()
         for thread in (self._pump, self._answering):
             if thread is not None:
-                thread.join()
+                thread.join(1.0)
+        if self._parts.recognisers is not None and self._recogniser is not None:
+            self._parts.recognisers.give_back(self._recogniser)
 
     def _take(self, part: UtterancePart, recogniser: Recogniser) -> None:
         # Speech interrupts an answer under way, and the avatar turns to the speaker.
@@ -227,6 +241,9 @@ class Conversation:
                 turn.mark("sentence")
                 turn.answered.append(sentence)
                 self._say(turn, number, sentence, reader.spoken(sentence))
+                if turn.seconds > _MOST_SPOKEN:
+                    self._note("The answer was too long and is cut here.")
+                    break
         except InputError as error:
             if not turn.cancelled:
                 self._note(str(error))
@@ -241,7 +258,7 @@ class Conversation:
     def _words(self, turn: Turn) -> Iterator[str]:
         count = 0
         try:
-            for piece in self._parts.partner.answer(history(self._turns)):
+            for piece in self._partner.answer(history(self._turns)):
                 if turn.cancelled:
                     return
                 turn.mark("first words")
@@ -261,6 +278,9 @@ class Conversation:
         if not words:
             self._tell({"kind": "silent", "turn": turn.number, "line": number, "text": sentence})
             return
+        self._wait_for_room(lambda: not turn.cancelled)
+        if turn.cancelled:
+            return
         try:
             spoken = self._parts.voice.say(words)
         except InputError as error:  # another alphabet or punctuation alone is shown and not spoken
@@ -269,6 +289,7 @@ class Conversation:
                 self._note(str(error))
             return
         turn.mark("voice")
+        turn.seconds += spoken.sound.seconds
         self.frames.say(spoken, Line(turn.number, number, sentence), lambda: not turn.cancelled)
         turn.mark("sent")
 

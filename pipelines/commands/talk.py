@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,11 @@ from rich.progress import track
 
 from pipelines.commands.animate_student import StudentFilm, student_frames
 from pipelines.commands.options import ClothMode, OptionalPath, OptionalText
-from pipelines.commands.talking_page import check_page_path, live_lips, write_talking_page
 from pipelines.commands.templates import BUNDLE_SUFFIX, person_of_run
+from pipelines.commands.web import PAGES, live_lips
 from pipelines.figures.film import write_film
 from smplxpp.core import BodyParams, InputError, require_at_least
-from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files import atomic_write_bytes, read_bytes
 from smplxpp.core.files.sound_file import Sound, wave_bytes
 
 if TYPE_CHECKING:
@@ -205,3 +206,39 @@ class Talk:
         cameras, frames = student_frames(bundle, motion, range(lead, len(motion)), film, notes)
         shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)
         write_film(out, shown, fps=self.fps, size=(cameras[0].width, cameras[0].height), sound=sound)
+
+
+def check_page_path(path: Path) -> None:
+    """Refuse what is neither one page nor a folder.
+
+    Raises:
+        InputError: another suffix, or a file where a folder is to be.
+    """
+    if path.suffix.lower() not in (*PAGES, ""):
+        raise InputError(f"output {path}", expected="NAME.html or a folder", received=path.suffix)
+    if not path.suffix and path.exists() and not path.is_dir():
+        raise InputError(f"output {path}", expected="a folder, or nothing yet", received="a file")
+
+
+def write_talking_page(
+    path: Path, bundle: Path, motion: BodyParams, sound: Sound, *, name: str, lips: bytes | None
+) -> None:
+    """Write the page, each file of it whole or not at all.
+
+    Args:
+        bundle: file of the avatar; what it plays is the motion. sound: from the motion's first frame on.
+        lips: of the avatar, for live sound.
+    """
+    from avatar.runtime.bundle import SUFFIX, save_with_motion
+    from pipelines.web.page import PageContent, single_page, write_page_folder
+
+    with tempfile.TemporaryDirectory() as folder:
+        # The page plays the motion of its bundle: write a copy of the bundle with this motion.
+        talking = Path(folder) / f"me{SUFFIX}"
+        save_with_motion(talking, bundle, motion)
+        data = read_bytes(talking, subject="avatar")
+    content = PageContent(name=name, sound=wave_bytes(sound), lips=lips)
+    if path.suffix:
+        atomic_write_bytes(path, single_page(data, content))
+    else:
+        write_page_folder(path, data, content)

@@ -28,7 +28,7 @@ class Label:
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
     host: str = "127.0.0.1"
-    """Address to listen at. 0.0.0.0 lets every machine of the network in, without a password."""
+    """Address to listen at. 0.0.0.0 lets every machine of the network in that has the token of the printed address."""
     no_browser: bool = False
     """Open no browser, print the address alone."""
     json: bool = False

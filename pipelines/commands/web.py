@@ -14,18 +14,33 @@ from rich.console import Console
 from pipelines.commands.options import (
     LARGEST_PORT,
     MOST_AVATAR_BYTES,
+    Exposure,
     Lighting,
     OptionalFloat,
     OptionalPath,
     OptionalText,
 )
-from pipelines.commands.talking_page import PAGES, live_lips
 from pipelines.commands.templates import BUNDLE_SUFFIX, export_bundle
 from smplxpp.core import InputError, require_between
 from smplxpp.core.files import atomic_write_bytes, read_bytes
 
 if TYPE_CHECKING:
+    from avatar.runtime import AvatarBundle
     from pipelines.web.page import PageLight
+
+PAGES = (".html", ".htm")
+"""Suffixes of a page in one file."""
+
+
+def live_lips(bundle: AvatarBundle) -> bytes | None:
+    """Return what moves a bundle's mouth by live sound in a page; None for a face whose mouth cannot speak."""
+    from avatar.driving import face_of_bundle
+    from pipelines.web.page import lips_of
+
+    try:
+        return lips_of(face_of_bundle(bundle))
+    except InputError:
+        return None
 
 
 @dataclass(frozen=True)
@@ -39,9 +54,11 @@ class Web:
     single_file: OptionalPath = None
     """Write one HTML file there, with player and avatar in it, that opens from disk."""
     serve: bool = False
-    """Serve the page to browsers on this machine until Ctrl-C."""
+    """Serve the page to browsers until Ctrl-C."""
     port: int = 8090
     """Port to serve at; the next free one where it is taken."""
+    exposure: Annotated[Exposure, tyro.conf.arg(name="")] = field(default_factory=Exposure)
+    """Who may ask the server."""
     no_browser: bool = False
     """Open no browser, print the address alone."""
     params: OptionalPath = None
@@ -82,6 +99,7 @@ class Web:
 
     def _check(self) -> None:
         require_between("option port", self.port, 1, LARGEST_PORT)
+        self.exposure.access()
         # Check outputs before the bundle is made, which takes seconds.
         if self.out is None and self.single_file is None and not self.serve:
             raise InputError(
@@ -144,8 +162,8 @@ class Web:
     def _serve(self, files: dict[str, bytes], console: Console) -> None:
         from pipelines.web.server import PageServer
 
-        with PageServer(files, port=self.port) as server:
-            console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False)
+        with PageServer(files, port=self.port, access=self.exposure.access()) as server:
+            console.print(f"{server.address}  (Ctrl-C ends it)", highlight=False, soft_wrap=True)
             if not self.no_browser:
                 webbrowser.open_new_tab(server.address)
             try:

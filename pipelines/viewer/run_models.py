@@ -70,7 +70,7 @@ class TrainingNow:
         """Return one line of text for the window."""
         old = 120.0
         still = "" if self.age < old else f", and nothing for {self.age / 60:.0f} minutes: it may have been stopped"
-        return f"training `{self.stage}`: {self.words}{still}"
+        return f"training {self.stage}: {self.words}{still}"
 
 
 def training_now(run: Path, *, clock: float | None = None) -> TrainingNow | None:

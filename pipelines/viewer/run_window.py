@@ -194,7 +194,7 @@ class RunWindow:
 
     def _words(self) -> str:
         session = self.session
-        of = "no Gaussians yet" if session.source is None else f"Gaussians: {session.source.words}"
+        of = "no Gaussians yet" if session.source is None else f"Gaussians: {plain_markdown(session.source.words)}"
         changed = ", changed by hand" if session.turned or session.expression else ""
         count = len(session.motion.numbers)
         source = plain_markdown(str(session.motion.source))
@@ -212,7 +212,7 @@ class RunWindow:
 
     def _tell(self) -> None:
         now = self.session.now
-        self._training.content = "none is running" if now is None else str(now)
+        self._training.content = "none is running" if now is None else plain_markdown(str(now))
         if now is None or now.picture is None:
             self._preview.visible = False
             return

@@ -15,47 +15,56 @@ from threading import Lock
 from typing import Any
 from urllib.parse import urlsplit
 
+from pipelines.web.access import HOST, Access, new_token
 from smplxpp.core.errors import InputError
 from smplxpp.core.lazy import import_extra
 
 log = logging.getLogger(__name__)
-_THIS_MACHINE = ("127.0.0.1", "localhost")
 _STARTING = Lock()
 
 
 def start_server(label: str, *, host: str, port: int) -> Any:
-    """Start viser's server; the next free port where this one is taken.
+    """Start viser's server, which only browsers with the token of `address_of` may ask; the next free port if taken.
 
     Raises:
         MissingExtraError: viser is not installed.
+        InputError: the host is no address.
     """
+    access = Access(host=host, token=new_token())
     viser = import_extra("viser", extra="viewer", purpose="the viewer")
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it tells of every connection
     # viser answers every page of every site; it takes its server from this module by name, when it starts.
     server_module = import_extra("websockets.asyncio.server", extra="viewer", purpose="the viewer")
     with _STARTING, redirect_stdout(StringIO()):  # viser tells its address, whatever it is asked for
         serve = server_module.serve
-        server_module.serve = _for_own_pages(serve, host)  # type: ignore[attr-defined]
+        server_module.serve = _for_own_pages(serve, access)  # type: ignore[attr-defined]
         try:
-            return viser.ViserServer(host=host, port=port, label=label, verbose=False)
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+            server.access = access
+            return server
         finally:
             server_module.serve = serve  # type: ignore[attr-defined]
 
 
-def _for_own_pages(serve: Callable[..., Any], bound: str) -> Callable[..., Any]:
+def _for_own_pages(serve: Callable[..., Any], access: Access) -> Callable[..., Any]:
     """Return a `serve` of websockets that answers its own pages alone, because the window shows a person's data.
 
-    A connection must come from a page of the address that it asks (`Origin` against `Host`). A server of this machine
-    must also be asked by one of its names, because others reach it by a trick (DNS rebinding).
+    A connection must come under a name of the server, from a page of the address that it asks (`Origin` against
+    `Host`), and with the token, because other users of this machine reach its ports too.
     """
 
     def guarded(handler: Any, host: Any, port: Any, *, process_request: Any = None, **options: Any) -> Any:
         async def process(connection: Any, request: Any) -> Any:
             asked, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-            foreign = origin is not None and urlsplit(origin).netloc != asked
-            name = asked.rpartition(":")[0] or asked
-            if foreign or (bound in _THIS_MACHINE and name not in _THIS_MACHINE):
+            if not access.knows(asked) or (origin is not None and not access.own_page(asked, origin)):
                 return connection.respond(HTTPStatus.FORBIDDEN, "this window is of its own page alone\n")
+            if access.takes_token(urlsplit(request.path).query):
+                moved = connection.respond(HTTPStatus.SEE_OTHER, "")
+                moved.headers["Location"], moved.headers["Set-Cookie"] = "./", access.set_cookie
+                return moved
+            if not access.brings_token("; ".join(request.headers.get_all("Cookie"))):
+                words = "open the address that the command has printed, with its token\n"
+                return connection.respond(HTTPStatus.FORBIDDEN, words)
             answer = None if process_request is None else process_request(connection, request)
             return await answer if isawaitable(answer) else answer
 
@@ -65,9 +74,9 @@ def _for_own_pages(serve: Callable[..., Any], bound: str) -> Callable[..., Any]:
 
 
 def address_of(server: Any) -> str:
-    """Return the address of a server for a browser."""
-    host = server.get_host()
-    return f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1') else host}:{server.get_port()}"
+    """Return the address of a server for a browser, with its token."""
+    address: str = server.access.address(server.get_port())
+    return address.replace(f"//{HOST}:", "//localhost:")
 
 
 def plain_markdown(text: str) -> str:

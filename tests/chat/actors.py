@@ -92,6 +92,9 @@ class Script:
     def cancel(self) -> None:
         self.cancelled.set()
 
+    def another(self) -> Script:
+        return self
+
 
 class Words:
     """A recogniser that hears the same words in every utterance."""
@@ -134,4 +137,7 @@ def cast(body: BodyModel, **changes: Any) -> ChatParts:
         "activity": LoudnessActivity,
         "recogniser": Words(),
     }
-    return ChatParts(**{**parts, **changes})
+    parts = {**parts, **changes}
+    words = parts.pop("recogniser")
+    lent = SimpleNamespace(take=lambda: words, give_back=lambda _: None)
+    return ChatParts(**parts, recognisers=lent)

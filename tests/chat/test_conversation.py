@@ -191,6 +191,14 @@ def test_words_that_do_not_match_their_sounds_are_said_and_not_answered(talk):
     assert not any(one["kind"] == "heard" and one["text"] for one in page.told)
 
 
+def test_digits_are_not_spoken_for_longer_than_an_answer(talk, monkeypatch):
+    monkeypatch.setattr("pipelines.chat.conversation._MOST_SPOKEN", 10.0)
+    it, page, _ = talk(partner=Script(["7" * 100 + ". "] * 9))
+    it.typed("go on")
+    until(lambda: "answered" in page.kinds())
+    assert len(page.spoken) == 2 and any("cut" in one.get("text", "") for one in page.told)
+
+
 def test_an_endless_answer_is_cut_and_too_long_a_text_refused(talk):
     it, page, _ = talk(partner=Script(["word " * 20 + ". "] * 1000))
     it.typed("go on")

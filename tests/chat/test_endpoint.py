@@ -187,6 +187,8 @@ def test_a_cancelled_answer_ends_at_once(address):
 
     threading.Thread(target=ask, daemon=True).start()
     assert first.wait(900)
+    partner.another().cancel()  # of another conversation
+    assert not ended.wait(0.1)
     began = time.monotonic()
     partner.cancel()
     assert ended.wait(900) and time.monotonic() - began < 2.5  # it would be silent for longer

@@ -6,17 +6,19 @@ import http.client
 import json
 import socket
 import threading
+import urllib.error
 import urllib.request
 
 import numpy as np
 import pytest
+from viser import GuiApi
 
 from pipelines.cli import main
 from pipelines.commands import view as label_command
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, RegisterInputs, save_build
 from pipelines.viewer.run_scene import label_again, open_session
-from pipelines.viewer.server import plain_markdown
+from pipelines.viewer.server import one_at_a_time, plain_markdown
 from pipelines.viewer.session import LabelledScan, LabelSession
 from pipelines.viewer.window import LabelWindow, open_window
 from smplxpp.core import HAIR, LOWER, SHOE, UPPER, InputError, concatenate_meshes
@@ -57,9 +59,15 @@ def test_it_answers_on_this_machine_alone_and_ends(scan, tmp_path):
     port = free_port()
     before = threading.active_count()
     window = open_window(LabelSession(scan), tmp_path, port=port)
-    assert window.server.get_host() == "127.0.0.1" and window.address == f"http://localhost:{port}"
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=60) as answer:
+    assert window.server.get_host() == "127.0.0.1" and window.address.startswith(f"http://localhost:{port}/?token=")
+    assert len(window.address.partition("=")[2]) >= 32
+    # The token goes from the address into a cookie, without which nothing is shown to other users of the machine.
+    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    with browser.open(window.address, timeout=60) as answer:
         assert answer.status == 200 and b"<html" in answer.read(4000).lower()
+        assert answer.url == f"http://localhost:{port}/"
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(f"http://127.0.0.1:{port}/?token=guess", timeout=60)
     window.close()
     assert threading.active_count() <= before + 1
     with socket.socket() as one:
@@ -79,7 +87,9 @@ def test_it_answers_on_this_machine_alone_and_ends(scan, tmp_path):
 )
 def test_no_page_of_another_site_may_look(window, host, origin, status):
     port = window.server.get_port()
-    headers = {"Host": host.format(port)} | ({} if origin is None else {"Origin": origin.format(port)})
+    access = window.server.access
+    headers = {"Host": host.format(port), "Cookie": f"{access.cookie}={access.token}"}
+    headers |= {} if origin is None else {"Origin": origin.format(port)}
     for upgrade in ({}, {"Upgrade": "websocket", "Connection": "Upgrade"}):
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=900)
         connection.request("GET", "/", headers=headers | upgrade)
@@ -88,9 +98,19 @@ def test_no_page_of_another_site_may_look(window, host, origin, status):
         connection.close()
 
 
-def test_names_are_no_markup():
+def test_names_are_no_markup(scan, tmp_path, monkeypatch):
     text = plain_markdown("<img src=x onerror=alert(1)> [a](javascript:b) **c** `d` don't")
     assert "<" not in text and "](" not in text and "**" not in text.replace("\\*", "") and "don't" in text
+    shown, show = [], GuiApi.add_markdown
+    monkeypatch.setattr(
+        GuiApi, "add_markdown", lambda gui, content, **more: (shown.append(content), show(gui, content))[1]
+    )
+    window = open_window(LabelSession(scan), tmp_path / "<img src=x onerror=alert(1)>", port=free_port())
+    window._undo = lambda: (_ for _ in ()).throw(InputError("<b>", expected="<i>", received="<script>"))
+    one_at_a_time(lambda window: window._undo())(window)
+    assert "&lt;script&gt;" in said(window) and "onerror" in shown[0]
+    assert not any("<" in one for one in (*shown, said(window)))
+    window.close()
 
 
 def test_a_click_does_what_the_tool_does(window, scan):
@@ -227,7 +247,7 @@ def test_the_command_serves_until_it_is_interrupted_and_keeps_what_was_not_saved
     port = free_port()
     assert main(["label", str(run), "--port", str(port)]) == 0
     printed = capsys.readouterr().out
-    assert addresses == [f"http://localhost:{port}"] and "labels_corrections.json" in printed
+    assert addresses[0].startswith(f"http://localhost:{port}/?token=") and "labels_corrections.json" in printed
     assert len(json.loads((run / "labels_corrections.json").read_text())["corrections"]) == 1
 
 

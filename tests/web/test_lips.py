@@ -13,7 +13,7 @@ import pytest
 from avatar.speech import ARTICULATORS, Face
 from avatar.speech.audio_features import FRAME, RATE, log_mel
 from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, smooth_mouth
-from pipelines.commands.talking_page import write_talking_page
+from pipelines.commands.talk import write_talking_page
 from pipelines.web.page import PageContent, lips_of, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.body import load_body

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import http.client
 import re
+import socket
 import threading
 from collections.abc import Iterator
 
 import pytest
 
 from pipelines.cli import main
+from pipelines.web.access import Access, new_token
 from pipelines.web.page import PageContent, page_files, single_page, write_page_folder
-from pipelines.web.server import PageServer, answer
+from pipelines.web.server import PageServer
 from smplxpp.core.errors import InputError
 from tests.web.avatars import write_avatar
 from tests.web.chromium import Page, find_chromium
@@ -27,9 +29,11 @@ def server() -> Iterator[PageServer]:
         it.shutdown()
 
 
-def get(server: PageServer, path: str, method: str = "GET", host: str | None = None) -> http.client.HTTPResponse:
+def get(
+    server: PageServer, path: str, method: str = "GET", host: str | None = None, cookie: str = ""
+) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection(*server.server_address, timeout=900)
-    connection.request(method, path, headers={} if host is None else {"Host": host})
+    connection.request(method, path, headers=({} if host is None else {"Host": host}) | {"Cookie": cookie})
     response = connection.getresponse()
     response.content = response.read()
     connection.close()
@@ -52,13 +56,97 @@ def test_the_server_gives_the_page_and_the_bundle_and_isolates_them(server):
 )
 def test_the_server_gives_nothing_else(server, path):
     assert get(server, path).status == 404
-    assert answer(FILES, server.hosts, "http://[", next(iter(server.hosts)))[0] == 404
 
 
 def test_the_server_answers_this_machine_alone(server):
     assert server.server_address[0] == "127.0.0.1"
     assert get(server, "/", host="evil.example").status == 403
-    assert get(server, "/", "POST").status == 501
+    assert get(server, "/", "POST").status == 405
+
+
+@pytest.mark.parametrize(
+    ("access", "host", "origin", "known", "own"),
+    [
+        ({}, "localhost:9000", "http://localhost:9000", True, True),  # a forwarded port: ssh -L 9000:localhost:8091
+        ({}, "localhost:8091", "http://localhost:3000", True, False),  # another server's page on this machine
+        ({}, "[::1]:8091", "http://[::1]:8091", True, True),
+        ({}, "192.168.0.7:8091", "http://192.168.0.7:8091", False, False),
+        ({}, "localhost.evil.example", "", False, False),
+        ({}, "", "", False, False),
+        ({}, "localhost:8091, evil.example", "", False, False),
+        ({"host": "0.0.0.0"}, "192.168.0.7:8091", "http://192.168.0.7:8091", True, True),
+        ({"host": "0.0.0.0"}, "evil.example:8091", "http://evil.example:8091", False, False),
+        ({"public_url": "https://me.org/a"}, "me.org", "https://me.org", True, True),
+        (
+            {"public_url": "https://me.org/a"},
+            "127.0.0.1:8091",
+            "https://me.org",
+            True,
+            True,
+        ),  # proxies may not pass Host
+        ({"public_url": "https://me.org/a"}, "me.org", "https://evil.example", True, False),
+        ({"public_url": "https://me.org/a"}, "me.org", "", True, False),
+    ],
+)
+def test_a_server_knows_its_names_and_its_own_pages(access, host, origin, known, own):
+    it = Access(**access)
+    assert (it.knows(host), it.own_page(host, origin)) == (known, own)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"host": "example.org"}, {"public_url": "me.org"}, {"public_url": "https://me.org/?a"}, {"token": "short"}],
+)
+def test_what_is_no_address_or_can_be_guessed_is_refused(options):
+    with pytest.raises(InputError, match=next(iter(options)).replace("_", "-")):
+        Access(**options)
+
+
+def test_a_token_goes_from_the_address_into_a_cookie():
+    access = Access(public_url="https://me.org/a/", token=new_token())
+    with PageServer(FILES, access=access) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        assert server.address == f"https://me.org/a/?token={access.token}" and access.token not in repr(access)
+        assert get(server, "/").status == get(server, "/a/me.avatar").status == 403
+        assert get(server, "/?token=" + new_token()).status == 403
+        moved = get(server, f"/a/?token={access.token}")
+        assert moved.status == 303 and moved.headers["Location"] == "./"
+        cookie, *rules = moved.headers["Set-Cookie"].split("; ")
+        assert set(rules) == {"HttpOnly", "SameSite=Lax", "Path=/a/", "Secure"}
+        # A proxy passes the path of the public address on, or leaves it out.
+        for path in ("/a/me.avatar", "/me.avatar"):
+            assert get(server, path, cookie=f"other=1; {cookie}").content == FILES["me.avatar"]
+
+
+def test_half_requests_and_pages_that_do_not_read_hold_no_thread():
+    with PageServer(FILES | {"big": bytes(8 << 20)}) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        assert get(server, "/").status == 200
+        before, open_ones = threading.active_count(), []
+        for text in ("GET / HTTP/1.1\r\nHost: 127", "", "GET /big HTTP/1.1\r\nHost: localhost\r\n\r\n") * 20:
+            open_ones.append(socket.create_connection(server.server_address))
+            open_ones[-1].sendall(text.encode())
+        assert get(server, "/me.avatar").content == FILES["me.avatar"]
+        assert threading.active_count() == before
+        for one in open_ones:
+            one.close()
+
+
+@pytest.mark.parametrize(
+    ("raw", "status"),
+    [
+        (b"GET http://[ HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
+        (b"GET /\xff\xfe HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n", b"400"),
+        (b"GET / HTTP/1.1\r\nHost : localhost\r\n\r\n", b"400"),
+        (b"\x16\x03\x01 tls\r\n\r\n", b"400"),
+        (b"GET / HTTP/1.1\r\nCookie: " + b"x" * 40_000, b"431"),
+    ],
+)
+def test_what_is_no_request_is_answered_with_what_is_wrong(server, raw, status):
+    with socket.create_connection(server.server_address, timeout=900) as stream:
+        stream.sendall(raw)
+        assert stream.recv(64).split()[1] == status
 
 
 def test_a_taken_port_gives_way_to_the_next(server):
@@ -128,6 +216,6 @@ def test_no_port_is_an_error(monkeypatch):
     def taken(*_: object) -> None:
         raise OSError(98, "taken")
 
-    monkeypatch.setattr("http.server.ThreadingHTTPServer.__init__", taken)
+    monkeypatch.setattr("socket.socket.bind", taken)
     with pytest.raises(InputError, match="port"):
         PageServer(FILES, port=8090)
