@@ -7,16 +7,21 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import platform
 import re
+import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
-from importlib.util import find_spec
+from importlib.util import cache_from_source, find_spec
 from pathlib import Path
 
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.atomic import atomic_write_text
+from smplxpp.core.files.json_file import as_object, as_text, read_json
 from smplxpp.core.files.paths import regular_file
 
 PACKAGES = ("smplxpp", "avatar", "pipelines")
@@ -60,6 +65,7 @@ def code_of(*modules: str) -> dict[str, str]:
         found[name] = module.digest
         waiting += module.imports
         kernels |= {folder for symbol, folder in _exports().items() if symbol in module.names}
+    _keep_digests()
     for folder in sorted(kernels | ({"common"} if kernels else set())):
         found[f"{NATIVE}/{folder}"] = _native_digest(folder)
     return dict(sorted(found.items()))
@@ -70,14 +76,61 @@ def _module(name: str) -> _Module:
     path = _source(name)
     if path is None:
         raise ModuleNotFoundError(f"no source of module {name}")
-    tree = ast.parse(path.read_text(encoding="utf-8"))
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-    imports = dict.fromkeys(part for module in _imported(tree, package) for part in _with_packages(module))
+    text = path.read_text(encoding="utf-8")
+    # What follows from this text alone is looked up by the text; which of the imported names are modules is asked anew.
+    key = hashlib.sha256("\0".join([package, text, *_exports()]).encode()).hexdigest()
+    known = _digests()
+    if key not in known:
+        known[key] = _parsed(text, package)
+        _UNKEPT.append(key)
+    digest, imported, names = known[key]
+    found = (part for module in _modules_of(imported) for part in _with_packages(module))
+    return _Module(digest, tuple(dict.fromkeys(found)), frozenset(names))
+
+
+_Parsed = tuple[str, list[tuple[str, list[str]]], list[str]]
+"""Digest of a text, its imports (module, names taken from it), and the native functions that it names."""
+_UNKEPT: list[str] = []
+"""Keys of `_digests` that the file does not have."""
+
+
+def _parsed(text: str, package: str) -> _Parsed:
+    tree = ast.parse(text)
+    imported = list(_imported(tree, package))
     # Write the tree out once and look for names in the text, because a walk over all nodes costs as much again.
     _drop_strings(tree)
-    text = ast.dump(tree, annotate_fields=False)
-    names = frozenset(symbol for symbol in _exports() if f", '{symbol}', Load())" in text)
-    return _Module(hashlib.sha256(text.encode()).hexdigest()[:16], tuple(imports), names)
+    dumped = ast.dump(tree, annotate_fields=False)
+    names = [symbol for symbol in _exports() if f", '{symbol}', Load())" in dumped]
+    return hashlib.sha256(dumped.encode()).hexdigest()[:16], imported, names
+
+
+def _digests_file() -> Path:
+    """Return the file beside this module's bytecode that spares each process two seconds of parsing all sources."""
+    return Path(cache_from_source(__file__)).with_suffix(".json")
+
+
+@cache
+def _digests() -> dict[str, _Parsed]:
+    """Return what is known of texts by their key; empty where no process has kept it yet, or the file is damaged."""
+    try:
+        content = as_object(read_json(_digests_file()), subject="digests")
+        return {
+            key: (as_text(digest, subject=key), [(base, list(names)) for base, names in pairs], list(symbols))
+            for key, (digest, pairs, symbols) in content.items()
+        }
+    except (InputError, TypeError, ValueError):
+        return {}
+
+
+def _keep_digests() -> None:
+    """Write what is known of the texts that this process has met, so that the file does not grow with each edit."""
+    if not _UNKEPT or sys.dont_write_bytecode:
+        return
+    _UNKEPT.clear()
+    with suppress(OSError, InputError):  # installed where nobody may write
+        _digests_file().parent.mkdir(exist_ok=True)
+        atomic_write_text(_digests_file(), json.dumps(_digests(), separators=(",", ":")))
 
 
 def _drop_strings(tree: ast.Module) -> None:
@@ -93,17 +146,23 @@ def _is_string(node: ast.AST) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _imported(tree: ast.Module, package: str) -> Iterable[str]:
-    """Yield the modules of `PACKAGES` that a file imports."""
+def _imported(tree: ast.Module, package: str) -> Iterable[tuple[str, list[str]]]:
+    """Yield the modules of `PACKAGES` that a file imports, with the names that it takes from them."""
     for node in _statements(tree, executed=True):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name.split(".")[0] in PACKAGES)
+            yield from ((alias.name, []) for alias in node.names if alias.name.split(".")[0] in PACKAGES)
         elif isinstance(node, ast.ImportFrom):
             parent = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
             base = ".".join([*parent, *([node.module] if node.module else [])])
             if base.split(".")[0] in PACKAGES:
-                yield base
-                yield from (f"{base}.{a.name}" for a in node.names if _source(f"{base}.{a.name}") is not None)
+                yield base, [alias.name for alias in node.names]
+
+
+def _modules_of(imported: Iterable[tuple[str, list[str]]]) -> Iterable[str]:
+    """Yield the modules of imports, and those of the names that are modules themselves."""
+    for base, names in imported:
+        yield base
+        yield from (f"{base}.{name}" for name in names if _source(f"{base}.{name}") is not None)
 
 
 def _statements(tree: ast.Module, *, executed: bool = False) -> Iterable[ast.AST]:

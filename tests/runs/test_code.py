@@ -86,6 +86,28 @@ def test_what_is_run_is_named_when_it_changes(copy, path, old, new, named):
     assert {name for name in after if after[name] != before[name]} == {named}
 
 
+def test_digests_are_kept_in_a_file_and_a_damaged_one_is_made_anew(tmp_path, monkeypatch):
+    """Parsing all sources took every process two seconds."""
+
+    def forget():
+        for cached in (code._module, code._digests):
+            cached.cache_clear()
+
+    file = tmp_path / "kept" / "digests.json"
+    monkeypatch.setattr(code, "_digests_file", lambda: file)
+    monkeypatch.setattr(code.sys, "dont_write_bytecode", False)
+    before = code_of("smplxpp.core.labels")
+    for damage in ('{"0": [1, 2', '{"0": [1, 2, 3]}', "[]", ""):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(damage)
+        forget()
+        assert code_of("smplxpp.core.labels") == before and len(file.read_text()) > 100
+    forget()
+    monkeypatch.setattr(code, "_parsed", lambda *text: pytest.fail("parsed again"))
+    assert code_of("smplxpp.core.labels") == before
+    forget()
+
+
 def test_an_unknown_module_is_an_error():
     with pytest.raises(ModuleNotFoundError, match="nonsense"):
         code_of("pipelines.nonsense")
