@@ -22,6 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jaxtyping
+import numpy as np
 
 PACKAGES = ("smplxpp", "avatar")
 _SHAPED = re.compile(r"\b(Float|Float16|Float32|Float64|Int|Int32|Int64|Integer|UInt8|Bool|Num|Shaped|Real)\d*\[")
@@ -50,24 +51,30 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
         raise TypeError(f"{function.__qualname__}: shapes of *{', '.join(open_ended)} cannot be checked")
     hints: dict[str, Any] = {}
     held: set[Any] = set()
+    slots = [(places.get(name, sys.maxsize), name) for name in shaped if name != "return"]
+    returns = "return" in shaped
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        if not hints:
-            hints.update({name: _resolved(text, function) for name, text in shaped.items()})
-        pairs = {}
-        for name, hint in hints.items():
-            if name == "return":
-                pairs[name] = (hint, result)
-            elif name in kwargs:
-                pairs[name] = (hint, kwargs[name])
-            elif places.get(name, len(args)) < len(args):
-                pairs[name] = (hint, args[places[name]])
-        _hold(function.__qualname__, pairs, held)
+        given = len(args)
+        values = [args[place] if place < given else kwargs.get(name, _ABSENT) for place, name in slots]
+        if returns:
+            values.append(result)
+        kinds = tuple(map(_kind, values))
+        if kinds not in held:
+            if not hints:
+                hints.update({name: _resolved(text, function) for name, text in shaped.items()})
+            names = [name for _, name in slots] + ["return"] * returns
+            _hold(function.__qualname__, {name: (hints[name], v) for name, v in zip(names, values, strict=True)})
+            held.add(kinds)
         return result
 
     return call
+
+
+_ABSENT = object()
+"""Stands for an argument that a call leaves to its default."""
 
 
 def _checked_dataclass(cls: type) -> None:
@@ -80,9 +87,13 @@ def _checked_dataclass(cls: type) -> None:
     @functools.wraps(made)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
         made(self, *args, **kwargs)
-        if not hints:
-            hints.update({name: _resolved(text, _declaring(cls, name)) for name, text in shaped.items()})
-        _hold(cls.__qualname__, {name: (hint, getattr(self, name)) for name, hint in hints.items()}, held)
+        values = [getattr(self, name) for name in shaped]
+        kinds = tuple(map(_kind, values))
+        if kinds not in held:
+            if not hints:
+                hints.update({name: _resolved(text, _declaring(cls, name)) for name, text in shaped.items()})
+            _hold(cls.__qualname__, {name: (hints[name], v) for name, v in zip(shaped, values, strict=True)})
+            held.add(kinds)
 
     cls.__init__ = init
 
@@ -106,25 +117,27 @@ def _resolved(text: str, owner: Any) -> Any:
             names[error.name] = Any  # a class that only type checkers see: not a shape
 
 
-def _hold(where: str, pairs: dict[str, tuple[Any, Any]], held: set[Any]) -> None:
-    """Raise where a value does not fit its hint; kinds of values that were `held` before fit as they did then."""
-    kinds = tuple((name, _kind(value)) for name, (_, value) in pairs.items())
-    if kinds in held:
-        return
+def _hold(where: str, pairs: dict[str, tuple[Any, Any]]) -> None:
+    """Raise where a value does not fit its hint."""
     with jaxtyping.jaxtyped("context"):
         for name, (hint, value) in pairs.items():
-            if not _fits(value, hint):
+            if value is not _ABSENT and not _fits(value, hint):
                 raise ContractError(f"{where}: {name} should be {hint}, is {_described(value)}")
-    held.add(kinds)
 
 
 def _kind(value: Any) -> Any:
-    """All of a value that decides whether it fits: its type, and the dtype and shape of arrays."""
+    """All of a value that decides whether it fits: its type, and the dtype and shape of arrays.
+
+    Values of the same kinds fit as those before them did, so that most calls are answered by one look into a set.
+    """
+    kind = type(value)
+    if kind is np.ndarray:
+        return kind, value.dtype, value.shape
     if isinstance(shape := getattr(value, "shape", None), tuple):  # not a body's shape
-        return type(value), getattr(value, "dtype", None), shape
+        return kind, getattr(value, "dtype", None), shape
     if isinstance(value, list | tuple):
-        return type(value), *map(_kind, value)
-    return (dict, *map(_kind, value.values())) if isinstance(value, dict) else type(value)
+        return kind, *map(_kind, value)
+    return (dict, *map(_kind, value.values())) if isinstance(value, dict) else kind
 
 
 def _fits(value: Any, hint: Any) -> bool:
