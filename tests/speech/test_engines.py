@@ -37,9 +37,9 @@ def test_a_voice_says_a_sentence_with_its_stresses(spoken):
     stressed = [one.name for one in spoken.speech.phonemes if one.stress == 1]
     assert stressed[:3] == ["IY", "IH", "EH"] and set(stressed) <= VOWELS
     assert 1.5 < spoken.speech.seconds < 5.0
-    again = PiperVoice(threads=1).say(TEXT, slower=1.5)
-    assert 1.3 < again.sound.seconds / spoken.sound.seconds < 1.7
-    np.testing.assert_array_equal(PiperVoice(threads=1).say(TEXT).sound.samples, spoken.sound.samples)
+    other = PiperVoice(threads=1)
+    assert 1.3 < other.say(TEXT, slower=1.5).sound.seconds / spoken.sound.seconds < 1.7
+    np.testing.assert_array_equal(other.say(TEXT).sound.samples, spoken.sound.samples)
 
 
 def test_the_voice_is_quiet_where_its_phonemes_say_so(spoken):
@@ -88,10 +88,10 @@ def test_lips_rest_in_a_pause_of_a_recording_with_noise(spoken, recogniser, snr)
     assert len(closures(found)) == len(truth) and np.abs(closures(found) - truth).mean() < 0.05
 
 
-def test_a_sound_of_the_voice_begins_with_the_pad_ahead_of_it(spoken):
+def test_a_sound_of_the_voice_begins_with_the_pad_ahead_of_it(voice):
     """Pads were given to the sound ahead of them: words began 75 ms behind their sound. Hisses have clear edges."""
     # Not the sentence's first sounds: a frame of the voice, 12 ms, more or less there hangs on the processor.
-    said = PiperVoice(threads=1).say("And she saw a ship, and I see a sofa.")
+    said = voice.say("And she saw a ship, and I see a sofa.")
     rate = said.sound.rate
     high = np.abs(np.diff(said.sound.samples, 3)).astype(np.float64)
     loud = np.convolve(high, np.ones(rate // 100) / (rate // 100), "same")
@@ -200,9 +200,9 @@ def test_tones_that_are_taken_for_noises_alone_are_no_speech(recogniser):
         align(Sound(np.clip(chord + noise, -1.0, 1.0).astype(np.float32), 16_000))
 
 
-def test_sounds_that_a_voice_does_not_have_are_refused(spoken):
+def test_sounds_that_a_voice_does_not_have_are_refused(voice):
     with pytest.raises(InputError, match="voice's language"):
-        PiperVoice(threads=1).read("¤ ¤")
+        voice.read("¤ ¤")
 
 
 def test_music_is_refused_or_heard_as_few_words(recogniser):
