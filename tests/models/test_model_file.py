@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -246,9 +247,42 @@ def content(path) -> tuple[dict, dict[str, torch.Tensor]]:
         return json.loads(file.metadata()[HEADER]), {name: file.get_tensor(name) for name in file.keys()}
 
 
-def written(path, about: object, tensors: dict[str, torch.Tensor]):
-    save_file(tensors, path, metadata={HEADER: json.dumps(about)})
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """A tensor as its file holds it: safetensors would turn hundreds of tensors into bytes for each of their faults."""
+
+    dtype: str
+    shape: list[int]
+    data: bytes
+
+
+DTYPES = {torch.float32: "F32", torch.float16: "F16", torch.int32: "I32", torch.int64: "I64", torch.bool: "BOOL"}
+
+
+def packed(value: torch.Tensor) -> Packed:
+    return Packed(DTYPES[value.dtype], list(value.shape), value.numpy().tobytes())
+
+
+def written(path, about: object, tensors: Mapping[str, torch.Tensor | Packed]):
+    """Write a file of safetensors: the length of a header in JSON, the header, all bytes."""
+    header, parts, end = {"__metadata__": {HEADER: json.dumps(about)}}, [], 0
+    for name, value in tensors.items():
+        one = packed(value) if isinstance(value, torch.Tensor) else value
+        begin, end = end, end + len(one.data)
+        header[name] = {"dtype": one.dtype, "shape": one.shape, "data_offsets": [begin, end]}
+        parts.append(one.data)
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    path.write_bytes(len(text).to_bytes(8, "little") + text + b"".join(parts))
     return path
+
+
+def test_a_file_that_a_test_writes_is_one_of_safetensors(rig, tmp_path):
+    save_avatar(tmp_path / "good", make("pruned", rig), compact=True)
+    about, tensors = content(written(tmp_path / "own", *content(tmp_path / "good")))
+    own, truth = content(tmp_path / "good")
+    assert about == own and tensors.keys() == truth.keys()
+    assert all(torch.equal(value, truth[name]) and value.dtype == truth[name].dtype for name, value in tensors.items())
 
 
 FULL = ("tracked", "centred", "student", "pruned")
@@ -264,10 +298,10 @@ def test_every_tensor_is_needed_in_its_shape_finite_and_of_its_kind(kind, compac
     monkeypatch.setattr(model_file, "Teacher", cache(model_file.Teacher))
     save_avatar(tmp_path / "good", make(kind, rig), compact=compact)
     about, tensors = content(tmp_path / "good")
-    path = tmp_path / "bad"
+    path, raw = tmp_path / "bad", {name: packed(value) for name, value in tensors.items()}
     for name, value in tensors.items():
         short = name.removeprefix("gaussians.")
-        without = {other: kept for other, kept in tensors.items() if other != name}
+        without = {other: kept for other, kept in raw.items() if other != name}
         if name != "track_controls":  # without it a teacher has no track
             with pytest.raises(InputError, match=rf"{short}.*received n[o]"):
                 load_avatar(written(path, about, without), rig)
@@ -276,13 +310,13 @@ def test_every_tensor_is_needed_in_its_shape_finite_and_of_its_kind(kind, compac
             spoilt = value.clone()
             spoilt.view(-1)[-1] = float("nan")
             with pytest.raises(InputError, match=rf"{short}: expected finite values, received NaN or infinity in 1 of"):
-                load_avatar(written(path, about, tensors | {name: spoilt}), rig)
+                load_avatar(written(path, about, raw | {name: spoilt}), rig)
             wrong.append(value.int())
         elif value.dtype != torch.bool:
             wrong.append(value.float())
         for other in wrong:
             with pytest.raises(InputError, match=short):
-                load_avatar(written(path, about, tensors | {name: other}), rig)
+                load_avatar(written(path, about, raw | {name: other}), rig)
 
 
 @pytest.mark.parametrize("kind", FULL)
@@ -293,13 +327,14 @@ def test_metadata_of_another_kind_is_refused_before_anything_is_made(kind, wrong
     """Or gives the same model, where the value says the same; a size that the tensors do not have takes no memory."""
     save_avatar(tmp_path / "good", make(kind, rig))
     about, tensors = content(tmp_path / "good")
+    raw = {name: packed(value) for name, value in tensors.items()}
     changed_abouts = [about | {name: wrong} for name in about]
     for name, value in about.items():
         if isinstance(value, dict):
             changed_abouts += [about | {name: value | {field: wrong}} for field in value]
     for changed_about in changed_abouts:
         try:
-            model = load_avatar(written(tmp_path / "bad", changed_about, tensors), rig)
+            model = load_avatar(written(tmp_path / "bad", changed_about, raw), rig)
         except InputError as error:
             assert str(tmp_path / "bad") in str(error)
             continue
