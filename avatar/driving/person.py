@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from avatar.runtime import AvatarBundle
+from avatar.runtime.bundle import AvatarBundle, read_motion
 from avatar.runtime.skeleton import clothed_template, skeleton_body
 from avatar.speech import Face, StandingBody
 from smplxpp.body.blendshapes import ARKIT
@@ -23,7 +23,7 @@ def person_of_bundle(bundle: AvatarBundle) -> tuple[Face, StandingBody]:
     """
     standing = StandingBody.of(
         Skeleton.of(skeleton_body(bundle)),
-        _with_expressions(_motion_of(bundle), len(bundle.about.expression_names)),
+        _with_expressions(read_motion(bundle), len(bundle.about.expression_names)),
         observed_poses=bundle.tensors.get("poses.known"),
         surface=bundle.tensors["surface.vertices"].astype(np.float64),
     )
@@ -39,7 +39,7 @@ def face_of_bundle(bundle: AvatarBundle) -> Face:
     about = bundle.about
     # Numbered expressions have no meaning by name: what they do to the surface is measured.
     body = None if set(ARKIT) & set(about.expression_names) else clothed_template(bundle)[0].body
-    return Face.of(about.expression_names, about.joint_names, _motion_of(bundle), body=body)
+    return Face.of(about.expression_names, about.joint_names, read_motion(bundle), body=body)
 
 
 def person_of_template(template: Template, seen: BodyParams | None = None) -> tuple[Face, StandingBody]:
@@ -57,13 +57,6 @@ def person_of_template(template: Template, seen: BodyParams | None = None) -> tu
     face = Face.of(body.expression_names, body.joint_names, seen, body=body)
     frames = _with_expressions(seen, body.num_expressions)
     return face, StandingBody.of(Skeleton.of(body, template.betas), frames, surface=template.vertices)
-
-
-def _motion_of(bundle: AvatarBundle) -> BodyParams | None:
-    if not bundle.motion:
-        return None
-    arrays = {name: np.asarray(value, np.float64) for name, value in bundle.motion.items()}
-    return BodyParams.from_mapping(arrays, source="motion of the bundle")
 
 
 def _with_expressions(seen: BodyParams | None, expressions: int) -> BodyParams:

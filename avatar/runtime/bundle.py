@@ -5,19 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avatar.runtime.layout import MAX_GAUSSIANS, NEEDED, PIECES, REMEDY, check_shapes, decode
-from smplxpp.body.layout import JOINT_NAMES
+from avatar.runtime.layout import NEEDED, PIECES, REMEDY, check_consistency, check_shapes, decode
+from smplxpp.body.layout import HAND_WIDTH, SMPL_JOINTS
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.errors import one_line
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, parse_json
 from smplxpp.core.files.package_file import read_package, write_package
 from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
+from smplxpp.core.params import ARRAY_NAMES
 
 FORMAT, VERSION = "smplxpp-avatar", 2
 """Version 2 added a regression for poses without a code."""
@@ -123,6 +124,41 @@ def motion_tensors(motion: BodyParams) -> dict[str, np.ndarray]:
     return {name: np.asarray(value, np.float32) for name, value in motion.without_shape().as_dict().items()}
 
 
+def read_motion(bundle: AvatarBundle, *, subject: str = "motion of the bundle") -> BodyParams | None:
+    """Return the motion in a bundle, checked against its body; None if there is none.
+
+    Raises:
+        InputError: unknown arrays, wrong shapes or rates, a body's shape, or expressions and components of a hand that
+            the body has not.
+    """
+    # Numbers of every type stand for themselves; the reader of parameters checks shapes, rate and size.
+    if not bundle.motion:
+        return None
+    unknown = set(bundle.motion) - {*ARRAY_NAMES, "fps", "flat_hand_mean"}
+    if unknown:
+        raise InputError(
+            subject, expected="arrays of body parameters", received=", ".join(sorted(unknown))[:200], remedy=REMEDY
+        )
+    numbers = {name: np.asarray(value, np.float64) for name, value in bundle.motion.items()}
+    motion = BodyParams.from_mapping({"expression": np.zeros(0), **numbers}, source=subject)
+
+    # A player has no shape of its own to change, and as many expressions and components of a hand as its skeleton.
+    def require(name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            received = f"shape {getattr(motion, name).shape}"
+            raise InputError(f"{subject}: {name}", expected=expected, received=received, remedy=REMEDY)
+
+    E = bundle.sizes["E"]
+    require("global_orient", len(motion) > 0, "frames")
+    require("betas", motion.betas.shape[1] == 0, "none: the shape is the avatar's")
+    require("expression", not motion.expression[:, E:].any(), f"zeros beyond the {E} expressions of the avatar")
+    for hand in ("left_hand", "right_hand") if bundle.sizes["J"] > len(SMPL_JOINTS) else ():
+        width, components = getattr(motion, f"{hand}_pose").shape[1], bundle.tensors.get(f"skeleton.{hand}_components")
+        fits = width == HAND_WIDTH or (components is not None and width <= len(components))
+        require(f"{hand}_pose", fits, f"{HAND_WIDTH} angles, or as many components as the avatar has")
+    return replace(motion, expression=motion.expression[:, :E])
+
+
 def _manifest(model: Mapping[str, Any], data: Mapping[str, bytes]) -> bytes:
     pieces = {
         file.split(".")[0]: {"file": file, "bytes": len(value), "sha256": hashlib.sha256(value).hexdigest()}
@@ -147,7 +183,7 @@ def load_bundle(path: str | Path) -> AvatarBundle:
     if _MANIFEST not in data:
         raise InputError(subject, expected=_EXPECTED, received=f"a zip without {_MANIFEST}", remedy=REMEDY)
     manifest = as_object(
-        parse_json(data.pop(_MANIFEST), subject=f"{subject}: manifest"), subject=f"{subject}: manifest"
+        parse_json(data.pop(_MANIFEST), subject=f"{subject}: manifest", strict=True), subject=f"{subject}: manifest"
     )
     _check_version(manifest, subject)
     raw = _checked_pieces(manifest, data, subject)
@@ -159,10 +195,12 @@ def load_bundle(path: str | Path) -> AvatarBundle:
         own = decode(raw.get(piece, ({}, {}))[0], piece, f"{subject}: {piece}")
         tensors |= {f"{piece}.{name}": value for name, value in own.items()}
     sizes = check_shapes(tensors, there, subject)
-    _check_consistency(about, tensors, sizes, subject)
-    # Garments and motion have checks of their own, in the modules that use them.
+    check_consistency(about, tensors, sizes, subject)
+    # A player checks garments, which it poses for that; a motion is checked here.
     garments, garments_about = raw.get(GARMENTS, ({}, {}))
-    return AvatarBundle(about, tensors, sizes, garments, garments_about, raw.get(MOTION, ({}, {}))[0])
+    bundle = AvatarBundle(about, tensors, sizes, garments, garments_about, raw.get(MOTION, ({}, {}))[0])
+    read_motion(bundle, subject=f"{subject}: motion")
+    return bundle
 
 
 def _check_version(manifest: Mapping[str, Any], subject: str) -> None:
@@ -245,98 +283,3 @@ def _about(stored: Mapping[str, Any], subject: str) -> AboutAvatar:
         eps2d=as_number(stored.get("eps2d"), subject=f"{subject}: eps2d", least=0.0, most=100.0),
         reductions=notes("reductions"),
     )
-
-
-def _check_consistency(
-    about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], subject: str
-) -> None:
-    """Check the values of tensors, and their agreement with the description, where shapes do not suffice."""
-
-    def require(condition: bool, what: str, expected: str, received: object) -> None:
-        if not condition:
-            raise InputError(f"{subject}: {what}", expected=expected, received=str(received)[:200], remedy=REMEDY)
-
-    # Skeleton, then Gaussians, surface, field, regression and blend shapes.
-    parents, faces, count = tensors["skeleton.parents"], tensors["gaussians.per_face"], sizes["N"]
-    require(sizes["J"] in JOINT_NAMES, "joints", f"{' or '.join(map(str, JOINT_NAMES))} of them", sizes["J"])
-    # Forward kinematics goes through the joints once, and needs each parent before its children.
-    ordered = parents[0] == -1 and bool((parents[1:] >= 0).all() and (parents[1:] < np.arange(1, sizes["J"])).all())
-    require(ordered, "skeleton.parents", "the root first, every parent before its children", parents.tolist())
-    for what, names, letter in (
-        ("joint_names", about.joint_names, "J"),
-        ("expression_names", about.expression_names, "E"),
-    ):
-        require(len(names) == sizes[letter], what, f"{sizes[letter]} names", len(names))
-    require(0 < count <= MAX_GAUSSIANS, "gaussians", f"1 to {MAX_GAUSSIANS}", count)
-    require(
-        bool((faces >= 0).all()) and int(faces.sum()) == count, "gaussians.per_face", f"counts of {count}", "others"
-    )
-    # Spherical harmonics of degree 1 to d have (d + 1)^2 - 1 coefficients.
-    require(sizes["K"] in (0, 3, 8, 15), "gaussians.sh", "0, 3, 8 or 15 coefficients", sizes["K"])
-    require(
-        bool((np.square(tensors["gaussians.quats"]).sum(1) > 1e-6).all()), "gaussians.quats", "lengths above 0", "0"
-    )
-    # Weights are stored in 16 bits, and may miss a sum of 1 by rounding.
-    opacity, weights = tensors["gaussians.opacities"], tensors["surface.joint_weights"]
-    require(bool((opacity >= 0).all() and (opacity <= 1).all()), "gaussians.opacities", "values in [0, 1]", "others")
-    sums = weights.sum(1)
-    positive = bool((weights >= 0).all() and (np.abs(sums - 1.0) < 0.01).all())
-    require(positive, "surface.joint_weights", "rows that sum to 1", "others")
-    for name, most in (("parts", len(about.part_names)), ("labels", 256), ("colors", 256)):
-        value = tensors[f"surface.{name}"]
-        require(
-            not value.size or (value.min() >= 0 and value.max() < most),
-            f"surface.{name}",
-            f"values in [0, {most})",
-            "others",
-        )
-    # The skin's vertices come first, since expressions and pose correctives index them alone.
-    body_first = bool((np.diff(tensors["surface.parts"]) >= 0).all())
-    require(body_first, "surface.parts", "the parts one after the other", "another order")
-    if "P" in sizes:
-        require(sizes["P"] == 9 * (sizes["J"] - 1), "surface.pose", f"{9 * (sizes['J'] - 1)} directions", sizes["P"])
-    # A positional encoding has 3 + 6 L numbers: the point, and L sines and cosines of three coordinates.
-    if "field.points" in tensors:
-        bands, inputs = sizes["X"] - 3, 63 + sizes["Z"]
-        require(bands % 6 == 0 and 0 <= bands <= 96, "field", "bands of sines and cosines", f"{bands} inputs")
-        require(sizes["Y"] == inputs, "field of_frame", f"{inputs} inputs", sizes["Y"])
-        require(sizes["T"] == len(about.frames) > 0, "field.codes", f"{len(about.frames)} codes", sizes["T"])
-    # Angles are clamped to [low, high], which has to be an interval.
-    if "regression.level" in tensors:
-        require("field.points" in tensors, "regression", "a field whose points it moves", "none")
-        low, high = tensors["regression.low"], tensors["regression.high"]
-        require(bool((low <= high).all()), "regression.low", "at most `high`", "more")
-    if "blend.head.values" in tensors:
-        _check_blend(about, tensors, sizes, require)
-
-
-def _check_blend(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], require: Any) -> None:
-    # The head is driven by the expression, or by it and the jaw's three angles; the body by 63 pose angles.
-    part = tensors.get("blend.part")
-    parts = 1 if part is None else int(part.max()) + 1
-    require(part is None or part.min() >= 0, "blend.part", "no negative number", "one")
-    inputs = {"head": None if about.jaw else sizes["head_i"], "body": 63}
-    if about.jaw:
-        inputs["head"] = max(sizes["head_i"], 4)
-    for side in ("head", "body"):
-        shapes, rows = sizes[f"{side}_n"], tensors.get(f"blend.{side}.rows")
-        outputs, values = sizes[f"{side}_o"], tensors[f"blend.{side}.values"]
-        # The network gives all shapes' coefficients for each part, one part after the other.
-        fits = outputs % max(shapes, 1) == 0 and outputs >= parts * shapes
-        require(fits, f"blend.{side}", f"{parts} x {shapes} coefficients", outputs)
-        require(sizes[f"{side}_i"] == inputs[side], f"blend.{side}", f"{inputs[side]} inputs", sizes[f"{side}_i"])
-        if rows is None:
-            require(sizes[f"{side}_m"] == sizes["N"], f"blend.{side}", f"{sizes['N']} rows", sizes[f"{side}_m"])
-        else:
-            require(bool((np.diff(rows) > 0).all()), f"blend.{side}.rows", "increasing numbers", "others")
-        # Integers need steps to become numbers again; an exponent
-        # of at most 24 keeps 127 * 2^24 steps well within float32.
-        steps = tensors.get(f"blend.{side}.step")
-        require((values.dtype == np.int8) == (steps is not None), f"blend.{side}.step", "steps of integers", "others")
-        exponents = tensors.get(f"blend.{side}.exponent")
-        require(
-            exponents is None or bool(((exponents >= 0) & (exponents <= 24)).all()),
-            f"blend.{side}.exponent",
-            "0 to 24",
-            "others",
-        )

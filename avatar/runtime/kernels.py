@@ -283,4 +283,4 @@ def in_lanes(rows: Float32[np.ndarray, "C W"]) -> Float32[np.ndarray, "b W 16"]:
     blocks = -(-len(rows) // LANES)
     padded = np.zeros((blocks * LANES, rows.shape[1]), np.float32)
     padded[: len(rows)] = rows
-    return np.ascontiguousarray(padded.reshape(blocks, LANES, -1).transpose(0, 2, 1))
+    return np.ascontiguousarray(padded.reshape(blocks, LANES, rows.shape[1]).transpose(0, 2, 1))

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core.errors import InputError
+from smplxpp.core.labels import LABELS
+from smplxpp.core.params import LARGEST_PARAMETER
+
+if TYPE_CHECKING:
+    from avatar.runtime.bundle import AboutAvatar
 
 REMEDY = "export the avatar again with `smplxpp export RUN --out NAME.avatar`"
 
@@ -194,6 +201,118 @@ def check_shapes(tensors: Mapping[str, np.ndarray], pieces: tuple[str, ...], sub
     return sizes
 
 
+def check_consistency(
+    about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], subject: str
+) -> None:
+    """Check the values of tensors, and their agreement with the description, where shapes do not suffice.
+
+    Raises:
+        InputError: a value out of bounds, or one that contradicts another.
+    """
+
+    def require(condition: bool, what: str, expected: str, received: object) -> None:
+        if not condition:
+            raise InputError(f"{subject}: {what}", expected=expected, received=str(received)[:200], remedy=REMEDY)
+
+    # Skeleton, then Gaussians, surface, field, regression and blend shapes.
+    parents, faces, count = tensors["skeleton.parents"], tensors["gaussians.per_face"], sizes["N"]
+    require(sizes["J"] in JOINT_NAMES, "joints", f"{' or '.join(map(str, JOINT_NAMES))} of them", sizes["J"])
+    for place in ("skeleton.joints", "surface.vertices"):
+        near = bool((np.abs(tensors[place]) <= LARGEST_PARAMETER).all())
+        require(near, place, f"metres up to {LARGEST_PARAMETER:g}", "others")
+    # Forward kinematics goes through the joints once, and needs each parent before its children.
+    ordered = parents[0] == -1 and bool((parents[1:] >= 0).all() and (parents[1:] < np.arange(1, sizes["J"])).all())
+    require(ordered, "skeleton.parents", "the root first, every parent before its children", parents.tolist())
+    for what, names, letter in (
+        ("joint_names", about.joint_names, "J"),
+        ("expression_names", about.expression_names, "E"),
+    ):
+        require(len(names) == sizes[letter], what, f"{sizes[letter]} names", len(names))
+    require(0 < count <= MAX_GAUSSIANS, "gaussians", f"1 to {MAX_GAUSSIANS}", count)
+    require(
+        bool((faces >= 0).all()) and int(faces.sum()) == count, "gaussians.per_face", f"counts of {count}", "others"
+    )
+    # Spherical harmonics of degree 1 to d have (d + 1)^2 - 1 coefficients.
+    require(sizes["K"] in (0, 3, 8, 15), "gaussians.sh", "0, 3, 8 or 15 coefficients", sizes["K"])
+    # Rotations are normalised, for which a length needs a square in float32.
+    lengths = np.sqrt(np.square(tensors["gaussians.quats"], dtype=np.float64).sum(1))
+    usable = bool(((lengths > 1e-3) & (lengths < 1e3)).all())
+    require(usable, "gaussians.quats", "lengths from 0.001 to 1000", "others")
+    # Weights are stored in 16 bits, and may miss a sum of 1 by rounding.
+    opacity, weights = tensors["gaussians.opacities"], tensors["surface.joint_weights"]
+    require(bool((opacity >= 0).all() and (opacity <= 1).all()), "gaussians.opacities", "values in [0, 1]", "others")
+    sums = weights.sum(1)
+    positive = bool((weights >= 0).all() and (np.abs(sums - 1.0) < 0.01).all())
+    require(positive, "surface.joint_weights", "rows that sum to 1", "others")
+    for name, most in (("parts", len(about.part_names)), ("labels", len(LABELS.items)), ("colors", 256)):
+        value = tensors[f"surface.{name}"]
+        require(
+            not value.size or (value.min() >= 0 and value.max() < most),
+            f"surface.{name}",
+            f"values in [0, {most})",
+            "others",
+        )
+    # The skin's vertices come first, since expressions and pose correctives index them alone.
+    body_first = bool((np.diff(tensors["surface.parts"]) >= 0).all())
+    require(body_first, "surface.parts", "the parts one after the other", "another order")
+    skin = int((tensors["surface.parts"] == 0).sum())
+    for basis in ("expression_rows", "pose_rows"):
+        rows = tensors.get(f"surface.{basis}", np.empty(0, np.int32))
+        indexes_skin = bool((np.diff(rows) > 0).all()) and rows.max(initial=-1) < skin
+        require(indexes_skin, f"surface.{basis}", f"increasing indices below {skin}", "others")
+    both = "surface.pose" in tensors, "surface.pose_rows" in tensors
+    require(both[0] == both[1], "surface.pose", "correctives with their vertices, or neither", "one of the two")
+    if "P" in sizes:
+        require(sizes["P"] == 9 * (sizes["J"] - 1), "surface.pose", f"{9 * (sizes['J'] - 1)} directions", sizes["P"])
+    # A positional encoding has 3 + 6 L numbers: the point, and L sines and cosines of three coordinates.
+    if "field.points" in tensors:
+        bands, inputs = sizes["X"] - 3, 63 + sizes["Z"]
+        require(bands % 6 == 0 and 0 <= bands <= 96, "field", "bands of sines and cosines", f"{bands} inputs")
+        require(sizes["Y"] == inputs, "field of_frame", f"{inputs} inputs", sizes["Y"])
+        require(sizes["T"] == len(about.frames) > 0, "field.codes", f"{len(about.frames)} codes", sizes["T"])
+    # Angles are clamped to [low, high], which has to be an interval.
+    if "regression.level" in tensors:
+        require("field.points" in tensors, "regression", "a field whose points it moves", "none")
+        low, high = tensors["regression.low"], tensors["regression.high"]
+        require(bool((low <= high).all()), "regression.low", "at most `high`", "more")
+    if "poses.known" in tensors:
+        scale, known = tensors["poses.scale"], tensors["poses.known"]
+        usable = float(scale) > 0.0 and len(known) > 0 and bool((np.abs(known) <= LARGEST_PARAMETER).all())
+        require(usable, "poses", f"poses of at most {LARGEST_PARAMETER:g}, a scale above 0", "others")
+    if "blend.head.values" in tensors:
+        _check_blend(about, tensors, sizes, require)
+
+
+def _check_blend(about: AboutAvatar, tensors: Mapping[str, np.ndarray], sizes: Mapping[str, int], require: Any) -> None:
+    # The head is driven by the expression, or by it and the jaw's three angles; the body by 63 pose angles.
+    part = tensors.get("blend.part")
+    parts = 1 if part is None else int(part.max()) + 1
+    require(part is None or part.min() >= 0, "blend.part", "no negative number", "one")
+    inputs = {"head": sizes["E"] + 3 * about.jaw, "body": 63}
+    for side in ("head", "body"):
+        shapes, rows = sizes[f"{side}_n"], tensors.get(f"blend.{side}.rows")
+        outputs, values = sizes[f"{side}_o"], tensors[f"blend.{side}.values"]
+        # The network gives all shapes' coefficients for each part, one part after the other.
+        fits = outputs % max(shapes, 1) == 0 and outputs >= parts * shapes
+        require(fits, f"blend.{side}", f"{parts} x {shapes} coefficients", outputs)
+        require(sizes[f"{side}_i"] == inputs[side], f"blend.{side}", f"{inputs[side]} inputs", sizes[f"{side}_i"])
+        if rows is None:
+            require(sizes[f"{side}_m"] == sizes["N"], f"blend.{side}", f"{sizes['N']} rows", sizes[f"{side}_m"])
+        else:
+            require(bool((np.diff(rows) > 0).all()), f"blend.{side}.rows", "increasing numbers", "others")
+        # Integers need steps to become numbers again; an exponent
+        # of at most 24 keeps 127 * 2^24 steps well within float32.
+        steps = tensors.get(f"blend.{side}.step")
+        require((values.dtype == np.int8) == (steps is not None), f"blend.{side}.step", "steps of integers", "others")
+        exponents = tensors.get(f"blend.{side}.exponent")
+        require(
+            exponents is None or bool(((exponents >= 0) & (exponents <= 24)).all()),
+            f"blend.{side}.exponent",
+            "0 to 24",
+            "others",
+        )
+
+
 def _indices(value: np.ndarray, subject: str) -> np.ndarray:
     # The native kernels take 32-bit indices; a larger one would wrap round.
     out = value.astype(np.int32)
@@ -204,7 +323,8 @@ def _indices(value: np.ndarray, subject: str) -> np.ndarray:
 
 def _floats(value: np.ndarray, step: np.ndarray | None, start: np.ndarray | None, subject: str) -> np.ndarray:
     # A quantised float is q step + start, with one step and start for all, or one for each entry of the last axes.
-    out = value.astype(np.float32)
+    with np.errstate(over="ignore"):
+        out = value.astype(np.float32)
     for word, other in (("step", step), ("start", start)):
         if other is None:
             continue

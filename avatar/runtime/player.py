@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from avatar.runtime.bundle import AvatarBundle, load_bundle
+from avatar.runtime.bundle import AvatarBundle, load_bundle, read_motion
 from avatar.runtime.kernels import SurfaceKernel, WorldKernel, add_basis, joint_transforms
 from avatar.runtime.networks import BlendShapes, DisplacementField
 from avatar.runtime.skeleton import LooseClothes, skeleton_body
@@ -111,10 +111,7 @@ class AvatarPlayer:
     @property
     def motion(self) -> BodyParams | None:
         """The motion stored in the bundle; None if there is none."""
-        if not self.bundle.motion:
-            return None
-        arrays = {name: np.asarray(value, np.float64) for name, value in self.bundle.motion.items()}
-        return BodyParams.from_mapping(arrays, source="motion of the bundle")
+        return read_motion(self.bundle)
 
     @property
     def has_clothes(self) -> bool:

@@ -16,6 +16,7 @@ from smplxpp.cloth.garment import Garment, GarmentConfig
 from smplxpp.cloth.model import Fabric
 from smplxpp.core import BodyParams, InputError, TriangleMesh, row_lengths
 from smplxpp.core.files import as_list, as_number, as_object, as_text, parse_json, read_arrays, write_arrays
+from smplxpp.core.params import ARRAY_NAMES
 from smplxpp.template.template import Template
 
 SCHEMA = 1
@@ -103,6 +104,13 @@ def garments_from_arrays(
             subject, expected=f"version {SCHEMA} or older", received=f"version {schema:g}", remedy="update smplxpp"
         )
     rows = as_list(about.get("garments"), subject=f"{subject}: garments")
+    # An array without a meaning may have one in a newer version.
+    own = (*_ARRAYS, *(f"params.{name}" for name in (*ARRAY_NAMES, "fps", "flat_hand_mean", "v_shape")))
+    unknown = set(arrays) - {_ABOUT} - {f"{k}.{name}" for k in range(len(rows)) for name in own}
+    if unknown:
+        raise InputError(
+            subject, expected=f"arrays of {len(rows)} garments", received=min(unknown)[:80], remedy=_REMEDY
+        )
     return [
         _garment(arrays, k, as_object(row, subject=subject), template, f"{subject}: garment {k}")
         for k, row in enumerate(rows)
@@ -167,8 +175,8 @@ def _checked(found: Mapping[str, np.ndarray | None], template: Template, subject
                     f"{subject}: {name}", expected=f"shape ({shape})", received=f"{value.shape}", remedy=_REMEDY
                 )
         # Depth is infinite without a path to an attachment.
-        if value.dtype.kind == "f" and np.isnan(value).any():
-            raise InputError(f"{subject}: {name}", expected="numbers", received="NaN", remedy=_REMEDY)
+        if name.endswith("depth") and not (value >= 0).all():
+            raise InputError(f"{subject}: {name}", expected="metres from 0 on", received="others", remedy=_REMEDY)
         if value.dtype.kind == "f" and not name.endswith("depth") and not np.isfinite(value).all():
             raise InputError(f"{subject}: {name}", expected="finite numbers", received="infinity", remedy=_REMEDY)
         out[name] = value

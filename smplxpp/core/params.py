@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from jaxtyping import Float, Float64
 
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.core.files.atomic import atomic_path
+from smplxpp.core.files.json_file import as_number
 
 # Pose blocks in SMPL-X joint order, with their number of joints.
 POSE_BLOCKS: tuple[tuple[str, int], ...] = (
@@ -30,7 +32,7 @@ DEFAULT_FPS = 30.0
 the one that all exports had before there was one default. Files that state a rate keep theirs."""
 # Upper bound of the absolute value of radians, metres and coefficients. No valid file is near it, and squares of much
 # larger numbers overflow in float32.
-_LARGEST = 1e6
+LARGEST_PARAMETER = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +98,11 @@ class BodyParams:
                 value = np.repeat(value, frames, axis=0)
             if value.shape[0] != frames:
                 raise InputError(f"parameter {name}", expected=f"{frames} frames", received=f"{value.shape[0]} frames")
-            bad = ~(np.abs(value) <= _LARGEST).all(axis=1)
+            bad = ~(np.abs(value) <= LARGEST_PARAMETER).all(axis=1)
             if bad.any():
                 raise InputError(
                     f"parameter {name}",
-                    expected=f"finite values up to {_LARGEST:g}",
+                    expected=f"finite values up to {LARGEST_PARAMETER:g}",
                     received=f"others or NaN in {int(bad.sum())} frames, first in frame {int(np.argmax(bad))}",
                 )
             value.setflags(write=False)
@@ -257,8 +259,11 @@ class BodyParams:
             )
         zeros = _zero_pose() | {"expression": np.zeros(10)}
         arrays = zeros | {name: values[name] for name in (*ARRAY_NAMES, "v_shape") if name in values}
-        fps = float(values["fps"]) if "fps" in values else None
-        return _from_arrays(arrays, fps=fps, flat_hand_mean=bool(values.get("flat_hand_mean", False)))
+        fps = _single(values["fps"], source, "fps", least=0.0) if "fps" in values else None
+        if fps == 0.0:
+            raise InputError(f"{source}: fps", expected="a number above 0", received="0")
+        flat = _single(values.get("flat_hand_mean", False), source, "flat_hand_mean", least=0.0, most=1.0)
+        return _from_arrays(arrays, fps=fps, flat_hand_mean=bool(flat))
 
     def save(self, path: str | Path) -> None:
         """Write our npz layout (SMPL-X names, stacked frames), whole or not at all."""
@@ -295,6 +300,14 @@ def _zero_pose() -> dict[str, np.ndarray]:
     return {name: np.zeros(3 * joints) for name, joints in POSE_BLOCKS}
 
 
+def _single(value: object, source: str, name: str, *, least: float, most: float = math.inf) -> float:
+    """Return the only number of an array, of any type and shape."""
+    array = np.asarray(value)
+    number = array.reshape(-1)[0].item() if array.size == 1 and array.dtype.kind in "biuf" else value
+    subject = f"{source}: {name}"
+    return as_number(int(number) if isinstance(number, bool) else number, subject=subject, least=least, most=most)
+
+
 def _numbers(name: str, value: object) -> np.ndarray:
     """Return a (T, width) float64 copy of an array or a row."""
     try:
@@ -315,8 +328,8 @@ def _vertex_offsets(value: object, frames: int) -> np.ndarray:
         raise InputError(
             subject, expected=f"shape (V, 3), (1, V, 3) or ({frames}, V, 3)", received=f"shape {offsets.shape}"
         )
-    if not (np.abs(offsets) <= _LARGEST).all():
-        raise InputError(subject, expected=f"finite values up to {_LARGEST:g}", received="others or NaN")
+    if not (np.abs(offsets) <= LARGEST_PARAMETER).all():
+        raise InputError(subject, expected=f"finite values up to {LARGEST_PARAMETER:g}", received="others or NaN")
     offsets.setflags(write=False)
     return offsets
 

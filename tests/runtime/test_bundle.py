@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import zipfile
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,11 @@ import pytest
 
 from avatar.runtime import AvatarPlayer, load_bundle
 from avatar.runtime.bundle import VERSION
+from smplxpp.core import BodyParams
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.tensor_bytes import pack_tensors, unpack_tensors
-from tests.runtime.bundles import EXACT, student, write, write_dressed
+from tests.runtime.bundles import EXACT, student, tampered, write, write_dressed
+from tests.web.modules import TOOLS, node
 
 
 @pytest.fixture(scope="module")
@@ -208,3 +212,45 @@ def test_garments_of_another_avatar_are_refused(tmp_path):
 
     with pytest.raises(InputError, match="garments of the avatar"):
         AvatarPlayer(rewritten(tmp_path / "a.avatar", _with(tmp_path / "me.avatar", "garments", moved)))
+
+
+def _played(path: Path) -> bool:
+    """Whether a player takes a bundle, with its clothes and its motion; anything but an `InputError` is a fault."""
+    try:
+        player = AvatarPlayer(path, threads=1)
+    except InputError:
+        return False
+    return bool(player.pose(BodyParams.rest(betas=0) if player.motion is None else player.motion.frame(0)))
+
+
+_IN_THE_PAGE = """
+const result = {};
+for (const name of given.names) {
+  try {
+    const avatar = await read(`${given.folder}/${name}`), deformer = new m.Deformer(avatar, undefined, new m.Native(1));
+    if (avatar.garments.length) new m.ClothDriver(deformer, avatar.garments);
+    const rest = m.restPose(avatar.skeleton.names.length, avatar.expressionNames.length);
+    deformer.pose(avatar.motion ? m.poseAt(avatar.motion, 0) : rest);
+    deformer.native.close();
+    result[name] = true;
+  } catch (error) {
+    if (!(error instanceof m.BundleError)) throw new Error(`${name}: ${error.stack}`);
+    result[name] = false;
+  }
+}"""
+
+
+def test_both_players_take_and_refuse_the_same_bundles(good, tmp_path):
+    """The page played 67 of 154 bundles that the runtime refuses: names of joints, versions, holes, float indices."""
+    write_dressed(tmp_path)
+    # One of twelve faults, others of each bundle: the tests of one fault each are above.
+    bundles = [*islice(tampered(good), 0, None, 12), *islice(tampered(tmp_path / "me.avatar"), 5, None, 12)]
+    names = {f"{k}.avatar": fault for k, (fault, _) in enumerate(bundles)}
+    for name, (_, data) in zip(names, bundles, strict=True):
+        (tmp_path / name).write_bytes(data)
+    here = {name: _played(tmp_path / name) for name in names}
+    assert here["0.avatar"] and 0.6 * len(here) < list(here.values()).count(False) < len(here)
+    if shutil.which("node") is None or not (TOOLS / "esbuild").exists():
+        pytest.skip("no node with web/'s tools: npm ci in web/")
+    page = node(_IN_THE_PAGE, given={"folder": str(tmp_path), "names": list(names)})
+    assert [names[name] for name in names if page[name] != here[name]] == []

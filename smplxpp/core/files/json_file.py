@@ -34,8 +34,14 @@ def read_json(path: str | Path, *, subject: str = "file", remedy: str = "") -> A
     return parse_json(data, subject=f"{subject} {path}", remedy=remedy)
 
 
-def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
+def parse_json(data: bytes | str, *, subject: str, remedy: str = "", strict: bool = False) -> Any:
     """Parse a JSON text into dictionaries, lists, texts and numbers.
+
+    Args:
+        data: the text.
+        subject: what it is called in messages.
+        remedy: advice in messages.
+        strict: take what RFC 8259 has and browsers read: UTF-8 without a mark, no NaN and no infinity.
 
     Raises:
         InputError: broken JSON, more than 64 levels, integers of more than 18 digits, or texts with a NUL or half a
@@ -43,7 +49,8 @@ def parse_json(data: bytes | str, *, subject: str, remedy: str = "") -> Any:
     """
     # Integers are bounded while they are parsed: the conversion of long digits takes quadratic time.
     try:
-        value = json.loads(data, parse_int=_integer)
+        text = data.decode() if strict and isinstance(data, bytes) else data
+        value = json.loads(text, parse_int=_integer, parse_constant=_no_number if strict else None)
     except RecursionError:
         raise InputError(
             subject, expected=f"JSON of at most {_MAX_LEVELS} levels", received="more", remedy=remedy
@@ -156,6 +163,10 @@ def _integer(digits: str) -> int:
     if len(digits) > 19:  # digits of 2^63 with a sign
         raise ValueError(f"an integer of {len(digits)} digits")
     return int(digits)
+
+
+def _no_number(word: str) -> None:
+    raise ValueError(f"{word}, which is no number")
 
 
 def _levels(value: Any) -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -58,6 +59,7 @@ def read_package(path: str | Path, *, subject: str, expected: str, remedy: str =
         packed = path.stat().st_size
         with zipfile.ZipFile(path) as package:
             entries = package.infolist()
+            _check_frame(path, entries, about, expected, remedy)
             _check(entries, packed, about, remedy)
             # Sizes in the directory were checked; each entry is read to no more than its own.
             return {entry.filename: _unpacked(package, entry) for entry in entries}
@@ -70,6 +72,20 @@ def read_package(path: str | Path, *, subject: str, expected: str, remedy: str =
     except DAMAGED as error:
         received = f"{type(error).__name__}: {str(error)[:200]}"
         raise InputError(about, expected=expected, received=received, remedy=remedy) from None
+
+
+def _check_frame(path: Path, entries: list[zipfile.ZipInfo], subject: str, expected: str, remedy: str) -> None:
+    """Refuse bytes before the first entry, behind the directory, and between the two: readers disagree on them."""
+    # The last 22 bytes are the end record: signature, two numbers of disks, entries here and in all, size and offset of
+    # the directory, length of a comment.
+    with open(path, "rb") as stream:
+        size = stream.seek(0, 2)
+        stream.seek(size - 22)
+        signature, *_, count, directory, offset, comment = struct.unpack("<4s4H2IH", stream.read(22))
+    first = min((entry.header_offset for entry in entries), default=0)
+    whole = signature == b"PK\5\6" and comment == 0 and offset + directory == size - 22 and count == len(entries)
+    if not whole or first or any(entry.extra for entry in entries):
+        raise InputError(subject, expected=expected, received="a zip with other bytes about its pieces", remedy=remedy)
 
 
 def _check(entries: list[zipfile.ZipInfo], packed: int, subject: str, remedy: str) -> None:
@@ -90,7 +106,8 @@ def _check(entries: list[zipfile.ZipInfo], packed: int, subject: str, remedy: st
         )
     for entry in entries:
         # Bit 0 of the flags marks an encrypted entry.
-        if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        plain = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
+        if entry.flag_bits & 1 or not (plain or entry.compress_type == zipfile.ZIP_DEFLATED):
             raise InputError(
                 f"{subject}: {entry.filename}", expected="a piece stored or deflated", received="another", remedy=remedy
             )

@@ -70,7 +70,7 @@ def unpack_tensors(data: bytes, *, subject: str, remedy: str = "") -> tuple[dict
         raise InputError(
             subject, expected="tensors behind a header", received=f"{len(data)} bytes of something else", remedy=remedy
         )
-    header = as_object(parse_json(data[8 : 8 + length], subject=subject, remedy=remedy), subject=subject)
+    header = as_object(parse_json(data[8 : 8 + length], subject=subject, remedy=remedy, strict=True), subject=subject)
     metadata = as_object(header.pop(_METADATA, {}), subject=f"{subject}: metadata")
     body, out, spans = memoryview(data)[8 + length :], {}, []
     for name, entry in header.items():
@@ -88,7 +88,7 @@ def unpack_tensors(data: bytes, *, subject: str, remedy: str = "") -> tuple[dict
     if "about" not in metadata:
         return out, {}
     text = as_text(metadata["about"], subject=f"{subject}: metadata")
-    return out, as_object(parse_json(text, subject=f"{subject}: metadata"), subject=f"{subject}: metadata")
+    return out, as_object(parse_json(text, subject=f"{subject}: metadata", strict=True), subject=f"{subject}: metadata")
 
 
 def _tensor(

@@ -4,6 +4,7 @@ import type { Avatar } from "../avatar/avatar.ts";
 import { poseAt } from "../avatar/motion.ts";
 import { edgesOf, type Fabric, type Garment } from "../cloth/garment.ts";
 import { BundleError, EXPORT_AGAIN } from "./errors.ts";
+import { asList, asNumber, asObject, asText } from "./json.ts";
 import type { Tensors } from "./layout.ts";
 import { readMotion } from "./motion.ts";
 import type { Tensor } from "./tensors.ts";
@@ -15,45 +16,63 @@ const ARRAYS: Record<string, string> = {
   corners: "N 3 <n", weights: "N 3", offset: "N 3", collider_vertices: "c <V", collider_faces: "d 3 <c", collider_margin: "c",
   collider_deepest: "c",
 };
-const FABRIC: Record<keyof Fabric, number> = {
-  density: 1e-9, stretch_stiffness: 1e-9, compression: 1e-9, bend_stiffness: 0, slack: 0, drag: 0, normal_drag: 0, inner_friction: 0,
-  friction: 0,
+/** Their kinds: indices of vertices are integers of any kind, doubles were narrowed or not. */
+const WHOLE = ["I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8"], WIDE = ["F32", "F64"];
+const DTYPES: Record<string, string[]> = {
+  particles: WHOLE, rest_vertices: WIDE, rest_faces: ["I64"], lengths: WIDE, depth: WIDE, vertices: WHOLE, vertex_depth: WIDE,
+  corners: ["I32"], weights: ["F32"], offset: ["F32"], collider_vertices: WHOLE, collider_faces: ["I32"], collider_margin: ["F32"],
+  collider_deepest: ["F32"],
 };
+/** Numbers of a fabric and of a garment, and whether 0 is one of them. */
+const FABRIC: Record<keyof Fabric, boolean> = {
+  density: false, stretch_stiffness: false, compression: false, bend_stiffness: true, slack: true, drag: true, normal_drag: true,
+  inner_friction: true, friction: true,
+};
+const CONFIG = { spacing: false, collider_spacing: false, pin_depth: false, band: false, skin_margin: true, sheet_margin: true };
+const MOST = 1e9;
 
 /**
  * Reads them. @param about what the piece says of itself.
  *
  * @throws BundleError of a newer version, or arrays that do not fit.
  */
-export function readGarments(piece: Map<string, Tensor>, about: unknown, avatar: Avatar, tensors: Tensors): Garment[] {
-  const { schema, garments } = (about ?? {}) as { schema?: unknown; garments?: unknown };
-  if (typeof schema !== "number" || !Array.isArray(garments)) throw wrong("garments", "a list and its version", "another thing");
+export function readGarments(piece: Map<string, Tensor>, about: Record<string, unknown>, avatar: Avatar, tensors: Tensors): Garment[] {
+  const schema = asNumber(about.schema, "garments: schema", 1, Infinity), rows = asList(about.garments, "garments");
   if (schema > SCHEMA) {
     throw new BundleError("garments of the avatar", `version ${SCHEMA} or older`, `version ${schema}`,
       "open it with the player of the smplxpp that wrote it");
   }
-  return garments.map((row, k) => garment(piece, k, row ?? {}, avatar, tensors));
+  const own = /^(\d+)\.(?:params\.)?(\w+)$/;
+  for (const name of piece.keys()) {
+    const [, k, array] = own.exec(name) ?? [];
+    const known = name.includes(".params.") || Object.hasOwn(ARRAYS, array ?? "");
+    if (!known || String(Number(k)) !== k || Number(k) >= rows.length) throw wrong("garments", "the arrays of their version", name.slice(0, 80));
+  }
+  return rows.map((row, k) => garment(piece, k, asObject(row, `garment ${k}`), avatar, tensors));
 }
 
 function garment(piece: Map<string, Tensor>, k: number, about: Record<string, unknown>, avatar: Avatar, tensors: Tensors): Garment {
-  const own = checked(piece, k, avatar.mesh.vertices.length / 3), config = (about.config ?? {}) as Record<string, unknown>;
-  const number = (from: Record<string, unknown>, name: string, least: number) => {
-    const value = from[name];
-    if (typeof value !== "number" || !(value >= least && value < 1e9)) throw wrong(`garment ${k}: ${name}`, "a number", String(value));
-    return value;
-  };
-  const fabric = (config.fabric ?? {}) as Record<string, unknown>, prefix = `${k}.params.`;
+  const own = checked(piece, k, avatar.mesh.vertices.length / 3), config = asObject(about.config, `garment ${k}: config`);
+  const numbers = <Name extends string>(from: Record<string, unknown>, names: Record<Name, boolean>) =>
+    Object.fromEntries(Object.entries<boolean>(names).map(([name, zero]) => {
+      const value = asNumber(from[name], `garment ${k}: ${name}`, 0, MOST);
+      if (!zero && !value) throw wrong(`garment ${k}: ${name}`, "a number above 0", "0");
+      return [name, value];
+    })) as Record<Name, number>;
+  const options = numbers(config, CONFIG), prefix = `${k}.params.`;
   const params = new Map([...piece].filter(([name]) => name.startsWith(prefix)).map(([name, value]) => [name.slice(prefix.length), value]));
+  const reference = readMotion(params, avatar, tensors, `garment ${k}: reference pose`, true);
+  if (reference.frames !== 1) throw wrong(`garment ${k}`, "one reference pose", `${reference.frames}`);
   const floats = (name: string) => Float32Array.from(own[name].values), doubles = (name: string) => Float64Array.from(own[name].values);
   const ints = (name: string) => Int32Array.from(own[name].values);
   const faces = ints("rest_faces"), lengths = doubles("lengths"), edges = edgesOf(faces, own.particles.shape[0]).length / 2;
   if (!faces.length || edges !== lengths.length) throw wrong(`garment ${k}: lengths`, `${edges} edges`, String(lengths.length));
   return {
-    part: String(about.part),
-    fabric: Object.fromEntries(Object.entries(FABRIC).map(([name, least]) => [name, number(fabric, name, least)])) as unknown as Fabric,
-    pinDepth: number(config, "pin_depth", 0),
-    band: number(config, "band", 1e-9),
-    reference: poseAt(readMotion(params, avatar, tensors), 0),
+    part: asText(about.part, `garment ${k}: part`),
+    fabric: numbers(asObject(config.fabric, `garment ${k}: fabric`), FABRIC),
+    pinDepth: options.pin_depth,
+    band: options.band,
+    reference: poseAt(reference, 0),
     particles: ints("particles"), rest: doubles("rest_vertices"), faces, lengths,
     depth: doubles("depth"), vertexDepth: doubles("vertex_depth"), vertices: ints("vertices"),
     corners: ints("corners"), weights: floats("weights"), offset: floats("offset"),
@@ -69,9 +88,10 @@ function checked(piece: Map<string, Tensor>, k: number, vertices: number): Recor
   for (const [name, spec] of Object.entries(ARRAYS)) {
     const letters = spec.split(" ").filter((letter) => !letter.startsWith("<")), found = piece.get(`${k}.${name}`);
     const fits = found?.shape.length === letters.length && letters.every((letter, axis) => (sizes[letter] ??= found.shape[axis]) === found.shape[axis]);
+    const kind = fits && DTYPES[name].includes(found.dtype);
     // Depth is infinite where no way leads to what holds the cloth.
-    const numbers = fits && (name.endsWith("depth") ? found.values.every((value) => value >= 0) : found.values.every(Number.isFinite));
-    if (!numbers) throw wrong(`garment ${k}: ${name}`, `numbers of shape (${letters.join(", ")})`, `shape (${found?.shape.join(", ") ?? "none"})`);
+    const numbers = kind && (name.endsWith("depth") ? found.values.every((value) => value >= 0) : found.values.every(Number.isFinite));
+    if (!numbers) throw wrong(`garment ${k}: ${name}`, `numbers of shape (${letters.join(", ")})`, `${found?.dtype} of shape (${found?.shape.join(", ") ?? "none"})`);
     out[name] = found;
   }
   for (const [name, spec] of Object.entries(ARRAYS)) {
@@ -80,6 +100,7 @@ function checked(piece: Map<string, Tensor>, k: number, vertices: number): Recor
       throw wrong(`garment ${k}: ${name}`, `indices below ${sizes[bound]}`, "others");
     }
   }
+  if (!sizes.n || !sizes.N || !sizes.m) throw wrong(`garment ${k}`, "particles, faces and vertices", "none");
   return out;
 }
 

@@ -1,7 +1,7 @@
 /** What a bundle holds, tensor by tensor (`avatar/runtime/layout.py`), and the check of a file against it. */
 
 import { BundleError, EXPORT_AGAIN } from "./errors.ts";
-import type { Tensor } from "./tensors.ts";
+import type { Piece, Tensor } from "./tensors.ts";
 
 const NETWORK = {
   "of_point.weight": "f W X", "of_frame.weight": "f W Y", "of_frame.bias": "f W",
@@ -19,7 +19,7 @@ const shapes = (side: string) =>
  * Piece, tensor: kind, shape, bound. Kinds: f floats, or integers with a step and a start; i integers; q integers with
  * steps that stay so, or floats. Letters are sizes, the same in all pieces; `<J` bounds indices; ?: may be missing.
  */
-const PIECES: Record<string, Record<string, string>> = {
+export const PIECES: Record<string, Record<string, string>> = {
   skeleton: {
     parents: "i J", joints: "f J 3", expression: "f J 3 E", left_hand_mean: "f? 45", right_hand_mean: "f? 45",
     left_hand_components: "f? l 45", right_hand_components: "f? r 45",
@@ -46,20 +46,25 @@ function prefixed(side: string, specs: Record<string, string>): Record<string, s
   return Object.fromEntries(Object.entries(specs).map(([name, spec]) => [`${side}.${name}`, spec]));
 }
 
-/** The tensors of a bundle, checked; by "piece.name". */
+const INTEGERS = /^[IU]\d/, LARGEST_INDEX = 2 ** 31;
+
+/** The tensors of a bundle, of their kinds, shapes and bounds; by "piece.name". */
 export class Tensors {
   /** Sizes by letter. */
   readonly sizes: Record<string, number> = {};
   private readonly all = new Map<string, Tensor>();
 
-  constructor(pieces: Map<string, Map<string, Tensor>>) {
+  constructor(pieces: Map<string, Piece>) {
     for (const [piece, specs] of Object.entries(PIECES)) {
-      const tensors = pieces.get(piece);
+      const tensors = pieces.get(piece)?.tensors;
       if (!tensors) {
         if (NEEDED.includes(piece)) throw new BundleError("the avatar", `a piece ${piece}`, "none", EXPORT_AGAIN);
         continue;
       }
-      for (const [name, spec] of Object.entries(specs)) this.take(`${piece}.${name}`, name, spec, tensors);
+      const left = new Set(tensors.keys());
+      for (const [name, spec] of Object.entries(specs)) this.take(`${piece}.${name}`, name, spec, tensors, left);
+      // A newer version may have given it a meaning.
+      if (left.size) throw new BundleError(`piece ${piece}`, "the tensors of its version", [...left].join(", ").slice(0, 200), EXPORT_AGAIN);
     }
     this.checkBounds();
   }
@@ -83,27 +88,32 @@ export class Tensors {
     return this.all.get(name)!.values as Float32Array | Int8Array;
   }
 
-  private take(full: string, name: string, spec: string, tensors: Map<string, Tensor>): void {
-    const [kind, ...letters] = spec.split(" ");
+  private take(full: string, name: string, spec: string, tensors: Map<string, Tensor>, left: Set<string>): void {
+    const [kind, ...letters] = spec.split(" "), floats = kind[0] === "f";
     const found = tensors.get(name);
     if (!found) {
       if (!kind.endsWith("?")) throw new BundleError(full, "a tensor", "none", EXPORT_AGAIN);
       return;
     }
+    for (const used of floats ? [name, `${name}.step`, `${name}.start`] : [name]) left.delete(used);
     const dimensions = letters.filter((letter) => !letter.startsWith("<"));
     const fits = dimensions.length === found.shape.length && dimensions.every((letter, axis) => {
       const known = /^\d/.test(letter) ? Number(letter) : (this.sizes[letter] ??= found.shape[axis]);
       return known === found.shape[axis];
     });
-    const floating = found.dtype.startsWith("F");
-    const numbers = kind.startsWith("i") ? !floating : floating || kind === "q" || tensors.has(`${name}.step`);
+    const floating = found.dtype.startsWith("F"), whole = INTEGERS.test(found.dtype);
+    const numbers = kind[0] === "i" ? whole : floating || (whole && (kind[0] === "q" || tensors.has(`${name}.step`)));
     if (!fits || !numbers) {
       throw new BundleError(full, `${kind[0] === "i" ? "integers" : "numbers"} of shape (${dimensions.join(", ")})`,
         `${found.dtype} of shape (${found.shape.join(", ")})`, EXPORT_AGAIN);
     }
     let values = found.values;
-    if (kind.startsWith("i")) values = values instanceof Int32Array ? values : Int32Array.from(values);
-    else if (!(kind === "q" && values instanceof Int8Array)) values = decoded(full, found, tensors, name);
+    if (kind[0] === "i") {
+      if (values.some((value) => value < -LARGEST_INDEX || value >= LARGEST_INDEX)) {
+        throw new BundleError(full, "indices of 32 bits", "others", EXPORT_AGAIN);
+      }
+      values = values instanceof Int32Array ? values : Int32Array.from(values);
+    } else if (!(kind[0] === "q" && values instanceof Int8Array)) values = decoded(full, found, floats ? tensors : new Map(), name);
     this.all.set(full, { ...found, values });
   }
 
@@ -125,13 +135,16 @@ export class Tensors {
 function decoded(full: string, tensor: Tensor, tensors: Map<string, Tensor>, name: string): Float32Array {
   const out = Float32Array.from(tensor.values);
   for (const word of ["step", "start"] as const) {
-    const other = tensors.get(`${name}.${word}`)?.values;
+    const other = tensors.get(`${name}.${word}`);
     if (!other) continue;
-    if (other.length ? out.length % other.length : out.length) {
-      throw new BundleError(`${full}.${word}`, `numbers for the last axes`, `${other.length}`, EXPORT_AGAIN);
+    const { dtype, shape, values } = other, last = tensor.shape.slice(tensor.shape.length - shape.length);
+    if (!dtype.startsWith("F") || shape.length > tensor.shape.length || shape.some((n, axis) => n !== last[axis])) {
+      throw new BundleError(`${full}.${word}`, `floats for the last axes of (${tensor.shape.join(", ")})`,
+        `${dtype} of shape (${shape.join(", ")})`, EXPORT_AGAIN);
     }
-    for (let i = 0, k = 0; i < out.length; ++i, k = k + 1 === other.length ? 0 : k + 1) {
-      out[i] = word === "step" ? out[i] * other[k] : out[i] + other[k];
+    const by = values instanceof Float64Array ? Float32Array.from(values) : values;
+    for (let i = 0, k = 0; i < out.length; ++i, k = k + 1 === by.length ? 0 : k + 1) {
+      out[i] = word === "step" ? out[i] * by[k] : out[i] + by[k];
     }
   }
   if (!out.every(Number.isFinite)) throw new BundleError(full, "finite numbers", "NaN or infinity", EXPORT_AGAIN);

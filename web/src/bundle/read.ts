@@ -2,34 +2,20 @@
 
 import type { Avatar, BlendShapes, BlendSide, Field, FieldNetwork, Gaussians, Layer } from "../avatar/avatar.ts";
 import { encodedPoints } from "../avatar/networks.ts";
+import { checkConsistency, readAbout, type About } from "./consistency.ts";
 import { BundleError, EXPORT_AGAIN } from "./errors.ts";
 import { readGarments } from "./garments.ts";
-import { Tensors } from "./layout.ts";
+import { asInteger, asObject, asText, parseJson } from "./json.ts";
+import { PIECES, Tensors } from "./layout.ts";
 import { readMotion } from "./motion.ts";
 import { sha256 } from "./sha256.ts";
 import { unpackTensors, type Piece } from "./tensors.ts";
 import { unzip } from "./zip.ts";
 
 const FORMAT = "smplxpp-avatar", VERSION = 2;
+const KNOWN = [...Object.keys(PIECES), "garments", "motion"];
 /** Scale of every Gaussian along its normal, in mean edge lengths of its triangle. */
 const THICKNESS = 0.01;
-
-interface Manifest {
-  format?: string;
-  version?: number;
-  model?: {
-    name?: string;
-    licence?: string;
-    provenance?: Record<string, string>;
-    joint_names?: string[];
-    expression_names?: string[];
-    part_names?: string[];
-    null_code_shown?: boolean;
-    jaw?: boolean;
-    eps2d?: number;
-  };
-  pieces?: Record<string, { file?: string; bytes?: number; sha256?: string }>;
-}
 
 /**
  * Reads a bundle, every piece held against its size and digest, every tensor against the layout.
@@ -37,61 +23,59 @@ interface Manifest {
  * @throws BundleError a damaged, changed or foreign file, or one of a newer version.
  */
 export async function readBundle(data: Uint8Array<ArrayBuffer>): Promise<Avatar> {
-  const pieces = await unzip(data);
-  const manifest = parsed(pieces.get("manifest.json"));
-  if (manifest.version! > VERSION) {
-    throw new BundleError("the avatar", `version ${VERSION} or older`, `version ${manifest.version}`,
-      "open it with the player of the smplxpp that wrote it");
-  }
-  const unpacked = new Map<string, Piece>();
-  for (const [name, { file = "", bytes, sha256: digest }] of Object.entries(manifest.pieces ?? {})) {
-    const content = pieces.get(file);
-    if (!content) throw new BundleError("the avatar", `a piece ${file}`, "none", EXPORT_AGAIN);
-    if (content.length !== bytes || (await sha256(content)) !== digest) {
-      throw new BundleError(`piece ${name}`, "the bytes that the manifest's digest is of",
-        "others: the file is damaged or was changed", EXPORT_AGAIN);
-    }
-    unpacked.set(name, unpackTensors(content, `piece ${name}`));
-  }
-  const tensors = new Tensors(new Map([...unpacked].map(([name, piece]) => [name, piece.tensors])));
-  const avatar = assembled(manifest, tensors, data.length), [motion, garments] = [unpacked.get("motion"), unpacked.get("garments")];
-  if (motion) avatar.motion = readMotion(motion.tensors, avatar, tensors);
-  if (garments) avatar.garments = readGarments(garments.tensors, garments.about, avatar, tensors);
+  const files = await unzip(data), manifest = readManifest(files.get("manifest.json"));
+  files.delete("manifest.json");
+  const pieces = await readPieces(manifest.pieces, files);
+  const about = readAbout(manifest.model), tensors = new Tensors(pieces);
+  checkConsistency(about, tensors);
+  const avatar = assembled(about, tensors, data.length), [motion, garments] = [pieces.get("motion"), pieces.get("garments")];
+  if (motion?.tensors.size) avatar.motion = readMotion(motion.tensors, avatar, tensors);
+  if (garments?.tensors.size) avatar.garments = readGarments(garments.tensors, garments.about, avatar, tensors);
   return avatar;
 }
 
-function parsed(text: Uint8Array | undefined): Manifest {
-  let manifest: Manifest | undefined;
-  try {
-    manifest = text && (JSON.parse(new TextDecoder().decode(text)) as Manifest);
-  } catch {
-    // What is no JSON is no manifest.
-  }
-  if (manifest?.format !== FORMAT || !Number.isInteger(manifest.version)) {
-    throw new BundleError("the file", "an avatar that smplxpp export wrote", "another archive", EXPORT_AGAIN);
+function readManifest(text: Uint8Array | undefined): Record<string, unknown> {
+  const manifest = text && asObject(parseJson(text, "manifest"), "manifest");
+  if (manifest?.format !== FORMAT) throw new BundleError("the file", "an avatar that smplxpp export wrote", "another archive", EXPORT_AGAIN);
+  const version = asInteger(manifest.version, "version", 1);
+  if (version > VERSION) {
+    throw new BundleError("the avatar", `version ${VERSION} or older`, `version ${version}`, "open it with the player of the smplxpp that wrote it");
   }
   return manifest;
 }
 
-function assembled(manifest: Manifest, t: Tensors, bytes: number): Avatar {
-  const { J, E, V } = t.sizes, model = manifest.model ?? {};
-  const parents = t.ints("skeleton.parents");
-  const ordered = parents[0] === -1 && parents.every((parent, j) => j === 0 || (parent >= 0 && parent < j));
-  if (!ordered) throw new BundleError("skeleton.parents", "every parent before its children", "another order", EXPORT_AGAIN);
-  const names = (list: string[] | undefined, count: number, word: string) =>
-    list?.length === count ? list.map(String) : Array.from({ length: count }, (_, k) => `${word} ${k + 1}`);
+/** The pieces of the manifest, each a known one and of its size and digest, and no file beside them. */
+async function readPieces(listed: unknown, files: Map<string, Uint8Array<ArrayBuffer>>): Promise<Map<string, Piece>> {
+  const pieces = new Map<string, Piece>(), beside = new Set(files.keys());
+  for (const [name, value] of Object.entries(asObject(listed, "pieces"))) {
+    const { file, bytes, sha256: digest } = asObject(value, `piece ${name}`), content = files.get(asText(file, `piece ${name}`));
+    if (!content || !KNOWN.includes(name)) {
+      throw new BundleError(`piece ${name}`, "one of its version, in the file", content ? "another" : "none", EXPORT_AGAIN);
+    }
+    if (content.length !== bytes || (await sha256(content)) !== digest) {
+      throw new BundleError(`piece ${name}`, "the bytes that the manifest's digest is of", "others: the file is damaged or was changed", EXPORT_AGAIN);
+    }
+    beside.delete(file as string);
+    pieces.set(name, unpackTensors(content, `piece ${name}`));
+  }
+  if (beside.size) throw new BundleError("the avatar", "the pieces of its manifest alone", `${[...beside].sort()[0]} beside them`, EXPORT_AGAIN);
+  return pieces;
+}
+
+function assembled(about: About, t: Tensors, bytes: number): Avatar {
+  const { E } = t.sizes;
   const parts = t.ints("surface.parts"), partCount = parts.reduce((most, part) => Math.max(most, part), 0) + 1;
   const faces = t.ints("surface.faces");
   return {
-    name: String(model.name ?? "avatar"),
-    licence: String(model.licence ?? ""),
-    provenance: model.provenance ?? {},
-    partNames: names(model.part_names?.slice(0, partCount), partCount, "part"),
-    expressionNames: names(model.expression_names, E, "expression"),
-    blur: Number(model.eps2d ?? 0.1),
+    name: about.name,
+    licence: about.licence,
+    provenance: about.provenance,
+    partNames: about.partNames.slice(0, partCount),
+    expressionNames: about.expressionNames,
+    blur: about.blur,
     skeleton: {
-      names: names(model.joint_names, J, "joint"),
-      parents,
+      names: about.jointNames,
+      parents: t.ints("skeleton.parents"),
       rest: t.floats("skeleton.joints"),
       byExpression: t.floats("skeleton.expression"),
     },
@@ -103,12 +87,12 @@ function assembled(manifest: Manifest, t: Tensors, bytes: number): Avatar {
       influences: t.sizes.k,
       parts,
       expressions: { rows: t.ints("surface.expression_rows"), basis: t.floats("surface.expression"), size: E },
-      correctives: t.has("surface.pose") && t.has("surface.pose_rows") && t.sizes.P === 9 * (J - 1)
+      correctives: t.has("surface.pose")
         ? { rows: t.ints("surface.pose_rows"), basis: t.floats("surface.pose"), size: t.sizes.P }
         : null,
     },
-    field: t.has("field.points") ? field(t, Boolean(model.null_code_shown), V) : null,
-    blendShapes: t.has("blend.head.values") ? blendShapes(t, Boolean(model.jaw)) : null,
+    field: t.has("field.points") ? field(t, about.nullCodeShown) : null,
+    blendShapes: t.has("blend.head.values") ? blendShapes(t, about.jaw) : null,
     known: t.has("poses.known") ? { poses: t.floats("poses.known"), scale: t.floats("poses.scale")[0] } : null,
     gaussians: gaussians(t, faces, parts),
     garments: [],
@@ -131,7 +115,7 @@ function hidden(t: Tensors, name: string, count: number): Layer[] {
   return Array.from({ length: count }, (_, k) => layer(t, name, k, count));
 }
 
-function field(t: Tensors, nullCodeShown: boolean, vertices: number): Field {
+function field(t: Tensors, nullCodeShown: boolean): Field {
   const { Z, H, W, n } = t.sizes, points = t.floats("field.points");
   const network = (name: string): FieldNetwork => ({
     ofPoint: encodedPoints(points, t.floats(`field.${name}.of_point.weight`), W),
@@ -139,12 +123,8 @@ function field(t: Tensors, nullCodeShown: boolean, vertices: number): Field {
     hidden: hidden(t, `field.${name}.hidden`, H),
     last: layer(t, `field.${name}.last`),
   });
-  const body = network("body");
-  if (body.ofFrame.inputs !== 63 + Z || vertices * n !== t.ints("field.neighbours").length) {
-    throw new BundleError("field", `${63 + Z} inputs`, `${body.ofFrame.inputs}`, EXPORT_AGAIN);
-  }
   return {
-    body,
+    body: network("body"),
     cloth: network("cloth"),
     clothPoints: t.ints("field.cloth"),
     // What training showed of poses without a frame: zero; else the first frame's code.
@@ -168,9 +148,6 @@ function blendShapes(t: Tensors, jaw: boolean): BlendShapes {
   const side = (name: string): BlendSide => {
     const own = (tensor: string) => `blend.${name}.${tensor}`;
     const shapes = t.sizes[`${name}n`], rows = t.has(own("rows")) ? t.ints(own("rows")) : null;
-    if (!rows && t.sizes[`${name}m`] !== t.sizes.N) {
-      throw new BundleError(own("values"), `${t.sizes.N} rows`, `${t.sizes[`${name}m`]}`, EXPORT_AGAIN);
-    }
     return {
       layers: [layer(t, own("first")), ...hidden(t, own("hidden"), t.sizes[`${name}h`]), layer(t, own("last"))],
       shapes, rows,
@@ -180,14 +157,7 @@ function blendShapes(t: Tensors, jaw: boolean): BlendShapes {
     };
   };
   const part = t.has("blend.part") ? t.ints("blend.part") : null;
-  const [head, body] = [side("head"), side("body")];
-  const most = part ? part.reduce((largest, one) => Math.max(largest, one), 0) + 1 : 1;
-  for (const { layers, shapes } of [head, body]) {
-    if (layers.at(-1)!.outputs < most * shapes) {
-      throw new BundleError("blend", `${most} x ${shapes} coefficients`, `${layers.at(-1)!.outputs}`, EXPORT_AGAIN);
-    }
-  }
-  return { head, body, jaw, part };
+  return { head: side("head"), body: side("body"), jaw, part };
 }
 
 function gaussians(t: Tensors, faces: Int32Array, parts: Int32Array): Gaussians {
@@ -200,9 +170,6 @@ function gaussians(t: Tensors, faces: Int32Array, parts: Int32Array): Gaussians 
     part.fill(parts[faces[3 * f]], filled, filled + perFace[f]);
     filled += perFace[f];
     first[f + 1] = filled;
-  }
-  if (filled !== N || perFace.some((count) => count < 0)) {
-    throw new BundleError("gaussians.per_face", `counts of ${N}`, `${filled}`, EXPORT_AGAIN);
   }
   return {
     count: N, face, first, part,

@@ -3,6 +3,7 @@
 import type { Pose } from "../avatar/avatar.ts";
 import type { Deformer, Displaced } from "../avatar/deform.ts";
 import { between } from "../avatar/motion.ts";
+import { BundleError, EXPORT_AGAIN } from "../bundle/errors.ts";
 import { multiply, quaternionFromRotvec, rotvecFromQuaternion } from "../math/rotations.ts";
 import type { Block } from "../native/memory.ts";
 import { SkinnedRows } from "./carried.ts";
@@ -17,6 +18,8 @@ const TELEPORT = 12;
 const FAR = 4;
 /** Metres from where what holds the cloth was at the last cold start, within which that start serves again. */
 const AGAIN = 0.06;
+/** Metres between a vertex and the particle that is one. */
+const SAME = 1e-4;
 /** Seconds between pictures beyond which a motion is not followed. */
 export const LONGEST_FOLLOWED = 1;
 
@@ -72,6 +75,15 @@ export class ClothDriver {
       return 1 - (share[corners[0]] + share[corners[1]] + share[corners[2]]) / 3;
     });
     this.displaced = { displacements: native.floats(3 * V), share: native.keep(share), keep: native.keep(keep) };
+    garments.forEach(({ reference, rest }, k) => this.checkPlaces(reference, rest, this.rows[k].particles));
+  }
+
+  /** Refuses a garment of another avatar: its particles are vertices of this one in the reference pose. */
+  private checkPlaces(reference: Pose, rest: Float64Array, particles: SkinnedRows): void {
+    this.origin = this.root(reference);
+    this.joints(reference);
+    const off = this.places(particles).reduce((most, value, i) => Math.max(most, Math.abs(value + this.origin[i % 3] - rest[i])), 0);
+    if (!(off < SAME)) throw new BundleError("garments of the avatar", "particles that are its vertices", `some that are ${(1e3 * off).toPrecision(3)} mm off`, EXPORT_AGAIN);
   }
 
   /** (n, 3) where the particles of each garment are in the world, metres. */
