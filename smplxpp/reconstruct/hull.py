@@ -8,6 +8,7 @@ import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
+from scipy import ndimage
 
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.topology import face_components
@@ -46,7 +47,9 @@ def soft_hull(silhouettes: Sequence[Silhouette], box: Box, *, cell: float, disse
     return zero_surface(field, box, cell=cell)
 
 
-def zero_surface(field: Field, box: Box, *, cell: float, coarsest: float = 0.02) -> TriangleMesh:
+def zero_surface(
+    field: Field, box: Box, *, cell: float, coarsest: float = 0.02, smoothing: float = 0.0
+) -> TriangleMesh:
     """Return the closed, outward surface on which a field is zero, by marching cubes on cells refined around it.
 
     A cell is refined if the field at its centre is below half the cell's diagonal, with 5 % to spare. For a Lipschitz
@@ -57,6 +60,8 @@ def zero_surface(field: Field, box: Box, *, cell: float, coarsest: float = 0.02)
         box: that holds the surface.
         cell: size of the finest cells, metres.
         coarsest: size of the first cells, metres; larger ones save time where the field is Lipschitz everywhere.
+        smoothing: standard deviation of a Gaussian over the field, truncated at one cell, metres. Sheets and slits
+            thinner than twice it vanish, at which the field jumps; a plane stays where it is.
 
     Raises:
         InputError: the field is positive nowhere.
@@ -88,6 +93,8 @@ def zero_surface(field: Field, box: Box, *, cell: float, coarsest: float = 0.02)
             remedy="look at masks and cameras (`smplxpp capture check`)",
         )
     corners, index, values = _closed(cells, within, origin, size)
+    if smoothing:
+        corners, index, values = _smoothed(corners, values, size, smoothing)
     vertices, faces, _ = igl.marching_cubes(values, origin + corners * size, index, 0.0)
     if not len(faces):
         raise InputError("silhouettes", expected="a body that lies in all of them", received="none")
@@ -124,6 +131,37 @@ def _closed(
     found = np.concatenate(values)[first]
     index = np.searchsorted(corner_keys, _keys((_cells_of(known)[:, None] + _CORNERS).reshape(-1, 3)))
     return _cells_of(corner_keys), index.reshape(-1, 8), found
+
+
+def _smoothed(
+    corners: Int64[np.ndarray, "C 3"], values: Float64[np.ndarray, " C"], size: float, smoothing: float
+) -> tuple[Int64[np.ndarray, "D 3"], Int64[np.ndarray, "M 8"], Float64[np.ndarray, " D"]]:
+    """Return corners, cells and values of a field, truncated at one cell, after a Gaussian filter."""
+    low = corners.min(axis=0) - 1
+    dense = np.zeros(np.ptp(corners, axis=0) + 3, np.float32)
+    dense[tuple((corners - low).T)] = np.clip(values, -size, size)
+    # Regions without a sample lie on one side of the surface: that of the samples around them.
+    region, count = ndimage.label(dense == 0.0)
+    side = np.full(count + 1, np.float32(size))
+    for axis in range(3):
+        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        for unknown, known in ((ahead, behind), (behind, ahead)):
+            within = (region[tuple(unknown)] > 0) & (dense[tuple(known)] < 0)
+            side[region[tuple(unknown)][within]] = -size
+    dense = np.where(region > 0, side[region], dense)
+    dense = ndimage.gaussian_filter(dense, smoothing / size, mode="nearest", truncate=3.0)
+    dense[dense == 0.0] = -1e-3 * size
+    # Keep the cells whose corners differ in sign.
+    inside = dense < 0
+    some, every = inside[:-1, :-1, :-1].copy(), inside[:-1, :-1, :-1].copy()
+    for x, y, z in _CORNERS[1:]:
+        one = inside[x : x + some.shape[0], y : y + some.shape[1], z : z + some.shape[2]]
+        some, every = some | one, every & one
+    cells = np.argwhere(some & ~every)
+    keys, index = np.unique(_keys((cells[:, None] + _CORNERS).reshape(-1, 3)), return_inverse=True)
+    used = _cells_of(keys)
+    return used + low, index.reshape(-1, 8), dense[tuple(used.T)].astype(np.float64)
 
 
 def _keys(cells: np.ndarray) -> np.ndarray:

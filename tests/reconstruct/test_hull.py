@@ -95,3 +95,18 @@ def test_a_pixel_takes_as_many_metres_as_it_is_far():
     camera = silhouettes[0].camera
     expected = np.linalg.norm(camera.position) / camera.K[0, 0]
     assert pixel_footprint(silhouettes, np.zeros(3)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_teeth_and_slits_of_a_field_vanish_and_its_surface_stays():
+    """Sheets as thin as a cell stood between thighs where the field jumps from one leg's to the other's."""
+
+    def field(points):
+        away = np.linalg.norm(points, axis=1)
+        teeth = (np.abs(points[:, 0]) < 0.006) & (away < RADIUS + 0.1) & (points[:, 1] % 0.04 < 0.02)
+        slit = (np.abs(points[:, 2]) < 0.006) & (away > RADIUS - 0.1)
+        return np.where(teeth, 0.006, np.where(slit, -0.006, inside_ball(points))).astype(np.float32)
+
+    rough, smooth = (zero_surface(field, BOX, cell=0.01, smoothing=sigma) for sigma in (0.0, 0.012))
+    away = [np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() for mesh in (rough, smooth)]
+    assert away[0] > 0.09 and away[1] < 0.012
+    assert solid_status(smooth) == ("NoError", 0)

@@ -18,8 +18,8 @@ from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.segment import UNSURE, label_by_body, read_labels, segment_scan
-from smplxpp.segment.by_body_outfit import NAT, RUNS, label_shares
-from smplxpp.segment.by_body_rings import cloth_against_skin
+from smplxpp.segment.by_body_outfit import NAT, RUNS, OutfitConfig, find_outfit, label_shares
+from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 
 PERSON = Path(__file__).resolve().parents[2] / "data/fixtures/person"
 _SKIN_RGB, _BLUE, _GREY = (222, 176, 150), (58, 98, 170), (90, 90, 94)
@@ -373,3 +373,22 @@ def test_votes_of_few_views_are_completed_by_the_body(body, scanned):
     assert (both.face_labels == truth)[front].mean() > 0.995
     with pytest.raises(InputError, match="prior"):
         segment_scan(mesh.submesh(np.arange(1000))[0], votes=votes[:1000], prior=prior)
+
+
+@pytest.mark.parametrize("boots", [False, True])
+def test_light_that_fades_along_trousers_is_no_top_of_boots(boots):
+    """Of a real man in black shoes and trousers the shins became boots: light faded along them more than at the shoes."""
+    places = STEP * np.arange(round(COLUMN_END / STEP))
+    # Shade among 30 neighbouring ones: shoes 0 to 2; trousers from 3 on, lighter by one every 15 cm; shirt.
+    shade = np.where(places < 0.09, 1.0, 4.0 + np.clip(places - 0.09, 0.0, 0.9) / 0.15)
+    shade = np.where(places > 0.96, 25.0, shade)
+    if boots:
+        shade = np.where(places < 0.40, 1.0, 12.0)
+    spread = np.exp(-0.5 * ((np.arange(30) - shade[:, None]) / 1.2) ** 2)
+    ones = np.ones(len(places))
+    column = Rings(
+        0.0, ones, spread / spread.sum(axis=1, keepdims=True), np.outer(ones, [0.0, 4.0]), 0.012 * ones, 0.003 * ones
+    )
+    arm = Rings(ARM_START, ones[:45], column.colors[-45:], column.skin[:45], column.distance[:45], column.spread[:45])
+    found = find_outfit(column, arm, OutfitConfig(), misfit=0.005)
+    assert found.shoe_top == pytest.approx(0.40 if boots else 0.09, abs=0.02)
