@@ -1,9 +1,12 @@
 """Measure what one camera gives of a person who turns before it: body, poses, lens and surface, against the truth.
 
-    smplxpp synth --motion turntable --frames 24 --fps 3 --size 960 --out turn24
-    python -m benchmarks turntable --captures turn24
+    smplxpp synth --motion turntable --frames 8 --fps 1 --size 960 --seed 1 --out trousers8
+    smplxpp synth --motion turntable --frames 8 --fps 1 --size 960 --seed 2 --outside 8 --out outside8
+    smplxpp synth --motion turntable --frames 8 --fps 1 --size 960 --seed 3 --clothes skirt --out skirt8
+    smplxpp synth --motion turntable --frames 24 --fps 3 --size 960 --out trousers24
+    python -m benchmarks turntable --captures trousers8 outside8 skirt8 trousers24
 
-Captures of `smplxpp synth --motion turntable`: a tracker's keypoints (3 px of noise at 640 rows, 5 % outliers, 10 %
+Captures of `smplxpp synth --motion turntable`, rows called by their folders: a tracker's keypoints (3 px of noise at 640 rows, 5 % outliers, 10 %
 missing), true masks. Body: mean distance of the skin's vertices in a frame after a rigid alignment, over all frames;
 similar: after one with a scale. Surface: the reconstruction in the pose of frame 0, aligned as that frame's body is, to
 the true outer surface (P2S) and back from those points that two frames see (completeness).
@@ -67,8 +70,8 @@ class TurntableBenchmark:
                     made = surface(body, seen, found)
                     row |= {"surface_cpu_s": time.process_time() - begin}
                     row |= surface_figures(body, folder, seen, (found, made), truth)
-                rows[f"{len(truth)} frames, {case}"] = row
-                print(len(truth), case, row, flush=True)
+                rows[f"{folder.name}, {case}"] = row
+                print(folder.name, case, row, flush=True)
         if self.store:
             print(f"stored {store_results('turntable', COMMAND, {'rows': rows}).name}")
 
