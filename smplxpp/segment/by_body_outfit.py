@@ -232,7 +232,7 @@ def _hidden_top(runs: _RunCosts, place: np.ndarray) -> Float64[np.ndarray, " R1"
     """Return the cost of shoes that end at each border, nats: boots whose top no change of colours within 12 cm shows.
 
     The change is what two runs of four rings, below and above, cost less than one. At the tops of procedural knee boots
-    it is 14 nats and more, and 20 at the black shoes of a real man in black trousers; light that fades along these gives
+    it is 14 nats and more, 20 at the black shoes of a real man in black trousers; light that fades along these gives
     5 at most, and over 40 cm more than the shoes.
     """
     beside, least, cost, low_shoe = 4, 8.0, 60.0, 0.12  # rings of 15 mm; nats; nats; metres above the sole
