@@ -6,10 +6,11 @@
     smplxpp synth --motion turntable --frames 24 --fps 3 --size 960 --out trousers24
     python -m benchmarks turntable --captures trousers8 outside8 skirt8 trousers24
 
-Captures of `smplxpp synth --motion turntable`, rows called by their folders: a tracker's keypoints (3 px of noise at 640 rows, 5 % outliers, 10 %
-missing), true masks. Body: mean distance of the skin's vertices in a frame after a rigid alignment, over all frames;
-similar: after one with a scale. Surface: the reconstruction in the pose of frame 0, aligned as that frame's body is, to
-the true outer surface (P2S) and back from those points that two frames see (completeness).
+Captures of `smplxpp synth --motion turntable`, rows called by their folders: a tracker's keypoints (3 px of noise at
+640 rows, 5 % outliers, 10 % missing), true masks. Body: mean distance of the skin's vertices in a frame after a rigid
+alignment, over all frames; similar: after one with a scale. Surface: the reconstruction in the pose of frame 0,
+aligned as that frame's body is, to the true outer surface (P2S) and back from those points that two frames see
+(completeness).
 """
 
 from __future__ import annotations

@@ -377,7 +377,7 @@ def test_votes_of_few_views_are_completed_by_the_body(body, scanned):
 
 @pytest.mark.parametrize("boots", [False, True])
 def test_light_that_fades_along_trousers_is_no_top_of_boots(boots):
-    """A real man in black had boots up to the shins: light faded along his trousers more than it changed at his shoes."""
+    """A real man in black had boots: light faded along his trousers more than it changed at his shoes."""
     places = STEP * np.arange(round(COLUMN_END / STEP))
     # Shade among 30 neighbouring ones: shoes 0 to 2; trousers from 3 on, lighter by one every 15 cm; shirt.
     shade = np.where(places < 0.09, 1.0, 4.0 + np.clip(places - 0.09, 0.0, 0.9) / 0.15)
