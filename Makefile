@@ -9,7 +9,7 @@ RUN ?= runs/demo
 # make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 TORCH_INDEX ?=
 
-.PHONY: demo test test-slow test-fuzz coverage lint bench fixture wheel clean
+.PHONY: demo test test-slow test-fuzz coverage lint bench fixture wheel docs clean
 
 $(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -57,6 +57,11 @@ wheel: $(STAMP)
 	$(BIN)/pip wheel --quiet --no-deps --wheel-dir build/wheel --config-settings=cmake.define.SMPLXPP_BUNDLE_OPENMP=ON .
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --exclude libgomp.so.1 --wheel-dir dist build/wheel/*.whl
 	$(BIN)/python -m tools.try_wheel dist/smplxpp-*.whl
+
+# Documentation as a site in build/site, with a reference made of the docstrings; a broken link is an error.
+docs: $(STAMP)
+	$(BIN)/pip install --quiet -c constraints.txt mkdocs-material 'mkdocstrings[python]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

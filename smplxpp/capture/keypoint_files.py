@@ -1,6 +1,6 @@
 """Read keypoint files of OpenPose, EasyMocap, mmpose, COCO and MediaPipe, and this project's npz.
 
-Keypoints are one file of all frames or a folder with a file for each frame; docs/captures.md describes the layouts.
+Keypoints are one file of all frames or a folder with a file for each frame; docs/rigs.md describes the layouts.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _named_errors(path: Path, read: Callable[[], T]) -> T:
             raise
         raise InputError(
             f"keypoints {path}",
-            expected="one of the layouts of docs/captures.md",
+            expected="one of the layouts of docs/rigs.md",
             received=f"{type(error).__name__}: {error}",
         ) from None
 
@@ -237,7 +237,7 @@ def _frames(content: Any, number: int, options: KeypointOptions, *, source: str)
             frame = int(entry.get("frame", number + place))
             yield frame, [mediapipe_person(parts, size=options.size, normalised=normalised, source=source)]
     else:
-        raise InputError(source, expected="keypoints in a layout of docs/captures.md", received="JSON of another kind")
+        raise InputError(source, expected="keypoints in a layout of docs/rigs.md", received="JSON of another kind")
 
 
 def _kind(content: Any) -> str:

@@ -281,7 +281,7 @@ def _named(rows: Any, orders: Mapping[int, Order], *, source: str, shift: float 
             source,
             expected=f"{counts} points of u, v, confidence",
             received=f"{len(values)} points",
-            remedy="name the format, or convert the points to keypoints/CAM.npz by hand (docs/captures.md)",
+            remedy="name the format, or convert the points to keypoints/CAM.npz by hand (docs/rigs.md)",
         )
     # Copy, because the array may be a view of the caller's content.
     values = values.copy()

@@ -79,7 +79,8 @@ def uncovered_body(
         body: in the scan's pose.
         scan: in metres.
         behind: metres that the scan may lie behind the body along a view, for fits that are off.
-        views, resolution: of parallel views spread over the sphere.
+        views: number of parallel views spread over the sphere.
+        resolution: pixels of a view's side.
     """
     body = as_mesh(body, subject="body")
     scan = as_mesh(scan, subject="scan")

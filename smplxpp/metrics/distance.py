@@ -128,12 +128,14 @@ def compare(
     (`smplxpp.metrics.presets`).
 
     Args:
-        pred, gt: metres, or `config.unit`. A point cloud is measured from all of its points, and to the nearest.
+        pred: metres, or `config.unit`. A point cloud is measured from all of its points, and to the nearest.
+        gt: the truth, likewise.
         samples: points a mesh, before the choice of visible ones.
         seed: of the samples; the same seed, the same bits.
         preset: the convention of `p2s` and `chamfer`.
-        pred_labels, gt_labels: labels of the faces (M,) or vertices (N,) of either mesh; each adds a result a label. A
-            mesh without labels takes those of the closest points of the other.
+        pred_labels: labels of the faces (M,) or vertices (N,) of `pred`; each adds a result a label. A mesh without
+            labels takes those of the closest points of the other.
+        gt_labels: those of `gt`.
         config: thresholds, visible-only, certified Hausdorff distance, unit.
 
     Raises:

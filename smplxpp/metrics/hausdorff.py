@@ -71,7 +71,8 @@ def hausdorff(
     """Bound the Hausdorff distance of two surfaces, `max(max_a d(a, B), max_b d(b, A))`, over all points, not samples.
 
     Args:
-        a, b: meshes with an area; faces without area add no surface.
+        a: mesh with an area; faces without area add no surface.
+        b: the other one, likewise.
         tolerance_mm: gap between the bounds at which the search stops; infinity gives the maximum over vertices as the
             lower bound, and an upper bound from edge lengths, in one pass.
         most_evaluations: points a direction after which it stops with the gap that is left.

@@ -55,7 +55,8 @@ def mirrored_by_views(
         colors: of the scan's vertices.
         views: cameras, and what they saw, of their size; a few hundred pixels do.
         body: in the scan's pose.
-        center, across: as `mirror_ratio` takes them.
+        center: as `mirror_ratio` takes it.
+        across: as `mirror_ratio` takes it.
 
     Returns:
         None where the photographs look like neither, or no view shows enough.
@@ -222,7 +223,8 @@ def mirror_ratio(
     Args:
         points: of the scan, skin at best.
         body: in the scan's pose.
-        center, across: a point of the plane to mirror at, and its normal: the body's middle, from hip to hip.
+        center: a point of the plane to mirror at: the body's middle.
+        across: the plane's normal: from hip to hip.
     """
     body = as_mesh(body, subject="body")
     found, _ = as_points(points)

@@ -49,7 +49,8 @@ def pose_error(found: BodyParams, exact: BodyParams, body: BodyModel, covered: B
     `a = mean_{t,j} arccos((tr(R_j(found_t)^T R_j(exact_t)) - 1) / 2)`, the geodesic angle.
 
     Args:
-        found, exact: T frames each; either may have more or fewer shape coefficients than the other.
+        found: T frames; it may have more or fewer shape coefficients than `exact`.
+        exact: T frames.
         body: the model that both are for.
         covered: whether a part covers a vertex of the body.
 

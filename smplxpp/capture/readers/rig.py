@@ -107,7 +107,7 @@ def what_is_missing(root: Path) -> str | None:
     count = count or sum(name.lower().endswith("_json") for name in folders)
     if not count:
         return None
-    return "videos or folders of keypoints are there; a calibration (docs/captures.md) is not: --calibration names it"
+    return "videos or folders of keypoints are there; a calibration (docs/rigs.md) is not: --calibration names it"
 
 
 def _video_sizes(videos: Mapping[str, Path], cameras: Mapping[str, Camera]) -> dict[str, tuple[int, int]]:
