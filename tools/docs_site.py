@@ -1,7 +1,7 @@
 """Prepare the documentation for MkDocs: the README as start page, files that pages link to, an API reference.
 
-`mkdocs.yml` names this file as a hook. The pages of `docs/` also read well without the site, so their links are those of
-the repository; here they become links within the site.
+`mkdocs.yml` names this file as a hook. The pages of `docs/` also read well without the site, so their links are those
+of the repository; here they become links within the site.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ ROOMS = {
         "core body capture build segment clean transfer skinning template export metrics register reconstruct "
         "cloth raster detect people"
     ).split(),
-    "avatar": "data gaussians rendering losses models training evaluation metrics runtime driving speech export formats".split(),
+    "avatar": (
+        "data gaussians rendering losses models training evaluation metrics runtime driving speech export formats"
+    ).split(),
 }
 """Packages and their rooms in the order of the reference; a room's public names are its `__all__`."""
 PAGES = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
@@ -60,7 +62,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def outside_targets(file: File) -> Iterator[str]:
-    """Yield the files of the repository, by path, to which a page links and which are no page or picture of the site."""
+    """Yield the files of the repository to which a page links and which are no page or picture of the site."""
     for match in _LINK.finditer(file.content_string):
         path = repository_path(file, match[2])
         if site_place(path).startswith(SOURCES + "/") and (ROOT / path).is_file():

@@ -55,8 +55,8 @@ from smplxpp.transfer.checks import welded
 # Shares of a part's faces or vertices, %, at which a fault warns and fails; any other fault fails from the first face.
 # Chosen on templates of two real scans: a right shirt has 0.2 % of cut faces, one that is torn 2 %.
 _SHARES = {"faces that cut another": (0.0, 1.0), "needles": (0.1, 5.0)}
-# As a build counts: cloth whose weights are right still meets the body where limbs press on it, so that what is deep in a
-# hard pose warns alone.
+# As a build counts: cloth whose weights are right still meets the body where limbs press on it, so that what is deep
+# in a hard pose warns alone.
 _INSIDE_REST, _INSIDE_POSED, _STRETCH = (0.0, 1.0), (25.0, 100.0), (3.0, 10.0)
 _DEEP = 0.01  # metres within the body, from which a place counts in a hard pose
 _SEAM = (1.0, 5.0)  # mm between copies of a vertex: a slit of one is seen at arm's length
