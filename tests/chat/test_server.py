@@ -7,10 +7,14 @@ import json
 import random
 import re
 import socket
+import ssl
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from shutil import which
 from typing import Any
 
 import pytest
@@ -24,8 +28,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from pipelines.chat.server import MOST_BYTES, REPLACED, TAKEN, ChatServer
+from pipelines.web.access import Access, new_token
 
 LIMIT = 900
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass
@@ -237,6 +243,87 @@ def test_a_page_that_does_not_read_holds_nobody_up(serve):
         sent()
         it.server.shutdown()
         assert it.server._ended.is_set()
+
+
+NGINX = """daemon off; master_process off; worker_processes 1; pid {folder}/pid; error_log {folder}/errors.log;
+events {{}}
+http {{
+  client_body_temp_path {folder}/body; proxy_temp_path {folder}/proxy; fastcgi_temp_path {folder}/fast;
+  uwsgi_temp_path {folder}/uwsgi; scgi_temp_path {folder}/scgi;
+{site}
+}}"""
+
+
+@pytest.mark.skipif(not (which("nginx") and which("openssl")), reason="no nginx, or no openssl (apt-get install nginx)")
+def test_the_nginx_of_the_examples_offers_it_by_https(tmp_path):
+    """The site as it is written, with another port, certificate and folder."""
+    name, folder = "me.example.org", tmp_path
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    made = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2".split()
+    made += ["-subj", f"/CN={name}", "-addext", f"subjectAltName=DNS:{name}"]
+    made += ["-keyout", str(folder / "key.pem"), "-out", str(folder / "cert.pem")]
+    subprocess.run(["openssl", *made], check=True, capture_output=True)
+    base, token = f"https://{name}:{port}", new_token()
+    data, body = doll(tmp_path)
+    server = ChatServer(data, cast(body), name="Doll", access=Access(public_url=f"{base}/talk/", token=token))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    site = (ROOT / "examples" / "deploy" / "nginx.conf").read_text()
+    for written, here in (
+        ("listen 443", f"listen 127.0.0.1:{port}"),
+        ("127.0.0.1:8091", f"127.0.0.1:{server.server_address[1]}"),
+        (f"/etc/letsencrypt/live/{name}/fullchain.pem", str(folder / "cert.pem")),
+        (f"/etc/letsencrypt/live/{name}/privkey.pem", str(folder / "key.pem")),
+        ("/var/log/nginx", str(folder)),
+    ):
+        assert written in site
+        site = site.replace(written, here)
+    (folder / "nginx.conf").write_text(NGINX.format(folder=folder, site=site))
+    trusted = ssl.create_default_context(cafile=folder / "cert.pem")
+
+    def get(path: str, **headers: str) -> http.client.HTTPResponse:
+        connection = http.client.HTTPSConnection(name, port, timeout=LIMIT, context=trusted)
+        stream = socket.create_connection(("127.0.0.1", port), timeout=LIMIT)
+        connection.sock = trusted.wrap_socket(stream, server_hostname=name)
+        connection.request("GET", path, headers=headers)
+        reply = connection.getresponse()
+        reply.content = reply.read()
+        connection.close()
+        return reply
+
+    command = ["nginx", "-p", str(folder), "-c", str(folder / "nginx.conf"), "-e", str(folder / "errors.log")]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as nginx:
+        try:
+            end = time.monotonic() + LIMIT
+            while True:  # until it listens
+                try:
+                    assert nginx.poll() is None and time.monotonic() < end, (folder / "errors.log").read_text()
+                    moved = get(f"/talk/?token={token}")
+                    break
+                except ConnectionError:
+                    time.sleep(0.02)
+            assert moved.status == 303 and get("/talk/").status == 403 and get("/other").status == 404
+            cookie = moved.headers["Set-Cookie"].split(";")[0]
+            page = get("/talk/", Cookie=cookie)
+            assert f"wss://{name}:{port}" in page.content.decode()
+            assert get("/talk/me.avatar", Cookie=cookie).content == data
+            secret = re.search('data-chat="([^"]+)"', page.content.decode())[1]
+
+            def open_socket(origin: str) -> Any:
+                stream = socket.create_connection(("127.0.0.1", port))
+                options: dict[str, Any] = {"additional_headers": {"Cookie": cookie}, "max_size": None, "ssl": trusted}
+                return connect(f"wss://{name}:{port}/talk/{secret}", sock=stream, origin=origin, **options)
+
+            with pytest.raises(InvalidStatus, match="403"):
+                open_socket("https://evil.example")
+            with open_socket(base) as talk:
+                talk.send(json.dumps({"kind": "say", "text": "hello"}))
+                assert told(talk, "heard")["text"] == "hello"
+        finally:
+            nginx.terminate()
+            server.shutdown()
+    assert token not in (folder / "smplxpp.log").read_text()  # the log does not let its readers in
 
 
 @pytest.mark.parametrize("path", [b"/\xff\xfe", b"http://["])

@@ -181,7 +181,6 @@ def test_the_microphone_moves_the_mouth_and_nothing_else(listening, avatar):
         assert listening.errors == []
     finally:
         server.shutdown()
-        server.server_close()
 
 
 def test_a_file_is_heard_and_the_mouth_is_with_it(listening, avatar):
@@ -214,7 +213,6 @@ def test_a_file_is_heard_and_the_mouth_is_with_it(listening, avatar):
         assert listening.errors == []
     finally:
         server.shutdown()
-        server.server_close()
 
 
 def test_what_goes_wrong_is_said(deaf, avatar):
@@ -235,7 +233,6 @@ def test_what_goes_wrong_is_said(deaf, avatar):
         assert deaf.errors == []
     finally:
         server.shutdown()
-        server.server_close()
 
 
 def test_one_file_has_it_and_a_page_without_lips_has_no_voice(deaf, avatar, tmp_path):
