@@ -47,16 +47,23 @@ class OnnxModel:
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for every kind of damage
             raise InputError(self.subject, expected="an ONNX model", received=f"{error}"[:400]) from None
         self.inputs, self.outputs = self._session.get_inputs(), self._session.get_outputs()
+        self._releasing = onnxruntime.RunOptions()
+        self._releasing.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
-    def run(self, values: Mapping[str, np.ndarray]) -> list[Any]:
+    def run(self, values: Mapping[str, np.ndarray], *, release: bool = False) -> list[Any]:
         """Run the model on named inputs; returns its outputs in the order of `outputs`.
+
+        Args:
+            values: inputs by name.
+            release: give the memory of this run back, which is kept for the next one otherwise.
 
         Raises:
             InputError: the model cannot compute with these values.
         """
+        options = self._releasing if release else None
         try:
-            return self._session.run(None, dict(values))
+            return self._session.run(None, dict(values), options)
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for whatever a model cannot do
             raise InputError(self.subject, expected="a model that runs", received=f"{error}"[:400]) from None
 
