@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from importlib.util import find_spec
@@ -87,24 +88,28 @@ class PiperVoice:
             )
         self._model = OnnxModel(model, kind="voice", extra=EXTRA, threads=threads, shown=(_DURATIONS,))
 
-    def say(self, text: str, *, slower: float = 1.0) -> SynthesizedSpeech:
+    def say(self, text: str, *, slower: float = 1.0, wanted: Callable[[], bool] = lambda: True) -> SynthesizedSpeech:
         """Speak a text, sentence by sentence, without noise, so that the result is always the same.
 
         Args:
             text: words of the voice's language.
             slower: factor of the durations.
+            wanted: asked before each part of a sentence, a second of computation at most; the rest is left out.
         """
         pronounced = pronounce(text, language=self.language)
-        spoken = self.read(pronounced.ipa, slower=slower)
+        spoken = self.read(pronounced.ipa, slower=slower, wanted=wanted)
         return replace(spoken, guessed=pronounced.guessed, foreign=pronounced.foreign)
 
-    def read(self, ipa: str, *, slower: float = 1.0, noise: float = 0.0) -> SynthesizedSpeech:
+    def read(
+        self, ipa: str, *, slower: float = 1.0, noise: float = 0.0, wanted: Callable[[], bool] = lambda: True
+    ) -> SynthesizedSpeech:
         """Speak a text in IPA, as espeak-ng writes it.
 
         Args:
             ipa: the text.
             slower: factor of the durations.
             noise: of the voice and its durations, random each time; Piper's default is about 0.7.
+            wanted: asked before each part; the rest is left out.
 
         Raises:
             InputError: no symbol that the voice has.
@@ -112,7 +117,7 @@ class PiperVoice:
         sounds, phonemes, at = [], [], 0.0
         whole = re.findall(r"[^.!?]+[.!?]*", ipa)
         for sentence in (piece for one in whole for piece in _pieces(one.strip())):
-            if not sentence.strip(f" {PAUSES}"):
+            if not sentence.strip(f" {PAUSES}") or not wanted():
                 continue
             samples, own = self._sentence(sentence.strip(), slower, noise)
             phonemes += [replace(one, start=one.start + at, end=one.end + at) for one in own]

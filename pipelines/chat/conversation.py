@@ -185,14 +185,14 @@ class Conversation:
             self._report(turn)
 
     def close(self) -> None:
-        """End the conversation and its threads; a voice within a sentence is left to itself after a second."""
+        """End the conversation and its threads; a partner that is still being connected is left to itself."""
         self._closed.set()
         if self._turn is not None:
             self._turn.cancelled = True
             self._partner.cancel()
         for thread in (self._pump, self._answering):
             if thread is not None:
-                thread.join(1.0)
+                thread.join(2.0)  # seconds: the voice's longest part, on a busy machine
         if self._parts.recognisers is not None and self._recogniser is not None:
             self._parts.recognisers.give_back(self._recogniser)
 
@@ -282,8 +282,10 @@ class Conversation:
         if turn.cancelled:
             return
         try:
-            spoken = self._parts.voice.say(words)
+            spoken = self._parts.voice.say(words, wanted=lambda: not turn.cancelled)
         except InputError as error:  # another alphabet or punctuation alone is shown and not spoken
+            if turn.cancelled:
+                return
             self._tell({"kind": "silent", "turn": turn.number, "line": number, "text": sentence})
             if any(one.isalnum() for one in sentence):
                 self._note(str(error))

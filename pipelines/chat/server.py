@@ -74,6 +74,7 @@ class ChatServer(PageServer):
         self._parts, self._report, self._sessions = parts, report, sessions
         self._secret = secrets.token_urlsafe(24)
         self._pages: list[_Page] = []
+        self._leaving: set[threading.Thread] = set()
         self._pool = ThreadPoolExecutor(sessions + 1, thread_name_prefix="conversation")
         access = access or Access()
 
@@ -90,6 +91,13 @@ class ChatServer(PageServer):
             await asyncio.wait(leaving, timeout=ENDING)
         await super()._end()
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def shutdown(self) -> None:
+        """End all conversations and the server, within a second of computation."""
+        super().shutdown()
+        # A voice is code that the end of the process must not find at work.
+        for thread in list(self._leaving):
+            thread.join(2.0)
 
     async def _upgrade(
         self, request: Request, name: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
@@ -146,13 +154,19 @@ class ChatServer(PageServer):
         finally:
             page.leave()
             writing.cancel()
-            made.add_done_callback(_close)
+            made.add_done_callback(self._close)
 
+    def _close(self, made: Future[Conversation]) -> None:
+        """End a conversation beside everything else: its voice may be within a sentence."""
 
-def _close(made: Future[Conversation]) -> None:
-    """End a conversation beside everything else: its voice may be within a sentence."""
-    if not made.cancelled() and made.exception() is None:
-        threading.Thread(target=made.result().close, daemon=True).start()
+        def close() -> None:
+            made.result().close()
+            self._leaving.discard(thread)
+
+        if not made.cancelled() and made.exception() is None:
+            thread = threading.Thread(target=close, daemon=True)
+            self._leaving.add(thread)
+            thread.start()
 
 
 class _Page:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,7 @@ A_CHARACTER = 0.05
 class Hum:
     """A voice: so long as the text, one vowel, loud."""
 
-    def say(self, text: str) -> SynthesizedSpeech:
+    def say(self, text: str, *, wanted: Callable[[], bool] = lambda: True) -> SynthesizedSpeech:
         if not text.isascii():
             raise InputError("text", expected="English", received=text)
         samples = np.full(int(len(text) * A_CHARACTER * RATE), 0.5, np.float32)
