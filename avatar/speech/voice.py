@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -87,6 +89,8 @@ class PiperVoice:
                 f"voice {model}", expected="one speaker and Piper's symbols", received=f"{speakers} speakers"
             )
         self._model = OnnxModel(model, kind="voice", extra=EXTRA, threads=threads, shown=(_DURATIONS,))
+        # Several conversations wait for a core instead of sharing it: the first are done sooner, and memory is bounded.
+        self._free = threading.Semaphore(max(1, (os.cpu_count() or 1) // threads))
 
     def say(self, text: str, *, slower: float = 1.0, wanted: Callable[[], bool] = lambda: True) -> SynthesizedSpeech:
         """Speak a text, sentence by sentence, without noise, so that the result is always the same.
@@ -146,7 +150,8 @@ class PiperVoice:
         feed = {"input": np.array([ids]), "input_lengths": np.array([len(ids)]), "scales": scales}
         # What a long sentence took is given back: one of 400 IPA characters left the process 340 MB larger. Shorter
         # ones keep theirs, because memory that is asked for anew each time costs them a tenth of their time.
-        samples, frames = self._model.run(feed, release=len(ids) > 400)[:2]
+        with self._free:
+            samples, frames = self._model.run(feed, release=len(ids) > 400)[:2]
         # Durations are in frames of 256 samples.
         ends = np.cumsum(np.ravel(frames)) * 256 / self.rate
         samples = np.ravel(samples).astype(np.float32)

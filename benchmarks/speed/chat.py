@@ -6,12 +6,16 @@ A Piper voice (extra `[chat]`) says short sentences into a websocket of `smplxpp
 in pieces of 64 ms, in real time. Rules answer. The client is no browser: "heard" is when the message with the sound has
 come, "seen" when a picture of 512 x 640 was drawn by `avatar.runtime` after it. Times count from the end of the speech,
 which the server finds out only after a pause that it is set to wait for. How many words were recognised is counted too.
+
+Then the same sentences are typed, by one page and by ten at a time, which all wait for their answer: seconds from a
+message until the sound of its answer has come, and the memory of the process.
 """
 
 from __future__ import annotations
 
 import difflib
 import json
+import os
 import re
 import threading
 import time
@@ -49,6 +53,8 @@ PIECE = 1024
 """Samples of a message: 64 ms."""
 SILENCE = 2.0
 """Seconds between two sentences at least."""
+PAGES = 10
+"""Pages that type at a time: more than a small machine has cores, by far."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,7 @@ class ChatBenchmark:
             print(f"{sentence:40s} {heard:40s} {turns[-1]}")
         page.close()
         server.shutdown()
-        figures = {
+        figures: dict[str, Any] = {
             "sentences": len(SENTENCES),
             "words recognised": f"{right} of {words}",
             "seconds from the end of the speech": {
@@ -92,6 +98,7 @@ class ChatBenchmark:
                 }
                 for part in turns[0]
             },
+            "typed": [_typed(self.avatar, cast, pages) for pages in (1, PAGES)],
             "seconds of CPU": _cpu(cast, page),
             "gaussians": bundle.sizes["N"],
         }
@@ -100,19 +107,63 @@ class ChatBenchmark:
         print(f"stored {store_results('chat', 'python -m benchmarks chat --avatar me.avatar', figures).name}")
 
 
+def _connect(server: ChatServer) -> Any:
+    """Open the websocket of a page."""
+    from urllib.request import urlopen
+
+    from websockets.sync.client import connect
+
+    with urlopen(server.address) as reply:
+        secret = re.search('data-chat="([^"]+)"', reply.read().decode())
+    assert secret is not None
+    origin = server.address.rstrip("/")
+    return connect(f"{origin.replace('http', 'ws')}/{secret[1]}", origin=origin, max_size=None)
+
+
+def _typed(avatar: Path, cast: ChatParts, pages: int) -> dict[str, Any]:
+    """Type all sentences in each of some pages, each once the last is answered; return the seconds and the memory."""
+    server = ChatServer(avatar.read_bytes(), cast, name="benchmark", sessions=pages)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    began, seconds = time.process_time(), list[float]()
+
+    def talk() -> None:
+        page = _connect(server)
+        for sentence in SENTENCES:
+            page.send(json.dumps({"kind": "say", "text": sentence}))
+            sent, heard = time.monotonic(), 0.0
+            for message in page:
+                if isinstance(message, bytes):
+                    heard = heard or (time.monotonic() if b'"sound"' in message[:4096] else 0.0)
+                elif json.loads(message)["kind"] == "answered":
+                    break
+            seconds.append(heard - sent)
+        page.close()
+
+    threads = [threading.Thread(target=talk) for _ in range(pages)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    used = time.process_time() - began
+    resident = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    server.shutdown()
+    assert len(seconds) == pages * len(SENTENCES) and resident is not None
+    return {
+        "pages": pages,
+        "messages": len(seconds),
+        "median": round(float(np.median(seconds)), 3),
+        "worst": round(max(seconds), 3),
+        "CPU seconds a message": round(used / len(seconds), 3),
+        "resident MB": int(resident[1]) // 1024,
+        "load of the machine": round(os.getloadavg()[0], 1),
+    }
+
+
 class _Page:
     """A client that speaks, listens and draws."""
 
     def __init__(self, server: ChatServer, avatar: Path) -> None:
-        from urllib.request import urlopen
-
-        from websockets.sync.client import connect
-
-        with urlopen(server.address) as reply:
-            secret = re.search('data-chat="([^"]+)"', reply.read().decode())
-        assert secret is not None
-        origin = server.address.rstrip("/")
-        self._socket = connect(f"{origin.replace('http', 'ws')}/{secret[1]}", origin=origin, max_size=None)
+        self._socket = _connect(server)
         self._player = AvatarPlayer(avatar)
         motion = self._player.motion
         assert motion is not None
@@ -168,8 +219,8 @@ class _Page:
 def _cpu(cast: ChatParts, page: _Page) -> dict[str, float]:
     """Seconds of CPU of the parts on their own, means over the sentences; a block is 32 ms of sound."""
     out: dict[str, list[float]] = {}
-    activity, animator, recogniser = cast.activity(), cast.animator(), cast.recogniser
-    assert recogniser is not None
+    assert cast.recognisers is not None
+    activity, animator, recogniser = cast.activity(), cast.animator(), cast.recognisers.take()
 
     def timed(part: str, do: Callable[[], T]) -> T:
         began = time.process_time()
