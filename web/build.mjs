@@ -1,6 +1,8 @@
 // Builds the player into one file, its worker inside: pipelines/web/assets/player.js. With --tests: what the tests import.
+// With --package: dist/, which npm pack takes; with --package FOLDER: its scripts alone.
+import { execFileSync } from "node:child_process";
 import { createHash } from "node:crypto";
-import { readdirSync, readFileSync } from "node:fs";
+import { copyFileSync, readdirSync, readFileSync, rmSync } from "node:fs";
 import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
 
@@ -29,11 +31,26 @@ if (process.argv.includes("--tests")) {
     entryPoints: [here("test/modules.ts")], outfile: here("build/modules.mjs"), bundle: true, format: "esm",
     target: "es2022", platform: "neutral", define, ...files,
   });
+} else if (process.argv.includes("--package")) {
+  const worker = await scriptOf("src/worker/worker.ts", define);
+  const out = process.argv[process.argv.indexOf("--package") + 1] ?? here("dist");
+  rmSync(out, { recursive: true, force: true });
+  const entryPoints = ["index", "element", "three"].map((name) => here(`src/embed/${name}.ts`));
+  const licence = { js: "/* smplxpp, Apache-2.0 */" };
+  await build({
+    ...shared, ...files, entryPoints, outdir: out, format: "esm", splitting: true, external: ["three"], banner: licence,
+    define: { WORKER_SOURCE: worker },
+  });
+  await build({ ...shared, ...files, entryPoints: [here("src/worker/worker.ts")], outfile: `${out}/worker.js`, format: "iife", define, banner: licence });
+  if (out === here("dist")) {
+    execFileSync(process.execPath, [here("node_modules/typescript/bin/tsc"), "-p", here("tsconfig.package.json")], { stdio: "inherit" });
+    for (const name of ["LICENSE", "NOTICE"]) copyFileSync(here(`../${name}`), `${out}/${name}`);
+  }
 } else {
   const outfile = process.argv[2] ?? here("../pipelines/web/assets/player.js");
   const licence = `/* smplxpp player, Apache-2.0; web/ of the project has its sources ${digestOfSources()} */`;
   await build({
-    ...shared, ...files, entryPoints: [here("src/main.ts")], outfile, format: "iife", banner: { js: licence },
+    ...shared, ...files, entryPoints: [here("src/main.ts")], outfile, format: "esm", banner: { js: licence },
     define: { WORKER_SOURCE: await scriptOf("src/worker/worker.ts", define) },
   });
   console.log(`${outfile}: ${readFileSync(outfile).length} bytes`);

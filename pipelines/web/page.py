@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import json
 from collections.abc import Sequence
@@ -44,6 +45,19 @@ _POLICY = (
     "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; worker-src blob:; style-src 'unsafe-inline'; "
     "img-src data:; {connect}"
 )
+# Browsers give a page from disk no module that lies beside it: then only this script of the page itself can say so.
+_FROM_DISK = """
+if (location.protocol === "file:") {
+  const said = document.createElement("p");
+  said.className = "failed";
+  said.style.cssText = "margin: 20vh auto; max-width: 30em; padding: 1.5em; font: 16px/1.5 system-ui, sans-serif";
+  said.textContent = "This page was opened from disk, where a browser does not let it read the files beside it. " +
+    "Serve its folder (smplxpp web --serve, or python -m http.server), " +
+    "or make one file with smplxpp web --single-file.";
+  document.body.append(said);
+}
+"""
+_FROM_DISK_DIGEST = base64.b64encode(hashlib.sha256(_FROM_DISK.encode()).digest()).decode()
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -55,7 +69,7 @@ _PAGE = """<!doctype html>
 <link rel="icon" href="data:,">
 <title>{title}</title>
 </head>
-<body{attributes}>
+<body data-player{attributes}>
 {body}
 </body>
 </html>
@@ -116,12 +130,12 @@ def page_files(bundle: bytes, content: PageContent) -> dict[str, bytes]:
     """Return the files of a folder that plays a bundle, by name."""
     names = {"sound": SOUND, "lips": LIPS}
     page = _PAGE.format(
-        policy=_POLICY.format(script="'self' blob:", connect="connect-src *"),
+        policy=_POLICY.format(script=f"'self' blob: 'sha256-{_FROM_DISK_DIGEST}'", connect="connect-src *"),
         title=html.escape(content.name),
         attributes=f' data-avatar="{AVATAR}"'
         + "".join(f' data-{kind}="{names[kind]}"' for kind in content.beside)
         + content.lit,
-        body=f'<script src="{SCRIPT}"></script>',
+        body=f'<script>{_FROM_DISK}</script>\n<script type="module" src="{SCRIPT}"></script>',
     )
     files = {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
     return {**files, **{names[kind]: data for kind, data in content.beside.items()}}
@@ -137,7 +151,7 @@ def chat_files(bundle: bytes, *, name: str, secret: str, sockets: Sequence[str])
         policy=_POLICY.format(script="'self' blob:", connect=f"connect-src 'self' {' '.join(sockets)}"),
         title=html.escape(name),
         attributes=f' data-avatar="{AVATAR}" data-chat="{html.escape(secret)}"',
-        body=f'<script src="{SCRIPT}"></script>',
+        body=f'<script type="module" src="{SCRIPT}"></script>',
     )
     return {INDEX: page.encode(), SCRIPT: _script().encode(), AVATAR: bundle}
 
@@ -167,7 +181,7 @@ def single_page(bundle: bytes, content: PageContent) -> bytes:
         policy=_POLICY.format(script="'unsafe-inline' blob:", connect="connect-src 'none'"),
         title=html.escape(content.name),
         attributes=content.lit,
-        body=f"{inlined}<script>{script}</script>",
+        body=f'{inlined}<script type="module">{script}</script>',
     )
     return page.encode()
 

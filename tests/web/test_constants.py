@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from avatar.speech import audio_features
-from avatar.speech.coarticulation import ARTICULATORS
+from avatar.speech.coarticulation import ARTICULATORS, Timing
+from avatar.speech.face import JAW_ANGLE, MAX_UNOBSERVED
 from avatar.speech.lips import PHONES, VERSION
 from pipelines.chat.conversation import MOST_TYPED
 from pipelines.chat.hearing import RATE
@@ -49,7 +50,7 @@ def evaluated(text: str, known: dict[str, float]) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-DRIVER, SOLVER = DriverConfig(), SolverConfig()
+DRIVER, SOLVER, TIMING = DriverConfig(), SolverConfig(), Timing()
 REPEATED = {
     "src/bundle/motion.ts": {"USUAL_RATE": DEFAULT_FPS},
     "src/chat/connection.ts": {"REPLACED": REPLACED},
@@ -75,7 +76,14 @@ REPEATED = {
     },
     "src/lips/network.ts": {"VERSION": VERSION, "PHONES": len(PHONES), "ARTICULATORS": len(ARTICULATORS)},
     "src/lips/steady.ts": {name: ARTICULATORS.index(name.lower()) for name in ("JAW", "PRESS")},
-    "src/lips/face.ts": {name: ARTICULATORS.index(name.lower()) for name in ("JAW", "PRESS")},
+    "src/lips/face.ts": {
+        **{name: ARTICULATORS.index(name.lower()) for name in ("JAW", "PRESS")},
+        **{"JAW_ANGLE": JAW_ANGLE, "MOST": MAX_UNOBSERVED},
+    },
+    "src/lips/visemes.ts": {
+        **{name.upper(): place for place, name in enumerate(ARTICULATORS)},
+        **{name.upper(): getattr(TIMING, name) for name in ("before", "after", "lead", "closing", "rest")},
+    },
 }
 
 

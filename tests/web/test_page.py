@@ -174,7 +174,7 @@ def test_a_folder_opened_from_disk_says_what_it_needs(tmp_path):
 def test_a_single_page_refers_to_nothing_outside():
     page = single_page(b"\0\1bundle", PageContent(name="</title><script>")).decode()
     assert "</title><script>" not in page
-    assert not re.search(r"""(?:src|href)=["'](?!data:)""", page.split("<script>")[0])
+    assert not re.search(r"""(?:src|href)=["'](?!data:)""", page.split('<script type="module">')[0])
     assert page.count("</script>") == 2
     assert page_files(b"", PageContent(name="x")).keys() == {"index.html", "player.js", "me.avatar"}
 

@@ -1,11 +1,12 @@
-/** The page: finds a renderer and a bundle, and plays it. */
+/** The page of the player, built on the module that other pages embed, which the same file exports. */
 
 import style from "./style.css";
 import { Conversation } from "./chat/conversation.ts";
-import { Player, type View } from "./player.ts";
-import { makeRenderer } from "./render/choose.ts";
+import { createAvatar, type CanvasAvatar, type CanvasOptions } from "./embed/canvas.ts";
+import type { Source } from "./embed/source.ts";
+import { BACKGROUND, type Player, type View } from "./player.ts";
 import type { Light } from "./light/irradiance.ts";
-import { App, type Data } from "./ui/app.ts";
+import { App } from "./ui/app.ts";
 import { element } from "./ui/elements.ts";
 import { shine } from "./ui/light.ts";
 
@@ -17,61 +18,40 @@ const LIGHT = "data-light";
 declare global {
   interface Window {
     /** For scripts on the page and for tests: the player, and pictures of single views. */
-    smplxppPlayer?: { player: Player; talking: Promise<Conversation | null>; ready: Promise<void>; picture(view: View): Promise<string>; open(data: ArrayBuffer): Promise<void> };
+    smplxppPlayer?: { avatar: CanvasAvatar; player: Player; talking: Promise<Conversation | null>; ready: Promise<void>; picture(view: View): Promise<string>; open(data: ArrayBuffer): Promise<void> };
   }
 }
 
 async function start(): Promise<void> {
   document.head.append(element("style", {}, style));
-  const stage = element("canvas", { class: "stage" });
-  document.body.append(stage);
-  const wanted = new URLSearchParams(location.search).get("renderer");
-  const player = new Player(await makeRenderer(stage, wanted), stage);
-  const app = new App(player, stage);
+  const stage = element("canvas", { class: "stage", tabindex: 0, role: "application", "aria-label": "Avatar" });
+  document.body.append(element("main", {}, stage));
+  const query = new URLSearchParams(location.search), renderer = query.get("renderer") as CanvasOptions["renderer"];
+  const avatar = createAvatar(stage, { renderer, background: BACKGROUND });
+  await avatar.ready;
+  const app = new App(avatar), player = avatar.player!;
   const light = document.body.getAttribute(LIGHT);
   if (light) {
     const { turn, ...rest } = JSON.parse(light) as Light & { turn: number };
     shine(player, rest, turn);
   }
-  const named = new URLSearchParams(location.search).get("avatar");
-  const data = named ? download(named) : find("avatar");
+  const named = query.get("avatar"), data = named ?? find("avatar");
   const ready = data ? app.open(data, named ? {} : { sound: find("sound"), lips: find("lips") }) : Promise.resolve(app.invite());
   const secret = document.body.getAttribute("data-chat");
   const talking = ready.then(() => secret && player.summary ? new Conversation(player, secret) : null);
   window.smplxppPlayer = {
-    player, talking, ready: talking.then(() => {}),
+    avatar, player, talking, ready: talking.then(() => {}),
     open: (bytes) => app.open(bytes),
     picture: async (view) => base64(await player.picture(view)),
   };
 }
 
-function find(kind: "avatar" | "sound" | "lips"): Data | null {
+function find(kind: "avatar" | "sound" | "lips"): Source | null {
   const inlined = document.getElementById(kind + INLINED);
-  if (inlined) {
-    const bytes = bytesOf(inlined.textContent ?? "");
-    inlined.remove();
-    return bytes;
-  }
-  const named = document.body.getAttribute(BESIDE + kind);
-  if (!named) return null;
-  const bytes = download(named);
-  // Sound and lips are awaited after the avatar, whose own failure would leave theirs without a listener.
-  bytes.catch(() => {});
+  if (!inlined) return document.body.getAttribute(BESIDE + kind);
+  const bytes = bytesOf(inlined.textContent ?? "");
+  inlined.remove();
   return bytes;
-}
-
-async function download(address: string): Promise<ArrayBuffer> {
-  // Browsers refuse pages from disk the files beside them, with an error that does not tell why.
-  if (location.protocol === "file:" && !/^[a-z]+:/i.test(address))
-    throw new Error("This page was opened from disk, where a browser does not let it read the files beside it. " +
-      "Serve its folder (smplxpp web --serve, or python -m http.server), or make one file with smplxpp web --single-file.");
-  const reply = await fetch(address).catch((error: Error) => {
-    const foreign = new URL(address, location.href).origin !== location.origin;
-    throw new Error(`${address}: ${error.message}` +
-      (foreign ? ". Another site must allow it by Access-Control-Allow-Origin (CORS)." : ""));
-  });
-  if (!reply.ok) throw new Error(`${address}: the server says ${reply.status} ${reply.statusText}`);
-  return reply.arrayBuffer();
 }
 
 function bytesOf(text: string): ArrayBuffer {
@@ -86,7 +66,11 @@ function base64(bytes: Uint8Array): string {
   return btoa(plain);
 }
 
-start().catch((error: Error) => {
+// Other pages take what is exported, and nothing else is done there.
+export * from "./embed/index.ts";
+export { AvatarElement } from "./embed/element.ts";
+
+if (document.body?.hasAttribute("data-player")) start().catch((error: Error) => {
   document.body.append(element("div", { class: "welcome" }, element("div", { class: "card failed" },
-    element("h2", {}, "This browser cannot show the avatar"), element("p", {}, error.message))));
+    element("h1", {}, "This browser cannot show the avatar"), element("p", {}, error.message))));
 });

@@ -4,6 +4,8 @@ export { poseAt, restPose, turned } from "../src/avatar/motion.ts";
 export { Resampler } from "../src/chat/resample.ts";
 export { SpeakingFace } from "../src/lips/face.ts";
 export { Ear } from "../src/lips/features.ts";
+export { spelt } from "../src/lips/spelling.ts";
+export { articulate, phonesOf } from "../src/lips/visemes.ts";
 export { LipNetwork } from "../src/lips/network.ts";
 export { Steady } from "../src/lips/steady.ts";
 export { unpackTensors } from "../src/bundle/tensors.ts";

@@ -12,8 +12,6 @@ import { readFrames } from "./wire.ts";
 const MOST_TYPED = 2000;
 /** Things said that are kept on the page. */
 const SHOWN = 40;
-/** Of the person's half height: where the camera looks above the middle; share of the distance that shows all of it. */
-const CHEST = 0.42, NEARER = 0.62;
 const NAMES: Record<string, string> = {
   pause: "pause", recognised: "words", "first words": "answer", sentence: "sentence", voice: "voice", sent: "sent",
   heard: "sound", seen: "picture",
@@ -166,11 +164,6 @@ export class Conversation {
 
   /** Shows head, chest and hands of who stands there. */
   private look(pose: Pose | null): void {
-    const { player } = this, { middle, reach, motion } = player.summary!;
-    const target: [number, number, number] = [...middle];
-    for (const axis of [0, 2]) target[axis] += (pose?.translation[axis] ?? 0) - (motion?.translation[axis] ?? 0);
-    target[1] += CHEST * reach;
-    player.orbit = { target, distance: NEARER * player.orbit.distance, azimuth: 0.12, elevation: 0.03 };
-    player.update();
+    this.player.lookAtChest(pose?.translation);
   }
 }

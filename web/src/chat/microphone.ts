@@ -14,16 +14,19 @@ export class Microphone {
 
   private stream: MediaStream | null = null;
   private context: AudioContext | null = null;
+  /** The stream is somebody else's, who stops it. */
+  private lent = false;
 
   get on(): boolean {
     return this.stream !== null;
   }
 
-  /** Begins to listen. @throws Error why it cannot. */
-  async start(hear: (samples: Int16Array) => void): Promise<void> {
-    if (!navigator.mediaDevices?.getUserMedia) throw new Error("this browser gives pages no microphone");
+  /** Begins to listen, to a stream in the place of the microphone where one is given. @throws Error why it cannot. */
+  async start(hear: (samples: Int16Array) => void, stream: MediaStream | null = null): Promise<void> {
+    this.lent = stream !== null;
+    if (!stream && !navigator.mediaDevices?.getUserMedia) throw new Error("this browser gives pages no microphone");
     const wanted = { channelCount: 1, echoCancellation: true, noiseSuppression: true, autoGainControl: true };
-    this.stream = await navigator.mediaDevices.getUserMedia({ audio: wanted });
+    this.stream = stream ?? await navigator.mediaDevices.getUserMedia({ audio: wanted });
     this.context = new AudioContext();
     const url = URL.createObjectURL(new Blob([WORKLET], { type: "text/javascript" }));
     await this.context.audioWorklet.addModule(url);
@@ -43,7 +46,7 @@ export class Microphone {
   }
 
   stop(): void {
-    this.stream?.getTracks().forEach((track) => track.stop());
+    if (!this.lent) this.stream?.getTracks().forEach((track) => track.stop());
     void this.context?.close();
     this.stream = this.context = null;
   }

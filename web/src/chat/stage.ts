@@ -2,7 +2,7 @@
 
 import type { Pose } from "../avatar/avatar.ts";
 import { between } from "../avatar/motion.ts";
-import type { Performer } from "../player.ts";
+import type { Performer } from "../animator.ts";
 import { poseOfRow, type Frames, type Line } from "./wire.ts";
 
 /** Seconds of frames behind the present that are kept; by which the clock may be off before it is set anew. */

@@ -67,7 +67,10 @@ export class LiveLips {
   /** What a file is heard through, for who wants to look at it. */
   output: GainNode | null = null;
   private readonly network: Piece;
-  private readonly face: SpeakingFace;
+  readonly face: SpeakingFace;
+  /** Settled when what is listened to is over. */
+  over: Promise<void> = Promise.resolve();
+  private end: () => void = () => {};
   private microphone: Microphone | null = null;
   private hearing: Hearing | null = null;
   private file: Playing | null = null;
@@ -110,32 +113,34 @@ export class LiveLips {
     return this.file && this.context ? Math.max(0, this.context.currentTime - (this.context.outputLatency || 0) - this.file.begun) : 0;
   }
 
-  /** Listens to the microphone; why it cannot is said. To be called by a click. */
-  async listen(): Promise<void> {
+  /** Listens to a stream, or to the microphone, and returns why it cannot, "" if it does. To be called by a click. */
+  async listen(stream: MediaStream | null = null): Promise<string> {
     this.stop();
     const turn = ++this.turn, hearing = new Hearing(new LipNetwork(this.network)), microphone = new Microphone(PIECE);
-    this.onsaid("The browser asks for the microphone");
+    if (!stream) this.onsaid("The browser asks for the microphone");
     try {
-      await microphone.start((samples) => this.hear(hearing, Float32Array.from(samples, (value) => value / 32767)));
+      await microphone.start((samples) => this.hear(hearing, Float32Array.from(samples, (value) => value / 32767)), stream);
     } catch (error) {
       microphone.stop();
-      if (turn === this.turn) this.onsaid(`The microphone cannot be used: ${(error as Error).message}`);
-      return;
+      return turn === this.turn ? this.say(`The microphone cannot be used: ${(error as Error).message}`) : "";
     }
     if (turn !== this.turn) {
       microphone.stop();
-      return;
+      return "";
     }
     this.microphone = microphone;
     this.hearing = hearing;
-    this.source = "microphone";
+    this.begin("microphone");
+    // A stream of somebody else's ends with its last sound.
+    stream?.getAudioTracks().forEach((track) => track.addEventListener("ended", () => turn === this.turn && this.stop()));
     this.lastLoud = performance.now() / 1000;
     this.quiet = false;
     this.onsaid("Listening: speak");
+    return "";
   }
 
-  /** Plays a sound's file and moves the mouth by it; why it cannot is said. To be called by a click. */
-  async play(data: ArrayBuffer, name: string): Promise<void> {
+  /** Plays a sound and moves the mouth by it; returns why it cannot, "" if it does. To be called by a click. */
+  async play(data: ArrayBuffer | AudioBuffer, name: string): Promise<string> {
     this.stop();
     const turn = ++this.turn;
     this.onsaid(`Opening ${name}`);
@@ -143,24 +148,17 @@ export class LiveLips {
       this.context ??= new AudioContext();
       void this.context.resume();
     } catch (error) {
-      this.onsaid(`This browser plays no sound: ${(error as Error).message}`);
-      return;
+      return this.say(`This browser plays no sound: ${(error as Error).message}`);
     }
     const { context } = this;
-    const buffer = await context.decodeAudioData(data).catch(() => null);
-    if (turn !== this.turn) return;
-    if (!buffer || !buffer.length) {
-      this.onsaid(`${name} is damaged, or no sound that this browser plays`);
-      return;
-    }
+    const buffer = data instanceof AudioBuffer ? data : await context.decodeAudioData(data).catch(() => null);
+    if (turn !== this.turn) return "";
+    if (!buffer || !buffer.length) return this.say(`${name} is damaged, or no sound that this browser plays`);
     const mono = new Float32Array(buffer.length);
     for (let c = 0; c < buffer.numberOfChannels; ++c) {
       buffer.getChannelData(c).forEach((value, k) => (mono[k] += value / buffer.numberOfChannels));
     }
-    if (!mono.some((value) => Math.abs(value) > LOUD)) {
-      this.onsaid(`${name} is silent`);
-      return;
-    }
+    if (!mono.some((value) => Math.abs(value) > LOUD)) return this.say(`${name} is silent`);
     this.output ??= context.createGain();
     this.output.connect(context.destination);
     const node = context.createBufferSource();
@@ -171,8 +169,26 @@ export class LiveLips {
     this.hearing = new Hearing(new LipNetwork(this.network));
     this.file = { mono, rate: buffer.sampleRate, resampler: new Resampler(buffer.sampleRate, RATE), given: 0, begun, node };
     node.start(begun);
-    this.source = "file";
+    this.begin("file");
     this.onsaid(`Playing ${name}`);
+    return "";
+  }
+
+  private begin(source: string): void {
+    this.source = source;
+    this.over = new Promise((resolve) => (this.end = resolve));
+  }
+
+  private say(message: string): string {
+    this.onsaid(message);
+    return message;
+  }
+
+  /** Listens no more, and gives back the loudspeakers. */
+  dispose(): void {
+    this.stop();
+    void this.context?.close();
+    this.context = null;
   }
 
   /** Listens no more: the mouth closes. */
@@ -183,6 +199,7 @@ export class LiveLips {
     this.microphone = this.file = this.hearing = null;
     if (this.source) this.ended = performance.now() / 1000;
     this.source = "";
+    this.end();
     this.onsaid(said);
   }
 

@@ -7,8 +7,8 @@ export interface Picture {
   records: Float32Array;
   count: number;
   camera: Camera;
-  /** sRGB in [0, 1]. */
-  background: readonly [number, number, number];
+  /** sRGB in [0, 1], and how much it covers of what is behind the canvas: 1 where left out. */
+  background: readonly number[];
   /** Pixels squared. */
   blur: number;
   /** The least and the largest depth, metres. */
@@ -31,6 +31,8 @@ export interface Renderer {
   readonly milliseconds: number | null;
   /** Those that it took before for projection and sort; null: it does not sort, or they are among the others. */
   readonly sorting: number | null;
+  /** Gives back what it holds of the GPU, and clears the canvas, which another renderer may take. */
+  dispose(): void;
   /** Loses context or device, as a driver that restarts does: for tests. It comes back by itself. */
   lose(): void;
 }

@@ -59,20 +59,42 @@ export class WebGL2Renderer implements Renderer {
 
   /** @throws Error no WebGL2 here. */
   constructor(private readonly canvas: HTMLCanvasElement) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+    const gl = canvas.getContext("webgl2", { alpha: true, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser has no WebGL2");
     this.gl = gl;
     this.resources = this.make();
-    canvas.addEventListener("webglcontextlost", (event) => {
-      event.preventDefault();
-      this.lost = true;
-      this.query = null;
-      this.fence = null;
-    });
-    canvas.addEventListener("webglcontextrestored", () => {
-      this.resources = this.make();
-      this.lost = false;
-    });
+    canvas.addEventListener("webglcontextlost", this.onlost);
+    canvas.addEventListener("webglcontextrestored", this.onrestored);
+  }
+
+  private readonly onlost = (event: Event): void => {
+    event.preventDefault();
+    this.lost = true;
+    this.query = null;
+    this.fence = null;
+  };
+
+  private readonly onrestored = (): void => {
+    this.resources = this.make();
+    this.lost = false;
+  };
+
+  dispose(): void {
+    const { gl, canvas, resources: { plain, lit, array, buffer, target, texture, normals } } = this;
+    canvas.removeEventListener("webglcontextlost", this.onlost);
+    canvas.removeEventListener("webglcontextrestored", this.onrestored);
+    this.lost = true;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    for (const { splats, resolve } of lit ? [plain, lit] : [plain]) [splats, resolve].forEach((program) => gl.deleteProgram(program));
+    gl.deleteVertexArray(array);
+    gl.deleteBuffer(buffer);
+    gl.deleteFramebuffer(target);
+    [texture, normals].forEach((one) => gl.deleteTexture(one));
+    gl.deleteSync(this.fence);
+    gl.deleteQuery(this.query);
+    gl.flush();
   }
 
   get busy(): boolean {
@@ -136,7 +158,8 @@ export class WebGL2Renderer implements Renderer {
     gl.useProgram(resolve);
     gl.bindTexture(gl.TEXTURE_2D, own.texture);
     const to = (name: string) => gl.getUniformLocation(resolve, name);
-    gl.uniform3f(to("background"), ...background);
+    const [red, green, blue, covers = 1] = background;
+    gl.uniform4f(to("background"), red, green, blue, covers);
     gl.uniform2i(to("corner"), x, y);
     if (isLit) {
       gl.activeTexture(gl.TEXTURE1);
@@ -251,6 +274,8 @@ export class WebGL2Renderer implements Renderer {
       gl.attachShader(program, shader);
     }
     gl.linkProgram(program);
+    // Deleted with the program.
+    for (const shader of gl.getAttachedShaders(program) ?? []) gl.deleteShader(shader);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
       throw new Error(`shaders of the player: ${gl.getProgramInfoLog(program)}`);
     }

@@ -5,39 +5,25 @@ export function lit(shader: string): string {
   return shader.replace("\n", "\n#define LIT\n");
 }
 
-/** One Gaussian an instance, four corners: the ellipse where alpha reaches 1/255, along its own axes. */
-export const SPLAT_VERTEX = `#version 300 es
-precision highp float;
-layout(location = 0) in vec4 place;
-layout(location = 1) in vec4 covariance0;
-layout(location = 2) in vec2 covariance1;
-layout(location = 3) in vec4 color;
+/** The ellipse of a Gaussian where alpha reaches 1/255, along its own axes, and one of its corners. */
+export const PROJECTION = `
 uniform mat3 rotation;
 uniform vec3 translation;
 uniform vec4 pinhole;
 uniform vec2 size;
 uniform float blur;
-out vec2 at;
-flat out vec4 paint;
-flat out float reach;
-#ifdef LIT
-flat out vec3 facing;
 
-// What web/splats.cpp has folded.
-vec3 unfolded(float code) {
-  if (code == 0.0) return vec3(0.0);
-  float high = floor(code / 4096.0);
-  vec2 at = (vec2(high, code - 4096.0 * high) - 2048.0) / 2047.0;
-  float z = 1.0 - abs(at.x) - abs(at.y), over = max(-z, 0.0);
-  return normalize(vec3(at.x - (at.x < 0.0 ? -over : over), at.y - (at.y < 0.0 ? -over : over), z));
-}
-#endif
+struct Ellipse {
+  bool visible;
+  vec3 middle;
+  float reach;
+  vec2 pixel;
+};
 
-void main() {
-  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+Ellipse ellipse(vec4 place, vec4 covariance0, vec2 covariance1, vec2 corner) {
   vec3 p = rotation * place.xyz + translation;
-  reach = log(255.0 * place.w);
-  if (!(p.z >= 0.01) || !(reach > 0.0)) return;
+  float reach = log(255.0 * place.w);
+  if (!(p.z >= 0.01) || !(reach > 0.0)) return Ellipse(false, p, reach, vec2(0.0));
   vec2 focal = pinhole.xy, middle = pinhole.zw;
   vec2 center = focal * p.xy / p.z + middle;
 
@@ -54,16 +40,48 @@ void main() {
   float mean = 0.5 * (a + c), spread = sqrt(0.25 * (a - c) * (a - c) + b * b);
   float angle = 0.5 * atan(2.0 * b, a - c);
   vec2 along = vec2(cos(angle), sin(angle));
-  vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
   // Half axes where sigma = reach: sqrt(2 reach lambda).
   float longer = sqrt(2.0 * reach * (mean + spread)), shorter = sqrt(2.0 * reach * max(mean - spread, 1e-9));
   vec2 pixel = center + corner.x * longer * along + corner.y * shorter * vec2(-along.y, along.x);
-  at = corner;
+  return Ellipse(true, p, reach, pixel);
+}
+`;
+
+/** One Gaussian an instance, four corners. */
+export const SPLAT_VERTEX = `#version 300 es
+precision highp float;
+layout(location = 0) in vec4 place;
+layout(location = 1) in vec4 covariance0;
+layout(location = 2) in vec2 covariance1;
+layout(location = 3) in vec4 color;
+out vec2 at;
+flat out vec4 paint;
+flat out float reach;
+${PROJECTION}
+#ifdef LIT
+flat out vec3 facing;
+
+// What web/splats.cpp has folded.
+vec3 unfolded(float code) {
+  if (code == 0.0) return vec3(0.0);
+  float high = floor(code / 4096.0);
+  vec2 at = (vec2(high, code - 4096.0 * high) - 2048.0) / 2047.0;
+  float z = 1.0 - abs(at.x) - abs(at.y), over = max(-z, 0.0);
+  return normalize(vec3(at.x - (at.x < 0.0 ? -over : over), at.y - (at.y < 0.0 ? -over : over), z));
+}
+#endif
+
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  at = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
+  Ellipse seen = ellipse(place, covariance0, covariance1, at);
+  reach = seen.reach;
+  if (!seen.visible) return;
   paint = vec4(color.rgb, place.w);
 #ifdef LIT
   facing = unfolded(color.w);
 #endif
-  gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
+  gl_Position = vec4(2.0 * seen.pixel.x / size.x - 1.0, 1.0 - 2.0 * seen.pixel.y / size.y, 0.0, 1.0);
 }`;
 
 /** Front to back: the target holds colour so far, and in alpha what still shines through. */
@@ -97,7 +115,7 @@ void main() {
 export const RESOLVE_FRAGMENT = `#version 300 es
 precision highp float;
 uniform sampler2D blended;
-uniform vec3 background;
+uniform vec4 background;
 uniform ivec2 corner;
 out vec4 result;
 #ifdef LIT
@@ -129,5 +147,6 @@ void main() {
   float share = 1.0 - value.a;
   if (share > 1e-3) value.rgb = share * relit(value.rgb / share, texelFetch(normals, ivec2(gl_FragCoord.xy) - corner, 0).xyz);
 #endif
-  result = vec4(value.rgb + value.a * background, 1.0);
+  // Premultiplied, as browsers want what is seen through.
+  result = vec4(value.rgb + value.a * background.a * background.rgb, 1.0 - value.a * (1.0 - background.a));
 }`;

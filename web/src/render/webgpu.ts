@@ -43,6 +43,7 @@ export class WebGPURenderer implements Renderer {
   sorting: number | null = null;
   private clock: Clock | null = null;
   private pending = 0;
+  private disposed = false;
   private device!: GPUDevice;
   private pipelines!: Pipelines;
   private scene!: GPUBuffer;
@@ -84,7 +85,7 @@ export class WebGPURenderer implements Renderer {
     new Float32Array(scene).set(depths, 20);
     new Uint32Array(scene)[22] = tiles;
     device.queue.writeBuffer(this.scene, 0, scene);
-    device.queue.writeBuffer(this.background, 0, new Float32Array([...background, 1]));
+    device.queue.writeBuffer(this.background, 0, new Float32Array([...background, 1].slice(0, 4)));
     device.queue.writeBuffer(own.records, 0, records.buffer, records.byteOffset, 4 * RECORD * count);
 
     const encoder = device.createCommandEncoder();
@@ -162,6 +163,12 @@ export class WebGPURenderer implements Renderer {
     return out;
   }
 
+  dispose(): void {
+    this.disposed = this.lost = true;
+    this.context.unconfigure();
+    this.device.destroy();
+  }
+
   lose(): void {
     this.lost = true;
     this.device.destroy();
@@ -188,7 +195,7 @@ export class WebGPURenderer implements Renderer {
     this.device = device;
     device.lost.then(() => this.recover());
     const format = navigator.gpu.getPreferredCanvasFormat();
-    this.context.configure({ device, format, alphaMode: "opaque" });
+    this.context.configure({ device, format, alphaMode: "premultiplied" });
     const uniform = (size: number) => device.createBuffer({ size, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
     this.scene = uniform(SCENE_BYTES);
     this.background = uniform(16);
@@ -212,6 +219,7 @@ export class WebGPURenderer implements Renderer {
   /** A new device in the place of one that is lost, as long as there is one to be had. */
   private async recover(): Promise<void> {
     this.lost = true;
+    if (this.disposed) return;
     const device = await freshDevice();
     if (device) await this.start(device);
   }

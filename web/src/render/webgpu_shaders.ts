@@ -251,7 +251,8 @@ fn whole(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
 fn resolve(@builtin(position) at: vec4f) -> @location(0) vec4f {
   let value = textureLoad(blended, vec2i(at.xy), 0);
   ${isLit ? "let rgb = shown(value, textureLoad(normals, vec2i(at.xy), 0).xyz);" : "let rgb = value.rgb;"}
-  return vec4f(rgb + value.a * background.rgb, 1.0);
+  // Premultiplied, as browsers want what is seen through.
+  return vec4f(rgb + value.a * background.a * background.rgb, 1.0 - value.a * (1.0 - background.a));
 }
 `;
 

@@ -1,6 +1,6 @@
 /** Sound that goes with a motion: its clock leads, so that both stay together at any rate of pictures. */
 
-import type { Clock } from "../player.ts";
+import type { Clock } from "../animator.ts";
 
 /** Seconds ahead of the present at which a sound is begun: what is asked for at once may begin late. */
 const AHEAD = 0.05;

@@ -1,10 +1,9 @@
 /** The page around the player. */
 
-import { BundleError } from "../bundle/errors.ts";
+import type { CanvasAvatar } from "../embed/canvas.ts";
+import type { Source } from "../embed/source.ts";
 import type { Player } from "../player.ts";
 import { element, iconButton, ICONS, paintShare, setIcon } from "./elements.ts";
-import { LiveLips } from "../lips/lips.ts";
-import { Soundtrack } from "../sound/soundtrack.ts";
 import { enterStereo, offersStereo } from "../xr/stereo.ts";
 import { isRadiance } from "../light/radiance.ts";
 import { listen } from "./gestures.ts";
@@ -15,8 +14,9 @@ const SPEEDS = [1, 0.5, 0.25, 2];
 /** Milliseconds between changes of the numbers on the page. */
 const RATES_EVERY = 400;
 
-/** Bytes that are there or on their way. */
-export type Data = Promise<ArrayBuffer> | ArrayBuffer;
+/** CSS pixels at the bottom that the controls cover. */
+const COVERED = 64;
+const TITLES = { avatar: "This avatar cannot be shown", sound: "There is no sound", lips: "The mouth cannot follow live sound" };
 
 export class App {
   private readonly title = element("header", { class: "title" });
@@ -25,97 +25,96 @@ export class App {
   private readonly playButton = iconButton("Pause", "play", ICONS.pause);
   private readonly scrub = element("input", { type: "range", min: 0, max: 1, step: 0.001, "aria-label": "Time" });
   private readonly clock = element("span", { class: "time" });
-  private readonly speed = element("button", { class: "speed", title: "Speed" }, "1×");
+  private readonly speed = element("button", { class: "speed", title: "Speed", "aria-label": "Speed 1×" }, "1×");
   private readonly menu = iconButton("Settings", "menu", ICONS.settings);
   private readonly stereo = iconButton("View in the headset", "stereo", ICONS.stereo);
   private readonly bar: HTMLElement;
   private readonly speak = element("button", { class: "button speak", hidden: true }, "Play with sound");
   private panel: HTMLElement | null = null;
-  private soundtrack: Soundtrack | null = null;
   private lastRates = 0;
 
-  constructor(private readonly player: Player, stage: HTMLCanvasElement) {
+  private readonly player: Player;
+  private readonly stage: HTMLCanvasElement;
+
+  constructor(private readonly avatar: CanvasAvatar) {
+    const stage = (this.stage = avatar.canvas), player = (this.player = avatar.player!);
+    player.covered = COVERED;
     this.bar = element("div", { class: "bar" }, this.playButton, this.scrub, this.clock, this.speed);
-    document.body.append(this.title, this.menu, this.stereo, this.rates, this.bar, this.speak, this.welcome);
+    stage.after(this.title, this.menu, this.stereo, this.rates, this.bar, this.speak, this.welcome);
+    this.menu.setAttribute("aria-controls", "settings");
     this.showControls(false);
-    listen(stage, player);
+    listen(stage, player, document.body);
     this.listenToControls();
     this.listenToFiles();
-    new ResizeObserver(() => player.update()).observe(stage);
-    player.onpicture = () => this.refresh();
-    player.onerror = (message) => this.fail(message);
+    avatar.on("ready", () => this.begin());
+    avatar.on("picture", () => this.refresh());
+    avatar.on("error", ({ about, message }) => this.fail(message, TITLES[about]));
   }
 
-  /** Opens a bundle's bytes, the sound of its motion and its lips, and shows it; what is wrong is said on the page. */
-  async open(data: Data, { sound = null, lips = null }: { sound?: Data | null; lips?: Data | null } = {}): Promise<void> {
-    this.say(element("div", { class: "spinner" }), element("h2", {}, "Opening the avatar"));
-    try {
-      const about = await this.player.open(await data);
-      this.welcome.replaceChildren();
-      await this.takeSound(sound);
-      this.player.lips?.stop();
-      this.player.lips = lips && this.speaking(await lips);
-      document.title = about.name;
-      this.title.replaceChildren(element("h1", {}, about.name), element("p", {}, "SMPLX++ avatar"));
-      this.panel?.remove();
-      this.panel = makePanel(this.player, (message, title) => this.fail(message, title));
-      this.title.after(this.panel);
-      setIcon(this.menu, ICONS.settings);
-      this.showControls(true);
-      this.bar.hidden = !this.player.duration;
-    } catch (error) {
-      this.fail(error instanceof BundleError || error instanceof Error ? error.message : String(error));
-    }
+  /** Opens an avatar, the sound of its motion and its lips, and shows it; what is wrong is said on the page. */
+  async open(data: Source, more: { sound?: Source | null; lips?: Source | null } = {}): Promise<void> {
+    this.say("Opening the avatar").prepend(element("div", { class: "spinner" }));
+    await this.avatar.open(data, more).catch((error: Error) => this.fail(error.message));
   }
 
-  /** Plays the motion with this sound from now on; without one, by itself. */
-  private async takeSound(data: Data | null): Promise<void> {
-    const { player } = this;
-    player.clock?.at(false, 0, 1);
-    this.soundtrack = data && new Soundtrack(await data, (message) => this.fail(message, "There is no sound"));
-    player.clock = this.soundtrack;
-    player.playing = !this.soundtrack;
-    this.speak.hidden = !this.soundtrack;
-  }
-
-  /** What moves the mouth by live sound; null: it cannot, which is said. */
-  private speaking(data: ArrayBuffer): LiveLips | null {
-    const { expressionNames, jointNames } = this.player.summary!;
-    try {
-      return new LiveLips(data, expressionNames.length, jointNames);
-    } catch (error) {
-      this.fail((error as Error).message, "The mouth cannot follow live sound");
-      return null;
-    }
+  /** Shows the controls of what was opened. */
+  private begin(): void {
+    const { name } = this.avatar.summary!;
+    this.welcome.replaceChildren();
+    this.speak.hidden = !this.player.clock;
+    document.title = name;
+    this.stage.ariaLabel = `${name}, an avatar. Arrow keys turn it, plus and minus come nearer and go away, Home goes back.`;
+    this.title.replaceChildren(element("h1", {}, name), element("p", {}, "SMPLX++ avatar"));
+    this.panel?.remove();
+    this.panel = makePanel(this.player, (message, title) => this.fail(message, title));
+    this.title.after(this.panel);
+    this.openPanel(false);
+    this.showControls(true);
+    this.bar.hidden = !this.player.duration;
   }
 
   /** Says what went wrong, and offers another file. */
   fail(message: string, title = "This avatar cannot be shown"): void {
     const said = message.charAt(0).toUpperCase() + message.slice(1);
     const buttons = this.chooser("Open another file");
-    if (this.player.summary) {
-      const back = element("button", { class: "button" }, "Back");
-      back.addEventListener("click", () => this.welcome.replaceChildren());
-      buttons.prepend(back);
-    }
-    const card = this.say(element("h2", {}, title), element("p", {}, `${said}.`), buttons);
+    const card = this.say(title, element("p", {}, `${said}.`), buttons);
     card.classList.add("failed");
+    card.setAttribute("role", "alert");
+    if (!this.player.summary) return;
+    const back = element("button", { class: "button back" }, "Back");
+    back.addEventListener("click", () => this.closeCard());
+    buttons.prepend(back);
+    back.focus();
   }
 
   /** Asks for a file. */
   invite(): void {
-    this.say(element("h2", {}, "Open an avatar"), element("p", {}, "Drop a .avatar file here, or choose one."), this.chooser("Choose a file"));
+    this.say("Open an avatar", element("p", {}, "Drop a .avatar file here, or choose one."), this.chooser("Choose a file"));
   }
 
-  private say(...content: Node[]): HTMLElement {
-    const card = element("div", { class: "card", role: "status" }, ...content);
+  /** Shows a card, whose title is the page's as long as there is no other. */
+  private say(title: string, ...content: Node[]): HTMLElement {
+    const heading = element(this.player.summary ? "h2" : "h1", {}, title);
+    const card = element("div", { class: "card", role: "status" }, heading, ...content);
     this.welcome.replaceChildren(card);
     return card;
   }
 
+  private closeCard(): void {
+    this.welcome.replaceChildren();
+    this.stage.focus();
+  }
+
+  private openPanel(open: boolean): void {
+    if (!this.panel) return;
+    this.panel.hidden = !open;
+    setIcon(this.menu, open ? ICONS.close : ICONS.settings);
+    this.menu.ariaExpanded = String(open);
+  }
+
   private chooser(label: string): HTMLElement {
-    const input = element("input", { type: "file", accept: ".avatar,.zip", hidden: true });
-    input.addEventListener("change", () => input.files?.[0] && this.open(input.files[0].arrayBuffer()));
+    const input = element("input", { type: "file", accept: ".avatar,.zip", hidden: true, "aria-label": label });
+    input.addEventListener("change", () => input.files?.[0] && this.open(input.files[0]));
     const button = element("button", { class: "button" }, label);
     button.addEventListener("click", () => input.click());
     return element("div", {}, button, input);
@@ -130,15 +129,14 @@ export class App {
   private listenToControls(): void {
     const { player } = this;
     const toggle = () => {
-      player.playing = !player.playing;
-      if (player.playing) this.soundtrack?.unlock();
+      if (player.playing) this.avatar.pause();
+      else void this.avatar.play();
       this.speak.hidden = true;
-      player.update();
       this.showPlaying();
     };
     this.speak.addEventListener("click", toggle);
     this.playButton.addEventListener("click", toggle);
-    window.addEventListener("keydown", (event) => {
+    document.body.addEventListener("keydown", (event) => {
       if (event.key !== " " || event.target instanceof HTMLButtonElement || event.target instanceof HTMLInputElement) return;
       event.preventDefault();
       toggle();
@@ -154,11 +152,16 @@ export class App {
     this.speed.addEventListener("click", () => {
       player.speed = SPEEDS[(SPEEDS.indexOf(player.speed) + 1) % SPEEDS.length];
       this.speed.textContent = `${player.speed}×`;
+      this.speed.ariaLabel = `Speed ${player.speed}×`;
     });
-    this.menu.addEventListener("click", () => {
-      if (!this.panel) return;
-      this.panel.hidden = !this.panel.hidden;
-      setIcon(this.menu, this.panel.hidden ? ICONS.settings : ICONS.close);
+    this.menu.addEventListener("click", () => this.openPanel(Boolean(this.panel?.hidden)));
+    document.body.addEventListener("keydown", (event) => {
+      if (event.key !== "Escape") return;
+      if (this.welcome.querySelector(".back")) this.closeCard();
+      else if (this.panel && !this.panel.hidden) {
+        this.openPanel(false);
+        this.menu.focus();
+      }
     });
   }
 

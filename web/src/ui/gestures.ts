@@ -6,8 +6,12 @@ import { panned } from "../render/camera.ts";
 const TURN = 0.0055, WHEEL = 0.0012, KEY_TURN = 0.08;
 const CLOSEST = 0.15, FARTHEST = 40, STEEPEST = 1.5;
 
-/** One pointer turns, two (or the right button, or Shift) move and pinch, the wheel goes nearer; double click: all back. */
-export function listen(stage: HTMLElement, player: Player): void {
+/**
+ * One pointer turns, two (or the right button, or Shift) move and pinch, the wheel goes nearer; double click: all back.
+ *
+ * @param keys whose keys move the camera, too. @param signal ends it.
+ */
+export function listen(stage: HTMLElement, player: Player, keys: HTMLElement = stage, signal?: AbortSignal): void {
   const pointers = new Map<number, { x: number; y: number }>();
 
   const turn = (dx: number, dy: number) => {
@@ -30,9 +34,9 @@ export function listen(stage: HTMLElement, player: Player): void {
   stage.addEventListener("pointerdown", (event) => {
     stage.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-  });
+  }, { signal });
   for (const name of ["pointerup", "pointercancel"] as const) {
-    stage.addEventListener(name, (event) => pointers.delete(event.pointerId));
+    stage.addEventListener(name, (event) => pointers.delete(event.pointerId), { signal });
   }
   stage.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
@@ -49,21 +53,23 @@ export function listen(stage: HTMLElement, player: Player): void {
       pan(dx / 2, dy / 2);
     }
     pointers.set(event.pointerId, now);
-  });
+  }, { signal });
   stage.addEventListener("wheel", (event) => {
     event.preventDefault();
     if (player.summary) zoom(Math.exp(WHEEL * event.deltaY * (event.deltaMode ? 20 : 1)));
-  }, { passive: false });
-  stage.addEventListener("contextmenu", (event) => event.preventDefault());
-  stage.addEventListener("dblclick", () => player.resetView());
-  window.addEventListener("keydown", (event) => {
-    const typing = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
-    if (typing || !player.summary) return;
+  }, { passive: false, signal });
+  stage.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
+  stage.addEventListener("dblclick", () => player.resetView(), { signal });
+  keys.addEventListener("keydown", (event) => {
+    const free = event.target === keys || event.target === stage;
+    if (!free || event.ctrlKey || event.altKey || event.metaKey || !player.summary) return;
     const moves: Record<string, () => void> = {
       ArrowLeft: () => turn(-KEY_TURN, 0), ArrowRight: () => turn(KEY_TURN, 0),
       ArrowUp: () => turn(0, KEY_TURN), ArrowDown: () => turn(0, -KEY_TURN),
       "+": () => zoom(0.9), "-": () => zoom(1.1), Home: () => player.resetView(),
     };
-    moves[event.key]?.();
-  });
+    if (!moves[event.key]) return;
+    event.preventDefault();
+    moves[event.key]();
+  }, { signal });
 }

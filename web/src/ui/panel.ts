@@ -18,23 +18,38 @@ export function makePanel(player: Player, fail: (message: string, title: string)
   const light = lightPage(player, (message) => fail(message, "This light cannot be shown"));
   pages.push(["Pose", pose(player)], ["Light", page(light)], ["About", details(player)]);
 
-  const tabs = element("div", { class: "tabs", role: "tablist" });
-  const show = (chosen: number) => {
-    pages.forEach(([, page], k) => (page.hidden = k !== chosen));
-    [...tabs.children].forEach((tab, k) => tab.setAttribute("aria-selected", String(k === chosen)));
-  };
-  pages.forEach(([name], k) => {
-    const tab = element("button", { role: "tab" }, name);
-    tab.addEventListener("click", () => show(k));
-    tabs.append(tab);
+  const tabs = element("div", { class: "tabs", role: "tablist", "aria-label": "Settings" });
+  const buttons = pages.map(([name, page]) => {
+    const id = name.toLowerCase();
+    page.id = `page-${id}`;
+    page.setAttribute("aria-labelledby", `tab-${id}`);
+    return element("button", { role: "tab", id: `tab-${id}`, "aria-controls": page.id }, name);
   });
-  const panel = element("section", { class: "panel", "aria-label": "Settings", hidden: true }, tabs, ...pages.map(([, page]) => page));
+  // One stop of the Tab key; arrows go on from there.
+  const show = (chosen: number, focused = false) => {
+    pages.forEach(([, page], k) => (page.hidden = k !== chosen));
+    buttons.forEach((tab, k) => {
+      tab.setAttribute("aria-selected", String(k === chosen));
+      tab.tabIndex = k === chosen ? 0 : -1;
+    });
+    if (focused) buttons[chosen].focus();
+  };
+  buttons.forEach((tab, k) => tab.addEventListener("click", () => show(k)));
+  tabs.append(...buttons);
+  tabs.addEventListener("keydown", (event) => {
+    const last = pages.length - 1, now = buttons.indexOf(event.target as HTMLButtonElement);
+    const next: Record<string, number> = { ArrowRight: now < last ? now + 1 : 0, ArrowLeft: now > 0 ? now - 1 : last, Home: 0, End: last };
+    if (now < 0 || !(event.key in next)) return;
+    event.preventDefault();
+    show(next[event.key], true);
+  });
+  const panel = element("section", { class: "panel", id: "settings", "aria-label": "Settings", hidden: true }, tabs, ...pages.map(([, page]) => page));
   show(0);
   return panel;
 }
 
 function page(...children: (Node | string)[]): HTMLElement {
-  return element("div", { class: "page", role: "tabpanel" }, ...children);
+  return element("div", { class: "page", role: "tabpanel", tabindex: 0 }, ...children);
 }
 
 /** "left_up_arm" as people write it. */

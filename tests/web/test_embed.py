@@ -1,0 +1,343 @@
+"""Avatars in other people's pages: the examples in a real browser, and the mouth by visemes as Python makes it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import subprocess
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avatar.runtime import AvatarPlayer
+from avatar.speech import Face, Speech, articulate
+from avatar.speech.phonemes import Phoneme
+from pipelines.web.page import PageContent, page_files
+from pipelines.web.server import PageServer
+from smplxpp.body.blendshapes import ARKIT
+from smplxpp.core.files.sound_file import wave_bytes
+from tests.web.avatars import BACKGROUND, NAME, asked, camera, decibels, motion
+from tests.web.chromium import Page, find_chromium
+from tests.web.modules import NEEDS_BUILD, TOOLS, WEB, node
+from tests.web.test_lips import babble, dolls_lips
+
+NEEDS_BROWSER = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
+EXAMPLES = WEB.parent / "examples" / "web"
+# Counts what a page has running, before any of its scripts.
+COUNT = """window.running = new Set(); window.names = new Set(Object.keys(window));
+window.Worker = class extends Worker {
+  constructor(...args) { super(...args); running.add(this); }
+  terminate() { running.delete(this); super.terminate(); } };"""
+
+
+@pytest.fixture(scope="module")
+def site(avatar, browser, tmp_path_factory) -> Iterator[str]:
+    """The examples, the folder of `smplxpp web`, and, where npm's tools are, the package built of `web/`."""
+    files = page_files(avatar.read_bytes(), PageContent(name=NAME, lips=dolls_lips(avatar)))
+    files |= {name: (EXAMPLES / name).read_bytes() for name in ("plain.html", "three.html")}
+    if (TOOLS / "esbuild").exists() and (WEB / "node_modules" / "three").exists():
+        package = tmp_path_factory.mktemp("package") / "dist"
+        subprocess.run(["node", "build.mjs", "--package", str(package)], cwd=WEB, check=True, capture_output=True)
+        command = [str(TOOLS / "esbuild"), str(EXAMPLES / "react" / "main.jsx"), "--bundle", "--jsx=automatic"]
+        command += [f"--alias:smplxpp-player={package / 'index.js'}", "--log-level=error"]
+        paths = {**os.environ, "NODE_PATH": str(WEB / "node_modules")}
+        files["main.js"] = subprocess.run(command, env=paths, check=True, capture_output=True).stdout
+        files["react.html"] = (EXAMPLES / "react" / "index.html").read_bytes()
+        files |= {f"smplxpp-player/{path.name}": path.read_bytes() for path in package.glob("*.js")}
+        for name in ("three.module.js", "three.core.js"):
+            files[f"three/{name}"] = (WEB / "node_modules" / "three" / "build" / name).read_bytes()
+    browser.send("Page.addScriptToEvaluateOnNewDocument", source=COUNT)
+    with PageServer(files) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.address
+        server.shutdown()
+
+
+def show(page: Page, address: str, condition: str) -> None:
+    """Open a page of somebody else's, and wait for something in it."""
+    page.errors.clear()
+    page.send("Page.navigate", url=address)
+    page.until(f"document.readyState === 'complete' && ({condition})", f"{address}: {condition}")
+
+
+def pixels(page: Page, expression: str, shape: tuple[int, int]) -> np.ndarray:
+    """Return (H, W, 4) bytes that a promise gives."""
+    text = page.evaluate(
+        f"Promise.resolve({expression}).then(bytes => {{ let text = ''; for (const one of bytes)"
+        " text += String.fromCharCode(one); return btoa(text); })"
+    )
+    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(*shape, 4)
+
+
+def failure(page: Page, promise: str) -> str:
+    return page.evaluate(f"{promise}.then(() => 'it did not fail', error => error.message)")
+
+
+@NEEDS_BROWSER
+def test_a_page_without_any_build_has_two_avatars_and_loses_nothing_of_its_own(browser, site, avatar):
+    other = "document.querySelector('smplxpp-avatar')"
+    show(browser, site + "plain.html", f"guide.player?.pictures && {other}.avatar.player?.pictures")
+    # The page keeps its names, keys and wheel.
+    assert browser.evaluate("Object.keys(window).filter(name => !names.has(name) && name !== 'names')") == ["guide"]
+    taken = """[...[" ", "ArrowDown", "Home"].map(key => [document.body, new KeyboardEvent("keydown", {key, ...how})]),
+      [guide.canvas, new WheelEvent("wheel", how)]].filter(([target, event]) => !target.dispatchEvent(event)).length"""
+    assert browser.evaluate(f"(how => {taken})({{bubbles: true, cancelable: true}})") == 0
+    # What shines through is what Python leaves open.
+    view, player = camera(), AvatarPlayer(avatar, threads=1)
+    player.pose(motion().frame(0))
+    image, alpha = player.draw(view, background=(0.0, 0.0, 0.0))
+    given = json.dumps({**asked(view, 0), "background": [0, 0, 0, 0]})
+    browser.evaluate("guide.pause()")
+    got = pixels(browser, f"guide.player.picture({given})", image.shape[:2]) / 255.0
+    assert np.abs(got[..., 3] - alpha).max() < 0.03
+    assert decibels(got[..., :3], np.clip(image, 0.0, 1.0), alpha > 0.5) > 38.0
+    # Poses, parts, and what they cannot be.
+    joint = browser.evaluate("guide.summary.jointNames[3]")
+    browser.evaluate(f"guide.pose({{joints: {{{joint}: [0.1, 0.2, 0.3]}}, expression: [0.5], translation: [1, 2, 3]}})")
+    pose = "(({rotations, translation, expression}) => [...rotations.slice(9, 12), ...translation, expression[0]])"
+    assert browser.evaluate(f"{pose}(guide.player.pose(0))") == [0.1, 0.2, 0.3, 1, 2, 3, 0.5]
+    browser.evaluate("guide.pose(null).then(() => guide.set({parts: {[guide.summary.partNames[1]]: false}}))")
+    assert browser.evaluate("[...guide.player.hidden, guide.player.held.size]") == [1, 0]
+    assert 'received "tail"' in failure(browser, "guide.pose({joints: {tail: [0, 0, 0]}})")
+    assert 'received "hat"' in failure(browser, "guide.set({parts: {hat: true}})")
+    assert "colour" in failure(browser, "guide.set({background: 'blurple'})")
+    assert "frames a second" in failure(browser, "guide.play({framesPerSecond: 0, rotations: [[]]})")
+    # A motion of the page's own goes on from the pose before it, and ends.
+    browser.evaluate(
+        "guide.play({framesPerSecond: 20, rotations: [0, 1].map(() => [[0, 0.4, 0]])}, {loop: false})"
+        ".then(() => new Promise(done => guide.on('end', done)))"
+    )
+    assert browser.evaluate("guide.player.motion.rotations[1] > 0.39 && !guide.player.playing")
+    assert browser.errors == []
+    # Nothing is left running, however often.
+    browser.evaluate(f"{other}.remove(), guide.dispose()")
+    browser.evaluate(
+        "(async () => { const { createAvatar } = await import('./player.js'); for (let k = 0; k < 3; ++k) {"
+        " const it = createAvatar(guide.canvas, {url: 'me.avatar'}); if (k < 2) await it.ready; it.dispose(); } })()"
+    )
+    browser.until("running.size === 0", "a worker goes on")
+    assert browser.errors == []
+
+
+@NEEDS_BROWSER
+def test_what_is_said_moves_the_mouth(browser, site):
+    """By visemes, by a service's sound with them or without, by a browser's voice; the last one leads."""
+    show(browser, site + "plain.html", "guide.summary")
+    jaw = "guide.player.pose(0).rotations[3 * guide.summary.jointNames.indexOf('jaw')]"
+    browser.evaluate(
+        "window.told = []; window.jaws = []; guide.on('saying', () => told.push('saying'));"
+        f"guide.on('said', ({{complete}}) => told.push(complete)); setInterval(() => jaws.push({jaw}), 15);"
+        "guide.voice.tts = text => ({visemes: [...text].map((viseme, k) => ({viseme, start: 0.3 * k}))}); 0"
+    )
+    assert browser.evaluate("guide.say('apa')") is True
+    assert browser.evaluate("Math.max(...jaws) > 0.05")
+    assert abs(browser.evaluate(jaw)) < 1e-6
+    browser.evaluate("window.one = guide.say([{viseme: 'aa', start: 0, end: 60}]); 0")
+    browser.until("told.length === 3", "it does not begin")
+    # The second never begins.
+    more = "[one, guide.say([{viseme: 'aa', start: 0, end: 60}]), guide.say([{viseme: 21, start: 0}])]"
+    assert browser.evaluate(f"Promise.all({more})") == [False, False, True]
+    assert browser.evaluate("told.join()") == "saying,true,saying,false,saying,true"
+    # Sound waits for a click.
+    sound = json.dumps(list(wave_bytes(babble(1.2, 16_000))))
+    browser.evaluate(f"window.sound = () => new Uint8Array({sound}).buffer; 0")
+    browser.click("h1")
+    assert browser.evaluate("jaws.length = 0, guide.say({audio: sound(), visemes: [{viseme: 'aa', start: 0}]})") is True
+    assert browser.evaluate("Math.max(...jaws) > 0.05")
+    assert browser.evaluate("jaws.length = 0, guide.say(sound())") is True
+    assert browser.evaluate("Math.max(...jaws) > 0.02")
+    assert "damaged" in failure(browser, "guide.say(new ArrayBuffer(9))")
+    assert "one of" in failure(browser, "guide.say([{viseme: 'QQ', start: 0}])")
+    assert "neither" in failure(browser, "guide.say({})")
+    # A browser's own voice, of which this one has none: first missing, then one that tells its words.
+    browser.evaluate("guide.voice.tts = {}; 0")
+    assert "no voice" in failure(browser, "guide.say('hello')")
+    browser.evaluate(
+        "Object.defineProperty(window, 'speechSynthesis', {value: {cancel() {},"
+        " getVoices: () => [{name: 'x', lang: 'en'}], speak(it) { it.onstart();"
+        " setTimeout(() => it.onboundary({name: 'word', charIndex: 4}), 200); setTimeout(() => it.onend(), 900); }}});"
+        "jaws.length = 0"
+    )
+    assert browser.evaluate("guide.say('the aarhus')") is True
+    assert browser.evaluate("Math.max(...jaws) > 0.05")
+    assert browser.errors == []
+
+
+AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
+FINDINGS = """axe.run({runOnly: ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]})
+  .then(({violations}) => violations.map(({id, nodes}) => [id, ...nodes.map(({html}) => html.slice(0, 100))]))"""
+# What a finger is to hit and is lower than so many CSS pixels; a label is hit for its switch.
+SMALL = """[...document.querySelectorAll("button, input, select")].filter(one => one.checkVisibility())
+  .map(one => [one.ariaLabel || one.textContent, (one.closest("label") ?? one).getBoundingClientRect().height])
+  .filter(([, height]) => height < LEAST)"""
+# WCAG's contrast of an element's text on its own colour.
+CONTRAST = """(one => {
+  const linear = v => v > 0.04045 ? ((v + 0.055) / 1.055) ** 2.4 : v / 12.92;
+  const light = text => text.match(/[0-9.]+/g).slice(0, 3).map(v => linear(v / 255))
+    .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0.05);
+  const {color, backgroundColor} = getComputedStyle(one), [a, b] = [light(color), light(backgroundColor)];
+  return Math.max(a, b) / Math.min(a, b);
+})(document.querySelector(".speak"))"""
+
+
+@NEEDS_BROWSER
+@pytest.mark.skipif(not AXE.exists(), reason="no axe-core: npm ci in web/")
+@pytest.mark.parametrize(("width", "height", "least"), [(1280, 800, 24), (390, 844, 44)])
+def test_the_players_page_is_for_keys_fingers_and_screen_readers(browser, avatar, width, height, least):
+    """The first button was black on black, tabs knew no arrows, and a card lay below the settings."""
+    files = page_files(
+        avatar.read_bytes(), PageContent(name=NAME, sound=wave_bytes(babble(1.0, 16_000)), lips=dolls_lips(avatar))
+    )
+    with PageServer(files) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser.resize(width, height)
+        browser.go(server.address)
+        browser.errors.clear()
+        browser.evaluate(AXE.read_text() + ";0")
+        assert browser.evaluate(CONTRAST) > 4.5
+        assert browser.evaluate("document.querySelector('.speak').offsetWidth") < 300
+        assert browser.evaluate(FINDINGS) == []
+
+        def press(key: str) -> None:
+            for kind in ("keyDown", "keyUp"):
+                browser.send("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+        browser.click(".menu")
+        tabs = browser.evaluate("[...document.querySelectorAll('[role=tab]')].map(one => one.textContent)")
+        assert tabs[:3] == ["Parts", "Face", "Voice"]
+        browser.evaluate("document.querySelector('[role=tab]').focus()")
+        chosen = "document.querySelector('[aria-selected=true]').textContent"
+        for name in [*tabs[1:], tabs[0]]:
+            press("ArrowRight")
+            assert browser.evaluate(f"{chosen} === document.activeElement.textContent && {chosen}") == name
+            assert browser.evaluate(FINDINGS) == [], name
+            assert browser.evaluate(SMALL.replace("LEAST", str(least))) == [], name
+        # A card is above the settings, and goes before they do.
+        browser.evaluate("smplxppPlayer.open(new ArrayBuffer(9))")
+        below = "(({x, width, bottom}) => document.elementFromPoint(x + width / 2, bottom - 4))"
+        assert browser.evaluate(f"!!{below}(document.querySelector('.card').getBoundingClientRect()).closest('.card')")
+        assert browser.evaluate(FINDINGS) == []
+        for opened, gone in (("document.querySelector('.card')", 1), ("!document.querySelector('.panel').hidden", 2)):
+            assert browser.evaluate(f"!!({opened})"), gone
+            press("Escape")
+            assert not browser.evaluate(f"!!({opened})"), gone
+        assert browser.evaluate("document.activeElement.className") == "round menu"
+        # Arrows turn the person where the canvas has the focus, and change nothing while a slider has it.
+        turned = "smplxppPlayer.player.orbit.azimuth"
+        browser.evaluate("document.querySelector('canvas').focus()")
+        before = browser.evaluate(turned)
+        press("ArrowRight")
+        assert browser.evaluate(turned) > before
+        assert browser.evaluate("document.querySelector('canvas').ariaLabel").startswith(NAME)
+        assert browser.errors == []
+        server.shutdown()
+
+
+@NEEDS_BUILD
+@NEEDS_BROWSER
+def test_a_react_page_mounts_it_twice_and_keeps_one(browser, site):
+    show(browser, site + "react.html", "document.querySelector('[role=status]')?.textContent.endsWith('is here')")
+    assert browser.evaluate("running.size") == 1  # StrictMode mounts, unmounts and mounts
+    canvas = browser.evaluate("document.querySelector('canvas').ariaLabel")
+    assert canvas == NAME
+    browser.click("button")
+    browser.until("document.querySelector('[role=status]').textContent === 'Said'", "nothing is said")
+    assert browser.errors == []
+
+
+@NEEDS_BUILD
+@NEEDS_BROWSER
+def test_in_a_scene_of_three_js_it_is_drawn_as_python_draws_it_with_depth(browser, site, avatar):
+    show(browser, site + "three.html", "window.person?.avatar.player?.pictures > 1")
+    width, height = 320, 240
+    # Time stands still, and the window's size does not matter: pictures are drawn into a target of their own size.
+    browser.evaluate(
+        "renderer.setAnimationLoop(null); person.avatar.pause(); person.avatar.player.simulating = false;"
+        f"camera.aspect = {width} / {height}; camera.updateProjectionMatrix(); renderer.setPixelRatio(1);"
+        f"renderer.setSize({width}, {height}, false); person.avatar.player.seek(0);"
+        "window.shot = async () => { for (let k = 0; person.material.visible && k < 3; ++k) {"
+        " const before = person.avatar.player.pictures;"
+        " do { renderer.render(scene, camera); await new Promise(done => setTimeout(done, 20)); }"
+        " while (person.avatar.player.pictures === before); }"
+        " renderer.render(scene, camera); renderer.render(scene, camera);"
+        f"const gl = renderer.getContext(), out = new Uint8Array({4 * width * height});"
+        f" gl.readPixels(0, 0, {width}, {height}, gl.RGBA, gl.UNSIGNED_BYTE, out); return out; }}; 0"
+    )
+
+    def inside(mask: np.ndarray) -> np.ndarray:
+        return mask & np.roll(mask, 2, 1) & np.roll(mask, -2, 1) & np.roll(mask, 2, 0) & np.roll(mask, -2, 0)
+
+    def shot(change: str) -> np.ndarray:
+        browser.evaluate(f"{change}; 0")
+        return pixels(browser, "shot()", (height, width))[::-1, :, :3].astype(int)
+
+    thin = "for (const [one, x] of [[before, 0.05], [behind, -0.05]]) {"
+    whole = shot(thin + " one.position.x = x; one.scale.x = one.scale.z = 0.25; }")
+    gone = shot("person.material.visible = false")
+    ghost = shot("person.material.visible = true; person.material.depthTest = false")
+    # Edges are of both.
+    red, blue = (inside(sign * (gone[..., 0] - gone[..., 2]) > 60) for sign in (1, -1))
+    hers = np.abs(ghost - gone).max(axis=-1) > 40
+    assert (red & hers).sum() > 20 and (blue & hers).sum() > 20  # she is behind one, and before the other
+    assert np.abs(whole - gone)[red].max() <= 2
+    assert np.abs(whole - ghost)[blue & ~red].max() <= 2
+    # Alone before a colour she is what Python draws of the same camera.
+    red_, green, blue_ = BACKGROUND
+    alone = shot(
+        "person.material.depthTest = true; scene.children.forEach(one => one.visible = one === person);"
+        f"scene.background.setRGB({red_}, {green}, {blue_}, 'srgb')"
+    )
+    rows, scale, pinhole = browser.evaluate(
+        "(({rows, scale, pinhole}) => [rows, scale, pinhole])(person.project(renderer, camera))"
+    )
+    view = np.eye(4)
+    view[:3] = np.reshape(rows, (3, 4)) / scale
+    K = np.array([[pinhole["fx"], 0, pinhole["cx"]], [0, pinhole["fy"], pinhole["cy"]], [0, 0, 1]])
+    player = AvatarPlayer(avatar, threads=1)
+    player.pose(motion().frame(0))
+    seen = replace(camera(), K=K, cam_from_world=view, width=width, height=height)
+    image, alpha = player.draw(seen, background=BACKGROUND)
+    assert (alpha > 0.5).sum() > 200
+    assert decibels(alone / 255.0, np.clip(image, 0.0, 1.0), alpha > 0.5) > 33.0  # eight bits after each splat
+    browser.evaluate("person.dispose()")
+    assert browser.evaluate("[running.size, renderer.info.memory.geometries]") == [0, 3]
+    assert browser.errors == []
+
+
+@NEEDS_BUILD
+def test_visemes_make_the_mouth_of_python():
+    """Every phoneme, a diphthong, closures and gaps; names of other programs are phonemes of ours."""
+    rng = np.random.default_rng(2)
+    names = "SIL M AA P OW F IY CH S W UW B R AY TH ER K L V EH Y AO UH".split()
+    names += "IH AE AH T JH Z HH NG D N G DH SH ZH EY AW OY".split()
+    starts = np.cumsum(rng.uniform(0.05, 0.14, len(names)))
+    ends = starts + np.where(rng.random(len(names)) < 0.2, 0.03, 0.05)
+    times = np.arange(0.0, starts[-1] + 0.3, 1.0 / 30.0)
+    phones = [{"name": n, "start": s, "end": e} for n, s, e in zip(names, starts, ends, strict=True)]
+    script = """const names = ["PP", "viseme_aa", 21, "@", "DH"].map((viseme, k) => ({ viseme, start: 1 - k }));
+      const ours = m.phonesOf(names).map(({ name, start, end }) => [name, start, end]);
+      const spelt = m.spelt("Map, tomorrow", 0, 0, 1).map(({ name }) => name).join(" ");
+      const result = { ours, spelt, mouth: given.times.map(t => [...m.articulate(given.phones, t)]) };"""
+    found = node(script, given={"phones": phones, "times": times.tolist()})
+    speech = Speech(tuple(Phoneme(**one) for one in phones), float(ends[-1]))
+    np.testing.assert_allclose(found["mouth"], articulate(speech, times), atol=2e-5)
+    assert found["ours"] == [["DH", -3, -2], ["AH", -2, -1], ["P", -1, 0], ["AA", 0, 1], ["P", 1, 1.12]]
+    assert found["spelt"] == "M AE P T O M AO R R OW"
+
+
+@NEEDS_BUILD
+def test_a_face_with_names_of_arkit_needs_no_lips():
+    """What the page knows of ARKit's expressions is what Python does, on a body with a jaw."""
+    mouths = np.random.default_rng(1).random((4, 6))
+    script = """const face = m.SpeakingFace.named(given.names, 1), zeros = count => new Float64Array(count);
+      const pose = () => ({ rotations: zeros(6), translation: zeros(3), expression: zeros(given.names.length) });
+      const posed = given.mouths.map(mouth => face.pose(mouth, pose()));
+      const result = posed.map(({ expression, rotations }) => [...expression, rotations[3]]);"""
+    found = np.array(node(script, given={"names": list(ARKIT), "mouths": mouths.tolist()}))
+    expression, jaw = Face.of(ARKIT, ["pelvis", "jaw"]).pose(mouths, np.zeros(4))
+    np.testing.assert_allclose(found, np.column_stack([expression, jaw[:, 0]]), atol=1e-9)
+    assert np.ptp(expression) > 0.3
