@@ -23,6 +23,7 @@ from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import UnposeConfig, Unposed, invertible_weights, unpose
 from smplxpp.transfer import TransferConfig, rigid_weights, shoe_weights, transfer_weights
 from smplxpp.transfer.checks import surface_components
+from smplxpp.transfer.unfollowed import webs_to_hands
 
 _FOLDED = 1e-6
 """Least determinant of a blended transform in trials of the T-pose: what is smaller has no inverse in float64."""
@@ -175,6 +176,10 @@ def _without_bridges(
     """
     source = np.arange(part.vertex_count)
     opened = np.unique(part.border_edges)
+    # Cloth that passes a hand hangs on the sleeve where the scan has fused them, and would follow it.
+    web = webs_to_hands(fit.mesh, body.weights, part, ruled.settings) & ~ruled.stiff(part, source)
+    if web.any():
+        part, source = cut_bridges(part, web, config=config)
     weights = ruled.weights(fit, body, part, source)
     # Folded vertices lose their fold for the trial alone: those that are left with the part are counted later.
     limits = UnposeConfig(warn_below=0.0, fail_below=_FOLDED)

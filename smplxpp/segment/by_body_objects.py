@@ -224,4 +224,20 @@ def _accepted(
             continue
         faces |= own
         notes.append(f"a thing of {area:.0f} cm2 at a hand is labelled object")
-    return FoundObjects(faces, tuple(notes))
+    return FoundObjects(faces | _enclosed(mesh, faces, where), tuple(notes))
+
+
+def _enclosed(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"], where: _Where) -> Bool[np.ndarray, " M"]:
+    """Return the pieces of the surface that things go all round, as the inside of a folder that an arm presses.
+
+    Fingers that reach round a thing are such pieces, too, and stay what they are: they are at the hand.
+    """
+    left = ~faces
+    piece = component_labels(where.pairs[left[where.pairs].all(axis=1)], len(faces))
+    border = faces[where.pairs[:, 0]] != faces[where.pairs[:, 1]]
+    beside = np.unique(piece[where.pairs[border]][left[where.pairs[border]]])
+    area = np.bincount(piece, mesh.face_areas * left)
+    to_hand = np.bincount(piece, mesh.face_areas * left * where.to_hand) / np.maximum(area, 1e-12)
+    # The person herself is the largest piece beside a thing.
+    inside = beside[(area[beside] < 0.5 * area[beside].max(initial=0.0)) & (to_hand[beside] > 2.0 * _TOUCHES)]
+    return left & np.isin(piece, inside)

@@ -39,21 +39,32 @@ class Correspondence:
         matrix = sp.csr_matrix((self.barycentric.ravel(), (rows, corners)), (len(self.face), source.vertex_count))
         return matrix @ values
 
+    def instead(self, rows: Bool[np.ndarray, " N"], other: Correspondence) -> Correspondence:
+        """Return these points with those of `other` in some rows."""
+        names = ("face", "barycentric", "distance", "angle")
+        values = {name: getattr(self, name).copy() for name in names}
+        for name in names:
+            values[name][rows] = getattr(other, name)[rows]
+        return Correspondence(**values)
+
     def matched(self, *, max_distance: float, max_angle: float) -> Bool[np.ndarray, " N"]:
         """Return the points that are near enough (metres) and whose normals agree (radians)."""
         return (self.distance <= max_distance) & (self.angle <= max_angle)
 
 
-def closest_points(source: TriangleMesh, target: TriangleMesh) -> Correspondence:
-    """Find the closest point of `source` for every vertex of `target`, in float64.
+def closest_points(
+    source: TriangleMesh, target: TriangleMesh, *, among: Bool[np.ndarray, " V"] | None = None
+) -> Correspondence:
+    """Find the closest point of `source`, or of its faces `among` some vertices, for every vertex of `target`.
 
     Normals are weighted by angle on both meshes and interpolated on the source. Of several points
     as close as each other (borders of two layers that coincide) the first that the tree finds is taken.
     """
     points = np.ascontiguousarray(target.vertices)
-    squared, face, closest = igl.point_mesh_squared_distance(points, source.vertices, source.faces)
+    chosen = np.arange(source.face_count) if among is None else np.flatnonzero(among[source.faces].all(axis=1))
+    squared, face, closest = igl.point_mesh_squared_distance(points, source.vertices, source.faces[chosen])
     # The tree counts in C's `long long`, another type to numpy even where it is as wide.
-    face = face.astype(np.int64)
+    face = chosen[face.astype(np.int64)]
     corners = source.faces[face]
     barycentric = _barycentric(closest, *(source.vertices[corners[:, k]] for k in range(3)))
     found = Correspondence(face, barycentric, np.sqrt(squared), np.full(len(face), np.nan))

@@ -41,7 +41,7 @@ from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.hanging import bounded_legs, hung_from_top, leg_bound
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 from smplxpp.transfer.rigid import rigid_weights
-from smplxpp.transfer.unfollowed import unfollowed_arms
+from smplxpp.transfer.unfollowed import PassedHand, passed_hands, unfollowed_arms
 
 _PUBLISHED_FAR = 0.4
 """By how much of itself the published method's share grows where anchor weights replace those of the body nearby: the
@@ -217,12 +217,23 @@ def _transferred(
             if whole and unfollowed.any():
                 source, weights = restrict_source(source, weights, ~unfollowed)
                 found = closest_points(source, target)
+    # Cloth of the trunk that passes a hand, as the corner of a jacket does over one in a pocket, is none of that arm's.
+    passing: list[PassedHand] = []
+    if whole and limbs is not None:
+        passing = passed_hands(target, found.interpolate(source, weights), limbs, config)
+    if passing:
+        hands = np.any([passed.hand for passed in passing], axis=0)
+        source, weights = restrict_source(source, weights, ~hands)
+        found = closest_points(source, target)
     # Find the confident vertices among the matched ones.
     limit = config.max_distance * extent(target)
     found, normals = face_outward(found, target, component, max_distance=limit)
     if config.confident is not None:
         # An opposite normal costs 4 % of the source's extent in distance.
         found = prefer_facing(found, source, target.vertices, normals, length=0.02 * size)
+    for passed in passing:
+        off = weights[:, ~passed.arm].sum(axis=1) > 0.5
+        found = found.instead(passed.vertices, closest_points(source, target, among=off))
     angle = np.radians(config.max_angle_deg)
     matched = found.matched(max_distance=limit, max_angle=angle)
     near = min(limit, (config.confident or 0.0) * size)
@@ -235,6 +246,8 @@ def _transferred(
     # Compute each vertex's own value, then smooth the values over the surface.
     at = _Matches(target, normals, found, component, confident, hangs)
     values = _values(source, weights, at, allowed, size, config)
+    for passed in passing:
+        values = passed.without_arm(values)
     far_off = np.zeros(len(values))
     if limbs is not None:
         far_off = limbs.share * smooth_step(found.distance, *(k * size for k in config.around))
@@ -257,6 +270,8 @@ def _transferred(
         share *= 1.0 + _PUBLISHED_FAR * smooth_step(found.distance, *(k * size for k in config.far))
         share = np.minimum(share, 1.0)
         share *= 1.0 - far_off
+        for passed in passing:
+            answer = passed.without_arm(answer)
         share[settled | hangs | components_without(component, confident)] = 0.0
         if allowed is not None:
             # Leave out joints that the label excludes and nothing here follows, such as the hand beside a skirt.

@@ -1,17 +1,23 @@
-"""Find arms that a part does not follow although they are near: beside empty sleeves, and under a poncho."""
+"""Find arms and hands that a part does not follow although they are near: beside empty sleeves, under a poncho, in a
+pocket.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.core.topology import border_loops, manifold_corners
+from smplxpp.transfer.checks import extent
 from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.enclosed import Enclosure, LimbAxis
+from smplxpp.transfer.correspond import closest_points
+from smplxpp.transfer.enclosed import Enclosure, LimbAxis, enclosed_by_one, limb_axes
 from smplxpp.transfer.rings import piercings, rings_around
 
 _LEAST_TUBE = 0.1
@@ -20,6 +26,10 @@ _OPEN = 0.75
 """Least share of a turn about the trunk that what covers the arms has to make: a cape is open in front."""
 _COVERED = 10
 """Planes across the trunk (20 cm) in which a ring has to go around an arm, too: armholes of a waistcoat are shorter."""
+
+
+_HAND, _ARM = ("wrist", "thumb", "index", "middle", "ring", "pinky"), ("collar", "shoulder", "elbow")
+"""Parts of the names of joints of hands and of arms."""
 
 
 def empty_tubes(mesh: TriangleMesh, axes: list[LimbAxis], size: float) -> Bool[np.ndarray, " N"]:
@@ -75,6 +85,100 @@ def unfollowed_arms(
     for k, name in enumerate(names):
         out[k] = name.startswith(tuple(hidden)) and not any(word in name for word in worn)
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class PassedHand:
+    """Cloth that passes a hand, without being worn on it.
+
+    Attributes:
+        vertices: that are nearest to the hand, and cloth of the trunk.
+        hand: joints of the hand.
+        arm: joints of the hand and its arm.
+    """
+
+    vertices: Bool[np.ndarray, " N"]
+    hand: Bool[np.ndarray, " J"]
+    arm: Bool[np.ndarray, " J"]
+
+    def without_arm(self, weights: Float64[np.ndarray, "N J"]) -> Float64[np.ndarray, "N J"]:
+        """Return weights whose rows of these vertices leave the arm out, unless they have nothing else."""
+        out = np.where(self.vertices[:, None] & self.arm, 0.0, weights)
+        total = out.sum(axis=1, keepdims=True)
+        return np.where(total > 1e-3, out / np.maximum(total, 1e-3), weights)
+
+
+def passed_hands(
+    mesh: TriangleMesh, copied: Float64[np.ndarray, "N J"], found: Enclosure | None, config: TransferConfig
+) -> list[PassedHand]:
+    """Find the hands at the sleeves of a part that it passes and is not worn on.
+
+    What is worn on a hand, or ends at it, goes on into the sleeve; cloth of the trunk that a hand lies behind, in front
+    of, or in, goes on into the trunk. The longer of the two borders of the vertices nearest to a hand decides; cloth is
+    then the trunk's where that border is nearer along the surface.
+
+    Args:
+        mesh: the part.
+        copied: weights of the body's closest points.
+        found: the limbs that it goes around; capes and skirts, which have no sleeves, blend what is near. None leaves
+            it open whether there are sleeves.
+        config: settings, with the names of the joints.
+    """
+    names = config.joint_names or JOINT_NAMES.get(copied.shape[1], ())
+    edges = mesh.edges
+    length = row_lengths(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]])
+    out = []
+    for limb, side in ((2, "left_"), (3, "right_")):
+        hand, arm = (
+            np.array([name.startswith(side) and any(word in name for word in words) for name in names], dtype=bool)
+            for words in (_HAND, _HAND + _ARM)
+        )
+        at_hand, on_arm = (copied[:, joints].sum(axis=1) > 0.5 for joints in (hand, arm))
+        # A sleeve lies about the arm that it goes around.
+        sleeve = None if found is None else (found.limb == limb) & (found.share > 0.5)
+        if sleeve is not None and not on_arm[sleeve].sum() > 0.5 * sleeve.sum():
+            continue
+        # The edges across the border of what is at the hand, and their ends on its other side.
+        border = at_hand[edges[:, 0]] != at_hand[edges[:, 1]]
+        beyond = np.where(at_hand[edges[:, 0]], edges[:, 1], edges[:, 0])[border]
+        if length[border] @ ~on_arm[beyond] <= length[border] @ on_arm[beyond]:
+            continue
+        within = at_hand[edges].any(axis=1)
+        graph = coo_matrix((length[within], edges[within].T), shape=(mesh.vertex_count,) * 2).tocsr()
+        far = [
+            dijkstra(graph, directed=False, indices=np.unique(beyond[ends]), min_only=True)
+            if ends.any()
+            else np.full(mesh.vertex_count, np.inf)
+            for ends in (~on_arm[beyond], on_arm[beyond])
+        ]
+        out.append(PassedHand(at_hand & (far[0] <= far[1]), hand, arm))
+    return out
+
+
+def webs_to_hands(
+    source: TriangleMesh, weights: Float64[np.ndarray, "V J"], target: TriangleMesh, config: TransferConfig
+) -> Bool[np.ndarray, " M"]:
+    """Return the faces of a part that join cloth that passes a hand with the sleeve, as scans fuse them.
+
+    Args:
+        source: the body.
+        weights: of its vertices.
+        target: the part, in the body's pose.
+        config: settings, with the names of the joints.
+    """
+    web = np.zeros(target.face_count, dtype=bool)
+    copied = closest_points(source, target).interpolate(source, weights)
+    # Rings are looked for only where cloth passes a hand at all.
+    if not passed_hands(target, copied, None, config):
+        return web
+    axes = limb_axes(source, weights, extent(source), config)
+    if not axes:
+        return web
+    found = enclosed_by_one(target, axes, weights.shape[1])
+    for passed in passed_hands(target, copied, found, config):
+        on_arm = (copied[:, passed.arm].sum(axis=1) > 0.5) & ~passed.vertices
+        web |= passed.vertices[target.faces].any(axis=1) & on_arm[target.faces].any(axis=1)
+    return web
 
 
 def _covers(mesh: TriangleMesh, trunk: LimbAxis, arm: LimbAxis) -> bool:

@@ -1,12 +1,12 @@
-"""Places on the body are continuous: they go on between the body's vertices."""
+"""Places on the body are continuous, go on between the body's vertices, and leave out hands that are hidden."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from smplxpp.body import load_body
-from smplxpp.core import BodyParams, TriangleMesh
-from smplxpp.segment.by_body_chart import LEG, chart_of_body, chart_of_scan
+from smplxpp.core import BodyParams, TriangleMesh, concatenate_meshes
+from smplxpp.segment.by_body_chart import HAND, LEG, chart_of_body, chart_of_scan
 
 
 def test_heights_go_on_between_the_vertices_of_a_shin():
@@ -33,3 +33,31 @@ def test_heights_go_on_between_the_vertices_of_a_shin():
     ends = 0.5 * np.abs(own.height[a] - own.height[b])  # what the nearest end alone leaves
     assert np.median(error) < 0.0015 < np.median(ends)
     assert np.percentile(error, 95) < 0.006 < np.percentile(ends, 95)
+
+
+def test_a_hand_under_a_cape_has_no_faces_and_a_bare_one_keeps_its_own():
+    """The corner of a jacket behind a hand in a pocket was that hand's skin, and the jacket lost it."""
+    body = load_body()
+    pose = np.zeros((1, body.joint_count, 3))
+    pose[0, body.joint_names.index("left_shoulder"), 2] = -np.radians(75.0)
+    params = BodyParams.from_full_pose(
+        pose, betas=np.zeros(body.num_betas), expression=np.zeros(body.num_expressions), transl=np.zeros(3)
+    )
+    skin = body.mesh(body.forward(params).vertices[0])
+    own = chart_of_body(body, params)
+    hand = (own.region == HAND) & (own.side == 1)
+    # A cape from the shoulder to the knee, wide enough for the hanging hand; the other hand is stretched out of it.
+    low, high = skin.vertices[own.height < 0.5, 1].max(), skin.vertices[:, 1].max() - 0.25
+    turn, up = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False), np.linspace(low, high, 60), indexing="ij")
+    wide = skin.vertices[hand, 0].max() + 0.04
+    points = np.stack([wide * np.sin(turn), up, 0.3 * np.cos(turn)], axis=-1).reshape(-1, 3)
+    corner = np.arange(96 * 60).reshape(96, 60)
+    a, b = corner[:, :-1], np.roll(corner, -1, axis=0)[:, :-1]
+    faces = np.concatenate([np.stack([a, b, b + 1], -1), np.stack([a, b + 1, a + 1], -1)]).reshape(-1, 3)
+    right = ((own.region == HAND) & (own.side == -1))[skin.faces].all(axis=1)
+    under = concatenate_meshes([TriangleMesh(points, faces), TriangleMesh(skin.vertices, skin.faces[right])])
+    found = chart_of_scan(under, body, params)
+    bare = chart_of_scan(skin, body, params)
+    assert not ((found.region == HAND) & (found.side == 1)).any()
+    assert (found.region[len(faces) :] == HAND).mean() > 0.95
+    assert (bare.region[hand[skin.faces].all(axis=1)] == HAND).mean() > 0.95

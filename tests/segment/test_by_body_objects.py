@@ -9,10 +9,11 @@ import pytest
 
 from smplxpp.body import BodyModel, PosedBody, load_body
 from smplxpp.core import OBJECT, BodyParams, InputError, TriangleMesh, concatenate_meshes
+from smplxpp.core.topology import face_adjacency
 from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
 from smplxpp.people.things import THINGS, Thing, thing_mesh
 from smplxpp.segment import label_by_body
-from smplxpp.segment.by_body_objects import find_objects
+from smplxpp.segment.by_body_objects import _enclosed, _Where, find_objects
 from smplxpp.segment.flat_patches import flat_share
 from smplxpp.transfer import rigid_weights
 
@@ -93,6 +94,21 @@ def test_only_what_is_flat_over_ten_centimetres_is_a_board():
     share = flat_share(mesh, np.ones(mesh.face_count, dtype=bool))
     sheet = np.arange(mesh.face_count) >= tube.face_count
     assert share[~sheet].max() == 0.0 and share[sheet].mean() > 0.9
+
+
+def test_what_a_thing_goes_all_round_is_the_thing_unless_it_is_at_the_hand():
+    """The inside of a folder, which an arm pressed, was a piece of the shirt and became a flap at the sleeve."""
+    across, up = np.meshgrid(np.linspace(0.0, 0.4, 41), np.linspace(0.0, 0.4, 41))
+    mesh = grid_mesh(np.stack([across, up, np.zeros_like(up)], axis=-1))
+    x, y, _ = mesh.face_centers.T
+    thing = (np.abs(x - 0.1) < 0.08) & (np.abs(y - 0.2) < 0.16)
+    far, near = ((np.abs(x - 0.1) < 0.03) & (np.abs(y - at) < 0.03) for at in (0.28, 0.12))
+    thing &= ~far & ~near
+    pairs, _ = face_adjacency(mesh.faces)
+    to_hand = np.hypot(x - 0.1, y - 0.12)
+    none = np.zeros(mesh.face_count)
+    where = _Where(none, to_hand, none.astype(int), none, pairs, *np.ones((2, len(pairs))))
+    assert (_enclosed(mesh, thing, where) == far).all()
 
 
 def grid_mesh(points: np.ndarray, *, closed: bool = False) -> TriangleMesh:

@@ -8,14 +8,14 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import WORN_POSES, worn_poses
-from smplxpp.core import TriangleMesh
-from smplxpp.people.garments.mannequin import Mannequin, shares
+from smplxpp.core import TriangleMesh, concatenate_meshes
+from smplxpp.people.garments.mannequin import Mannequin, lowered, named, shares
 from smplxpp.people.garments.wardrobe import Case, garments_of, scan
 from smplxpp.skinning import skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.checks import extent
 from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes
-from smplxpp.transfer.unfollowed import empty_tubes
+from smplxpp.transfer.unfollowed import empty_tubes, webs_to_hands
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +175,38 @@ def test_a_poncho_follows_no_forearm_under_it(mannequin, worn):
     dense = transfer_weights(case.source, mannequin.body.weights, case.mesh, config=config).dense()
     assert dense[:, [k for k, name in enumerate(names) if "elbow" in name or "wrist" in name]].max() == 0
     assert dense[:, names.index("left_shoulder")].max() > 0.3
+
+
+def test_a_jacket_over_a_hand_follows_the_trunk_and_is_cut_from_its_sleeve(mannequin):
+    """Behind a hand in a pocket the corner of a jacket lay nearest to the hand, and went up with it into the T-pose."""
+    body, params = mannequin.body, lowered(mannequin, 68.0)
+    source = body.mesh(body.forward(params).vertices[0])
+    left = named(body, ("left_",))
+    hand = left & named(body, ("wrist", "index", "middle", "pinky", "ring", "thumb"))
+    arm = hand | (left & named(body, ("collar", "shoulder", "elbow")))
+    # Sleeves 12 mm off the arms, and a jacket about the trunk whose side runs through the left hand.
+    on_arms = np.isin(body.weights.argmax(axis=1), np.flatnonzero(named(body, ("shoulder", "elbow"))))
+    sleeves, _ = source.with_vertices(source.vertices + 0.012 * source.vertex_normals).submesh(
+        on_arms[source.faces].all(axis=1)
+    )
+    at = source.vertices[body.weights[:, hand].sum(axis=1) > 0.5].mean(axis=0)
+    turn, up = np.meshgrid(
+        np.linspace(0, 2 * np.pi, 96, endpoint=False), np.linspace(at[1] - 0.1, at[1] + 0.4, 40), indexing="ij"
+    )
+    points = np.stack([at[0] * np.sin(turn), up, at[2] + 0.16 * np.cos(turn)], axis=-1).reshape(-1, 3)
+    corner = np.arange(96 * 40).reshape(96, 40)
+    a, b = corner[:, :-1], np.roll(corner, -1, axis=0)[:, :-1]
+    faces = np.concatenate([np.stack([a, b, b + 1], -1), np.stack([a, b + 1, a + 1], -1)]).reshape(-1, 3)
+    tube, config = TriangleMesh(points, faces), TransferConfig.for_label("upper")
+    jacket = concatenate_meshes([tube, sleeves])
+    dense = transfer_weights(source, body.weights, jacket, config=config).dense()
+    near = np.flatnonzero(np.linalg.norm(points - at, axis=1) < 0.04)
+    assert len(near) > 10 and dense[near][:, arm].sum(axis=1).mean() < 0.15 and dense[near][:, hand].max() < 0.01
+    assert dense[len(points) :][:, named(body, ("shoulder", "elbow"))].sum(axis=1).mean() > 0.9
+    # Where the jacket is nearest to the forearm it is cut from what is nearest to the hand; without sleeves nothing is.
+    web = webs_to_hands(source, body.weights, jacket, config)
+    assert web.any() and not web[len(faces) :].any()
+    assert not webs_to_hands(source, body.weights, tube, config).any()
 
 
 def test_a_beard_hangs_from_the_jaw_though_the_chest_is_nearer(mannequin, worn):
