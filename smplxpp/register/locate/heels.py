@@ -136,12 +136,14 @@ class _Shoe:
         proxy: points of the body below the knee.
         weight: of each of them; those of the foot count 1, of the shin, which trousers cover, less.
         surface: points of the scan.
+        tree: search tree of their positions.
     """
 
     side: str
     proxy: BodyProxy
     weight: np.ndarray
     surface: SurfacePoints
+    tree: cKDTree
 
     @staticmethod
     def of(search: Search, state: BodyState, side: str) -> _Shoe:
@@ -151,16 +153,17 @@ class _Shoe:
         posture, ankle = kinematics.posture(state, 0), names.index(f"{side}_ankle")
         proxy = many.select(np.flatnonzero(kinematics.descends_from[many.limb, names.index(f"{side}_knee")]))
         hip = names.index("right_hip" if side == "left" else "left_hip")
-        nearest = cKDTree(many.posed(kinematics, posture)[0]).query(fine.points)[1]
+        nearest = cKDTree(kinematics.points(many.points, posture)).query(fine.points)[1]
         near = np.linalg.norm(fine.points - posture.joints[ankle], axis=1) < _AROUND
         own = near & ~kinematics.descends_from[many.limb[nearest], hip]
         weight = np.where(kinematics.descends_from[proxy.limb, ankle], 1.0, 0.3)
-        return _Shoe(side, proxy, weight / weight.sum(), fine.select(np.flatnonzero(own)))
+        surface = fine.select(np.flatnonzero(own))
+        return _Shoe(side, proxy, weight / weight.sum(), surface, cKDTree(surface.points))
 
     def cost(self, search: Search, state: BodyState) -> float:
         """Return the cost of the module's docstring, square millimetres."""
-        places = self.proxy.posed(search.kinematics, search.kinematics.posture(state, 0))[0]
-        distance, nearest = cKDTree(self.surface.points).query(places)
+        places = search.kinematics.points(self.proxy.points, search.kinematics.posture(state, 0))
+        distance, nearest = self.tree.query(places)
         offset = places - self.surface.points[nearest]
         outside = np.einsum("ij,ij->i", self.surface.normals[nearest], offset) > 0
         depth = np.where(outside, np.minimum(distance, 0.05), np.clip(distance - 0.015, 0.0, 0.03))
@@ -179,9 +182,10 @@ def _on_shoe(search: Search, state: BodyState, shoe: _Shoe) -> BodyState:
     if not len(shoe.surface):
         return state
     ankle = search.kinematics.body.joint_names.index(f"{shoe.side}_ankle")
+    joints = search.kinematics.posture(state, 0).joints
 
     def turned(x: np.ndarray) -> BodyState:
-        pitched = on_heel(search, state, shoe.side, (0.0, float(x[0]), float(x[1])))
+        pitched = on_heel(search, state, shoe.side, (0.0, float(x[0]), float(x[1])), joints)
         rotations = pitched.rotations.copy()
         rotations[0, ankle] = rotations[0, ankle] @ matrix_from_rotvec(np.radians([0.0, x[2], x[3]]))
         return replace(pitched, rotations=rotations)
@@ -207,15 +211,23 @@ def _below_floor(search: Search, state: BodyState, side: str) -> float:
     posture = kinematics.posture(state, 0)
     ankle = kinematics.body.joint_names.index(f"{side}_ankle")
     own = kinematics.descends_from[search.many.limb, ankle]
-    places = search.many.posed(kinematics, posture)[0][own]
+    places = kinematics.points(search.many.points, posture)[own]
     near = np.linalg.norm(search.fine.points - posture.joints[ankle], axis=1) < _AROUND
     if not own.any() or not near.any():
         return 0.0
     return float(search.fine.points[near, 1].min() - places[:, 1].min())
 
 
-def on_heel(search: Search, state: BodyState, side: str, heel: tuple[float, float, float]) -> BodyState:
+def on_heel(
+    search: Search,
+    state: BodyState,
+    side: str,
+    heel: tuple[float, float, float],
+    joints: np.ndarray | None = None,
+) -> BodyState:
     """Return the body with one foot on a heel of a height (metres), with pitches of foot and toes (degrees).
+
+    The posed joints of the state are computed where they are not given.
 
     With thigh a, shin b and the distance d from hip to ankle, the angle at the knee is acos((a^2 + b^2 - d^2) / 2ab),
     and that between thigh and d acos((a^2 + d^2 - b^2) / 2ad). The height is taken off d.
@@ -223,7 +235,7 @@ def on_heel(search: Search, state: BodyState, side: str, heel: tuple[float, floa
     height, foot, toes = heel
     names = search.kinematics.body.joint_names
     index = {name: names.index(f"{side}_{name}") for name in ("hip", "knee", "ankle", "foot")}
-    joints = search.kinematics.posture(state, 0).joints
+    joints = search.kinematics.posture(state, 0).joints if joints is None else joints
     hip, knee, ankle = (joints[index[name]] for name in ("hip", "knee", "ankle"))
     a, b, d = (float(np.linalg.norm(v)) for v in (knee - hip, ankle - knee, ankle - hip))
 

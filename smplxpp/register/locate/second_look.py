@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -249,15 +250,23 @@ def _worth(limb: _Limb) -> float:
 
 def _grid(state: BodyState, limb: _Limb) -> Iterator[BodyState]:
     """Yield the body with its limb in every pose of the grid; fingers stay as they are."""
-    side, kind = limb.name.split()
-    mirror = np.ones(3) if side == "left" else MIRROR
-    for pose in _arms() if kind == "arm" else _legs():
+    for pose in _poses(*limb.name.split()):
         rotations = state.rotations.copy()
-        rotations[0, limb.joints] = np.eye(3)
-        for k, rotvecs in zip(limb.joints, pose, strict=False):
-            for vector in rotvecs:
-                rotations[0, k] = rotations[0, k] @ matrix_from_rotvec(np.radians(vector * mirror))
+        rotations[0, limb.joints] = pose
         yield replace(state, rotations=rotations)
+
+
+@cache
+def _poses(side: str, kind: str) -> list[Float64[np.ndarray, "3 3 3"]]:
+    """Return the rotations of the three joints of a limb in all poses of its grid."""
+    mirror, out = np.ones(3) if side == "left" else MIRROR, []
+    for pose in _arms() if kind == "arm" else _legs():
+        rotations = np.tile(np.eye(3), (3, 1, 1))
+        for k, rotvecs in enumerate(pose):
+            for vector in rotvecs:
+                rotations[k] = rotations[k] @ matrix_from_rotvec(np.radians(vector * mirror))
+        out.append(rotations)
+    return out
 
 
 def _arms() -> Iterator[LimbPose]:
