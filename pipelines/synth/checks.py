@@ -48,15 +48,19 @@ def _depths(person: Person, frames: Float[np.ndarray, "T V 3"]) -> dict[str, Flo
     count, own = person.body.vertex_count, {k: person.vertex_part == PART_NAMES.index(k) for k in _GARMENTS}
     found: dict[str, list[np.ndarray]] = {name: [] for name in _GARMENTS}
     for vertices in frames:
-        body = TriangleMesh(vertices[:count], person.body.faces)
+        body = SignedDistanceField(TriangleMesh(vertices[:count], person.body.faces), solid=True)
         for name in _GARMENTS:
-            found[name].append(depths(body, vertices[own[name]]))
+            found[name].append(_depths_in(body, vertices[own[name]]))
     return {name: np.stack(rows) for name, rows in found.items()}
 
 
 def depths(surface: TriangleMesh, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
     """Return the depth of points inside a closed surface, metres; 0 outside. Winding numbers give the side exactly."""
-    return np.maximum(-SignedDistanceField(surface, solid=True).query(points).distance, 0.0)
+    return _depths_in(SignedDistanceField(surface, solid=True), points)
+
+
+def _depths_in(solid: SignedDistanceField, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    return np.maximum(-solid.query(points).distance, 0.0)
 
 
 def free_edge_strain(person: Person, take: Take, garment: str) -> Float[np.ndarray, "T E"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import igl
@@ -10,6 +11,12 @@ from jaxtyping import Bool, Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.mesh import TriangleMesh, normalize_rows
+
+_SOLIDS: dict[bytes, tuple[igl.FastWindingNumberBVH, np.ndarray]] = {}
+"""The solids asked of last with their outer faces, because garments, layers and checks ask one after the other of the
+same body, of which both take a tenth of a second."""
+_REMEMBERED = 5
+"""Number of solids that are kept, 10 MB each of a body: as many as the poses that a check goes through, and one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +84,10 @@ class SignedDistanceField:
                 received="faces that point inward",
                 remedy="reverse the order of the corners of every face",
             )
+        key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).digest()
+        if key in _SOLIDS:
+            self._winding, outer = _SOLIDS[key]
+            return outer
         self._winding = igl.FastWindingNumberBVH()
         self._winding.init(mesh.vertices, mesh.faces)
         # A face is buried if the point a thousandth of the mesh's size (2 mm on a body) in front of it is inside: the
@@ -84,6 +95,9 @@ class SignedDistanceField:
         in_front = mesh.face_centers + 1e-3 * mesh.bbox_diagonal * mesh.face_normals
         outer = np.flatnonzero(~self._inside(in_front))
         assert len(outer), "a solid with a positive volume has an outside"
+        _SOLIDS[key] = self._winding, outer
+        while len(_SOLIDS) > _REMEMBERED:
+            _SOLIDS.pop(next(iter(_SOLIDS)), None)
         return outer
 
     def _inside(self, points: np.ndarray) -> np.ndarray:

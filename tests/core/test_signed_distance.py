@@ -45,6 +45,21 @@ def test_gradient_leads_to_the_asked_distance(solid):
     assert np.allclose(field.query(there).distance, 0.01, atol=1e-9)
 
 
+def test_solids_that_are_remembered_are_not_taken_for_each_other(monkeypatch):
+    """The same vertices with other faces are another solid; one asked of again is computed once."""
+    whole, points = sphere(), np.random.default_rng(2).normal(0, 0.8, (200, 3))
+    open_ball = TriangleMesh(whole.vertices, whole.faces[whole.face_centers[:, 1] < 0.5])
+    solids = [sphere(radius) for radius in np.linspace(0.5, 1.5, 8)] + [whole, open_ball]
+    first = [SignedDistanceField(one, solid=True).query(points).distance for one in solids]
+    monkeypatch.setattr("smplxpp.core.signed_distance._SOLIDS", {})
+    inside, calls = SignedDistanceField._inside, []
+    monkeypatch.setattr(SignedDistanceField, "_inside", lambda self, p: (calls.append(len(p)), inside(self, p))[1])
+    for mesh, distance in zip(solids, first, strict=True):
+        for _ in range(2):
+            np.testing.assert_array_equal(SignedDistanceField(mesh, solid=True).query(points).distance, distance)
+    assert [calls.count(mesh.face_count) for mesh in (open_ball, whole)] == [1, 9]
+
+
 def test_points_on_the_surface_get_its_normal():
     mesh = sphere()
     found = SignedDistanceField(mesh, solid=False).query(mesh.vertices)
