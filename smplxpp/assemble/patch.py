@@ -174,7 +174,9 @@ def _area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
 
 def _angle(corner: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
     u, v = one - corner, other - corner
-    return float(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v))
+    # The cross product of two single vectors by hand, because numpy's takes twenty times as long for them.
+    (a, b, c), (d, e, f) = u.tolist(), v.tolist()
+    return float(np.arctan2(np.linalg.norm(np.array([b * f - c * e, c * d - a * f, a * e - b * d])), u @ v))
 
 
 def _harmonic(faces: Int64[np.ndarray, "F 3"], rim: int, count: int) -> Float64[np.ndarray, "K L"]:

@@ -133,9 +133,12 @@ class _Ruled:
 
     def stiff(self, part: TriangleMesh, source: np.ndarray) -> Bool[np.ndarray, " M"]:
         """Which faces are of rigid pieces, in which there is no bridge."""
-        texts = (self.rules.get(int(v), self.settings.rule) for v in source)
-        rigid = np.array([PartRule.parse(text).kind in ("rigid", "isolate") for text in texts], dtype=bool)
-        return rigid[part.faces[:, 0]]
+        own, rules = self.settings.rule, self.rules
+        # There are few rules and many vertices: each is read once.
+        rigid = {text: PartRule.parse(text).kind in ("rigid", "isolate") for text in {own, *rules.values()}}
+        if not rules:
+            return np.full(part.face_count, rigid[own])
+        return np.array([rigid[rules.get(v, own)] for v in source.tolist()], dtype=bool)[part.faces[:, 0]]
 
 
 def rules_of_pieces(name: str, part: TriangleMesh, rules: Mapping[str, str]) -> dict[int, str]:
