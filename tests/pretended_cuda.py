@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from typing import Any
@@ -106,6 +106,11 @@ class PretendedTensor(Tensor):
 class _Placed(TorchDispatchMode):
     """Computes what is asked of the pretended device."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        # Nothing is compiled here, and torch's guard against that would cost as much as a call.
+        return False
+
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
         return _call(func, args, kwargs or {})
 
@@ -115,7 +120,8 @@ class _Asked(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if func is torch.device or getattr(func, "__name__", "") in ("__get__", "_parse_to"):
+        # Attributes are most of what is asked, and C++ knows them.
+        if getattr(func, "__name__", "") in ("__get__", "_parse_to") or func is torch.device:
             return func(*args, **kwargs)
         if func in (torch.tensor, torch.as_tensor, torch.asarray) and _is_cuda(kwargs.get("device")):
             # C++ would make a tensor of "meta" from nothing but the shape of the data.
@@ -156,7 +162,7 @@ def _known(value: Any) -> Any:
 
 def _call(func: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     """Compute on the CPU what the pretended device is asked for; anything else as it is."""
-    tensors = list(_tensors_in((*args, *kwargs.values())))
+    tensors = _tensors_in(args) + (_tensors_in(kwargs.values()) if kwargs else [])
     ours = any(isinstance(one, PretendedTensor) for one in tensors)
     asked = kwargs.get("device")
     placed = asked is not None and asked.type == "meta" and not _META_IS_MEANT[0]
@@ -175,26 +181,28 @@ def _call(func: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     return found if asked is not None and not placed else _shown(found)
 
 
-def _tensors_in(values: Any) -> Iterator[Tensor]:
+def _tensors_in(values: Iterable[Any]) -> list[Tensor]:
+    found = []
     for value in values:
         if isinstance(value, Tensor):
-            yield value
+            found.append(value)
         elif isinstance(value, list | tuple):
-            yield from _tensors_in(value)
+            found += _tensors_in(value)
+    return found
 
 
 def _held(value: Any) -> Any:
     """What the CPU computes with."""
-    if isinstance(value, list | tuple):
-        return type(value)(map(_held, value))
-    return value.held if isinstance(value, PretendedTensor) else value
+    if isinstance(value, PretendedTensor):
+        return value.held
+    return type(value)(map(_held, value)) if isinstance(value, list | tuple) else value
 
 
 def _shown(value: Any) -> Any:
     """What the CPU has computed, as the pretended device's."""
-    if isinstance(value, list | tuple):
-        return type(value)(map(_shown, value))
-    return PretendedTensor(value) if type(value) is Tensor else value
+    if type(value) is Tensor:
+        return PretendedTensor(value)
+    return type(value)(map(_shown, value)) if isinstance(value, list | tuple) else value
 
 
 @cache

@@ -18,8 +18,9 @@ from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, NOT_FOUND_PICTUR
 from pipelines.runs.stage import require_stage
 from smplxpp.body import load_body, load_params
 from smplxpp.build import locate
+from smplxpp.clean import simplify
 from smplxpp.core import BACKGROUND, SKIN, TriangleMesh
-from smplxpp.core.mesh_files.mesh_io import read_raw_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from smplxpp.register.locate import BodyNotFoundError, Candidate, LocateConfig, LocatedBody
 from smplxpp.segment import read_labels
 
@@ -92,8 +93,9 @@ def test_the_report_shows_what_else_it_might_have_been(alone):
     assert [row[0].startswith("chosen") for row in section.tables[0].rows][:2] == [True, False]
 
 
-def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, scan, monkeypatch):
-    shown = []
+def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, monkeypatch):
+    shown, scan = [], tmp_path / "coarse.ply"
+    write_ply(scan, simplify(read_mesh(PERSON / "scans" / "scan_000000.ply").mesh, 9500).mesh)
     fit = load_params(PERSON / "params" / "params.npz").frame(0)
 
     def look(body, mesh, *, colors, landmarks, labeller):

@@ -69,6 +69,22 @@ def small(small_scan, tmp_path) -> Small:
     return Small(*small_scan, tmp_path)
 
 
+@pytest.fixture(scope="module")
+def built_once(small_scan, tmp_path_factory) -> Path:
+    """The folder of a small scan and its finished run; nobody may change it."""
+    small = Small(*small_scan, tmp_path_factory.mktemp("small"))
+    records = small.build("run", small.inputs())
+    assert all(record.ran for record in records.values())
+    return small.folder
+
+
+@pytest.fixture
+def built(small, built_once) -> Small:
+    """A small scan with a copy of its finished run, which tests go on with."""
+    shutil.copytree(built_once, small.folder, dirs_exist_ok=True)
+    return small
+
+
 def template_of(run: Path) -> Template:
     return Template.load(run / "60_assemble" / "smplxpp.npz")
 
@@ -122,8 +138,9 @@ def test_where_no_view_looks_the_body_says_what_is_what(person_run):
     assert numbers["labels_from"] == "views"
 
 
-def test_labels_corrected_by_hand_are_taken_up_and_kept(small):
+def test_labels_corrected_by_hand_are_taken_up_and_kept(built):
     """The run's file is found, a change of it makes the labels anew, and no run removes it."""
+    small = built
     before = small.build("run", small.inputs(), last="30_clean")
     scan, run = load_scan(small.folder / "run")[0], small.folder / "run"
     low, high = scan.vertices.min(axis=0), scan.vertices.max(axis=0)
@@ -170,7 +187,8 @@ def test_corrections_of_another_run_are_copied(small, capsys):
     assert b"hair" in (run / "labels_corrections.json").read_bytes()
 
 
-def test_bridges_stay_where_the_user_wants_them(small):
+def test_bridges_stay_where_the_user_wants_them(built):
+    small = built
     kept = small.build("run", small.inputs(), last="40_transfer", bridges=BridgeConfig(rounds=0))
     cut = small.build("run", small.inputs(), last="40_transfer")
     assert kept["40_transfer"].ran and cut["40_transfer"].ran and not cut["30_clean"].ran
@@ -184,7 +202,8 @@ def test_bridges_stay_where_the_user_wants_them(small):
     assert Build(run_folder=small.folder, keep_bridges=True).config().bridges.rounds == 0
 
 
-def test_holes_stay_where_the_user_wants_them(small):
+def test_holes_stay_where_the_user_wants_them(built):
+    small = built
     record = small.build("run", small.inputs(), last="60_assemble", fill_holes=FillHolesConfig(width=0.0))[
         "60_assemble"
     ]
@@ -242,10 +261,8 @@ def test_a_second_call_runs_nothing_and_keeps_the_report(person_run, capsys):
 # --- resuming -------------------------------------------------------------------------------------------------------
 
 
-def test_only_what_is_damaged_or_changed_runs_again(small, monkeypatch):
-    inputs = small.inputs()
-    first = small.build("run", inputs)
-    assert all(record.ran for record in first.values())
+def test_only_what_is_damaged_or_changed_runs_again(built, monkeypatch):
+    small, inputs = built, built.inputs()
     run = small.folder / "run"
     truth = (run / "60_assemble" / "smplxpp.npz").read_bytes()
 
@@ -309,9 +326,8 @@ def test_a_build_from_a_late_stage_needs_the_earlier_ones(small):
 # --- invariance -----------------------------------------------------------------------------------------------------
 
 
-def test_units_and_axes_of_the_scan_do_not_matter(small):
-    small.build("metres", small.inputs())
-    truth = template_of(small.folder / "metres")
+def test_units_and_axes_of_the_scan_do_not_matter(small, built_once):
+    truth = template_of(built_once / "run")
     x, y, z = 100 * small.vertices.T
     small.build("zup", small.inputs(vertices=np.stack([x, -z, y], axis=1)), units="cm", up="z")
     other = template_of(small.folder / "zup")
