@@ -34,6 +34,7 @@ _EXPORTS: dict[str, str] = {
     "TriangleMesh": "smplxpp.core",
     "as_mesh": "smplxpp.core",
     "build_template": "smplxpp.build",
+    "check_mesh": "smplxpp.build",
     "load_body": "smplxpp.body",
     "load_params": "smplxpp.body",
     "open_capture": "smplxpp.capture",

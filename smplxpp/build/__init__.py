@@ -13,9 +13,11 @@ _EXPORTS: dict[str, str] = {
     "BuildInputs": "smplxpp.build.config",
     "BuildReport": "smplxpp.build.report",
     "BuildResult": "smplxpp.build.report",
+    "MeshVerdict": "smplxpp.build.mesh_verdict",
     "Part": "smplxpp.build.data",
     "ScanFile": "smplxpp.build.scan",
     "build_template": "smplxpp.build.template",
+    "check_mesh": "smplxpp.build.mesh_verdict",
     "read_scan": "smplxpp.build.scan",
 }
 
