@@ -78,6 +78,18 @@ def test_what_is_typed_is_answered_and_nothing_becomes_markup(talking):
     assert page.errors == []
 
 
+@pytest.mark.parametrize("talking", [{"partner": Script(("...", "Done."))}], indirect=True)
+def test_a_sign_shows_that_an_answer_is_awaited(talking):
+    page, _ = talking
+    type_in(page, "think")
+    page.until("document.querySelector('.thinking')?.getBoundingClientRect().height > 10", "no sign")
+    page.evaluate("conversation.connection.send({ kind: 'stop' })")
+    page.until("!document.querySelector('.thinking')", "it stays")
+    type_in(page, "again")
+    page.until("/Done/.test(document.querySelector('.theirs')?.textContent)")
+    assert page.evaluate("document.querySelector('.thinking')") is None and page.errors == []
+
+
 @pytest.mark.parametrize("talking", [{"partner": Script((LONG,))}], indirect=True)
 def test_sound_and_poses_are_on_one_clock_and_typing_stops_both(talking):
     """When the hum begins by the audio's time, the pose is that of the frame that it was sent with."""

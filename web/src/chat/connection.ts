@@ -2,8 +2,8 @@
 
 /** Seconds until it is tried again: each time longer. */
 const FIRST = 0.5, LONGEST = 8;
-/** The server's code of a conversation that another page has taken over. */
-const REPLACED = 4001;
+/** The server's codes of a conversation that another page has taken over, and of one that finds all places taken. */
+const REPLACED = 4001, TAKEN = 4002;
 
 /** What the server tells: an object with a kind. */
 export interface Told {
@@ -27,7 +27,10 @@ export class Connection {
   }
 
   connect(): void {
-    const socket = new WebSocket(`ws://${location.host}/${this.secret}`);
+    // Beside the page, which may lie in a folder of a proxy, and as safe as the page.
+    const address = new URL(this.secret, location.href);
+    address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+    const socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     socket.onopen = () => {
@@ -38,9 +41,10 @@ export class Connection {
       if (typeof data === "string") this.ontold(JSON.parse(data) as Told);
       else this.onframes(data);
     };
-    socket.onclose = ({ code }) => {
+    socket.onclose = ({ code, reason }) => {
       const final = code === REPLACED;
       this.onlost(final);
+      if (code === TAKEN) this.ontold({ kind: "note", text: `${reason}; this page waits for its turn.` });
       if (final) return;
       setTimeout(() => this.connect(), 1000 * this.wait);
       this.wait = Math.min(2 * this.wait, LONGEST);

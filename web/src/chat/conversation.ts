@@ -24,6 +24,7 @@ export class Conversation {
   private readonly log = element("div", { class: "said", role: "log", "aria-label": "Conversation" });
   private readonly note = element("div", { class: "note", role: "status" });
   private readonly times = element("div", { class: "times" });
+  private readonly thinking = element("div", { class: "thinking", role: "img", "aria-label": "An answer is being made" }, element("i"), element("i"), element("i"));
   private readonly input = element("input", { type: "text", maxlength: MOST_TYPED, placeholder: "Say something", "aria-label": "Say something", autocomplete: "off" });
   private readonly speak = iconButton("Speak", "microphone", ICONS.microphone);
   private turn = 0;
@@ -71,6 +72,7 @@ export class Conversation {
       this.say("");
     };
     this.connection.onlost = (final) => {
+      this.thinking.remove();
       this.stage.hush();
       this.say(final ? "Another page has taken over. Reload this one to talk here." : "The connection is lost; it is tried again. If the server was started anew, reload the page.");
     };
@@ -118,6 +120,7 @@ export class Conversation {
 
   private hear(told: Told): void {
     const text = String(told.text ?? "");
+    if (["answered", "stopped", "note", "hello", "listening"].includes(told.kind)) this.thinking.remove();
     if (told.kind === "hello") {
       this.speak.hidden = !told.hears;
       this.times.textContent = `Answers: ${told.partner}`;
@@ -130,6 +133,7 @@ export class Conversation {
       this.turn = Number(told.turn);
       this.answer = null;
       this.add("mine", text);
+      this.log.append(this.thinking);
     } else if (told.kind === "stopped") {
       this.stage.hush();
     } else if (told.kind === "silent") {
@@ -145,6 +149,7 @@ export class Conversation {
   /** Shows words of the answer as they are heard. */
   private show({ turn, text }: { turn: number; text: string }): void {
     if (turn !== this.turn) return;
+    this.thinking.remove();
     this.answer ??= this.add("theirs", "");
     this.answer.textContent += `${this.answer.textContent ? " " : ""}${text}`;
     this.log.scrollTop = this.log.scrollHeight;
