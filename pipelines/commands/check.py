@@ -13,7 +13,7 @@ from rich.table import Table
 
 from pipelines.commands.options import OptionalPath
 from pipelines.commands.templates import load_params_for, load_run_template
-from smplxpp.build import check_mesh
+from smplxpp.build.mesh_verdict import check_mesh
 from smplxpp.core import InputError, SkinWeights, read_mesh, write_ply
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.template.template import Template
