@@ -1,6 +1,7 @@
 """Measure `label_by_body` on scans of known people: accuracy, and the calibration of its confidence.
 
     SMPLXPP_PEOPLE=DIR python -m benchmarks labels_by_body [--count 36] [--seed 0] [--only NAME] [--outsiders]
+        [--faces 16000] [--draws 1] [--cases "a fit" ...]
 
 The cast of `synth.people`, the fixture, and the captures where they are; or with --outsiders the people whose surface
 the body model cannot reach. Accuracy is of the seen faces, by area
@@ -9,22 +10,27 @@ and by number. The body is
           as a fit would place it and then moved by 8 to 15 mm: 13 to 45 mm of mean vertex error; two draws a person
   exact   the truth's; of an outsider the model's nearest shape
 and the scan is as it is, or as photographs give it (a fit, colours blurred over 6 rings of vertices, 3 mm of smooth
-noise), or without colours (a fit, exact).
+noise), or without colours (a fit, exact). `--faces` simplifies every scan first, `--draws` and `--cases` leave out fits
+and cases, where time is short.
 """
 
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
+from smplxpp.clean import simplify
 from smplxpp.core import LABELS, BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.people import CAST, OUTSIDERS, PersonScan, person
 from smplxpp.people.outside import reachable
@@ -71,13 +77,25 @@ def as_photographed(scan: PersonScan, seed: int) -> tuple[TriangleMesh, np.ndarr
     return moved, np.clip(np.rint(colors), 0, 255).astype(np.uint8)
 
 
-def measure(scan: PersonScan, body: BodyModel, seed: int) -> list[dict]:
-    """One row a case."""
+def simplified(scan: PersonScan, faces: int | None) -> PersonScan:
+    """Return a scan with about so many faces, whose truth is that of the nearest faces before."""
+    if faces is None or scan.mesh.face_count <= faces:
+        return scan
+    kept = simplify(scan.mesh, faces)
+    nearest = cKDTree(scan.mesh.face_centers).query(kept.mesh.face_centers)[1]
+    colors = None if scan.colors is None else scan.colors[kept.source_vertex]
+    return replace(scan, mesh=kept.mesh, colors=colors, face_labels=scan.face_labels[nearest], seen=scan.seen[nearest])
+
+
+def measure(scan: PersonScan, body: BodyModel, seed: int, *, draws: int = 2, cases: Sequence[str] = ()) -> list[dict]:
+    """One row a case; all of them where `cases` is empty."""
     nearest = reachable(body, scan.body, scan.params)
-    fits = [as_fitted(body, nearest, 2 * seed + k) for k in (1, 2)]
+    fits = [as_fitted(body, nearest, 2 * seed + k) for k in range(1, draws + 1)]
     rows = []
 
     def add(case: str, mesh: TriangleMesh, params: BodyParams, colors: np.ndarray | None) -> None:
+        if cases and case not in cases:
+            return
         start = time.perf_counter()
         found = label_by_body(mesh, body, params, colors=colors)
         seconds = time.perf_counter() - start
@@ -146,19 +164,8 @@ def scans(count: int | None, seed: int, only: str, outsiders: bool) -> Iterator[
             yield person(names[k % len(names)], seed=seed + k // len(names)).as_read()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=None)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="")
-    parser.add_argument("--outsiders", action="store_true")
-    options = parser.parse_args()
-    body, rows = load_body(), []
-    for k, scan in enumerate(scans(options.count, options.seed, options.only, options.outsiders)):
-        own = measure(scan, body, k)
-        print(f"{scan.name}: {', '.join(format(r['accuracy'], '.3f') for r in own)}", flush=True)
-        rows += own
-    # The summary of a case weighs scans alike for accuracy, and area alike for calibration.
+def summarise(rows: list[dict]) -> dict[str, dict]:
+    """Return the figures of each case, which weigh scans alike for accuracy, and area alike for calibration."""
     summary = {}
     for case in dict.fromkeys(r["case"] for r in rows):
         own = sorted((r for r in rows if r["case"] == case), key=lambda r: r["accuracy"])
@@ -175,7 +182,13 @@ def main() -> None:
             "worst_by_confidence": _worst_by_confidence(own),
             "seconds_most": max(r["seconds"] for r in own),
         }
-        s = summary[case]
+    return summary
+
+
+def show(summary: dict[str, dict], rows: list[dict]) -> None:
+    """Print the figures of each case, and its worst scans."""
+    for case, s in summary.items():
+        own = sorted((r for r in rows if r["case"] == case), key=lambda r: r["accuracy"])
         print(
             f"\n{case}: {len(own)} scans, mean {s['mean']:.1%} by area, {s['mean_faces']:.1%} by faces, "
             f"median {s['median']:.1%}, at least 93 %: {s['at_least_93']:.0%}"
@@ -186,8 +199,28 @@ def main() -> None:
             print(f"  confidence {low:.2f} to {high:.2f}: {share:6.1%} of the area, {good:6.1%} right{least}")
         for r in own[:12]:
             print(f"  {r['accuracy']:6.1%} {r['accuracy_faces']:6.1%}  {r['person'][:44]:44s} {r['worst']}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=None)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--outsiders", action="store_true")
+    parser.add_argument("--faces", type=int, default=None)
+    parser.add_argument("--draws", type=int, default=2)
+    parser.add_argument("--cases", nargs="+", default=[])
+    options = parser.parse_args()
+    body, rows = load_body(), []
+    for k, scan in enumerate(scans(options.count, options.seed, options.only, options.outsiders)):
+        scan = simplified(scan, options.faces)
+        own = measure(scan, body, k, draws=options.draws, cases=options.cases)
+        print(f"{scan.name}: {', '.join(format(r['accuracy'], '.3f') for r in own)}", flush=True)
+        rows += own
+    summary = summarise(rows)
+    show(summary, rows)
     if not options.only:
-        command = "python -m benchmarks labels_by_body" + (" --outsiders" if options.outsiders else "")
+        command = shlex.join(["python", "-m", "benchmarks", "labels_by_body", *sys.argv[1:]])
         name = "labels_by_body_outsiders" if options.outsiders else "labels_by_body"
         store_results(name, command, {"bins": BINS, "summary": summary, "rows": rows})
 
