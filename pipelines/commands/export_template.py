@@ -21,9 +21,8 @@ from smplxpp.build.detail import simplified_template
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
 from smplxpp.core import BodyParams, InputError
-from smplxpp.export.amass import write_amass
-from smplxpp.export.bvh import write_bvh
 from smplxpp.export.by_suffix import export_template, pruning_error, with_texture_size
+from smplxpp.export.motion_files import write_amass, write_bvh
 from smplxpp.template.template import Template
 
 Writers = tuple[float | None, Iterator[tuple[int, Callable[[Path], object]]], list[str]]

@@ -21,8 +21,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.core import TriangleMesh
 from smplxpp.reconstruct.photographs import Pyramids, Sight, sight_of_camera
-from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette
-from smplxpp.reconstruct.views import PhotoView
+from smplxpp.reconstruct.views import UNSEEN, PhotoView, Silhouette
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from scipy import ndimage
 
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.topology import face_components
-from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
-from smplxpp.reconstruct.views import Box
+from smplxpp.reconstruct.views import Box, Silhouette, smallest_depths
 
 Field = Callable[[Float32[np.ndarray, "N 3"]], Float32[np.ndarray, " N"]]
 """Depth inside the surface at (N, 3) points, metres, negative outside; Lipschitz with constant 1."""

@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float64
 from scipy import ndimage
 
 from smplxpp.core.errors import InputError
-from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette, least_shown
-from smplxpp.reconstruct.views import LEAST_VIEWS, Box
+from smplxpp.reconstruct.views import LEAST_VIEWS, UNSEEN, Box, Silhouette, least_shown
 
 # Smallest share of a mask that the hull of the trusted views must explain. It trades faulty masks that are missed
 # against good ones that are dropped, since cameras and masks are never exact.

@@ -22,7 +22,6 @@ from smplxpp.reconstruct.colors import blend_colors
 from smplxpp.reconstruct.hull import Field, main_body, pixel_footprint, soft_hull, solid_status
 from smplxpp.reconstruct.mask_consensus import Consensus, find_consensus
 from smplxpp.reconstruct.photographs import Pyramids
-from smplxpp.reconstruct.silhouettes import Silhouette, smallest_depths
 from smplxpp.reconstruct.sweep import (
     PatchConfig,
     SweepLevel,
@@ -32,7 +31,7 @@ from smplxpp.reconstruct.sweep import (
     sweep_scores,
     taubin,
 )
-from smplxpp.reconstruct.views import PhotoView, check_spread, usable_views
+from smplxpp.reconstruct.views import PhotoView, Silhouette, check_spread, smallest_depths, usable_views
 
 # Cameras that must see a vertex for photographs to determine it.
 _LEAST_SEEN = 2

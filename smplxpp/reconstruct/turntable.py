@@ -28,9 +28,8 @@ from smplxpp.raster import rasterize_mesh
 from smplxpp.reconstruct.carried import REACH_M, CarriedPyramids, PosedPerson, clothing_limits
 from smplxpp.reconstruct.hull import Field, main_body, zero_surface
 from smplxpp.reconstruct.reconstruct import ReconstructConfig, Reconstruction, cell_size, refined
-from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette, least_shown
 from smplxpp.reconstruct.sweep import mean_of_neighbours, taubin
-from smplxpp.reconstruct.views import INSIDE, LEAST_VIEWS, Box, PhotoView, mask_fault
+from smplxpp.reconstruct.views import INSIDE, LEAST_VIEWS, UNSEEN, Box, PhotoView, Silhouette, least_shown, mask_fault
 
 # Share of the frames that may reject a point of the surface, and of the first hull, which a wrong frame must not spoil.
 # It trades thin limbs, which wrong poses cut off, against fat ones.

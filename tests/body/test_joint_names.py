@@ -12,8 +12,8 @@ from smplxpp.body.bvh_params import load_bvh
 from smplxpp.body.layout import NAME_SCHEMES, PROGRAMS, SMPLX_JOINTS, names_of_joints
 from smplxpp.body.retarget import Skeleton
 from smplxpp.core import InputError
-from smplxpp.export.bvh import write_bvh
 from smplxpp.export.gltf_skin import with_joint_names
+from smplxpp.export.motion_files import write_bvh
 from tests.export.glb_reader import GlbReader
 from tests.export.templates import open_body_template, random_motion, random_template
 

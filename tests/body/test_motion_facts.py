@@ -12,8 +12,7 @@ from pipelines.commands.params import ParamsInspect
 from smplxpp.body import load_body
 from smplxpp.body.motion_facts import inspect_motion
 from smplxpp.core import BodyParams
-from smplxpp.export.amass import write_amass
-from smplxpp.export.bvh import write_bvh
+from smplxpp.export.motion_files import write_amass, write_bvh
 from tests.body.walks import FPS, walk
 
 

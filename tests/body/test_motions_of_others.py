@@ -9,7 +9,7 @@ from pipelines.commands.params import ParamsConvert
 from smplxpp.body import load_body, load_params
 from smplxpp.body.bvh_params import load_bvh
 from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec
-from smplxpp.export.bvh import write_bvh
+from smplxpp.export.motion_files import write_bvh
 from tests.body.walks import FPS, shaped, walk
 
 SMPL_NAMES = {

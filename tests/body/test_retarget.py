@@ -14,7 +14,7 @@ from smplxpp.body.bvh import BvhMotion, read_bvh
 from smplxpp.body.bvh_params import bvh_params, load_bvh, named_joints, read_joint_map
 from smplxpp.body.retarget import Skeleton, retarget
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
-from smplxpp.export.bvh import write_bvh
+from smplxpp.export.motion_files import write_bvh
 from tests.body.walks import FPS, betas, rotation_z, shaped, slide, walk
 
 PAIRS = [(1, 2), (1, None), (5, 6), (None, 9)]

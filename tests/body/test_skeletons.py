@@ -13,7 +13,7 @@ from smplxpp.body.bvh import BvhMotion, read_bvh
 from smplxpp.body.bvh_params import bvh_params, load_bvh, matched_skeleton, named_joints
 from smplxpp.core import BodyParams, GeometryWarning, matrix_from_rotvec
 from smplxpp.core.rotations import rotvec_from_matrix
-from smplxpp.export.bvh import write_bvh
+from smplxpp.export.motion_files import write_bvh
 from tests.body.walks import shaped, walk
 
 SIDES = {"left": ("Left", "L", "l", "左"), "right": ("Right", "R", "r", "右")}

@@ -15,7 +15,7 @@ from smplxpp.body.retarget import FEET, Skeleton
 from smplxpp.body.smpl_joints import BODY_JOINTS, smpl_joint_regressor, smpl_offsets
 from smplxpp.body.smpl_params import from_smpl, rests_like_smpl, smpl_places, smpl_skeleton
 from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec
-from smplxpp.export.amass import write_amass
+from smplxpp.export.motion_files import write_amass
 from tests.body.walks import shaped, walk
 
 Z_UP = np.array([np.pi / 2, 0.0, 0.0])  # SMPL's rest pose, upright in a world with z up

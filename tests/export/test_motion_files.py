@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from smplxpp.body import load_body, load_params
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
-from smplxpp.export.amass import write_amass
-from smplxpp.export.bvh import euler_zxy, write_bvh
+from smplxpp.export.motion_files import euler_zxy, write_amass, write_bvh
 from tests.export.templates import random_motion
 
 

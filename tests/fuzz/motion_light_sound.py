@@ -15,7 +15,7 @@ from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.files.sound_file import Sound, read_sound, wave_bytes
 from smplxpp.core.light import Irradiance
 from smplxpp.core.params import BodyParams
-from smplxpp.export.bvh import write_bvh
+from smplxpp.export.motion_files import write_bvh
 from tests.core.files.openexr import write_openexr
 from tests.core.files.radiance import write_radiance
 from tests.core.files.test_wave_file import coded, file_of

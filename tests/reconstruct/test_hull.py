@@ -4,8 +4,7 @@ import pytest
 from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.reconstruct.hull import main_body, pixel_footprint, soft_hull, solid_status, zero_surface
-from smplxpp.reconstruct.silhouettes import Silhouette
-from smplxpp.reconstruct.views import Box
+from smplxpp.reconstruct.views import Box, Silhouette
 from tests.reconstruct.scene import BOX, RADIUS, dented_views, inside_ball, inside_dented
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from smplxpp.core.errors import InputError
 from smplxpp.reconstruct.mask_consensus import find_consensus
-from smplxpp.reconstruct.silhouettes import Silhouette
+from smplxpp.reconstruct.views import Silhouette
 from tests.reconstruct.scene import RADIUS, dented_views
 
 

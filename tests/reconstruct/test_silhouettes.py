@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core.camera import Camera
-from smplxpp.reconstruct.silhouettes import UNSEEN, Silhouette, least_shown, signed_distance, smallest_depths
-from smplxpp.reconstruct.views import PhotoView
+from smplxpp.reconstruct.views import UNSEEN, PhotoView, Silhouette, least_shown, signed_distance, smallest_depths
 
 SIZE = 64
 

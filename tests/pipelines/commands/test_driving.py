@@ -16,7 +16,7 @@ from pipelines.viewer.run_session import open_run
 from smplxpp.body import load_body
 from smplxpp.body.retarget import Skeleton, retarget
 from smplxpp.core import BodyParams, InputError
-from smplxpp.export.bvh import write_bvh
+from smplxpp.export.motion_files import write_bvh
 from tests.body.walks import betas, shaped, walk
 from tests.dolls.dancing import template, write_dance_run
 from tests.pipelines.test_animate import run  # noqa: F401
