@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import re
 import socket
 import threading
@@ -12,13 +13,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import PurePosixPath
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 from urllib.parse import unquote, urlsplit
 
 from pipelines.web.access import Access
 from smplxpp.core.errors import InputError
 
-T = TypeVar("T")
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -74,26 +74,29 @@ def read_request(raw: bytes) -> Request | None:
     return Request(found[1], found[2], headers, raw)
 
 
-def at_free_port(make: Callable[[int], T], port: int) -> T:
-    """Return what is made at a port, or at the next free one; 0: any.
+def _listen_at_free_port(access: Access, port: int) -> socket.socket:
+    """Listen at a port, or at the next free one where only people look for it; 0: any.
 
     Raises:
-        InputError: no port is free.
+        InputError: no port is free; the host is no address of this machine.
     """
-    tries = 32
+    tries = 1 if access.exposed else 32
     for one in range(port, port + tries if port else 1):
         try:
-            return make(one)
+            return _listen(access.host, one)
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise
-    raise InputError("option port", expected="a port that is free", received=f"{port} and those after it taken")
+    taken = f"{port} taken, which a proxy asks" if access.exposed else f"{port} and those after it taken"
+    raise InputError("option port", expected="a port that is free", received=taken)
 
 
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listening = socket.socket(family, socket.SOCK_STREAM)
     try:
+        if os.name == "posix":  # a server that is started anew has its port at once; elsewhere two would share it
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))
         listening.listen(128)
     except BaseException as error:
@@ -127,17 +130,17 @@ class PageServer:
     Args:
         files: contents by plain name, or a function that makes them for the `Host` under which they are asked.
         access: who may ask.
-        port: to listen at, or the next free one; 0: any.
+        port: to listen at, or the next free one where other machines do not ask it; 0: any.
 
     Raises:
-        InputError: no port is free.
+        InputError: no port is free, no such host.
     """
 
     def __init__(
         self, files: Mapping[str, bytes | Callable[[str], bytes]], *, access: Access | None = None, port: int = 0
     ) -> None:
         self.files, self.access = files, access or Access()
-        self._socket = at_free_port(lambda at: _listen(self.access.host, at), port)
+        self._socket = _listen_at_free_port(self.access, port)
         self.server_address: tuple[str, int] = self._socket.getsockname()[:2]
         self._tasks: set[asyncio.Task[Any]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None

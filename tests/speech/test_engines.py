@@ -40,6 +40,9 @@ def test_a_voice_says_a_sentence_with_its_stresses(spoken):
     other = PiperVoice(threads=1)
     assert 1.3 < other.say(TEXT, slower=1.5).sound.seconds / spoken.sound.seconds < 1.7
     np.testing.assert_array_equal(other.say(TEXT).sound.samples, spoken.sound.samples)
+    # A listener who interrupts does not wait for the rest.
+    asked = iter([True, False])
+    assert other.say("Hi. " + TEXT, wanted=lambda: next(asked)).sound.seconds < 1.0
 
 
 def test_the_voice_is_quiet_where_its_phonemes_say_so(spoken):

@@ -118,7 +118,7 @@ def test_a_token_goes_from_the_address_into_a_cookie():
             assert get(server, path, cookie=f"other=1; {cookie}").content == FILES["me.avatar"]
 
 
-def test_half_requests_and_pages_that_do_not_read_hold_no_thread():
+def test_half_requests_and_pages_that_do_not_read_hold_no_thread(caplog):
     with PageServer(FILES | {"big": bytes(8 << 20)}) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         assert get(server, "/").status == 200
@@ -130,6 +130,8 @@ def test_half_requests_and_pages_that_do_not_read_hold_no_thread():
         assert threading.active_count() == before
         for one in open_ones:
             one.close()
+        assert get(server, "/player.js").content == FILES["player.js"]
+    assert not caplog.records  # browsers that leave early are no errors
 
 
 @pytest.mark.parametrize(
@@ -152,6 +154,8 @@ def test_what_is_no_request_is_answered_with_what_is_wrong(server, raw, status):
 def test_a_taken_port_gives_way_to_the_next(server):
     with PageServer(FILES, port=server.server_address[1]) as second:
         assert second.server_address[1] > server.server_address[1]
+    with pytest.raises(InputError, match="proxy"):  # a proxy would ask another server
+        PageServer(FILES, port=server.server_address[1], access=Access(public_url="https://me.org/"))
 
 
 def test_a_folder_keeps_what_else_is_in_it(tmp_path):
