@@ -98,7 +98,7 @@ class ChatBenchmark:
                 }
                 for part in turns[0]
             },
-            "typed": [_typed(self.avatar, cast, pages) for pages in (1, PAGES)],
+            "typed": {f"{pages} at a time": _typed(self.avatar, cast, pages) for pages in (1, PAGES)},
             "seconds of CPU": _cpu(cast, page),
             "gaussians": bundle.sizes["N"],
         }
@@ -149,7 +149,6 @@ def _typed(avatar: Path, cast: ChatParts, pages: int) -> dict[str, Any]:
     server.shutdown()
     assert len(seconds) == pages * len(SENTENCES) and resident is not None
     return {
-        "pages": pages,
         "messages": len(seconds),
         "median": round(float(np.median(seconds)), 3),
         "worst": round(max(seconds), 3),
