@@ -125,6 +125,9 @@ def _hold(where: str, pairs: dict[str, tuple[Any, Any]]) -> None:
                 raise ContractError(f"{where}: {name} should be {hint}, is {_described(value)}")
 
 
+_PLAIN = frozenset({int, float, bool, str, type(None)})
+
+
 def _kind(value: Any) -> Any:
     """All of a value that decides whether it fits: its type, and the dtype and shape of arrays.
 
@@ -133,6 +136,8 @@ def _kind(value: Any) -> Any:
     kind = type(value)
     if kind is np.ndarray:
         return kind, value.dtype, value.shape
+    if kind in _PLAIN:
+        return kind
     if isinstance(shape := getattr(value, "shape", None), tuple):  # not a body's shape
         return kind, getattr(value, "dtype", None), shape
     if isinstance(value, list | tuple):

@@ -105,7 +105,7 @@ def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, monkeypatch):
 
     monkeypatch.setattr(locate, "locate_body", look)
     run = tmp_path / "run"
-    build = Build(run_folder=run, scan=scan, until_stage=LOCATE_STAGE, json=True)
+    build = Build(run_folder=run, scan=scan, units="m", up="y", until_stage=LOCATE_STAGE, json=True)
     # A body that nobody would show is not built on: the run keeps it, with a picture.
     with pytest.raises(BodyNotFoundError, match="one hand is not there") as stopped:
         build.run()
@@ -146,6 +146,6 @@ def test_nothing_is_built_on_what_is_no_person(tmp_path, monkeypatch):
     )
     write_ply(tmp_path / "cube.ply", TriangleMesh(cube * 1.8, faces))
     with pytest.raises(BodyNotFoundError, match="one whole person"):
-        Build(run_folder=tmp_path / "run", scan=tmp_path / "cube.ply", json=True).run()
+        Build(run_folder=tmp_path / "run", scan=tmp_path / "cube.ply", units="m", up="y", json=True).run()
     assert [path.name for path in (tmp_path / "run").glob("[0-9]*")] == [LOCATE_STAGE]
     assert (tmp_path / "run" / NOT_FOUND_PICTURE).is_file()
