@@ -16,8 +16,8 @@ LEAST_CONFIDENCE = 0.1
 """Confidence of a located body below which a build stops.
 
 Of 14 real scans and 18 procedural people in rare poses, bodies with every limb in its place have .74 and up, but for
-one in clothes 45 mm wide (.03); the other facing, lost poses and two people stay below .04. A single limb elsewhere has
-up to .38, and a note."""
+one in clothes 45 mm wide (.03); the other facing, lost poses and two people stay below .04, a single limb elsewhere
+below .09."""
 _HELP = (
     "cut away everything but the person, place landmarks (`smplxpp label`, --landmarks), ask a "
     "detector (--detector mediapipe), or give the parameters (--params). --accept-failures builds all the same"

@@ -1,4 +1,4 @@
-"""Make the things that procedural people hold: closed meshes at a hand, in the pose of the person."""
+"""Make the things that procedural people hold or wear: closed meshes at hand, head or trunk, in the person's pose."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from smplxpp.core import InputError, TriangleMesh
 
 @dataclass(frozen=True)
 class Thing:
-    """A thing that a person holds.
+    """A thing that a person holds or wears.
 
     Attributes:
-        kind: name among `THINGS`.
-        side: "left" or "right" hand.
+        kind: name among `THINGS` or `WORN`.
+        side: "left" or "right" hand; of a bag on a strap, the hip.
         color: sRGB.
     """
 
@@ -28,18 +28,20 @@ class Thing:
     color: tuple[int, int, int] = (40, 60, 120)
 
     def __post_init__(self) -> None:
-        if self.kind not in THINGS:
-            raise InputError("thing in a hand", expected=f"one of {', '.join(THINGS)}", received=self.kind)
+        if self.kind not in (*THINGS, *WORN):
+            raise InputError("thing", expected=f"one of {', '.join((*THINGS, *WORN))}", received=self.kind)
         if self.side not in ("left", "right"):
             raise InputError("hand", expected="left or right", received=self.side)
 
 
 def thing_mesh(thing: Thing, body: BodyModel, posed: PosedBody) -> TriangleMesh:
-    """Return the closed mesh of a thing at the hand of the first posed body, metres.
+    """Return the closed mesh of a thing on the first posed body, metres.
 
     What a hand grips is placed in the frame of the wrist: x along the fingers, y out of the back of the hand, z towards
     the thumb. What hangs from it stands upright in the world, whatever the hand does.
     """
+    if thing.kind in WORN:
+        return _joined(WORN[thing.kind](body, posed, 1.0 if thing.side == "left" else -1.0))
     at = {name: k for k, name in enumerate(body.joint_names)}
     joint, sign = at[f"{thing.side}_wrist"], 1.0 if thing.side == "left" else -1.0
     knuckles = posed.joints[0][at[f"{thing.side}_middle1"]]
@@ -51,7 +53,12 @@ def thing_mesh(thing: Thing, body: BodyModel, posed: PosedBody) -> TriangleMesh:
         forward = turn[:, 2] * [1.0, 0.0, 1.0]
         forward /= np.linalg.norm(forward)
         turn = np.stack([forward, [0.0, 1.0, 0.0], np.cross(forward, [0.0, 1.0, 0.0])], axis=1)
-    pieces = [_hull(piece @ turn.T + knuckles) for piece in points()]
+    return _joined([piece @ turn.T + knuckles for piece in points()])
+
+
+def _joined(convex: list[np.ndarray]) -> TriangleMesh:
+    """Return the convex hulls of some sets of points as one mesh."""
+    pieces = [_hull(points) for points in convex]
     count = np.cumsum([0] + [piece.vertex_count for piece in pieces])
     return TriangleMesh(
         np.concatenate([piece.vertices for piece in pieces]),
@@ -119,3 +126,80 @@ THINGS: dict[str, tuple[bool, Callable[[], list[np.ndarray]]]] = {
 }
 """For each kind: whether it hangs upright from the hand, and the points of its convex pieces, metres from the
 knuckles."""
+
+
+def _glasses(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
+    """Two discs before the eyes, a bridge, and two temples, in the frame of the head."""
+    eyes, turn = _head(body, posed)
+    left, right = eyes
+    middle, half = 0.5 * (left + right), 0.5 * float(np.linalg.norm(left - right))
+    lenses = [_tube(0.026, (sign * half, 0.0, 0.030), (sign * half, 0.0, 0.036)) for sign in (1.0, -1.0)]
+    temples = [_tube(0.004, (sign * 0.072, 0.004, 0.034), (sign * 0.078, 0.008, -0.075)) for sign in (1.0, -1.0)]
+    rims = [_tube(0.004, (sign * half, 0.0, 0.033), (sign * 0.072, 0.004, 0.033)) for sign in (1.0, -1.0)]
+    bridge = _tube(0.004, (-0.012, 0.004, 0.035), (0.012, 0.004, 0.035))
+    return [piece @ turn.T + middle for piece in (*lenses, *rims, *temples, bridge)]
+
+
+def _brimmed_hat(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
+    """A crown over the top of the head and a brim 19 cm wide about it, in the frame of the head."""
+    _, turn = _head(body, posed)
+    head = posed.vertices[0][body.weights[:, body.joint_names.index("head")] > 0.9] @ turn
+    x, z = 0.5 * (head.min(axis=0) + head.max(axis=0))[[0, 2]]
+    band = float(head[:, 1].max()) - 0.055  # metres, where the hat sits on the forehead
+    crown = _tube(0.108, (x, band, z), (x, band + 0.11, z))
+    brim = _tube(0.19, (x, band, z), (x, band + 0.012, z))
+    return [piece @ turn.T for piece in (crown, brim)]
+
+
+def _shoulder_bag(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
+    """A bag at one hip on a strap over the other shoulder, 25 mm off the skin for the clothes below."""
+    at = {name: k for k, name in enumerate(body.joint_names)}
+    own, other = ("left", "right") if side > 0 else ("right", "left")
+    joints, vertices = posed.joints[0], posed.vertices[0]
+    # The strap lies in the plane through hip and shoulder that looks along the trunk's front.
+    front = posed.posed_from_rest[0][at["pelvis"]][:3, 2]
+    hip = joints[at[f"{own}_hip"]] + [0.0, 0.02, 0.0]
+    shoulder = 0.5 * (joints[at[f"{other}_collar"]] + joints[at[f"{other}_shoulder"]])
+    up = (shoulder - hip) / np.linalg.norm(shoulder - hip)
+    depth = front - (front @ up) * up
+    depth /= np.linalg.norm(depth)
+    normal = np.cross(up, depth)
+    trunk = [k for name, k in at.items() if name.startswith(("pelvis", "spine")) or "collar" in name or "hip" in name]
+    skin = vertices[body.weights[:, trunk].sum(axis=1) > 0.6] - hip
+    near = skin[np.abs(skin @ normal) < 0.02]
+    flat = np.stack([near @ up, near @ depth], axis=1)
+    ring = flat[ConvexHull(flat).vertices]
+    out = ring - ring.mean(axis=0)
+    ring = ring.mean(axis=0) + out * (1.0 + 0.025 / np.linalg.norm(out, axis=1, keepdims=True))
+    places = hip + ring[:, :1] * up + ring[:, 1:] * depth
+    away = hip + ring.mean(axis=0)[0] * up + ring.mean(axis=0)[1] * depth
+    pieces = []
+    for start, end in zip(places, np.roll(places, -1, axis=0), strict=True):
+        thick = 0.5 * (start + end) - away
+        thick *= 0.006 / np.linalg.norm(thick)
+        pieces.append(
+            np.stack([p + w * normal + t * thick for p in (start, end) for w in (-0.02, 0.02) for t in (0.0, 1.0)])
+        )
+    # The bag hangs upright beside the hip, outside of the widest skin there.
+    right = np.cross([0.0, 1.0, 0.0], front)
+    right *= side / np.linalg.norm(right)
+    level = skin[np.abs(skin[:, 1]) < 0.08]
+    beside = float((level @ right).max()) + 0.025 + 0.045
+    frame = np.stack([front / np.linalg.norm(front), [0.0, 1.0, 0.0], right], axis=1)
+    return [*pieces, _box((0.28, 0.22, 0.09), (0.0, -0.06, beside)) @ frame.T + hip]
+
+
+def _head(body: BodyModel, posed: PosedBody) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the places of both eyes and the rotation of the head."""
+    left, right = (body.joint_names.index(f"{side}_eye_smplhf") for side in ("left", "right"))
+    return (posed.joints[0][left], posed.joints[0][right]), posed.posed_from_rest[0][
+        body.joint_names.index("head")
+    ][:3, :3]
+
+
+WORN: dict[str, Callable[[BodyModel, PosedBody, float], list[np.ndarray]]] = {
+    "glasses": _glasses,
+    "brimmed hat": _brimmed_hat,
+    "shoulder bag": _shoulder_bag,
+}
+"""For each kind, the points of its convex pieces on a posed body; 1 or -1 is the left or the right side."""

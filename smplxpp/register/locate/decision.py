@@ -48,6 +48,9 @@ _SIDES = ("left", "right")
 _OPEN_HAND = 0.4
 """Visible share of a hand below which its fingers are not found; fists show 0.35 to 0.5 where their pose is right."""
 _LIMB_PARTS = ("left forearm", "right forearm", "left foot", "right foot")
+_LIMB_SHARE = 0.03
+"""Share of the surface in one piece that no part of the body explains, from which it may be a limb: arms that were
+turned away from where 8 real people have them left 3.5 % and more."""
 _HEAD_SHOWN = 0.5
 """Visible share of the head below which it may be missing; hair and hoods hide some of it."""
 
@@ -109,6 +112,10 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
     if all(best.misfit.parts[part] < 0.2 for part in legs):
         trust = min(trust, 0.3)
         out.append("neither lower legs nor feet: it may be cut off below")
+    elsewhere = limb_elsewhere(surface, best)
+    if elsewhere:
+        trust = min(trust, 0.1)
+        out.append(elsewhere)
     if not no_person(best) and best.misfit.covered >= _BOUNDS.doubtful_covered:
         return tuple(out), trust
     # Something large that is no part of a body.
@@ -121,6 +128,25 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
             f"only {high - low:.2f} m from the lowest to the highest point: a small child, or a part of a person"
         )
     return tuple(out), trust
+
+
+def limb_elsewhere(surface: SurfacePoints, found: Found) -> str:
+    """Return in words that a limb of the body lies in the air, while the surface shows a piece that may be it, or "".
+
+    One of the two alone is no fault: limbs are cut off or hidden, things and wide clothes are no part of a body. A
+    skirt hides feet and stands off the legs, so that they count only where a body explains little of the surface.
+    """
+    shown = found.misfit.parts
+    lost = [f"{side} arm" for side in _SIDES if shown[f"{side} forearm"] < 0.4 and shown[f"{side} hand"] < 0.5]
+    if found.misfit.covered < _BOUNDS.doubtful_covered:
+        lost += [f"{side} leg" for side in _SIDES if max(shown[f"{side} lower leg"], shown[f"{side} foot"]) < 0.4]
+    piece = largest_piece(surface, found.misfit.unexplained) if lost else None
+    if piece is None or piece.share < _LIMB_SHARE:
+        return ""
+    return (
+        f"{' and '.join(lost)} not where the body has it, and {piece.share:.0%} of the surface, in one piece of "
+        f"{piece}, no part of the body found: a limb in the wrong place; place a landmark on its wrist or ankle"
+    )
 
 
 def confidence_of(best: Found, others: Sequence[Found]) -> float:

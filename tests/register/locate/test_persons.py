@@ -8,11 +8,14 @@ from scipy.spatial import ConvexHull
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import standing_poses
-from smplxpp.core import TriangleMesh, matrix_from_rotvec
+from smplxpp.build.verdict import LEAST_CONFIDENCE
+from smplxpp.core import TriangleMesh, ignore_progress, matrix_from_rotvec
 from smplxpp.core.surface_points import SurfacePoints
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.landmarks import visible_vertices
+from smplxpp.register.locate.decision import confidence_of, findings_of
 from smplxpp.register.locate.persons import convex_share, heads, largest_piece, people_apart
+from smplxpp.register.locate.search import LocateConfig, Search
 
 BODY = load_body()
 
@@ -92,3 +95,32 @@ def test_the_largest_piece_that_no_body_explains_has_the_size_of_what_is_held(pe
     assert piece is not None and np.abs(np.array(piece.size) - size).max() < 0.03
     assert abs(piece.share - 600 / 4600) < 0.001
     assert largest_piece(surface, np.zeros(4000, dtype=bool)) is None
+
+
+def test_an_arm_in_the_air_beside_one_that_no_body_explains_is_refused(person):
+    """One wrong arm had a confidence of .35 and went on to a template; an arm that is cut off is no such fault."""
+    config = LocateConfig(coarse_points=400, fine_points=2000)
+    pose = next(vectors for name, vectors in standing_poses(BODY.joint_count) if name == "arms lowered, legs apart")
+    right, raised = matrix_from_rotvec(pose)[None], matrix_from_rotvec(pose)[None]
+    raised[0, BODY.joint_names.index("left_shoulder")] = matrix_from_rotvec(np.array([0.0, 0.0, 1.2]))
+    follows = [
+        name.startswith(
+            ("left_elbow", "left_wrist", *(f"left_{one}" for one in ("thumb", "index", "middle", "ring", "pinky")))
+        )
+        for name in BODY.joint_names
+    ]
+    arm = (BODY.weights[:, follows].sum(axis=1) > 0.5)[person.faces].all(axis=1)
+    found = {}
+    for name, rotations, mesh in (
+        ("right", right, person),
+        ("raised", raised, person),
+        ("cut", right, person.submesh(~arm)[0]),
+    ):
+        search = Search(Kinematics(BODY), mesh, config, None, ignore_progress)
+        state = BodyState(rotations, np.zeros((1, 3)), np.zeros(BODY.num_betas), np.zeros((1, BODY.num_expressions)))
+        best = search.polished(name, state, None, steps=0)
+        findings, trust = findings_of(mesh, search.fine, best)
+        found[name] = (trust * confidence_of(best, []), "; ".join(findings))
+    assert found["raised"][0] < LEAST_CONFIDENCE < found["cut"][0] < found["right"][0]
+    assert found["raised"][1].startswith("left arm not where the body has it, and ")
+    assert not found["right"][1] and "not where" not in found["cut"][1]
