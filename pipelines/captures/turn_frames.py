@@ -17,12 +17,11 @@ from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import laplace
 
 from smplxpp.capture import Capture, open_capture
-from smplxpp.capture.files import IMAGE_SUFFIXES
+from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from smplxpp.capture.video_files import ffmpeg_program
 from smplxpp.core import InputError, spread
 from smplxpp.core.files.image_file import open_image
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 _UNKNOWN_LENS, _STATED_LENS = 0.25, 0.03  # standard deviations of log f
 
 

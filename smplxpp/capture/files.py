@@ -16,6 +16,23 @@ from smplxpp.core.errors import InputError
 # Largest frame number, above which float64 does not hold every integer.
 _LAST_FRAME = 1 << 53
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".mpg", ".mpeg")
+
+
+def require_folder(path: str | Path) -> None:
+    """Check that a capture is a folder.
+
+    Raises:
+        InputError: it is none; the film of one camera is no capture yet, and the message says how it becomes one.
+    """
+    if Path(path).is_dir():
+        return
+    film = Path(path).is_file() and Path(path).suffix.lower() in VIDEO_SUFFIXES
+    remedy = (
+        "a film of a person who turns before one camera becomes a capture with "
+        f"`smplxpp capture turntable {path} --out DIR`; films of several cameras lie in a folder with their calibration"
+    )
+    raise InputError("capture", expected="an existing folder", received=str(path), remedy=remedy if film else "")
 
 
 @dataclass(frozen=True, eq=False)

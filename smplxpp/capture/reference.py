@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries
+from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, require_folder
 from smplxpp.capture.protocols import ProtocolFiles, choose_protocol, read_description
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.errors import InputError
@@ -70,8 +70,7 @@ def find_reference(
         InputError: no such folder, no such protocol, or scan or parameters missing.
     """
     root = Path(capture)
-    if not root.is_dir():
-        raise InputError("capture", expected="an existing folder", received=str(root))
+    require_folder(root)
     description = read_description(root)
     files = choose_protocol(root, description, protocol)
     number = f"{frame:06d}"

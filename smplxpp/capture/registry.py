@@ -12,7 +12,7 @@ import numpy as np
 from smplxpp.body import BodyModel
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
-from smplxpp.capture.files import subfolders
+from smplxpp.capture.files import require_folder, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoints import KeypointFiles, with_keypoints
 from smplxpp.capture.masks import with_masks
@@ -90,8 +90,7 @@ def open_capture(
     """
     # Absolute, because a worker of a data loader may have another working directory.
     root = Path(path).absolute()
-    if not root.is_dir():
-        raise InputError("capture", expected="an existing folder", received=str(path))
+    require_folder(path)
     if format is not None:
         require_choice("format of the capture", format, FORMATS)
     options = ReaderOptions(

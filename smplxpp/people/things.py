@@ -192,9 +192,9 @@ def _shoulder_bag(body: BodyModel, posed: PosedBody, side: float) -> list[np.nda
 def _head(body: BodyModel, posed: PosedBody) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Return the places of both eyes and the rotation of the head."""
     left, right = (body.joint_names.index(f"{side}_eye_smplhf") for side in ("left", "right"))
-    return (posed.joints[0][left], posed.joints[0][right]), posed.posed_from_rest[0][
-        body.joint_names.index("head")
-    ][:3, :3]
+    return (posed.joints[0][left], posed.joints[0][right]), posed.posed_from_rest[0][body.joint_names.index("head")][
+        :3, :3
+    ]
 
 
 WORN: dict[str, Callable[[BodyModel, PosedBody, float], list[np.ndarray]]] = {

@@ -219,6 +219,9 @@ def test_broken_descriptions_are_refused(tmp_path, name, text, words):
 def test_unknown_folders_and_names_are_refused(tmp_path):
     with pytest.raises(InputError, match="existing folder"):
         open_capture(tmp_path / "nothing")
+    (tmp_path / "phone.MOV").write_bytes(b"film")
+    with pytest.raises(InputError, match=r"capture turntable .*phone\.MOV --out DIR"):
+        open_capture(tmp_path / "phone.MOV")
     with pytest.raises(InputError, match=r"cameras\.json"):
         open_capture(tmp_path)
     root = write_capture(tmp_path / "disc")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from smplxpp.capture.calibrations import find_calibration, read_calibration
 from smplxpp.capture.calibrations.names import matched_names
-from smplxpp.capture.files import IMAGE_SUFFIXES, FileSeries, subfolders
+from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FileSeries, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoints import KeypointFiles, find_places
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params
@@ -21,7 +21,6 @@ from smplxpp.core.files.image_file import image_size
 
 NAME = "rig"
 LOOKS_FOR = "a calibration of a known tool, there or beside it, with keypoints, images or videos of its cameras"
-VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".mpg", ".mpeg")
 # Where tools put keypoints, images, masks and videos; the first folder that holds something of the cameras is taken.
 _KEYPOINTS = ("keypoints", "pose-associated", "pose-sync", "pose", "poses", "openpose", "json", ".")
 _IMAGES = ("rgbs", "images", "imgs", "images_lr", "hdImgs", "frames", ".")
