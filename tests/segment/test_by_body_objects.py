@@ -11,7 +11,7 @@ from smplxpp.body import BodyModel, PosedBody, load_body
 from smplxpp.core import OBJECT, BodyParams, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.topology import face_adjacency
 from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
-from smplxpp.people.things import THINGS, Thing, thing_mesh
+from smplxpp.people.things import THINGS, WORN, Thing, thing_mesh
 from smplxpp.segment import label_by_body
 from smplxpp.segment.by_body_objects import _enclosed, _Where, find_objects
 from smplxpp.segment.flat_patches import flat_share
@@ -190,14 +190,26 @@ def test_a_thing_follows_the_wrist_that_holds_it_and_a_hat_the_head(open_body, s
 
 
 def test_things_are_closed_and_wound_outwards(open_body, stance):
-    for kind in THINGS:
+    for kind in (*THINGS, *WORN):
         mesh = thing_mesh(Thing(kind), open_body, stance[1])
         assert len(mesh.border_edges) == 0, kind
         assert np.einsum("ij,ij->", mesh.face_centers - mesh.vertices.mean(axis=0), mesh.face_cross) > 0, kind
 
 
+def test_what_is_worn_is_where_it_is_worn(open_body, stance):
+    joints = dict(zip(open_body.joint_names, stance[1].joints[0], strict=True))
+    bag = thing_mesh(Thing("shoulder bag", "left"), open_body, stance[1]).vertices
+    # The strap passes over the right shoulder, outside of the skin, and the bag hangs beside the left hip.
+    assert np.abs(bag[bag[:, 1].argmax(), [0, 1]] - joints["right_collar"][:2]).max() < 0.15
+    assert bag[:, 0].max() > joints["left_hip"][0] + 0.1 and bag[:, 1].min() < joints["left_hip"][1]
+    hat = thing_mesh(Thing("brimmed hat"), open_body, stance[1]).vertices
+    assert hat[:, 1].min() > joints["left_eye_smplhf"][1] and np.ptp(hat[:, 0]) > 0.35
+    glasses = thing_mesh(Thing("glasses"), open_body, stance[1]).vertices
+    assert np.abs(glasses[:, 1] - joints["left_eye_smplhf"][1]).max() < 0.04
+
+
 def test_unknown_things_and_hands_are_refused():
-    with pytest.raises(InputError, match="thing in a hand"):
+    with pytest.raises(InputError, match="thing: expected one of binder"):
         Thing("anvil")
     with pytest.raises(InputError, match="hand"):
         Thing("ball", "both")
