@@ -13,7 +13,7 @@ from pipelines.commands.options import OptionalPath, OptionalText, listed_names,
 from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.captures.masks import MatteModel
+    from smplxpp.build.capture_masks import MatteModel
     from smplxpp.capture import Capture
 
 
@@ -41,9 +41,9 @@ class CaptureMasks:
 
     def run(self) -> dict:
         """Write the masks and return how many there are."""
-        from pipelines.captures.masks import write_masks
         from pipelines.commands.terminal import shared_progress
         from pipelines.runs.folders import keep_out_of_capture
+        from smplxpp.build.capture_masks import write_masks
         from smplxpp.capture import open_capture
         from smplxpp.core.files.paths import same_place
 
@@ -75,7 +75,7 @@ class CaptureMasks:
         # The identity goes into the folder's record, because masks of two origins must not mix in one folder. Plates
         # differ by camera; the other two models are the same for all.
         if self.plates is not None:
-            from pipelines.captures.masks import Plates
+            from smplxpp.build.capture_masks import Plates
 
             plates = Plates(self.plates, cameras)
             return plates.of_camera, plates.identity

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.synth import tracked_inputs as tracked
-from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture, open_capture
+from smplxpp.capture.camera_rig import camera_rig
 from smplxpp.capture.writers.frame_files import save_params_by_row
 from smplxpp.capture.writers.metadata import write_cameras_json, write_description
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_at_least

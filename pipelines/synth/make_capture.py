@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.checks import scan_checks, take_checks
 from pipelines.synth.config import SynthConfig, motion_kind, split_frames
 from pipelines.synth.simulate import Take, simulate
@@ -20,6 +19,7 @@ from pipelines.synth.tracker import tracker_noise
 from pipelines.synth.views import Atlas, LitFrame, RenderedView, hidden_faces, normal_map, paint_atlas, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
+from smplxpp.capture.camera_rig import camera_rig
 from smplxpp.capture.writers.frame_files import (
     rounded,
     save_compact,

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.motion import Performance
 from pipelines.synth.tracker import DetectorConfig, detector_keypoints
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.capture.camera_rig import camera_rig
 from smplxpp.core import Camera, InputError, Keypoints2D, matrix_from_rotvec
 from smplxpp.people.fixture_person import PERSON_BETAS
 from smplxpp.register.keypoint_faults import mirror_index, number_ranges

@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 
 from pipelines.cli import main
-from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.config import SynthConfig, split_frames
 from pipelines.synth.make_capture import make_capture
 from pipelines.synth.motion import Performance
@@ -19,6 +18,7 @@ from pipelines.synth.simulate import SimulationConfig
 from pipelines.synth.views import LitFrame, normal_map, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
+from smplxpp.capture.camera_rig import camera_rig
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.writers.frame_files import png16, save_compact, write_normal_png
 from smplxpp.capture.writers.metadata import FACE, write_calibration_csv, write_cameras_json

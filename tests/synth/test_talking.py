@@ -11,7 +11,6 @@ import pytest
 
 from pipelines.cli import main
 from pipelines.commands.synth import Synth
-from pipelines.synth.camera_rig import camera_rig
 from pipelines.synth.config import SynthConfig
 from pipelines.synth.make_capture import make_capture
 from pipelines.synth.motion import Performance
@@ -21,6 +20,7 @@ from pipelines.synth.views import Atlas, LitFrame, _cell_centers, paint_atlas, r
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import open_capture
+from smplxpp.capture.camera_rig import camera_rig
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.fixture_person import load_person, read_layers
