@@ -153,6 +153,25 @@ def test_a_dropped_connection_comes_back(talking):
     assert page.errors == []
 
 
+def test_an_avatar_in_a_page_of_the_same_site_talks_with_the_server(talking):
+    """Without any of the player's page: events tell what is said, and closing gives the avatar back."""
+    page, _ = talking
+    page.evaluate(
+        "import('./player.js').then(async ({createAvatar}) => { const canvas = document.createElement('canvas');"
+        " canvas.style.cssText = 'width: 100px; height: 100px'; document.body.append(canvas); window.told = [];"
+        " window.guest = createAvatar(canvas, {url: 'me.avatar'}); window.dialogue = await guest.converse('./');"
+        " for (const event of ['hello', 'heard', 'answer']) dialogue.on(event, it => told.push([event, it])); })"
+    )
+    page.until("dialogue.stage.shown && told.length", "the server shows nobody")
+    assert page.evaluate("dialogue.type('hello')") is True
+    page.until("told.some(([event, {text}]) => event === 'answer' && /How are you/.test(text))")
+    assert page.evaluate("told.map(([event]) => event).join().startsWith('hello,heard,answer')")
+    assert page.evaluate("guest.player.performer !== null && (dialogue.close(), guest.player.performer === null)")
+    assert "expected the page" in page.evaluate("guest.converse('player.js').catch(error => error.message)")
+    page.evaluate("guest.dispose()")
+    assert page.errors == []
+
+
 @NEEDS_BUILD
 def test_a_lower_rate_keeps_what_it_can_hold_and_no_more():
     tones = [(48_000, 1000.0), (44_100, 3000.0), (48_000, 11_000.0)]  # samples a second, Hz

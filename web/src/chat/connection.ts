@@ -19,6 +19,7 @@ export class Connection {
   onframes: (data: ArrayBuffer) => void = () => {};
   private socket: WebSocket | null = null;
   private wait = FIRST;
+  private closed = false;
 
   constructor(private readonly secret: string) {}
 
@@ -27,6 +28,7 @@ export class Connection {
   }
 
   connect(): void {
+    if (this.closed) return;
     // Beside the page, which may lie in a folder of a proxy, and as safe as the page.
     const address = new URL(this.secret, location.href);
     address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
@@ -42,6 +44,7 @@ export class Connection {
       else this.onframes(data);
     };
     socket.onclose = ({ code, reason }) => {
+      if (this.closed) return;
       const final = code === REPLACED;
       this.onlost(final);
       if (code === TAKEN) this.ontold({ kind: "note", text: `${reason}; this page waits for its turn.` });
@@ -49,6 +52,12 @@ export class Connection {
       setTimeout(() => this.connect(), 1000 * this.wait);
       this.wait = Math.min(2 * this.wait, LONGEST);
     };
+  }
+
+  /** Ends it for good; nothing is told any more. */
+  close(): void {
+    this.closed = true;
+    this.socket?.close();
   }
 
   /** Sends, if there is somebody: an object, or samples. */

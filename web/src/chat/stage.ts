@@ -9,6 +9,8 @@ import { poseOfRow, type Frames, type Line } from "./wire.ts";
 const KEPT = 2, OFF = 0.25;
 /** Seconds ahead of the present at which a sound can still begin. */
 const AHEAD = 0.05;
+/** Seconds that a browser may take to wake its sound. */
+const WAKES = 1;
 /** Seconds in which a pose that is replaced goes over into the new one. */
 const FADE = 0.2;
 
@@ -55,7 +57,7 @@ export class Stage implements Performer {
   /** Lets sound be heard; to be called by a click or a key. */
   unlock(): void {
     if (this.context) {
-      if (this.context.state !== "running") void this.context.resume();
+      if (this.context.state !== "running") void this.context.resume().catch(() => {}); // closed before it is awake
       return;
     }
     const context = new AudioContext();
@@ -63,7 +65,7 @@ export class Stage implements Performer {
     this.output = context.createGain();
     this.output.connect(context.destination);
     context.onstatechange = () => this.lead();
-    void context.resume();
+    void context.resume().catch(() => {}); // closed before it is awake
     this.lead();
   }
 
@@ -83,8 +85,9 @@ export class Stage implements Performer {
     for (const k of this.rows.keys()) if (k < (this.now - KEPT) * this.fps) this.rows.delete(k);
     if (!frames.line) return;
     const { line } = frames, { context } = this;
-    // The first click's sound may not be awake yet.
-    if (context?.state === "suspended") void context.resume().then(() => this.sound(line, start));
+    // The first click's sound may not be awake yet; without a click it never is, and the line is shown alone.
+    const patience = new Promise((resolve) => setTimeout(resolve, 1000 * WAKES));
+    if (context?.state === "suspended") void Promise.race([context.resume().catch(() => {}), patience]).then(() => this.sound(line, start));
     else this.sound(line, start);
   }
 

@@ -7,6 +7,7 @@ import { readRadiance } from "../light/radiance.ts";
 import { SpeakingFace } from "../lips/face.ts";
 import { LiveLips } from "../lips/lips.ts";
 import type { Viseme } from "../lips/visemes.ts";
+import { Dialogue } from "../chat/dialogue.ts";
 import { Soundtrack } from "../sound/soundtrack.ts";
 import type { Summary } from "../worker/protocol.ts";
 import { bytesOf, type Source } from "./source.ts";
@@ -109,6 +110,7 @@ export class Avatar<P extends Animator = Animator> {
   private readonly voice = new Voice();
   private readonly listeners = new Map<string, Set<(detail: never) => void>>();
   private sound: Soundtrack | null = null;
+  private dialogue: Dialogue | null = null;
 
   /** @param make makes what animates the avatar. */
   constructor(make: (options: AvatarOptions) => Promise<P> | P, private readonly options: AvatarOptions = {}) {
@@ -131,6 +133,7 @@ export class Avatar<P extends Animator = Animator> {
     const player = await this.started(), { signal } = this.disposing, { autoplay = true } = this.options;
     const data = await bytesOf(url, signal), [ofLips, ofSound] = await Promise.all([lips, sound].map((one) => one && bytesOf(one, signal)));
     this.hush();
+    this.dialogue?.close();
     const summary = await player.open(data), { expressionNames, jointNames } = summary, jaw = jointNames.indexOf("jaw");
     this.alive(this.player);
     player.lips?.dispose();
@@ -225,6 +228,28 @@ export class Avatar<P extends Animator = Animator> {
     }
   }
 
+  /**
+   * Talks with a server of `smplxpp chat`, whose voice, face and gestures the avatar has until the dialogue is closed.
+   *
+   * @param server the address of its page, which has to be of the same site as this one.
+   * @returns before the server answers: `on("hello")` tells. @throws Error no such server, or one that asks for a token.
+   */
+  async converse(server: string | URL): Promise<Dialogue> {
+    const player = await this.opened(), { signal } = this.disposing, page = new URL(server, document.baseURI);
+    const reply = await fetch(page, { signal }), text = await reply.text();
+    // The page of the server knows the secret of its socket.
+    const secret = new DOMParser().parseFromString(text, "text/html").body.getAttribute("data-chat");
+    if (!reply.ok || !secret) {
+      throw new Error(`${page}: expected the page of smplxpp chat --serve, received ${reply.ok ? "another page" : `${reply.status} ${text.slice(0, 200)}`}`);
+    }
+    this.alive(this.player);
+    this.hush();
+    this.dialogue?.close();
+    this.dialogue = new Dialogue(player, String(new URL(secret, page)));
+    this.dialogue.connect();
+    return this.dialogue;
+  }
+
   /** Silence at once. */
   hush(): void {
     ++this.turn;
@@ -260,10 +285,11 @@ export class Avatar<P extends Animator = Animator> {
   dispose(): void {
     this.disposing.abort(new Error("the avatar is disposed of"));
     this.voice.dispose();
+    this.dialogue?.close();
     this.player?.clock?.at(false, 0, 1);
     void this.sound?.context?.close();
     this.player?.dispose();
-    this.player = this.summary = this.sound = null;
+    this.player = this.summary = this.sound = this.dialogue = null;
     this.listeners.clear();
   }
 

@@ -111,7 +111,7 @@ export class AvatarMesh extends Mesh<InstancedBufferGeometry, ShaderMaterial> {
   private see(renderer: WebGLRenderer, camera: SceneCamera): void {
     const { player } = this.avatar, { geometry, material: { uniforms } } = this;
     if (!player || !this.buffer) return;
-    const wrong = !("isWebGLRenderer" in renderer) ? "three's WebGLRenderer" : !("isPerspectiveCamera" in camera) ? "a perspective camera" : "";
+    const wrong = "isWebGPURenderer" in renderer ? "three's WebGLRenderer" : !("isPerspectiveCamera" in camera) ? "a perspective camera" : "";
     if (wrong) return this.complain(`the avatar's mesh: expected ${wrong}, received another one`);
     const { pinhole, rows, scale } = this.project(renderer, camera);
     const [a, b, c] = [rows.slice(0, 4), rows.slice(4, 8), rows.slice(8)];

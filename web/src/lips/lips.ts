@@ -146,7 +146,7 @@ export class LiveLips {
     this.onsaid(`Opening ${name}`);
     try {
       this.context ??= new AudioContext();
-      void this.context.resume();
+      void this.context.resume().catch(() => {}); // closed before it is awake
     } catch (error) {
       return this.say(`This browser plays no sound: ${(error as Error).message}`);
     }

@@ -32,7 +32,7 @@ export class Soundtrack implements Clock {
   unlock(): void {
     if (this.failed) return;
     if (this.context) {
-      if (this.context.state !== "running") void this.context.resume();
+      if (this.context.state !== "running") void this.context.resume().catch(() => {}); // closed before it is awake
       return;
     }
     this.asked = performance.now();
@@ -40,7 +40,7 @@ export class Soundtrack implements Clock {
       this.context = new AudioContext();
       this.output = this.context.createGain();
       this.output.connect(this.context.destination);
-      void this.context.resume();
+      void this.context.resume().catch(() => {}); // closed before it is awake
     } catch (error) {
       this.fail(`this browser plays no sound (${(error as Error).message})`);
       return;

@@ -14,8 +14,8 @@ const SPEEDS = [1, 0.5, 0.25, 2];
 /** Milliseconds between changes of the numbers on the page. */
 const RATES_EVERY = 400;
 
-/** CSS pixels at the bottom that the controls cover. */
-const COVERED = 64;
+/** CSS pixels at the bottom that the controls cover, and those that the button above them does. */
+const COVERED = 64, SPEAK = 52;
 const TITLES = { avatar: "This avatar cannot be shown", sound: "There is no sound", lips: "The mouth cannot follow live sound" };
 
 export class App {
@@ -61,7 +61,8 @@ export class App {
   private begin(): void {
     const { name } = this.avatar.summary!;
     this.welcome.replaceChildren();
-    this.speak.hidden = !this.player.clock;
+    this.offerSound(Boolean(this.player.clock));
+    this.player.resetView();
     document.title = name;
     this.stage.ariaLabel = `${name}, an avatar. Arrow keys turn it, plus and minus come nearer and go away, Home goes back.`;
     this.title.replaceChildren(element("h1", {}, name), element("p", {}, "SMPLX++ avatar"));
@@ -100,6 +101,13 @@ export class App {
     return card;
   }
 
+  /** Shows the button that begins a motion with its sound, and keeps the person above it. */
+  private offerSound(offered: boolean): void {
+    this.speak.hidden = !offered;
+    this.player.covered = offered ? COVERED + SPEAK : COVERED;
+    this.player.update();
+  }
+
   private closeCard(): void {
     this.welcome.replaceChildren();
     this.stage.focus();
@@ -131,7 +139,7 @@ export class App {
     const toggle = () => {
       if (player.playing) this.avatar.pause();
       else void this.avatar.play();
-      this.speak.hidden = true;
+      this.offerSound(false);
       this.showPlaying();
     };
     this.speak.addEventListener("click", toggle);
@@ -220,6 +228,6 @@ export class App {
     const size = `${(player.summary!.bytes / 1e6).toFixed(1)} MB`;
     this.rates.title = lost ?? "";
     this.rates.replaceChildren(element("b", {}, `${fps.toFixed(fps < 10 ? 1 : 0)} fps`),
-      ` · ${parts.join(" · ")} ms · ${player.renderer.name} · ${size}`);
+      element("span", {}, ` · ${parts.join(" · ")} ms · ${player.renderer.name} · ${size}`));
   }
 }
