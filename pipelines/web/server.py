@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import PurePosixPath
 from typing import Any, Self
-from urllib.parse import unquote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 from pipelines.web.access import Access
 from smplxpp.core.errors import InputError
@@ -239,7 +239,7 @@ class PageServer:
         elif access.takes_token(query):
             # The token goes from the address, which is shown and kept, into a cookie.
             status, body = HTTPStatus.SEE_OTHER, b""
-            more |= {"Location": f"./{name.rpartition('/')[2]}", "Set-Cookie": access.set_cookie}
+            more |= {"Location": f"./{quote(name.rpartition('/')[2])}", "Set-Cookie": access.set_cookie}
         elif not access.brings_token(request.headers.get("cookie", "")):
             status, body = HTTPStatus.FORBIDDEN, b"open the address that the server has printed, with its token\n"
         elif request.upgrades:

@@ -41,11 +41,15 @@ class Served:
     secret: str
 
     def open(self, **changes: Any) -> Any:
-        given = {"path": self.secret, "host": f"127.0.0.1:{self.port}", "origin": f"http://127.0.0.1:{self.port}"}
+        given = {"path": self.secret, "host": self.host, "origin": f"http://{self.host}"}
         given |= changes
         address = f"ws://{given['host']}/{given['path']}"
         stream = socket.create_connection(("127.0.0.1", self.port))
         return connect(address, sock=stream, origin=given["origin"], max_size=None, open_timeout=LIMIT)
+
+    @property
+    def host(self) -> str:
+        return f"127.0.0.1:{self.port}"
 
     def get(self, path: str, host: str | None = None) -> http.client.HTTPResponse:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=LIMIT)
@@ -107,8 +111,11 @@ def test_no_other_page_may_talk(served, changes):
     assert refused.value.response.status_code == 403
 
 
-def test_a_page_talks_and_hears(served):
-    with served.open() as page:
+@pytest.mark.parametrize("forwarded", [None, "localhost:9000"])  # ssh -L 9000:localhost:8091
+def test_a_page_talks_and_hears(served, forwarded):
+    changes = {} if forwarded is None else {"host": forwarded, "origin": f"http://{forwarded}"}
+    assert f"ws://{forwarded or served.host}".encode() in served.get("/", host=forwarded).content
+    with served.open(**changes) as page:
         assert told(page, "hello")["hears"] is True
         page.send(json.dumps({"kind": "say", "text": "hello"}))
         assert told(page, "heard")["text"] == "hello"

@@ -111,6 +111,7 @@ def test_a_token_goes_from_the_address_into_a_cookie():
         assert get(server, "/?token=" + new_token()).status == 403
         moved = get(server, f"/a/?token={access.token}")
         assert moved.status == 303 and moved.headers["Location"] == "./"
+        assert get(server, f"/%0d%0aX:y?{'a&' * 99}token={access.token}").headers["X"] is None
         cookie, *rules = moved.headers["Set-Cookie"].split("; ")
         assert set(rules) == {"HttpOnly", "SameSite=Lax", "Path=/a/", "Secure"}
         # A proxy passes the path of the public address on, or leaves it out.
