@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
+import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Literal
 
@@ -92,8 +93,39 @@ class FigureTable:
         winners = {name for name, value in known.items() if column.shown(value) == best}
         return winners if len(winners) < len(known) else set()
 
-    def text(self) -> str:
-        """Return the table aligned by spaces, groups over their columns, the caption above."""
+    def text(self, *, width: int | None = None) -> str:
+        """Return the table aligned by spaces, groups over their columns, the caption above.
+
+        Args:
+            width: of a line; a wider table goes on below with further columns, each time with the rows' names, and a
+                column or a word that alone is wider stays whole. None: one line a row.
+        """
+        caption = [self.caption] if self.caption else []
+        if width is not None:
+            caption = textwrap.wrap(self.caption, width, break_long_words=False, break_on_hyphens=False)
+        blocks = "\n\n".join("\n".join(part._lines()) for part in self._parts(width))
+        return "\n".join([*caption, blocks]) + "\n"
+
+    def _parts(self, width: int | None) -> list[FigureTable]:
+        """Return tables of neighbouring columns that are at most so wide; groups are cut where they alone are wider."""
+        if width is None or self._fits(width):
+            return [self]
+        units = [list(members) for _, members in groupby(self.columns, lambda column: column.group)]
+        parts: list[FigureTable] = []
+        for unit in units:
+            for columns in [unit] if replace(self, columns=tuple(unit))._fits(width) else [[one] for one in unit]:
+                wider = replace(self, columns=(*parts[-1].columns, *columns)) if parts else None
+                if wider is not None and wider._fits(width):
+                    parts[-1] = wider
+                else:
+                    parts.append(replace(self, columns=tuple(columns)))
+        return parts
+
+    def _fits(self, width: int) -> bool:
+        return max(map(len, self._lines())) <= width
+
+    def _lines(self) -> list[str]:
+        """Return the lines of headings and rows."""
         # A column is as wide as its widest cell, and the last column of a group takes what its title needs more.
         body = [[self.row_title, *(c.title for c in self.columns)], *self.cells()]
         widths = [max(map(len, column)) for column in zip(*body, strict=True)]
@@ -107,7 +139,7 @@ class FigureTable:
         if any(title for title, _ in groups):
             spans = [title.rjust(sum(widths[k + 1] for k in m) + 2 * (len(m) - 1)) for title, m in groups]
             lines.insert(0, "  ".join([" " * widths[0], *spans]))
-        return "\n".join([*([self.caption] if self.caption else []), *(line.rstrip() for line in lines)]) + "\n"
+        return [line.rstrip() for line in lines]
 
     def csv(self) -> str:
         """Return the table as CSV: keys as header, every digit of the figures, empty cells without a figure."""

@@ -182,7 +182,7 @@ def _progress(*, enabled: bool) -> Iterator[tuple[Training, ProgressCallback]]:
 def _print(outcome: AblationOutcome, how_to_continue: str) -> None:
     console = Console()
     if outcome.results["rows"]:
-        console.print(outcome.table.text(), soft_wrap=True, highlight=False)
+        console.print(outcome.table.text(width=console.width), soft_wrap=True, highlight=False)
     if outcome.waiting:
         console.print(f"still to do: {', '.join(outcome.waiting)}; {how_to_continue}", soft_wrap=True)
     console.print(f"table, figures and pictures: {outcome.folder}", soft_wrap=True, highlight=False, markup=False)

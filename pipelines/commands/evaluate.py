@@ -142,7 +142,7 @@ class Evaluate:
         if not self.json:
             console = Console()
             for table in evaluation_tables(report).values():
-                console.print(table.text(), highlight=False, soft_wrap=True)
+                console.print(table.text(width=console.width), highlight=False, soft_wrap=True)
             console.print(
                 f"{'' if record.ran else 'stands, not run again; '}tables  {record.folder / 'tables'}\n"
                 f"views   {record.folder / 'pictures'}",

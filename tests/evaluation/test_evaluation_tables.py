@@ -39,6 +39,18 @@ def test_text_aligns_figures_and_leaves_out_empty_columns():
     assert len(ends) == 1
 
 
+def test_a_wide_table_goes_on_below_with_every_figure_once_and_the_rows_named_again():
+    whole = table(caption="words that " * 12)
+    text = whole.text(width=40)
+    assert max(map(len, text.splitlines())) <= 40
+    assert text.split().count("Full") == 2 and "\n\n" in text
+    cells = [cell for row in whole.cells() for cell in row[1:] if cell != "-"]
+    assert all(text.split().count(cell) == cells.count(cell) for cell in cells)
+    assert whole.text(width=400) == whole.text().replace(whole.caption, whole.caption.strip())
+    # A column that alone is wider stays whole.
+    assert "parameters" in whole.text(width=5)
+
+
 def test_csv_keeps_every_digit():
     rows = list(csv.reader(io.StringIO(table().csv())))
     assert rows[0] == ["model", "psnr", "lpips", "count"]

@@ -30,7 +30,9 @@ def coefficient_std(student: Student, sequence: AvatarSequence) -> Float[Tensor,
             pose = sequence.pose(frame)
             jaw = pose.jaw[None] if shapes.config.jaw else None
             rows.append(shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)[0])
-    return torch.stack(rows).std(dim=0, correction=0)
+    found = torch.stack(rows).std(dim=0, correction=0)
+    # Shapes of motions that training did not show are held ready for them, and count as the strongest others do.
+    return torch.where(found == 0.0, found.max(), found)
 
 
 def pruned_to(student: Student, sequence: AvatarSequence, max_bytes: float) -> tuple[Student, float]:

@@ -1,0 +1,359 @@
+"""Hold the face's Gaussians to their surface in motions that training never showed: closing lids, a hanging jaw.
+
+Before the last training every Gaussian of the face is bound to the face of the mesh that it lies on: training lets them
+slide by centimetres, and one that draws an eye must not move with a lid. After it, the head's blend shapes get a shape
+for each such motion. Its coefficient is 0 up to the strength that training showed, so that nothing changes there, and 1
+from some more on, where lids have the colour of the skin around the eye and nothing hangs before an open mouth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.sampling import head_faces, seen_faces
+from avatar.gaussians.tensor_operations import multiply_quats
+from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.networks.blend_shapes import BlendShapes
+from avatar.models.student import Student
+from smplxpp.core import BodyParams, Camera, TriangleMesh, row_lengths
+from smplxpp.core.signed_distance import barycentric_coordinates
+from smplxpp.core.spherical_harmonics import rotate_sh
+from smplxpp.metrics import point_to_surface
+from smplxpp.raster import rasterize_mesh
+from smplxpp.template.mouth import inside_of_mouth
+from smplxpp.template.template import BODY_PART, Template
+
+_JAW = 0.3  # radians of a jaw that hangs: where the mouth's shape is made
+_JAW_OPEN = 0.35  # radians of the jaw that move lips as far as the expression jawOpen does
+_APART = 2e-3  # metres that two faces move apart, above which a Gaussian is bound to the one that it lies on
+_STRETCH = 1.5  # growth of a face's area as the jaw falls: above, it lies in a corner of the mouth and carries none
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenMotion:
+    """A motion of the face that goes beyond what training showed.
+
+    Attributes:
+        kind: "left", "right" (lids) or "jaw".
+        weights: of the head's inputs (expression, then jaw), whose sum is the motion's strength.
+        begin: strength up to which the trained appearance holds: the largest of training.
+        end: strength from which the held one does.
+    """
+
+    kind: str
+    weights: Float64[np.ndarray, " I"]
+    begin: float
+    end: float
+
+
+@torch.no_grad()
+def rebound(student: Student, expressions: Float[Tensor, "T E"]) -> Student:
+    """Return the student with the face's Gaussians bound to where they lie in the mean expression of training.
+
+    In that expression nothing moves. Faces inside the mouth and in its corners take none, because they are folded.
+
+    Args:
+        student: without blend shapes.
+        expressions: of the training frames.
+    """
+    rig, template = student.rig, student.rig.template
+    head = _head(template)
+    if student.blend_shapes is not None or not head.any():
+        return student
+    rest = _rest(template)
+    mean = expressions.mean(dim=0).double().cpu().numpy()
+    pose = rig.pose(replace(rest, expression=mean[None]))
+    vertices = rig.skin(pose, student.displacements(pose))
+    frames = triangle_frames(vertices, rig.faces)
+    bound = student.gaussians()
+    places = world_from_frames(bound, frames).means
+    # Faces that take Gaussians: seen from outside, and neither within the mouth nor torn open by the jaw.
+    mesh = TriangleMesh(vertices.double().cpu().numpy(), template.faces)
+    folded = inside_of_mouth(template)[template.faces].any(axis=1)
+    opened = mesh.with_vertices(template.pose(replace(rest, jaw_pose=np.array([[_JAW, 0.0, 0.0]])))[0])
+    torn = opened.face_areas > _STRETCH * np.maximum(template.mesh.face_areas, 1e-12)
+    taking = np.flatnonzero(head & seen_faces(mesh) & ~folded & ~torn)
+    old = bound.face_index.cpu().numpy()
+    rows = np.flatnonzero(head[old] & ~folded[old])
+    if not len(taking) or not len(rows):
+        return student
+    _, foot, found = point_to_surface(
+        places[torch.tensor(rows)].double().cpu().numpy(), TriangleMesh(mesh.vertices, template.faces[taking])
+    )
+    # The rest stays bound as it is: there both faces move alike.
+    apart = _apart(template, old[rows], taking[found])
+    use = apart > _APART
+    return _moved(student, rows[use], taking[found[use]], foot[use], vertices)
+
+
+def _moved(
+    student: Student,
+    rows: Int64[np.ndarray, " n"],
+    faces: Int64[np.ndarray, " n"],
+    foot: Float64[np.ndarray, "n 3"],
+    vertices: Float[Tensor, "V 3"],
+) -> Student:
+    """Return the student with Gaussians bound to other faces, unmoved for these vertices.
+
+    Args:
+        student: without blend shapes.
+        rows: the Gaussians.
+        faces: the new face of each.
+        foot: the point of it that is nearest to the Gaussian, metres.
+        vertices: of the posed template, metres.
+    """
+    rig = student.rig
+    bound, frames = student.gaussians.snapshot().to(device=rig.device), triangle_frames(vertices, rig.faces)
+    own, at = torch.tensor(rows, device=rig.device), torch.tensor(faces, device=rig.device)
+    before, place = bound.face_index[own], world_from_frames(bound, frames).means[own]
+    corners = barycentric_coordinates(foot, frames.corners[at].double().cpu().numpy())
+    bary = torch.tensor(corners[:, :2], dtype=place.dtype, device=rig.device)
+    # What was R_old x in the world is R_new y now, with y = R_new^T R_old x.
+    R, R_before = frames.rotations[at], frames.rotations[before]
+    local = torch.einsum("nij,ni->nj", R, place - on_triangles(frames.corners[at], bary))
+    back = frames.quats[at] * torch.tensor([1.0, -1.0, -1.0, -1.0], device=rig.device)
+    tensors = {name: value.clone() for name, value in bound.tensors.items()}
+    tensors["face_index"][own], tensors["barycentric"][own] = at, bary
+    tensors["normal_offset"][own], tensors["offset"][own] = 0.0, local
+    tensors["quats"][own] = multiply_quats(back, multiply_quats(frames.quats[before], bound.quats[own]))
+    tensors["log_scales"][own] += (frames.lengths[before] / frames.lengths[at]).log()[:, None]
+    tensors["sh"][own] = rotate_sh(bound.sh[own], R.transpose(1, 2) @ R_before)
+    other = student.with_blend_shapes(None)
+    other.gaussians = LearnedGaussians(
+        BoundGaussians(**tensors, face_count=bound.face_count, topology=bound.topology)
+    ).to(rig.device)
+    return other
+
+
+@torch.no_grad()
+def with_held_face(student: Student, expressions: Float[Tensor, "T E"], jaws: Float[Tensor, "T 3"]) -> Student:
+    """Return the student with a blend shape of the head for each motion of lids and jaw that training did not show.
+
+    Args:
+        student: trained, with blend shapes; one without, or of a body without a head, is returned as it is.
+        expressions: of the training frames.
+        jaws: their jaws' rotations, axis-angle, radians.
+    """
+    shapes = student.blend_shapes
+    if shapes is None or not _head(student.rig.template).any():
+        return student
+    found = []
+    for motion in _unseen_motions(student, expressions, jaws):
+        change = _open_mouth(student) if motion.kind == "jaw" else _closed_lids(student, motion.kind)
+        if change is not None:
+            found.append((motion, change))
+    return student.with_blend_shapes(_extended(shapes, found)) if found else student
+
+
+def _unseen_motions(
+    student: Student, expressions: Float[Tensor, "T E"], jaws: Float[Tensor, "T 3"]
+) -> list[UnseenMotion]:
+    """Return the motions whose full strength training did not come near, with the strengths that it reached."""
+    shapes, names = student.blend_shapes, list(student.rig.template.body.expression_names)
+    assert shapes is not None, "a student with blend shapes"
+    inputs = torch.cat([expressions, jaws], dim=1) if shapes.config.jaw else expressions
+    seen, size = inputs.double().cpu().numpy(), expressions.shape[1]
+    # Kind, weights, strength that shows enough, and how much beyond the seen one the shape takes to act fully.
+    wanted = []
+    for side in ("left", "right"):
+        weights = np.zeros(seen.shape[1])
+        if (name := f"eyeBlink{side.title()}") in names:
+            weights[names.index(name)] = 1.0
+            wanted.append((side, weights, 0.7, 0.3))
+    weights = np.zeros(seen.shape[1])
+    weights[size : size + 1] = 1.0
+    if "jawOpen" in names:
+        weights[names.index("jawOpen")] = _JAW_OPEN
+    wanted.append(("jaw", weights, 0.25, 0.1))
+    out = []
+    for kind, weights, enough, more in wanted:
+        most = max(0.0, float((seen @ weights).max()))
+        if weights.any() and most < enough:
+            out.append(UnseenMotion(kind, weights, most, most + more))
+    return out
+
+
+def _closed_lids(student: Student, side: str) -> tuple[Tensor, Tensor] | None:
+    """Return du and dc (N, 3) of closed lids: on their surface, in the colour of the skin around; the eye behind them.
+
+    The skin's colour is the median of the lighter half of the 48 nearest Gaussians that the lids do not move, which
+    leaves out brows and lashes.
+    """
+    template, names = student.rig.template, list(student.rig.template.body.expression_names)
+    rest = _rest(template)
+    both = [names.index(name) for name in ("eyeBlinkLeft", "eyeBlinkRight") if name in names]
+    expression = rest.expression.copy()
+    expression[0, both] = 1.0
+    bound = student.compensated(student.rig.pose(replace(rest, expression=expression)))
+    faces = template.faces[bound.face_index.cpu().numpy()]
+    head = _head(template)[bound.face_index.cpu().numpy()]
+    sides = {one: _lid_share(template, faces, head, one) for one in ("left", "right")}
+    total = sum(share for share, _ in sides.values())
+    share, ball = sides[side][0] / np.maximum(total, 1.0), sides[side][1]
+    places = template.vertices[faces].mean(axis=1)
+    still = head & (total == 0.0) & ~inside_of_mouth(template)[faces].any(axis=1)
+    held, around = np.flatnonzero(share > 0.0), 48
+    if not len(held) or still.sum() < around:
+        return None
+    colors = bound.dc.double().cpu().numpy()
+    skin = colors[still][cKDTree(places[still]).query(places[held], k=around)[1]]
+    light = np.argsort(skin.sum(axis=2), axis=1)[:, around // 2 :, None]
+    target = colors.copy()
+    target[held] = np.median(np.take_along_axis(skin, light, axis=1), axis=1)
+    # Lids within half a millimetre of their surface, the eye a millimetre behind its own.
+    offset = bound.offset.clone()
+    offset[:, 0] += bound.normal_offset
+    goal = torch.zeros_like(offset)
+    goal[:, 0] = torch.where(torch.tensor(ball, device=offset.device), -1e-3, offset[:, 0].clamp(-5e-4, 5e-4))
+    weight = torch.tensor(share).to(offset)[:, None]
+    return weight * (goal - offset), weight * torch.tensor(target - colors).to(offset)
+
+
+def _lid_share(
+    template: Template, faces: Int64[np.ndarray, "N 3"], head: Bool[np.ndarray, " N"], side: str
+) -> tuple[Float64[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """Return how much each face has to do with a side's blink, in [0, 1], and which are the eye itself.
+
+    All of the eye and of the skin about its corners, which move little, and lids by how far they move.
+    """
+    rest, name = _rest(template), f"eyeBlink{side.title()}"
+    if name not in template.body.expression_names:
+        return np.zeros(len(faces)), np.zeros(len(faces), dtype=bool)
+    expression = rest.expression.copy()
+    expression[0, list(template.body.expression_names).index(name)] = 1.0
+    moved = _travel(template, replace(rest, expression=expression))[faces].max(axis=1)
+    share = np.where(head, np.clip((moved / max(moved.max(), 1e-12) - 0.1) / 0.3, 0.0, 1.0), 0.0)
+    # The eye by its part of the body, where that has one; skin within 7 mm of it is its corners'.
+    near, parts = 0.007, np.full(template.vertex_count, -1)
+    parts[: template.body.vertex_count] = template.body.part_labels
+    eyes = [k for k, part in enumerate(template.body.part_label_names) if part == f"{side}_eye"]
+    ball = np.isin(parts[faces], eyes).all(axis=1) & head
+    if ball.any():
+        places = template.vertices[faces].mean(axis=1)
+        share[head & (cKDTree(places[ball]).query(places)[0] < near)] = 1.0
+    return share, ball
+
+
+def _open_mouth(student: Student) -> tuple[Tensor, Tensor] | None:
+    """Return du and dc (N, 3) of an open mouth: its inside in the template's colours, and nothing hanging before it.
+
+    Large Gaussians of the lips, which would veil the opening, go three centimetres back into the head.
+    """
+    rig, template = student.rig, student.rig.template
+    inside = inside_of_mouth(template)
+    if not inside.any():
+        return None
+    pose = rig.pose(replace(_rest(template), jaw_pose=np.array([[_JAW, 0.0, 0.0]])))
+    vertices = rig.skin(pose, student.displacements(pose))
+    frames, bound = triangle_frames(vertices, rig.faces), student.compensated(pose)
+    world, faces = world_from_frames(bound, frames), template.faces[bound.face_index.cpu().numpy()]
+    # Pixels of the opening, seen from ahead, and how far from it each Gaussian is.
+    extent, size = 0.06, 400  # half the view in metres, and its pixels
+    mesh = TriangleMesh(vertices.double().cpu().numpy(), template.faces)
+    camera = Camera.orthographic_view(
+        center=mesh.vertices[inside].mean(axis=0), direction=np.array([0.0, 0.0, 1.0]), half_extent=extent, size=size
+    )
+    ids = rasterize_mesh(mesh, camera).face_id
+    pixel = 2.0 * extent / size
+    shown = (ids >= 0) & inside[template.faces[np.maximum(ids, 0)]].any(axis=2)
+    # Its edge is the lips' to draw, four millimetres wide.
+    opening = np.argwhere(distance_transform_edt(shown) * pixel > 0.004)
+    if not len(opening):
+        return None
+    at = camera.screen_from_world(world.means.double().cpu().numpy())[:, 1::-1]
+    away = cKDTree(opening + 0.5).query(at)[0] * pixel
+    # A Gaussian of standard deviation s veils what is within 1.2 s of it.
+    reach, small = 1.2, 2.5e-3
+    sigma = world.scales[:, 1:].amax(dim=1).double().cpu().numpy()
+    skin = _head(template)[bound.face_index.cpu().numpy()] & ~inside[faces].all(axis=1)
+    veil = torch.tensor(skin & (away < reach * sigma) & ((sigma > small) | (away <= 0.0)), device=rig.device)
+    back = frames.rotations[bound.face_index].transpose(1, 2) @ torch.tensor([0.0, 0.0, -0.03], device=rig.device)
+    dark = torch.tensor(template.vertex_colors[faces].mean(axis=1) / 255.0).to(bound.dc) - bound.dc
+    within = torch.tensor(inside[faces].all(axis=1), device=rig.device)
+    return veil[:, None] * back, within[:, None] * dark
+
+
+def _extended(shapes: BlendShapes, found: Sequence[tuple[UnseenMotion, tuple[Tensor, Tensor]]]) -> BlendShapes:
+    """Return blend shapes with further ones of the head, each driven by a motion's strength x alone.
+
+    Their coefficient `z = (relu(x - begin) - relu(x - end)) / (end - begin)` takes two neurons of every hidden layer,
+    which the others do not see.
+    """
+    config, more = shapes.config, len(found)
+    heads, width = config.head_shapes, config.width
+    wide = replace(config, head_shapes=heads + more, width=width + 2 * more)
+    out = BlendShapes(wide, shapes.count, part=shapes.part, head_weight=shapes.head_weight, active=shapes.active)
+    out = out.to(shapes.U)
+    for name in ("head", "body"):
+        layers, others = (
+            [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+            for network in (getattr(out, name), getattr(shapes, name))
+        )
+        # The trained networks, whose new neurons are zero.
+        for new, old in zip(layers[:-1], others[:-1], strict=True):
+            new.weight.zero_()
+            new.bias.zero_()
+            new.weight[: old.weight.shape[0], : old.weight.shape[1]], new.bias[:width] = old.weight, old.bias
+        new, old = layers[-1], others[-1]
+        new.weight.zero_()
+        new.bias.zero_()
+        before = heads if name == "head" else config.body_shapes
+        new.weight.view(config.parts, -1, wide.width)[:, :before, :width] = old.weight.view(config.parts, before, width)
+        new.bias.view(config.parts, -1)[:, :before] = old.bias.view(config.parts, before)
+    # Two neurons for each motion, handed from layer to layer.
+    layers = [layer for layer in out.head.modules() if isinstance(layer, nn.Linear)]
+    for k, (motion, _) in enumerate(found):
+        for row, level, sign in ((width + 2 * k, motion.begin, 1.0), (width + 2 * k + 1, motion.end, -1.0)):
+            layers[0].weight[row], layers[0].bias[row] = torch.tensor(motion.weights).to(out.U), -level
+            for layer in layers[1:-1]:
+                layer.weight[row, row] = 1.0
+            last = layers[-1].weight.view(config.parts, heads + more, wide.width)
+            last[:, heads + k, row] = sign / (motion.end - motion.begin)
+    # Their changes stand behind the head's own.
+    for name in ("U", "C"):
+        old, new = getattr(shapes, name), getattr(out, name)
+        new[..., :heads], new[..., heads + more :] = old[..., :heads], old[..., heads:]
+    for k, (_, (du, dc)) in enumerate(found):
+        out.U[..., heads + k], out.C[..., heads + k] = du[shapes.active], dc[shapes.active]
+    return out
+
+
+def _rest(template: Template) -> BodyParams:
+    return BodyParams.rest(betas=template.body.num_betas, expressions=template.body.num_expressions)
+
+
+def _head(template: Template) -> Bool[np.ndarray, " F"]:
+    """Mark the faces of the head's own surface; none for a body without a head."""
+    if "head" not in template.body.joint_names or template.part_names[0] != BODY_PART:
+        return np.zeros(len(template.faces), dtype=bool)
+    return head_faces(template) & (template.vertex_part[template.faces[:, 0]] == 0)
+
+
+def _travel(template: Template, params: BodyParams) -> Float64[np.ndarray, " V"]:
+    """Return how far each vertex is from its place at rest, metres."""
+    return np.linalg.norm(template.pose(params)[0] - template.pose(_rest(template))[0], axis=1)
+
+
+def _apart(template: Template, faces: Int64[np.ndarray, " n"], others: Int64[np.ndarray, " n"]) -> np.ndarray:
+    """Return how far some expression, or a hanging jaw, takes the middles of two faces apart, metres (n,)."""
+    rest, strong = _rest(template), 1.0 if template.body.expression_names else 2.0
+    motions = [replace(rest, jaw_pose=np.array([[_JAW, 0.0, 0.0]]))]
+    for k in range(template.body.num_expressions):
+        expression = np.zeros_like(rest.expression)
+        expression[0, k] = strong
+        motions.append(replace(rest, expression=expression))
+    most, still = np.zeros(len(faces)), template.pose(rest)[0]
+    for params in motions:
+        moved = (template.pose(params)[0] - still)[template.faces].mean(axis=1)
+        most = np.maximum(most, row_lengths(moved[faces] - moved[others]))
+    return most

@@ -1,0 +1,142 @@
+"""Faces in motions that training never showed: on what they lie on, held there, and unchanged in what it showed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.gaussians.binding import world_from_frames
+from avatar.gaussians.frames import triangle_frames
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.student import Student, StudentConfig
+from avatar.rig.rig import Rig
+from avatar.training.student.unseen_motion import rebound, with_held_face
+from smplxpp.core import BodyParams
+from smplxpp.template.mouth import inside_of_mouth
+from tests.export.templates import open_body_template
+
+SKIN, EYE = torch.tensor([0.8, 0.6, 0.5]), torch.tensor([0.1, 0.2, 0.3])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return Rig(open_body_template())
+
+
+def labelled(rig: Rig, student: Student, name: str) -> torch.Tensor:
+    """The Gaussians on a named part of the body."""
+    template = rig.template
+    on = template.body.part_labels == template.body.part_label_names.index(name)
+    return torch.tensor(on[template.faces[student.gaussians.face_index.numpy()]].all(axis=1))
+
+
+def student_of(rig: Rig) -> Student:
+    """A student of skin and eyes in one colour each."""
+    gaussians = sample_on_mesh(rig.template, SamplingConfig(count=9000, head_share=0.9, hidden_density=1.0))
+    student = Student(StudentConfig(field=None), rig, gaussians, ())
+    with torch.no_grad():
+        student.gaussians.dc.copy_(SKIN.expand(len(gaussians), 3))
+        for side in ("left", "right"):
+            student.gaussians.dc[labelled(rig, student, f"{side}_eye")] = EYE
+    return student
+
+
+def strained(rig: Rig, *, blink: float = 0.0, jaw: float = 0.0) -> BodyParams:
+    body = rig.template.body
+    rest = BodyParams.rest(betas=body.num_betas, expressions=body.num_expressions)
+    expression = np.zeros_like(rest.expression)
+    for side in ("Left", "Right"):
+        expression[0, body.expression_names.index(f"eyeBlink{side}")] = blink
+    return replace(rest, expression=expression, jaw_pose=np.array([[jaw, 0.0, 0.0]]))
+
+
+def means(student: Student, params: BodyParams) -> torch.Tensor:
+    pose = student.rig.pose(params)
+    frames = triangle_frames(student.rig.skin(pose), student.rig.faces)
+    return world_from_frames(student.compensated(pose), frames).means
+
+
+@torch.no_grad()
+def test_a_gaussian_that_slid_from_the_lid_onto_the_eye_stays_on_the_eye_in_a_blink(rig):
+    student = student_of(rig)
+    seen = torch.zeros(3, rig.expression_size)
+    # One of the upper lid's is moved before the middle of the eye, as training does with what it cannot draw otherwise.
+    open_eyes, closed = strained(rig), strained(rig, blink=1.0)
+    travel = (means(student, closed) - means(student, open_eyes)).norm(dim=1)
+    lid = int(torch.argmax(torch.where(labelled(rig, student, "body"), travel, 0.0)))
+    eye = means(student, open_eyes)[
+        labelled(rig, student, "left_eye" if means(student, open_eyes)[lid, 0] > 0 else "right_eye")
+    ]
+    goal = eye[torch.argmax(eye[:, 2])] + torch.tensor([0.0, 0.0, 0.001])
+    frames = triangle_frames(rig.skin(rig.pose(open_eyes)), rig.faces)
+    away = goal - means(student, open_eyes)[lid]
+    student.gaussians.offset[lid] = frames.rotations[student.gaussians.face_index[lid]].T @ away
+    student.gaussians.sh.normal_(generator=torch.Generator().manual_seed(0))
+    bound = rebound(student, seen)
+    # Nothing moves, turns or changes its size or colour in what training showed, but for the share of thickness.
+    before, after = (world_from_frames(one.gaussians(), frames) for one in (student, bound))
+    torch.testing.assert_close(after.means, before.means, atol=1e-6, rtol=0)
+    torch.testing.assert_close(after.scales[:, 1:], before.scales[:, 1:], rtol=1e-4, atol=0)
+    torch.testing.assert_close(after.normals, before.normals, atol=1e-4, rtol=0)
+    moved = [(means(one, closed)[lid] - means(one, open_eyes)[lid]).norm().item() for one in (student, bound)]
+    assert moved[0] > 0.008 and moved[1] < 0.5 * moved[0]
+    assert labelled(rig, bound, "body").sum() < labelled(rig, student, "body").sum()
+
+
+@torch.no_grad()
+def test_lids_close_in_the_colour_of_skin_and_an_open_mouth_is_free_and_what_was_seen_does_not_change(rig):
+    student = student_of(rig).with_blend_shapes(
+        BlendShapeConfig(expression_size=rig.expression_size, head_shapes=2, body_shapes=3, width=8, jaw=True)
+    )
+    shapes = student.blend_shapes
+    generator = torch.Generator().manual_seed(1)
+    for value in (shapes.U, shapes.C):
+        value.normal_(std=1e-4, generator=generator)
+    # One of the lips is large enough to veil an open mouth.
+    opened = strained(rig, jaw=0.3)
+    inside = inside_of_mouth(rig.template)
+    within = torch.tensor(inside[rig.template.faces[student.gaussians.face_index.numpy()]].all(axis=1))
+    middle = means(student, opened)[within].mean(dim=0)
+    at = means(student, opened)
+    lips = torch.where(
+        labelled(rig, student, "body") & ~within & (at[:, 2] > middle[2]), (at - middle).norm(dim=1), 9.0
+    )
+    lip = int(torch.argmin(lips))
+    frames = triangle_frames(rig.vertices, rig.faces)
+    student.gaussians.log_scales[lip] = torch.log(0.02 / frames.lengths[student.gaussians.face_index[lip]])
+    blinks, jaws = torch.zeros(4, rig.expression_size), torch.zeros(4, 3)
+    names = rig.template.body.expression_names
+    blinks[:, [names.index("eyeBlinkLeft"), names.index("eyeBlinkRight")]] = torch.linspace(0.0, 0.2, 4)[:, None]
+    jaws[:, 0] = torch.linspace(0.0, 0.1, 4)
+    held = with_held_face(student, blinks, jaws)
+    assert held.blend_shapes.config.head_shapes == 2 + 3
+    for params in (strained(rig), strained(rig, blink=0.2, jaw=0.1)):
+        before, after = (one.compensated(one.rig.pose(params)) for one in (student, held))
+        torch.testing.assert_close(after.offset, before.offset, atol=1e-7, rtol=0)
+        torch.testing.assert_close(after.dc, before.dc, atol=1e-6, rtol=0)
+    # In a blink the eyes themselves have the skin's colour: a gap between lids shows skin.
+    closed = held.compensated(held.rig.pose(strained(rig, blink=1.0)))
+    for side in ("left", "right"):
+        torch.testing.assert_close(closed.dc[labelled(rig, held, f"{side}_eye")].mean(dim=0), SKIN, atol=0.01, rtol=0)
+    # The veil goes back into the head, and the inside has the template's colours; other skin stays.
+    free = held.compensated(held.rig.pose(opened))
+    own = student.compensated(student.rig.pose(opened))
+    drawn = means(held, opened)
+    assert (at[lip] - drawn[lip])[2] > 0.02
+    colors = torch.tensor(rig.template.vertex_colors[rig.template.faces].mean(axis=1) / 255.0, dtype=torch.float32)
+    torch.testing.assert_close(free.dc[within], colors[held.gaussians.face_index[within]], atol=0.01, rtol=0)
+    far = (at - middle).norm(dim=1) > 0.1
+    torch.testing.assert_close(free.offset[far], own.offset[far], atol=1e-7, rtol=0)
+    torch.testing.assert_close(free.dc[far], own.dc[far], atol=1e-6, rtol=0)
+
+
+@torch.no_grad()
+def test_motions_that_training_showed_get_no_shape(rig):
+    student = student_of(rig).with_blend_shapes(
+        BlendShapeConfig(expression_size=rig.expression_size, head_shapes=2, body_shapes=3, width=8, jaw=True)
+    )
+    assert with_held_face(student, torch.ones(2, rig.expression_size), torch.full((2, 3), 0.4)) is student
