@@ -153,6 +153,8 @@ class Export:
     By default as many as the format holds, 8 in a GLB."""
     texture_size: Annotated[Literal[0, 1024, 2048, 4096] | None, tyro.conf.arg(metavar="TEXELS")] = None
     """Texels a side of a template's texture, at most what the build made; 0: colours of vertices."""
+    texture_source: Literal["build", "student"] = "build"
+    """What paints a template's texture: the build, from scan or photographs, or the trained student."""
     faces: tuple[int, ...] = ()
     """Faces of a coarser template, such as 10000; several numbers make a file each: NAME_LOD0, NAME_LOD1 and so on."""
     blender: OptionalPath = None
@@ -234,6 +236,7 @@ class Export:
                 meta=self._meta() if name == "vrm" else None,
             ),
             faces=self.faces,
+            texture_source=self.texture_source,
         )
         # The notes go to standard error, so that a script that reads the output sees the file alone.
         report = export_file(request)

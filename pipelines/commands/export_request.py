@@ -59,6 +59,7 @@ class FileRequest:
         quiet: whether to hide the progress bar.
         rigged: options of files with a skeleton.
         faces: faces of the template's levels of detail, a file each; () for all of its faces.
+        texture_source: what paints the template's texture: "build" as it is, or the "student".
     """
 
     source: Path
@@ -74,6 +75,7 @@ class FileRequest:
     quiet: bool = True
     rigged: ExportOptions = field(default_factory=ExportOptions)
     faces: tuple[int, ...] = ()
+    texture_source: str = "build"
 
     @property
     def is_series(self) -> bool:
@@ -215,7 +217,8 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         if given and request.format != "ply":
             raise InputError(f"option {option}", expected="a PLY", received=request.format)
     of_template = ("template", request.format) in _BY_MODEL
-    if (request.rigged != ExportOptions() and model == "student" and of_template) or (
+    painted = request.texture_source != "build"
+    if ((request.rigged != ExportOptions() or painted) and model == "student" and of_template) or (
         request.faces and (model == "student" or not of_template or request.is_series)
     ):
         raise InputError(

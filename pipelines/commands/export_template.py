@@ -14,6 +14,7 @@ from rich.progress import track
 
 from pipelines.commands.animate_student import motion_for
 from pipelines.commands.export_request import PRE_ROLL, FileRequest, frames_a_second
+from pipelines.commands.options import require_avatar
 from pipelines.commands.templates import BUNDLE_SUFFIX, load_params_for, load_run_template
 from pipelines.runs.layout import GARMENTS
 from smplxpp.body.layout import names_of_joints
@@ -37,6 +38,8 @@ def template_writers(request: FileRequest) -> Writers:
     # An OBJ has no skeleton: its surfaces are posed here. The others store skeleton and motion.
     template = load_run_template(request.source)
     params = None if request.params is None else load_params_for(template, request.params, fps=request.fps)
+    if request.texture_source == "student":
+        template = _painted(request, template)
     # A motion places the person by itself; in the T-pose she stands on the floor.
     template = template.on_floor() if params is None else template
     if request.format == "obj":
@@ -58,6 +61,19 @@ def template_writers(request: FileRequest) -> Writers:
     count = 1 if chosen is None else len(chosen)
     files = iter([(count, partial(write, template=level)) for level in levels])
     return None if chosen is None else chosen.fps, files, notes
+
+
+def _painted(request: FileRequest, template: Template) -> Template:
+    """Return the template with its student's appearance as its texture."""
+    require_avatar("painting the student on the template")
+    import avatar
+    from avatar.export.posed import student_texture
+
+    student, asked = avatar.load(request.source), request.rigged.texture_size
+    if asked == 0:
+        raise InputError("option texture-source", expected="a --texture-size above 0", received="0")
+    own = 2048 if template.texture is None else template.texture.size
+    return replace(template, texture=student_texture(student, size=asked or own))
 
 
 def _levels(request: FileRequest, template: Template) -> tuple[list[Template], list[str]]:
