@@ -27,7 +27,7 @@ from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, Ph
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.student.prune import pruned_to
-from avatar.training.student.unseen_motion import rebound, with_held_face
+from avatar.training.student.unseen_motion import with_held_face
 from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core import InputError, require_at_least, require_between
 from smplxpp.core.spread import spread_inside
@@ -244,9 +244,7 @@ def compensate(
             torch.stack([getattr(pose, name) for pose in poses]) for name in ("body_pose", "expression", "jaw")
         )
         del poses
-        # Each Gaussian of the face on the surface that it lies on, before its shapes are learned there.
-        made = rebound(student, expressions)
-        made = made.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
+        made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
     tracked = teacher.track if config.surface_normals and teacher is not None else None

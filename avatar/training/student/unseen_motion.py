@@ -1,9 +1,9 @@
 """Hold the face's Gaussians to their surface in motions that training never showed: closing lids, a hanging jaw.
 
-Before the last training every Gaussian of the face is bound to the face of the mesh that it lies on: training lets them
-slide by centimetres, and one that draws an eye must not move with a lid. After it, the head's blend shapes get a shape
-for each such motion. Its coefficient is 0 up to the strength that training showed, so that nothing changes there, and 1
-from some more on, where lids have the colour of the skin around the eye and nothing hangs before an open mouth.
+Training lets Gaussians slide by a centimetre, so that one that draws an eye may move with a lid. The head's blend
+shapes get a shape for each such motion. Its coefficient is 0 up to the strength that training showed, so that nothing
+changes there, and 1 from some more on, where lids lie on their surface in the colour of the skin around the eye and
+nothing hangs before an open mouth.
 """
 
 from __future__ import annotations
@@ -18,25 +18,18 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
+from avatar.gaussians.binding import world_from_frames
 from avatar.gaussians.frames import triangle_frames
-from avatar.gaussians.sampling import head_faces, seen_faces
-from avatar.gaussians.tensor_operations import multiply_quats
-from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.gaussians.sampling import head_faces
 from avatar.models.networks.blend_shapes import BlendShapes
 from avatar.models.student import Student
-from smplxpp.core import BodyParams, Camera, TriangleMesh, row_lengths
-from smplxpp.core.signed_distance import barycentric_coordinates
-from smplxpp.core.spherical_harmonics import rotate_sh
-from smplxpp.metrics import point_to_surface
+from smplxpp.core import BodyParams, Camera, TriangleMesh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.mouth import inside_of_mouth
 from smplxpp.template.template import BODY_PART, Template
 
 _JAW = 0.3  # radians of a jaw that hangs: where the mouth's shape is made
 _JAW_OPEN = 0.35  # radians of the jaw that move lips as far as the expression jawOpen does
-_APART = 2e-3  # metres that two faces move apart, above which a Gaussian is bound to the one that it lies on
-_STRETCH = 1.5  # growth of a face's area as the jaw falls: above, it lies in a corner of the mouth and carries none
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,85 +47,6 @@ class UnseenMotion:
     weights: Float64[np.ndarray, " I"]
     begin: float
     end: float
-
-
-@torch.no_grad()
-def rebound(student: Student, expressions: Float[Tensor, "T E"]) -> Student:
-    """Return the student with the face's Gaussians bound to where they lie in the mean expression of training.
-
-    In that expression nothing moves. Faces inside the mouth and in its corners take none, because they are folded.
-
-    Args:
-        student: without blend shapes.
-        expressions: of the training frames.
-    """
-    rig, template = student.rig, student.rig.template
-    head = _head(template)
-    if student.blend_shapes is not None or not head.any():
-        return student
-    rest = _rest(template)
-    mean = expressions.mean(dim=0).double().cpu().numpy()
-    pose = rig.pose(replace(rest, expression=mean[None]))
-    vertices = rig.skin(pose, student.displacements(pose))
-    frames = triangle_frames(vertices, rig.faces)
-    bound = student.gaussians()
-    places = world_from_frames(bound, frames).means
-    # Faces that take Gaussians: seen from outside, and neither within the mouth nor torn open by the jaw.
-    mesh = TriangleMesh(vertices.double().cpu().numpy(), template.faces)
-    folded = inside_of_mouth(template)[template.faces].any(axis=1)
-    opened = mesh.with_vertices(template.pose(replace(rest, jaw_pose=np.array([[_JAW, 0.0, 0.0]])))[0])
-    torn = opened.face_areas > _STRETCH * np.maximum(template.mesh.face_areas, 1e-12)
-    taking = np.flatnonzero(head & seen_faces(mesh) & ~folded & ~torn)
-    old = bound.face_index.cpu().numpy()
-    rows = np.flatnonzero(head[old] & ~folded[old])
-    if not len(taking) or not len(rows):
-        return student
-    _, foot, found = point_to_surface(
-        places[torch.tensor(rows)].double().cpu().numpy(), TriangleMesh(mesh.vertices, template.faces[taking])
-    )
-    # The rest stays bound as it is: there both faces move alike.
-    apart = _apart(template, old[rows], taking[found])
-    use = apart > _APART
-    return _moved(student, rows[use], taking[found[use]], foot[use], vertices)
-
-
-def _moved(
-    student: Student,
-    rows: Int64[np.ndarray, " n"],
-    faces: Int64[np.ndarray, " n"],
-    foot: Float64[np.ndarray, "n 3"],
-    vertices: Float[Tensor, "V 3"],
-) -> Student:
-    """Return the student with Gaussians bound to other faces, unmoved for these vertices.
-
-    Args:
-        student: without blend shapes.
-        rows: the Gaussians.
-        faces: the new face of each.
-        foot: the point of it that is nearest to the Gaussian, metres.
-        vertices: of the posed template, metres.
-    """
-    rig = student.rig
-    bound, frames = student.gaussians.snapshot().to(device=rig.device), triangle_frames(vertices, rig.faces)
-    own, at = torch.tensor(rows, device=rig.device), torch.tensor(faces, device=rig.device)
-    before, place = bound.face_index[own], world_from_frames(bound, frames).means[own]
-    corners = barycentric_coordinates(foot, frames.corners[at].double().cpu().numpy())
-    bary = torch.tensor(corners[:, :2], dtype=place.dtype, device=rig.device)
-    # What was R_old x in the world is R_new y now, with y = R_new^T R_old x.
-    R, R_before = frames.rotations[at], frames.rotations[before]
-    local = torch.einsum("nij,ni->nj", R, place - on_triangles(frames.corners[at], bary))
-    back = frames.quats[at] * torch.tensor([1.0, -1.0, -1.0, -1.0], device=rig.device)
-    tensors = {name: value.clone() for name, value in bound.tensors.items()}
-    tensors["face_index"][own], tensors["barycentric"][own] = at, bary
-    tensors["normal_offset"][own], tensors["offset"][own] = 0.0, local
-    tensors["quats"][own] = multiply_quats(back, multiply_quats(frames.quats[before], bound.quats[own]))
-    tensors["log_scales"][own] += (frames.lengths[before] / frames.lengths[at]).log()[:, None]
-    tensors["sh"][own] = rotate_sh(bound.sh[own], R.transpose(1, 2) @ R_before)
-    other = student.with_blend_shapes(None)
-    other.gaussians = LearnedGaussians(
-        BoundGaussians(**tensors, face_count=bound.face_count, topology=bound.topology)
-    ).to(rig.device)
-    return other
 
 
 @torch.no_grad()
@@ -266,8 +180,8 @@ def _open_mouth(student: Student) -> tuple[Tensor, Tensor] | None:
     ids = rasterize_mesh(mesh, camera).face_id
     pixel = 2.0 * extent / size
     shown = (ids >= 0) & inside[template.faces[np.maximum(ids, 0)]].any(axis=2)
-    # Its edge is the lips' to draw, four millimetres wide.
-    opening = np.argwhere(distance_transform_edt(shown) * pixel > 0.004)
+    # Its edge is the lips' to draw, two millimetres wide.
+    opening = np.argwhere(distance_transform_edt(shown) * pixel > 0.002)
     if not len(opening):
         return None
     at = camera.screen_from_world(world.means.double().cpu().numpy())[:, 1::-1]
@@ -342,18 +256,3 @@ def _head(template: Template) -> Bool[np.ndarray, " F"]:
 def _travel(template: Template, params: BodyParams) -> Float64[np.ndarray, " V"]:
     """Return how far each vertex is from its place at rest, metres."""
     return np.linalg.norm(template.pose(params)[0] - template.pose(_rest(template))[0], axis=1)
-
-
-def _apart(template: Template, faces: Int64[np.ndarray, " n"], others: Int64[np.ndarray, " n"]) -> np.ndarray:
-    """Return how far some expression, or a hanging jaw, takes the middles of two faces apart, metres (n,)."""
-    rest, strong = _rest(template), 1.0 if template.body.expression_names else 2.0
-    motions = [replace(rest, jaw_pose=np.array([[_JAW, 0.0, 0.0]]))]
-    for k in range(template.body.num_expressions):
-        expression = np.zeros_like(rest.expression)
-        expression[0, k] = strong
-        motions.append(replace(rest, expression=expression))
-    most, still = np.zeros(len(faces)), template.pose(rest)[0]
-    for params in motions:
-        moved = (template.pose(params)[0] - still)[template.faces].mean(axis=1)
-        most = np.maximum(most, row_lengths(moved[faces] - moved[others]))
-    return most
