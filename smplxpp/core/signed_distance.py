@@ -96,8 +96,8 @@ class SignedDistanceField:
         outer = np.flatnonzero(~self._inside(in_front))
         assert len(outer), "a solid with a positive volume has an outside"
         _SOLIDS[key] = self._winding, outer
-        while len(_SOLIDS) > _REMEMBERED:
-            _SOLIDS.pop(next(iter(_SOLIDS)), None)
+        for oldest in list(_SOLIDS)[:-_REMEMBERED]:
+            _SOLIDS.pop(oldest, None)
         return outer
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
