@@ -2,7 +2,7 @@
 
 from smplxpp.assemble.body_colors import body_colors_from_scan
 from smplxpp.assemble.build import AssemblyConfig, AssemblyReport, CanonicalPart, LayerReport, assemble_template
-from smplxpp.assemble.fill_holes import FilledHoles, FillHolesConfig, cut_holes, cut_slits, fill_holes
+from smplxpp.assemble.fill_holes import FilledHoles, FillHolesConfig, cut_holes, cut_slits, fill_holes, part_legs
 from smplxpp.assemble.layers import Obstacle, Penetration, RemainingPenetration, measure_penetration
 from smplxpp.assemble.push_out import PushConfig, flipped_faces, push_out, stand_off
 
@@ -22,6 +22,7 @@ __all__ = [
     "cut_holes",
     "cut_slits",
     "fill_holes",
+    "part_legs",
     "flipped_faces",
     "measure_penetration",
     "push_out",

@@ -142,6 +142,54 @@ def cut_slits(
     return out
 
 
+def part_legs(
+    part: CanonicalPart, old: Bool[np.ndarray, " M"], leg: Float[np.ndarray, " M"]
+) -> tuple[CanonicalPart, list[Int[np.ndarray, " _"]]]:
+    """Return the inner sides of trouser legs that were cut apart from hem to hem, as polygons to be filled.
+
+    The border of such a cut runs down one leg in front, up behind, and over the other leg back; where it reaches the
+    hem, round that. It changes legs twice, in front of the crotch and behind it; a row of new vertices joins these
+    places. Each polygon consists of that row, a leg's two sides of the cut, and straight lines across its hem.
+
+    Args:
+        part: after the cut, in the T-pose.
+        old: vertices that were on openings before.
+        leg: what a vertex follows of the left leg less what it follows of the right one.
+
+    Returns:
+        The part with the rows' vertices, and two polygons for each such border.
+    """
+    polygons: list[np.ndarray] = []
+    for loop in border_loops(part.mesh.faces):
+        # Vertices between the legs follow both a little: the mean over nine along the border tells the leg.
+        if len(loop) < 9:
+            continue
+        left = np.convolve(np.pad(leg[loop], 4, mode="wrap"), np.ones(9) / 9, mode="valid") > 0
+        changes = np.flatnonzero(left != np.roll(left, 1))
+        if len(changes) != 2 or old[loop[changes]].any():
+            continue
+        arcs = [np.roll(loop, -k)[: (m - k) % len(loop) + 1] for k, m in (changes, changes[::-1])]
+        if min(np.ptp(part.mesh.vertices[arc, 1]) for arc in arcs) < _LEG_CUT:
+            continue
+        ends = part.mesh.vertices[loop[changes]]
+        usual = float(np.median(row_lengths(np.diff(part.mesh.vertices[part.mesh.edges], axis=1)[:, 0])))
+        count = max(int(np.round(np.linalg.norm(ends[1] - ends[0]) / usual)), 1) - 1
+        share = np.arange(1, count + 1)[:, None] / (count + 1)
+        row = part.mesh.vertex_count + np.arange(count)
+        part = _with_vertices(part, loop[changes], np.concatenate([1.0 - share, share], axis=1))
+        old, leg = (np.concatenate([values, np.zeros(count, dtype=values.dtype)]) for values in (old, leg))
+        polygons += [np.concatenate([_across(arcs[0], old), row[::-1]]), np.concatenate([_across(arcs[1], old), row])]
+    return part, polygons
+
+
+def _across(arc: Int[np.ndarray, " A"], old: Bool[np.ndarray, " M"]) -> Int[np.ndarray, " B"]:
+    """Return an arc of a border without its openings but their ends, across which it goes straight."""
+    pieces = np.split(arc, np.flatnonzero(np.diff(old[arc])) + 1)
+    return np.concatenate([p if len(p) <= _FEW or not old[p[0]] else p[[0, -1]] for p in pieces])
+
+
+_LEG_CUT = 0.2
+"""Metres that a cut reaches down both legs from which on it parts them; a hole between the thighs is closed across."""
 _FEW = 3
 """Vertices of an old segment up to which it is part of the polygon: the opening that was left would be a pinhole."""
 

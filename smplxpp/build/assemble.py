@@ -7,9 +7,17 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Integer
+from jaxtyping import Bool, Float, Integer
 
-from smplxpp.assemble import FilledHoles, FillHolesConfig, body_colors_from_scan, cut_holes, cut_slits, fill_holes
+from smplxpp.assemble import (
+    FilledHoles,
+    FillHolesConfig,
+    body_colors_from_scan,
+    cut_holes,
+    cut_slits,
+    fill_holes,
+    part_legs,
+)
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
 from smplxpp.assemble.drape import drape_patches
 from smplxpp.body import BodyModel
@@ -42,6 +50,8 @@ from smplxpp.texture.photographs import Painter, Photograph, PhotographPainter, 
 
 # Pixels of the longer side at which photographs are read: two a texel of a person that fills a 2048 texture's views.
 _LONGER_SIDE = 2400
+# Metres: no wall between trouser legs is wider.
+_ANY_WIDTH = 2.0
 
 
 def assemble_parts(
@@ -74,6 +84,9 @@ def assemble_parts(
     # Where a thing was taken off, the scan lacks the cloth behind it, and the thing's own back.
     taken = np.zeros(scan.mesh.vertex_count, dtype=bool)
     taken[scan.mesh.faces[kinds == OBJECT.id]] = True
+    words = ("hip", "knee", "ankle", "foot")
+    own = [joint if any(word in joint for word in words) else "" for joint in body.joint_names]
+    legs = np.array([1.0 * joint.startswith("left") - joint.startswith("right") for joint in own])
     for name, before in cleaned.items():
         # A part's vertices at rest come from the inverse skinning of its posed mesh. The faces are the same in both
         # poses.
@@ -85,7 +98,9 @@ def assemble_parts(
             vertex_colors=part.colors,
             scan_index=_of_file(scan, part.source_vertex),
         )
-        canonical[name], filled[name] = _filled(made, before, part, fit, taken=taken, config=config.fill_holes)
+        canonical[name], filled[name] = _filled(
+            made, before, part, fit, taken=taken, legs=legs, config=config.fill_holes
+        )
     # The clearance is given in millimetres by the user; every length inside the package is in metres.
     settings = AssemblyConfig(clearance=config.clearance_mm / MM, labels=labels)
     template, report = assemble_template(body, params, canonical, config=settings)
@@ -199,6 +214,7 @@ def _filled(
     fit: PosedFit,
     *,
     taken: Bool[np.ndarray, " N"],
+    legs: Float[np.ndarray, " J"],
     config: FillHolesConfig,
 ) -> tuple[CanonicalPart, FilledHoles]:
     """Close the holes and slits that cut bridges left in a part; cuffs and hems were open before and stay open.
@@ -211,21 +227,28 @@ def _filled(
         part: the same without bridges.
         fit: the body in the scan's pose and at rest.
         taken: the scan's vertices at which a thing was taken off.
+        legs: 1 for joints of the left leg, -1 for those of the right one, 0 for others.
         config: options.
     """
     opened = before.source_vertex[np.unique(before.mesh.border_edges)]
     cut = cut_borders(made.mesh, np.isin(part.source_vertex, opened))
     if cut.any():
         made = _with_smooth_cuts(made, cut, part.mesh, fit)
-    borders = (before.mesh, before.source_vertex, made.mesh, part.source_vertex)
+    # Trouser legs that were fused get their inner sides back, however wide.
+    parted = FilledHoles()
+    if config.width:
+        made, walls = part_legs(made, np.isin(part.source_vertex, opened), made.weights.dense() @ legs)
+        made, parted = fill_holes(made, walls, config=replace(config, width=_ANY_WIDTH))
+    source = np.concatenate([part.source_vertex, np.full(made.mesh.vertex_count - part.mesh.vertex_count, -1)])
+    borders = (before.mesh, before.source_vertex, made.mesh, source)
     holes = cut_holes(*borders, taken=taken)
-    behind = [bool(taken[part.source_vertex[hole]].any()) for hole in holes]
+    behind = [bool(taken[source[hole]].any()) for hole in holes]
     out, narrow = fill_holes(made, [hole for hole, wide in zip(holes, behind, strict=True) if not wide], config=config)
     # Slits have straight ends across a hem or a cuff, and a thing is as wide as it is: neither can become a sail.
     wide = [*(hole for hole, wide in zip(holes, behind, strict=True) if wide), *cut_slits(*borders, taken=taken)]
     out, others = fill_holes(out, wide, config=replace(config, width=1.5 * config.width))
-    patched = np.arange(out.mesh.vertex_count) >= made.mesh.vertex_count
-    return drape_patches(out, patched, fit.at_rest), narrow + others
+    patched = np.arange(out.mesh.vertex_count) >= part.mesh.vertex_count
+    return drape_patches(out, patched, fit.at_rest), parted + narrow + others
 
 
 def _with_smooth_cuts(

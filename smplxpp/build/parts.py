@@ -22,7 +22,8 @@ from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weig
 from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import UnposeConfig, Unposed, invertible_weights, unpose
 from smplxpp.transfer import TransferConfig, rigid_weights, shoe_weights, transfer_weights
-from smplxpp.transfer.checks import surface_components
+from smplxpp.transfer.checks import extent, surface_components
+from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
 from smplxpp.transfer.unfollowed import webs_to_hands
 
 _FOLDED = 1e-6
@@ -117,10 +118,11 @@ def transfer_to_parts(
 
 @dataclass(frozen=True)
 class _Ruled:
-    """Settings of a part's transfer, and the rules of some of its vertices by the cleaned part's numbers."""
+    """Settings of a part's transfer; for the cleaned part's vertices rules of some, and the limbs they go around."""
 
     settings: TransferConfig
     rules: Mapping[int, str]
+    limbs: Enclosure | None = None
 
     def weights(self, fit: PosedFit, body: BodyModel, part: TriangleMesh, source: np.ndarray) -> SkinWeights:
         """Transfer to what is left of the part; a component has the rule of its vertices."""
@@ -129,7 +131,8 @@ class _Ruled:
             component = surface_components(part)
             found = {int(c): self.rules[int(v)] for c, v in zip(component, source, strict=True) if int(v) in self.rules}
             config = replace(config, component_rules=found)
-        return transfer_weights(fit.mesh, body.weights, part, config=config)
+        limbs = None if self.limbs is None else self.limbs.of(source)
+        return transfer_weights(fit.mesh, body.weights, part, config=config, enclosure=limbs)
 
     def stiff(self, part: TriangleMesh, source: np.ndarray) -> Bool[np.ndarray, " M"]:
         """Which faces are of rigid pieces, in which there is no bridge."""
@@ -180,9 +183,16 @@ def _without_bridges(
     source = np.arange(part.vertex_count)
     opened = np.unique(part.border_edges)
     # Cloth that passes a hand hangs on the sleeve where the scan has fused them, and would follow it.
-    web = webs_to_hands(fit.mesh, body.weights, part, ruled.settings) & ~ruled.stiff(part, source)
-    if web.any():
-        part, source = cut_bridges(part, web, config=config)
+    apart = webs_to_hands(fit.mesh, body.weights, part, ruled.settings) & ~ruled.stiff(part, source)
+    # Trouser legs that touch are parted, too. Which leg the cloth goes around is told before that opens its rings.
+    axes = limb_axes(fit.mesh, body.weights, extent(fit.mesh), ruled.settings)
+    if axes and ruled.settings.confident is not None and config.rounds:
+        limbs = enclosed_by_one(part, axes, body.joint_count)
+        joined = limbs.joining_legs(part.faces) & ~ruled.stiff(part, source)
+        if joined.any():
+            ruled, apart = replace(ruled, limbs=limbs), apart | joined
+    if apart.any():
+        part, source = cut_bridges(part, apart, config=config)
     weights = ruled.weights(fit, body, part, source)
     # Folded vertices lose their fold for the trial alone: those that are left with the part are counted later.
     limits = UnposeConfig(warn_below=0.0, fail_below=_FOLDED)

@@ -6,13 +6,14 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 
 from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import TriangleMesh, row_lengths
+from smplxpp.core.topology import component_labels
 from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.rings import Ring, of_two_tubes, rings_around
+from smplxpp.transfer.rings import Ring, Septum, rings_around, septum_of
 
 _SPACING = 0.01
 """Distance of the planes along a limb, as a share of the body's extent: less than a ring of a coarse garment."""
@@ -54,8 +55,17 @@ class Enclosure:
 
     share: Float64[np.ndarray, " N"]
     weights: Float64[np.ndarray, "N J"]
-    limb: np.ndarray
+    limb: Int[np.ndarray, " N"]
     centre: Float64[np.ndarray, "N 3"]
+
+    def of(self, rows: Int[np.ndarray, " n"]) -> Enclosure:
+        """Return the enclosure of some of the vertices."""
+        return Enclosure(self.share[rows], self.weights[rows], self.limb[rows], self.centre[rows])
+
+    def joining_legs(self, faces: Int[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
+        """Return the faces from one leg to the other, where a scan has fused trousers."""
+        first, second = (((self.limb == k) & (self.share > 0.5))[faces].any(axis=1) for k in (0, 1))
+        return np.asarray(first & second)
 
 
 def limb_axes(
@@ -109,19 +119,33 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
     n = mesh.vertex_count
     alone, other = np.zeros((len(axes), n)), np.zeros((len(axes), n))
     place = np.zeros((len(axes), n))
+    # Each limb's rings.
+    rings: list[list[tuple[int, Ring]]] = []
     for k, axis in enumerate(axes[:-1]):
-        step = np.linalg.norm(axis.points[1] - axis.points[0])
         others = [a for m, a in enumerate(axes) if m != k]
-        # The vertices' heights over each plane, and the faces that it cuts.
-        side = axis.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", axis.tangents, axis.points)[:, None]
+        side = _heights(axis, mesh)
+        # The faces that each plane cuts.
         count = sum((side > 0)[:, mesh.faces[:, c]].astype(np.int8) for c in range(3))
         cut = (count > 0) & (count < 3)
-        found: list[tuple[int, Ring]] = []
-        for i in np.flatnonzero(cut.sum(axis=1) > 2):
-            found += [
-                (int(i), ring) for ring in rings_around(mesh, np.flatnonzero(cut[i]), side[i], axis, int(i), others)
-            ]
-        for plane, corners, single in of_two_tubes(mesh, found):
+        planes = np.flatnonzero(cut.sum(axis=1) > 2).tolist()
+        around = (rings_around(mesh, np.flatnonzero(cut[i]), side[i], axis, i, others) for i in planes)
+        rings.append([(i, ring) for i, each in zip(planes, around, strict=True) for ring in each])
+    # Where one leg is told from the other, so is that from it.
+    walls = [septum_of(found, len(axis.points)) for found, axis in zip(rings, axes[:-1], strict=True)]
+    for k, m in ((0, 1), (1, 0)):
+        wall = walls[m]
+        if walls[k] is None and wall is not None:
+            walls[k] = septum_of(rings[k], len(axes[k].points), first=wall.first)
+    for k, (axis, wall) in enumerate(zip(axes[:-1], walls, strict=True)):
+        if not rings[k]:
+            continue
+        side, step = _heights(axis, mesh), np.linalg.norm(axis.points[1] - axis.points[0])
+        for plane, ring in rings[k]:
+            corners, single = ring.corners, ring.single
+            if wall is not None and plane >= wall.first and ring.neck is not None and ring.neck.width < 1.0:
+                # This limb's are the vertices on its axis' side of the wall.
+                here = np.full(len(corners), float(plane))
+                corners, single = corners[wall.beyond(mesh.vertices[corners], here) < 0], True
             if len(corners):
                 # A vertex of a cut face counts the more, the nearer it lies to the plane.
                 near = step / (np.abs(side[plane, corners]) + 0.05 * step)
@@ -135,7 +159,10 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         better = own > share
         share[better], limb[better] = own[better], k
         at[better] = place[k, better] / alone[k, better]
-    _continue_to_hems(mesh, axes, share, at, limb, open_rows=(alone + other).sum(axis=0) == 0)
+    open_rows = (alone + other).sum(axis=0) == 0
+    legs = [(k, wall) for k, wall in enumerate(walls[:2]) if wall is not None]
+    _fill_fused(mesh, axes, legs, share, at, limb, open_rows=open_rows)
+    _continue_to_hems(mesh, axes, share, at, limb, open_rows=open_rows)
     # The axis' point and the weights at each vertex's place along its limb.
     weights, centre = np.zeros((n, joint_count)), np.zeros((n, 3))
     for k, axis in enumerate(axes[:-1]):
@@ -204,6 +231,42 @@ def _continue_to_hems(
         share[next_one], limb[next_one] = share[origin], limb[origin]
         at[next_one] = at[origin] + along / step
         open_rows = open_rows & (share == 0)
+
+
+def _fill_fused(
+    mesh: TriangleMesh,
+    axes: list[LimbAxis],
+    walls: list[tuple[int, Septum]],
+    share: np.ndarray,
+    at: np.ndarray,
+    limb: np.ndarray,
+    *,
+    open_rows: Bool[np.ndarray, " N"],
+) -> None:
+    """Give what is left of two fused tubes, in place, to the limb on whose side of the wall it lies.
+
+    That is their lining, and hems where planes leave the cloth: of a tube that goes around two legs nothing below the
+    crotch is between them.
+    """
+    if not walls:
+        return
+    component = component_labels(mesh.edges, mesh.vertex_count)
+    of_tubes = np.isin(component, component[np.isin(limb, [k for k, _ in walls])]) & open_rows
+    nearest = np.full(mesh.vertex_count, np.inf)
+    for k, wall in walls:
+        axis = axes[k]
+        step = float(np.linalg.norm(axis.points[1] - axis.points[0]))
+        index = cKDTree(axis.points).query(mesh.vertices)[1]
+        plane = index + np.einsum("ij,ij->i", mesh.vertices - axis.points[index], axis.tangents[index]) / step
+        beyond = wall.beyond(mesh.vertices, plane)
+        rows = of_tubes & (plane >= wall.first) & (beyond < np.minimum(nearest, 0.5 * step))
+        limb[rows], at[rows], nearest[rows] = k, plane[rows], beyond[rows]
+    share[np.isfinite(nearest)] = 1.0
+
+
+def _heights(axis: LimbAxis, mesh: TriangleMesh) -> Float64[np.ndarray, "K N"]:
+    """Return the height of each vertex over each of a limb's planes, metres."""
+    return axis.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", axis.tangents, axis.points)[:, None]
 
 
 def _mean(vertices: np.ndarray, share: np.ndarray) -> np.ndarray:

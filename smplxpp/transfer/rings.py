@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from smplxpp.core import TriangleMesh
+from smplxpp.core import TriangleMesh, normalize_rows
 
 if TYPE_CHECKING:
     from smplxpp.transfer.enclosed import LimbAxis
@@ -20,6 +21,9 @@ _CLOSED = 0.99
 _NARROW, _WIDEST = 0.75, 0.97
 """Widths of necks over their lobes: of trouser legs that touch, near the crotch, and of any farther out. Skirts of the
 garments have none below 1.0, the simulated one of the embedded person none below 0.82."""
+_LONG = 20
+"""Planes (36 cm) with a neck from which on a shallow groove is that between two legs. The skirt of a dancer's scan is
+drawn in between her striding legs over ten, the more the farther down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,21 +128,65 @@ def _neck(points: np.ndarray, own: np.ndarray, other: np.ndarray, tangent: np.nd
     return Neck(own + 0.1 * (at + 0.5) * (other - own), direction, float(width))
 
 
-def of_two_tubes(mesh: TriangleMesh, rings: list[tuple[int, Ring]]) -> Iterator[tuple[int, np.ndarray, bool]]:
-    """Yield plane, vertices, and whether they go around the limb alone, where a scan may have fused two tubes.
+@dataclass(frozen=True, eq=False)
+class Septum:
+    """The wall between a limb and another one that a scan has fused into one tube, by plane across the limb.
+
+    Attributes:
+        first: the first plane that cuts both.
+        points: (K, 3) on the wall, one for each of the limb's planes.
+        directions: (K, 3) unit vectors from the limb through the wall.
+    """
+
+    first: int
+    points: Float64[np.ndarray, "K 3"]
+    directions: Float64[np.ndarray, "K 3"]
+
+    def beyond(self, points: np.ndarray, plane: np.ndarray) -> Float64[np.ndarray, " N"]:
+        """Return how far points at the given planes lie beyond the wall, metres; negative on the limb's side."""
+        k = np.clip(np.rint(plane).astype(int), 0, len(self.points) - 1)
+        return np.einsum("ij,ij->i", points - self.points[k], self.directions[k])
+
+
+def septum_of(rings: list[tuple[int, Ring]], count: int, *, first: int | None = None) -> Septum | None:
+    """Return the wall between two limbs whose tubes a scan has fused, None where it has not.
 
     Trouser legs that touch are one surface in a scan: its rings have the shape of an eight. Where some have a narrow
     neck, all rings farther out are of two tubes, as legs do not merge again; those of a skirt are wide everywhere.
+
+    Args:
+        rings: around a limb, with their planes.
+        count: of the limb's planes.
+        first: the first plane of two tubes, where it is known. None: found by the necks.
     """
-    narrow = [i for i, ring in rings if ring.neck is not None and ring.neck.width < _NARROW]
-    from_here = min(narrow) if len(narrow) >= 3 else np.inf
-    for i, ring in rings:
-        neck = ring.neck
-        if neck is None or neck.width > _WIDEST or i < from_here:
-            yield i, ring.corners, ring.single
-            continue
-        # This limb's are the vertices on its axis' side of the neck.
-        yield i, ring.corners[(mesh.vertices[ring.corners] - neck.point) @ neck.direction < 0], True
+    necks = sorted(((i, ring.neck) for i, ring in rings if ring.neck is not None), key=lambda pair: pair[0])
+    first = _fused_from([(i, neck.width) for i, neck in necks]) if first is None else first
+    grooved = [(i, neck) for i, neck in necks if first is not None and i >= first and neck.width <= _WIDEST]
+    if first is None or not grooved:
+        return None
+    planes = np.array([i for i, _ in grooved])
+    # Pleats move the narrowest place from plane to plane: the median of the wall over nine planes stays.
+    near = [np.abs(planes - k) <= 4 for k in range(count)]
+    rows = [np.flatnonzero(own) if own.any() else [int(np.abs(planes - k).argmin())] for k, own in enumerate(near)]
+    points = np.stack([np.median([grooved[r][1].point for r in own], axis=0) for own in rows])
+    directions = np.stack([np.mean([grooved[r][1].direction for r in own], axis=0) for own in rows])
+    return Septum(first, points, normalize_rows(directions))
+
+
+def _fused_from(necks: list[tuple[int, float]]) -> int | None:
+    """Return the first plane from which on rings are of two fused tubes, by the widths of the planes' necks."""
+    narrow = [i for i, width in necks if width < _NARROW]
+    if len(narrow) >= 3:
+        return min(narrow)
+    # Pleats hide the groove between the legs of a hakama, which is shallow but goes on from the crotch to the hem.
+    grooved = [i for i, width in necks if width < _WIDEST]
+    if len(grooved) < _LONG:
+        return None
+    onwards = [width for i, width in necks if i >= grooved[0]]
+    # Of a skirt between striding legs it gets deeper towards the hem.
+    _, middle, last = np.array_split(onwards, 3)
+    whole = len(grooved) > 0.8 * len(onwards) and last.mean() > middle.mean() - 0.02
+    return grooved[0] if whole else None
 
 
 def _crossing(vertices: np.ndarray, side: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ from smplxpp.transfer.correspond import (
     settle_unmatched,
     vertex_components,
 )
-from smplxpp.transfer.enclosed import enclosed_by_one, limb_axes
+from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
 from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.hanging import bounded_legs, hung_from_top, leg_bound
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
@@ -59,6 +59,7 @@ def transfer_weights(
     target: MeshLike,
     *,
     config: TransferConfig | None = None,
+    enclosure: Enclosure | None = None,
 ) -> SkinWeights:
     """Transfer skin weights to `target` from the body that it is worn on, both in the same pose and place.
 
@@ -110,12 +111,15 @@ def transfer_weights(
     source = consistent_winding(source, subject="source mesh")
     # Copies of a vertex, as along texture seams, get one row of weights, which is handed back to all of them.
     target, copies = welded(target)
+    if enclosure is not None:
+        enclosure = enclosure.of(np.unique(copies, return_index=True)[1])
     target = consistent_winding(target, subject="target mesh")
     size = extent(source)
     # Weights by each rule that a component has; most targets have "auto" alone.
     component = vertex_components(target)
     rules = config.rules_of(int(component.max(initial=-1)) + 1, joint_count)
-    answers = {rule: _by_rule(rule, source, weights, target, component, size, config) for rule in dict.fromkeys(rules)}
+    worn = _Worn(target, component, enclosure)
+    answers = {rule: _by_rule(rule, source, weights, worn, size, config) for rule in dict.fromkeys(rules)}
     found = _chosen(tuple(answers[rule] for rule in rules), component)
     return SkinWeights.from_dense(
         found.dense[copies],
@@ -139,6 +143,15 @@ class _Weighted:
     policies: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _Worn:
+    """What weights are transferred to: a mesh of N vertices, the component of each, and the limbs they go around."""
+
+    mesh: TriangleMesh
+    component: np.ndarray
+    enclosure: Enclosure | None
+
+
 def _chosen(of_component: tuple[_Weighted, ...], component: np.ndarray) -> _Weighted:
     """Return for every component the rows of its own answer."""
     first = of_component[0]
@@ -156,14 +169,13 @@ def _by_rule(
     rule: PartRule,
     source: TriangleMesh,
     weights: np.ndarray,
-    target: TriangleMesh,
-    component: np.ndarray,
+    worn: _Worn,
     size: float,
     config: TransferConfig,
 ) -> _Weighted:
     """Return the weights that a rule gives all components of the target."""
     if rule.kind == "auto":
-        return _transferred(source, weights, target, component, size, config, whole=True)
+        return _transferred(source, weights, worn, size, config, whole=True)
     joint_count = weights.shape[1]
     chosen = [config.joint_index(joint, joint_count) for joint in rule.joints]
     if rule.kind == "chain":
@@ -171,18 +183,17 @@ def _by_rule(
         mask = np.zeros(joint_count, dtype=bool)
         mask[chosen] = True
         near, own = restrict_source(source, weights, mask)
-        out = _transferred(near, own, target, component, size, replace(config, allowed_joints=None), whole=False)
+        out = _transferred(near, own, worn, size, replace(config, allowed_joints=None), whole=False)
         return replace(out, policies=tuple(f"chain:{','.join(rule.joints)}" for _ in out.policies))
     names = config.joint_names or JOINT_NAMES.get(joint_count) or tuple(map(str, range(joint_count)))
-    rigid = rigid_weights(source, weights, target, joint_names=names, joint=names[chosen[0]] if chosen else None)
+    rigid = rigid_weights(source, weights, worn.mesh, joint_names=names, joint=names[chosen[0]] if chosen else None)
     return _Weighted(rigid.dense(), rigid.matched, rigid.distance, rigid.angle, rigid.policies)
 
 
 def _transferred(
     source: TriangleMesh,
     weights: np.ndarray,
-    target: TriangleMesh,
-    component: np.ndarray,
+    worn: _Worn,
     size: float,
     config: TransferConfig,
     *,
@@ -193,13 +204,13 @@ def _transferred(
     Args:
         source: the body, or a part of it.
         weights: of its vertices.
-        target: what it wears.
-        component: of each vertex of the target.
+        worn: what it wears.
         size: the body's extent.
         config: settings.
         whole: whether the source is the whole body, which tells where the target lies and which arms are in sleeves.
     """
     joint_count = weights.shape[1]
+    target, component = worn.mesh, worn.component
     allowed = config.allowed_mask(joint_count)
     if allowed is not None and config.confident is None:
         source, weights = restrict_source(source, weights, allowed)
@@ -212,7 +223,7 @@ def _transferred(
     if config.confident is not None and found.distance.max() > config.around[0] * size:
         axes = limb_axes(source, weights, size, config)
         if axes:
-            limbs = enclosed_by_one(target, axes, joint_count)
+            limbs = worn.enclosure or enclosed_by_one(target, axes, joint_count)
             unfollowed = unfollowed_arms(target, axes, limbs, size, config, joint_count)
             if whole and unfollowed.any():
                 source, weights = restrict_source(source, weights, ~unfollowed)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from smplxpp.assemble import CanonicalPart, FillHolesConfig, cut_holes, cut_slits, fill_holes
+from smplxpp.assemble import CanonicalPart, FillHolesConfig, cut_holes, cut_slits, fill_holes, part_legs
 from smplxpp.assemble.drape import drape_patches
 from smplxpp.core import UPPER, InputError, SkinWeights, TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups
@@ -101,6 +101,30 @@ def test_a_cut_from_one_opening_to_the_other_is_closed_along_its_whole_length(tu
     filled, report = fill_holes(part, [slit])
     assert report.closed == 1 and report.area == pytest.approx(100 * CELL**2, rel=0.25)
     assert len(border_loops(filled.mesh.faces)) == 2 and edge_groups(filled.mesh.faces)[2].max() == 2
+
+
+def test_trouser_legs_that_were_cut_apart_get_their_inner_sides_and_are_not_sewn_together(tube):
+    """Wide legs were closed in front and behind instead, like a skirt, because their hems' ends were far apart."""
+    # Scaled to half a metre about; cut in front and behind from the hem up, and the halves moved apart.
+    large = replace(tube, mesh=tube.mesh.with_vertices(4.0 * tube.mesh.vertices))
+    part = without(large, ((0, 14), (9, 11)), ((0, 14), (29, 31)))
+    x, y, _ = part.mesh.vertices.T
+    below = y < 4.0 * CELL * 14.5
+    moved = part.mesh.vertices + np.where(below, 0.05 * np.sign(x), 0.0)[:, None] * [1.0, 0.0, 0.0]
+    part = replace(part, mesh=part.mesh.with_vertices(moved))
+    old = np.isin(part.scan_index, large.scan_index[np.unique(large.mesh.border_edges)])
+    parted, walls = part_legs(part, old, np.sign(x) * below)
+    assert len(walls) == 2 and parted.mesh.vertex_count > part.mesh.vertex_count
+    filled, report = fill_holes(parted, walls, config=FillHolesConfig(width=2.0))
+    assert report.closed == 2
+    # A manifold with a waist and two hems; each wall stays on its own leg's side.
+    assert len(border_loops(filled.mesh.faces)) == 3 and edge_groups(filled.mesh.faces)[2].max() == 2
+    added = filled.mesh.vertices[filled.mesh.faces[part.mesh.face_count :]]
+    low = added[:, :, 1].max(axis=1) < 0.4
+    assert low.any() and (np.abs(added[low][:, :, 0]).min(axis=1) > 0.03).all()
+    # A short cut between the thighs is closed across.
+    short = without(large, ((0, 4), (9, 11)), ((0, 4), (29, 31)))
+    assert part_legs(short, np.zeros(short.mesh.vertex_count, dtype=bool), short.mesh.vertices[:, 0])[1] == []
 
 
 def test_ends_that_are_far_apart_are_not_joined(tube):
