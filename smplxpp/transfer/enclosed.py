@@ -125,7 +125,8 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         others = [a for m, a in enumerate(axes) if m != k]
         side = _heights(axis, mesh)
         # The faces that each plane cuts.
-        count = sum((side > 0)[:, mesh.faces[:, c]].astype(np.int8) for c in range(3))
+        a, b, c = ((side > 0)[:, mesh.faces[:, corner]].astype(np.int8) for corner in range(3))
+        count = a + b + c
         cut = (count > 0) & (count < 3)
         planes = np.flatnonzero(cut.sum(axis=1) > 2).tolist()
         around = (rings_around(mesh, np.flatnonzero(cut[i]), side[i], axis, i, others) for i in planes)
