@@ -149,7 +149,7 @@ class PiperVoice:
         scales = np.array([noise, self._scales[1] * slower, noise], np.float32)
         feed = {"input": np.array([ids]), "input_lengths": np.array([len(ids)]), "scales": scales}
         # What a long sentence took is given back: one of 400 IPA characters left the process 340 MB larger. Shorter
-        # ones keep theirs, because memory that is asked for anew each time costs them a tenth of their time.
+        # ones keep theirs, because memory that is requested each time costs them a tenth of their time.
         with self._free:
             samples, frames = self._model.run(feed, release=len(ids) > 400)[:2]
         # Durations are in frames of 256 samples.

@@ -67,7 +67,7 @@ class RulePartner:
         """Do nothing, because rules never wait."""
 
     def another(self) -> RulePartner:
-        """Return one that has said nothing yet."""
+        """Return one without a first answer."""
         return RulePartner()
 
     def _next(self, answers: tuple[str, ...]) -> str:

@@ -197,7 +197,7 @@ class Conversation:
             self._parts.recognisers.give_back(self._recogniser)
 
     def _take(self, part: UtterancePart, recogniser: Recogniser) -> None:
-        # Speech interrupts an answer under way, and the avatar turns to the speaker.
+        # Speech interrupts a running answer, and the avatar turns to the speaker.
         if part.begins:
             self.stop()
             self.frames.listen(True)

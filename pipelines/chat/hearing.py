@@ -258,7 +258,7 @@ class Recognisers:
         self._free = [Recogniser()]
 
     def take(self) -> Recogniser:
-        """Return one that nobody uses, a new one if need be."""
+        """Return a free one, a new one if need be."""
         try:
             return self._free.pop()
         except IndexError:

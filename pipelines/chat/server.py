@@ -85,7 +85,7 @@ class ChatServer(PageServer):
         super().__init__({**files, INDEX: page}, access=access, port=port)
 
     async def _end(self) -> None:
-        """Take leave of the pages, then end what is under way."""
+        """Take leave of the pages, then end what still runs."""
         leaving = [asyncio.create_task(page.end(1001, "the server ends")) for page in self._pages]
         if leaving:
             await asyncio.wait(leaving, timeout=ENDING)
@@ -278,7 +278,7 @@ class _Page:
                 opcode = frame.opcode  # type: ignore[union-attr]
                 if opcode == Opcode.PING:
                     self._pings += 1
-                    if self._pings > 100:  # nobody who reads the answers sends so many
+                    if self._pings > 100:  # a client that reads the answers sends fewer
                         self._cut()
                 if opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
                     continue

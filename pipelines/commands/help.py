@@ -93,12 +93,12 @@ def options_of(command: type) -> list[Option]:
                 name = f"--{'no-' if one.default is True else ''}{plain}"
                 value = "" if hint is bool else metavar or _value(hint)
             group = next((g for g, names in _NAMED.items() if plain in names), QUALITY)
-            said = words.get(one.name, "")
-            if name.startswith("--no-") and one.default is True and said:
-                said = f"Leave out what is done otherwise: {said[0].lower()}{said[1:]}"
+            text = words.get(one.name, "")
+            if name.startswith("--no-") and one.default is True and text:
+                text = f"Leave out what is done otherwise: {text[0].lower()}{text[1:]}"
             if value == _MANY:
-                said += f" One of {', '.join(map(str, _choices(hint)))}."
-            out.append(Option(name, value, said, _default(one, hint), NEED if positional or required else group))
+                text += f" One of {', '.join(map(str, _choices(hint)))}."
+            out.append(Option(name, value, text, _default(one, hint), NEED if positional or required else group))
     return out
 
 

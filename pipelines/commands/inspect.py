@@ -46,7 +46,7 @@ class Inspect:
     """Options of `smplxpp inspect`."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
-    """Folder that `smplxpp build` wrote; or any file or folder, of which it is said what it is."""
+    """Folder that `smplxpp build` wrote; or any file or folder, whose kind is named."""
     all: bool = False
     """List every check; by default those that pass are only counted."""
     strict: bool = False

@@ -193,7 +193,7 @@ EVERY_SECONDS = 30.0
 def _shown(bar: Progress) -> Iterator[Progress]:
     """Show a bar; where the output is no terminal, a line from time to time in its place.
 
-    The line is written by a thread of its own, because a long step calls nobody.
+    The line is written by a thread of its own, because a long step reports nothing.
     """
     if bar.disable or bar.console.is_terminal:
         with bar:

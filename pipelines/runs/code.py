@@ -78,7 +78,8 @@ def _module(name: str) -> _Module:
         raise ModuleNotFoundError(f"no source of module {name}")
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     text = path.read_text(encoding="utf-8")
-    # What follows from this text alone is looked up by the text; which of the imported names are modules is asked anew.
+    # What follows from this text alone is looked up by the text; which of the imported names are modules is looked up
+    # each time.
     key = hashlib.sha256("\0".join([package, text, *_exports()]).encode()).hexdigest()
     known = _digests()
     if key not in known:
@@ -128,7 +129,7 @@ def _keep_digests() -> None:
     if not _UNKEPT or sys.dont_write_bytecode:
         return
     _UNKEPT.clear()
-    with suppress(OSError, InputError):  # installed where nobody may write
+    with suppress(OSError, InputError):  # installed in a folder without write access
         _digests_file().parent.mkdir(exist_ok=True)
         atomic_write_text(_digests_file(), json.dumps(_digests(), separators=(",", ":")))
 

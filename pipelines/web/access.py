@@ -134,5 +134,5 @@ def _ip(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def new_token() -> str:
-    """Return a token that nobody guesses: 192 bits."""
+    """Return a random token of 192 bits."""
     return secrets.token_urlsafe(24)

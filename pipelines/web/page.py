@@ -48,13 +48,13 @@ _POLICY = (
 # Browsers give a page from disk no module that lies beside it: then only this script of the page itself can say so.
 _FROM_DISK = """
 if (location.protocol === "file:") {
-  const said = document.createElement("p");
-  said.className = "failed";
-  said.style.cssText = "margin: 20vh auto; max-width: 30em; padding: 1.5em; font: 16px/1.5 system-ui, sans-serif";
-  said.textContent = "This page was opened from disk, where a browser does not let it read the files beside it. " +
+  const notice = document.createElement("p");
+  notice.className = "failed";
+  notice.style.cssText = "margin: 20vh auto; max-width: 30em; padding: 1.5em; font: 16px/1.5 system-ui, sans-serif";
+  notice.textContent = "This page was opened from disk, where a browser does not let it read the files beside it. " +
     "Serve its folder (smplxpp web --serve, or python -m http.server), " +
     "or make one file with smplxpp web --single-file.";
-  document.body.append(said);
+  document.body.append(notice);
 }
 """
 _FROM_DISK_DIGEST = base64.b64encode(hashlib.sha256(_FROM_DISK.encode()).digest()).decode()

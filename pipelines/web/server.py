@@ -95,7 +95,7 @@ def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listening = socket.socket(family, socket.SOCK_STREAM)
     try:
-        if os.name == "posix":  # a server that is started anew has its port at once; elsewhere two would share it
+        if os.name == "posix":  # a server that is started again has its port at once; elsewhere two would share it
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))
         listening.listen(128)
@@ -189,7 +189,7 @@ class PageServer:
             await self._end()
 
     async def _end(self) -> None:
-        """End what is under way."""
+        """End what still runs."""
         for task in self._tasks:
             task.cancel()
         if self._tasks:

@@ -127,7 +127,7 @@ def assemble_parts(
             5.0,
             explanation=f"the body does not fit the scan here: register first. {report.remaining_where}"
             if report.remaining_where
-            else "nothing needs a push beyond what its part stands off the body",
+            else "nothing needs a larger push than what its part stands off the body",
         ),
         Check(
             "largest push of the repair",
