@@ -118,7 +118,8 @@ export class Dialogue {
     this.stage.hush();
     this.microphone.stop();
     this.connection.close();
-    void this.stage.context?.close();
+    // It may be closed already, by the avatar that is disposed of after its conversation.
+    if (this.stage.context?.state !== "closed") void this.stage.context?.close();
     this.listeners.clear();
     this.awaited = null;
     if (this.player.performer === this.stage) this.player.performer = null;
