@@ -189,11 +189,15 @@ def weigh_evidence(
     chart = chart_of_scan(mesh, body, params)
     pairs, ends = face_adjacency(mesh.faces)
     # What the person holds says nothing about her clothes, so that it has no area in the steps that follow. A body that
-    # is not even at the face, where nothing is held, would make a thing of her own arm.
-    elsewhere = chart.face_core.any() and _spread(chart.distance[chart.face_core]) > BODY_ELSEWHERE
+    # is not even at the face, where nothing is held, would make a thing of her own arm. Where it is at the hands, a hat
+    # or a mask stands off the face: what lies near it is the face.
+    face = chart.face_core
+    elsewhere = face.any() and _spread(chart.distance[face]) > BODY_ELSEWHERE
+    if elsewhere and chart.hand_core.any() and _spread(chart.distance[chart.hand_core]) < 0.5 * BODY_ELSEWHERE:
+        face, elsewhere = face & (np.abs(chart.distance) < 0.5 * BODY_ELSEWHERE), False
     objects = FoundObjects.none(mesh.face_count) if elsewhere else find_objects(mesh, body, params, lab=lab)
     area = np.where(objects.faces, 0.0, mesh.face_areas)
-    bare = (chart.face_core | chart.hand_core) & ~objects.faces
+    bare = (face | chart.hand_core) & ~objects.faces
     misfit = _spread(chart.distance[bare if bare.any() else slice(None)])
     misplaced = float(np.clip(misfit, 0.003, 0.02))
     # Colours: the palette, the skin model, and layers that hang over other clothes.
@@ -203,7 +207,7 @@ def weigh_evidence(
     skin_like = np.full(mesh.face_count, 0.5)
     if lab is not None:
         palette = Palette.of(lab)
-        skin = fit_skin(lab, chart.face_core, chart.hand_core, area)
+        skin = fit_skin(lab, face, chart.hand_core, area)
         ratio = skin.log_ratio(lab)
         skin_like = 1.0 / (1.0 + np.exp(-(ratio + 1.0)))
         layers = find_layers(chart, palette, ratio, area, pairs)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import igl
 import numpy as np
 import pytest
 
 from smplxpp.body import BodyModel, PosedBody, load_body
-from smplxpp.core import OBJECT, BodyParams, InputError, TriangleMesh, concatenate_meshes
+from smplxpp.core import HAIR, OBJECT, SKIN, UPPER, BodyParams, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.topology import face_adjacency
 from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
 from smplxpp.people.things import THINGS, WORN, Thing, thing_mesh
 from smplxpp.segment import label_by_body
+from smplxpp.segment.by_body_chart import chart_of_scan
+from smplxpp.segment.by_body_confidence import notes_on_worn_things
 from smplxpp.segment.by_body_objects import _enclosed, _Where, find_objects
 from smplxpp.segment.flat_patches import flat_share
 from smplxpp.transfer import rigid_weights
@@ -206,6 +209,28 @@ def test_what_is_worn_is_where_it_is_worn(open_body, stance):
     assert hat[:, 1].min() > joints["left_eye_smplhf"][1] and np.ptp(hat[:, 0]) > 0.35
     glasses = thing_mesh(Thing("glasses"), open_body, stance[1]).vertices
     assert np.abs(glasses[:, 1] - joints["left_eye_smplhf"][1]).max() < 0.04
+
+
+def test_under_a_hat_the_face_is_found_and_a_bag_on_a_strap_is_told(open_body, stance):
+    """A brim was taken for the face, so that no label was trusted; a bag was clothes in silence."""
+    skin, found = open_body.mesh(stance[1].vertices[0]), {}
+    for kind in ("brimmed hat", "shoulder bag"):
+        worn = thing_mesh(Thing(kind), open_body, stance[1])
+        mesh = concatenate_meshes([skin, TriangleMesh(*igl.upsample(worn.vertices, worn.faces, 4))])
+        found[kind] = mesh, chart_of_scan(mesh, open_body, stance[0])
+    mesh, _ = found["brimmed hat"]
+    hat = label_by_body(mesh, open_body, stance[0])
+    assert not any("no label can be trusted" in note for note in hat.notes)
+    assert (hat.face_labels[skin.face_count :] == HAIR.id).mean() > 0.7
+    # The bag as a shirt, as skin, and on both sides, as a coat would stand off.
+    mesh, chart = found["shoulder bag"]
+    for label, words in ((UPPER, "off the left side alone"), (SKIN, "labelled skin stand more than 5 cm off")):
+        labels = np.full(mesh.face_count, label.id)
+        (note,) = notes_on_worn_things(chart, mesh.face_areas, labels, misfit=0.005)
+        assert words in note
+        assert not notes_on_worn_things(chart, mesh.face_areas, labels, misfit=0.06)
+    both = replace(chart, side=np.where(np.arange(mesh.face_count) % 2, 1, -1))
+    assert not notes_on_worn_things(both, mesh.face_areas, np.full(mesh.face_count, UPPER.id), misfit=0.005)
 
 
 def test_unknown_things_and_hands_are_refused():

@@ -112,7 +112,7 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
     if all(best.misfit.parts[part] < 0.2 for part in legs):
         trust = min(trust, 0.3)
         out.append("neither lower legs nor feet: it may be cut off below")
-    elsewhere = limb_elsewhere(surface, best)
+    elsewhere = "" if out else limb_elsewhere(surface, best)
     if elsewhere:
         trust = min(trust, 0.1)
         out.append(elsewhere)
