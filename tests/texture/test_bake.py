@@ -18,7 +18,7 @@ from smplxpp.template.template import Template
 from smplxpp.texture.atlas import texels_of, texture_stretch, unwrap
 from smplxpp.texture.bake import bake
 from smplxpp.texture.painted_scan import PaintedScan, pictures_of
-from tests.export.templates import open_body_template
+from tests.export.templates import open_body_template, with_part
 
 pytest.importorskip("xatlas", reason="unwrapping needs xatlas")
 SKIN_TONE = np.array([200, 150, 120])
@@ -65,6 +65,26 @@ def test_every_point_has_the_scans_colour_and_hidden_skin_that_of_bare_skin(pers
     assert 0.3 < report.seen < 0.95 and report.by_part == {"body": report.seen}
     again, _ = bake(person, posed, atlas, scan, size=512, normals=False)
     assert again.colors == texture.colors
+
+
+def test_a_picture_a_part_has_that_parts_colours_and_the_body_lies_as_in_its_file(person):
+    shirt = person.faces[(np.abs(person.mesh.face_centers[:, 1]) < 0.15)]
+    worn = with_part(person, "upper", UPPER.id, shirt, 0.01)
+    atlas = unwrap(worn, load_body().uv, layout="part")
+    places, rows = load_body().uv
+    np.testing.assert_allclose(
+        atlas.uv[atlas.face_uv[: len(person.faces)]], (places * [1, -1] + [0, 1])[rows], atol=1e-12
+    )
+    red, blue = (200, 40, 40), (40, 40, 200)
+    colors = np.where(worn.vertex_part[:, None] == 0, red, blue).astype(np.uint8)
+    scan = PaintedScan(worn.mesh, colors, worn.vertex_labels[worn.faces[:, 0]])
+    texture, report = bake(worn, worn.vertices, atlas, scan, size=256, normals=False)
+    assert len(texture.colors) == 2 and texture.picture.tolist() == [0, 1] and set(report.by_part) == {"body", "upper"}
+    for part, color in enumerate((red, blue)):
+        faces = texture.face_uv[worn.vertex_part[worn.faces[:, 0]] == part]
+        middles = texture.uv[faces].mean(axis=1)
+        found = sample_bilinear(texture.color_image(part), middles, wrap=("clamp", "clamp"))
+        assert np.percentile(np.abs(found.astype(int) - color).max(axis=1), 99) < 8
 
 
 def test_a_level_of_detail_is_painted_anew_from_its_source(person, atlas):
