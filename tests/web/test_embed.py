@@ -117,7 +117,8 @@ def test_a_page_without_any_build_has_two_avatars_and_loses_nothing_of_its_own(b
     browser.evaluate(f"{other}.remove(), guide.dispose()")
     browser.evaluate(
         "(async () => { const { createAvatar } = await import('./player.js'); for (let k = 0; k < 3; ++k) {"
-        " const it = createAvatar(guide.canvas, {url: 'me.avatar'}); if (k < 2) await it.ready; it.dispose(); } })()"
+        " const it = createAvatar(guide.canvas, {url: 'me.avatar'}); if (k < 2) await it.ready;"
+        " it.say([{viseme: 'aa', start: 0}]); it.set({background: 'red', view: 'chest'}); it.dispose(); } })()"
     )
     browser.until("running.size === 0", "a worker goes on")
     assert browser.errors == []

@@ -130,7 +130,7 @@ export class Avatar<P extends Animator = Animator> {
   }
 
   private async load(url: Source, { lips = null, sound = null }: AvatarFiles): Promise<Summary> {
-    const player = await this.started(), { signal } = this.disposing, { autoplay = true } = this.options;
+    const player = this.alive(await this.started()), { signal } = this.disposing, { autoplay = true } = this.options;
     const data = await bytesOf(url, signal), [ofLips, ofSound] = await Promise.all([lips, sound].map((one) => one && bytesOf(one, signal)));
     this.hush();
     this.dialogue?.close();
@@ -166,6 +166,7 @@ export class Avatar<P extends Animator = Animator> {
     // Sounds begin within the click that asks for them.
     this.sound?.unlock();
     const player = await this.opened();
+    if (player !== this.player || !player) return;
     if (motion) {
       player.clock?.at(false, 0, 1);
       player.clock = null;
@@ -186,7 +187,9 @@ export class Avatar<P extends Animator = Animator> {
 
   /** Holds joints, expressions and the place of the body, whatever the motion does; null lets go of all. @throws Error no such joint or expression. */
   async pose(params: PoseParams | null): Promise<void> {
-    const player = await this.opened(), { jointNames, expressionNames } = this.summary!;
+    const player = await this.opened();
+    if (player !== this.player || !player) return;
+    const { jointNames, expressionNames } = this.summary!;
     const joints = named(params?.joints, jointNames, "joint", vector), expression = named(params?.expression, expressionNames, "expression", number);
     const place = params?.translation && vector(params.translation, "translation");
     player.held.clear();
@@ -215,7 +218,7 @@ export class Avatar<P extends Animator = Animator> {
   private async utter(said: string | Utterance, turn: number, before: Promise<unknown>): Promise<boolean> {
     await before;
     await this.opened();
-    if (turn !== this.turn) return false;
+    if (!this.player || turn !== this.turn) return false;
     let complete = false, began = false;
     try {
       return (complete = await this.voice.say(said, () => {
@@ -235,7 +238,7 @@ export class Avatar<P extends Animator = Animator> {
    * @returns before the server answers: `on("hello")` tells. @throws Error no such server, or one that asks for a token.
    */
   async converse(server: string | URL): Promise<Dialogue> {
-    const player = await this.opened(), { signal } = this.disposing, page = new URL(server, document.baseURI);
+    const player = this.alive(await this.opened()), { signal } = this.disposing, page = new URL(server, document.baseURI);
     const reply = await fetch(page, { signal }), text = await reply.text();
     // The page of the server knows the secret of its socket.
     const secret = new DOMParser().parseFromString(text, "text/html").body.getAttribute("data-chat");
@@ -261,6 +264,7 @@ export class Avatar<P extends Animator = Animator> {
   async set(settings: AvatarSettings): Promise<void> {
     const { environment, environmentTurn, parts, simulate } = settings;
     const player = parts ? await this.opened() : await this.started();
+    if (player !== this.player || !player) return;
     for (const [part, shown] of named(parts, this.summary?.partNames ?? [], "part", (value) => Boolean(value))) {
       if (shown) player.hidden.delete(part);
       else player.hidden.add(part);
@@ -269,7 +273,7 @@ export class Avatar<P extends Animator = Animator> {
     if (environmentTurn !== undefined) player.lightTurn = (environmentTurn * Math.PI) / 180;
     if (environment !== undefined) {
       const data = environment ? new Uint8Array(await bytesOf(environment, this.disposing.signal)) : null;
-      this.alive(this.player).light = data && { name: "environment", light: harmonicsOf(readRadiance(data)), captured: WHITE };
+      player.light = data && { name: "environment", light: harmonicsOf(readRadiance(data)), captured: WHITE };
     }
     player.update();
   }
@@ -297,18 +301,23 @@ export class Avatar<P extends Animator = Animator> {
     this.listeners.get(event)?.forEach((listener) => (listener as (detail: AvatarEvents[K]) => void)(detail));
   }
 
-  /** What animates it, once that is there. */
-  protected async started(): Promise<P> {
-    await this.beginning;
-    return this.alive(this.player);
+  /** What animates it, once that is there; null: the avatar is disposed of, and what was asked of it is nobody's any more. */
+  protected async started(): Promise<P | null> {
+    await this.unlessDisposed(this.beginning);
+    return this.player;
   }
 
   /** The same once the file is open. @throws Error none is. */
-  protected async opened(): Promise<P> {
-    if (!this.summary) await this.ready.then(() => this.opening);
-    const player = this.alive(this.player);
-    if (!this.summary) throw new Error("no avatar is open: give createAvatar `url`, or call open");
-    return player;
+  protected async opened(): Promise<P | null> {
+    if (!this.summary) await this.unlessDisposed(this.ready.then(() => this.opening));
+    if (this.player && !this.summary) throw new Error("no avatar is open: give createAvatar `url`, or call open");
+    return this.player;
+  }
+
+  private async unlessDisposed(work: Promise<unknown>): Promise<void> {
+    await work.catch((error) => {
+      if (!this.disposing.signal.aborted) throw error;
+    });
   }
 
   protected alive<T>(player: T | null): T {

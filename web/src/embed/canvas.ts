@@ -31,6 +31,7 @@ export class CanvasAvatar extends Avatar<Player> {
     }, options);
     const { signal } = this.disposing;
     this.started().then((player) => {
+      if (!player) return;
       if (controls) steer(canvas, player, signal);
       const sized = new ResizeObserver(() => player.update());
       const seen = new IntersectionObserver((entries) => (player.unseen = !entries.at(-1)!.isIntersecting));
@@ -47,11 +48,13 @@ export class CanvasAvatar extends Avatar<Player> {
 
   override async set(settings: CanvasSettings): Promise<void> {
     const { background, view } = settings, wanted = background === undefined ? null : colour(background);
-    if (view) await this.opened().then(() => this.look(view));
+    if (view) await this.opened();
+    if (!this.player && this.disposing.signal.aborted) return;
+    if (view) this.look(view);
     await super.set(settings);
-    if (!wanted) return;
-    this.player!.background = wanted;
-    this.player!.update();
+    if (!wanted || !this.player) return;
+    this.player.background = wanted;
+    this.player.update();
   }
 
   private look(view: NonNullable<CanvasSettings["view"]>): void {
