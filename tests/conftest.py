@@ -36,6 +36,7 @@ SHARED = ROOT.parent / "shared"
 LONGEST = (
     "tests/test_examples.py",
     "tests/pipelines/test_train_on_cuda.py",
+    "tests/build/test_build_template.py",
     "tests/pipelines/test_alone.py",
     "tests/pipelines/test_evaluate_cloth.py",
     "tests/register/locate/test_locate.py",
