@@ -92,7 +92,8 @@ def check_human_scale(vertices: PointsLike, *, subject: str = "scan") -> None:
             f"{subject}: axes",
             expected="a person standing along +Y",
             received=f"extents {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} m, longest along {axis.upper()}",
-            remedy=f"state the upward axis with --up {axis} (or --up=-{axis} if it points down)",
+            remedy=f"state the upward axis with --up {axis} (or --up=-{axis} if it points down); if it is +Y, the scan "
+            "is of half a person or of something else: legs, head and trunk have to be there",
         )
 
 

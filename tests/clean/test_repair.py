@@ -215,6 +215,12 @@ def test_units_and_axes_are_detected_and_converted(units: str, up: str):
         check_human_scale(foreign)
 
 
+def test_half_a_person_is_not_only_asked_for_another_axis():
+    wide = np.random.default_rng(0).uniform([-0.63, 0, -0.15], [0.63, 0.9, 0.15], (500, 3))
+    with pytest.raises(InputError, match=r"if it is \+Y, the scan is of half a person"):
+        check_human_scale(wide)
+
+
 def test_unknown_units_are_refused():
     with pytest.raises(InputError, match="'m' or 'cm' or 'mm' or 'inch'"):
         convert_points(np.zeros((1, 3)), units="feet")
