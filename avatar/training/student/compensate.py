@@ -239,11 +239,9 @@ def compensate(
     with fixed_seed(config.seed):
         # Poses near which the body's shapes keep their full weight (`PoseGate`); initial values come from a fixed
         # seed.
-        poses = [sequence.pose(frame) for frame in sequence.train_frames]
-        known, expressions, jaws = (
-            torch.stack([getattr(pose, name) for pose in poses]) for name in ("body_pose", "expression", "jaw")
-        )
-        del poses
+        # One pose at a time, because each holds all vertices.
+        shown = ((pose.body_pose, pose.expression, pose.jaw) for pose in map(sequence.pose, sequence.train_frames))
+        known, expressions, jaws = (torch.stack(rows) for rows in zip(*shown, strict=True))
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
