@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import sys
 
-from smplxpp.core.lazy import lazy_exports
-
-__getattr__, __dir__ = lazy_exports("pipelines", {"__version__": "smplxpp"})
-
 
 def main() -> int:
     """Run the `smplxpp` command; an interrupt while its modules are still being loaded ends without a traceback.
@@ -15,9 +11,18 @@ def main() -> int:
     Returns:
         The exit status of `pipelines.cli.main`; 130 after an interrupt.
     """
+    # Nothing of the package is imported before the guard: its modules take half a second.
     try:
         from pipelines.cli import main as run
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         return 130
     return run()
+
+
+def __getattr__(name: str) -> str:
+    if name != "__version__":
+        raise AttributeError(f"module 'pipelines' has no attribute {name!r}")
+    from smplxpp import __version__
+
+    return __version__

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
+import errno
+import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -12,11 +13,11 @@ from types import SimpleNamespace
 from typing import Any
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_path, atomic_write_bytes
+from smplxpp.core.files.atomic import WRITE_ERRORS, atomic_path, atomic_write_bytes
 from smplxpp.core.lazy import import_extra
 
 SUFFIXES = (".usdc", ".usda", ".usd", ".usdz")
-_MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "UsdVol", "Vt")
+_MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "UsdVol", "Vt")
 
 
 def usd_modules(purpose: str) -> SimpleNamespace:
@@ -67,7 +68,7 @@ def open_usd(
     for name, data in (beside or {}).items():
         atomic_write_bytes(path.parent / name, data)
     with atomic_path(path) as temporary:
-        stage.GetRootLayer().Export(str(temporary))
+        _export(pxr, stage, temporary)
 
 
 def _write_package(pxr: SimpleNamespace, stage: Any, path: Path, beside: Mapping[str, bytes]) -> None:
@@ -76,8 +77,19 @@ def _write_package(pxr: SimpleNamespace, stage: Any, path: Path, beside: Mapping
         inner = Path(folder) / f"{path.stem}.usdc"
         for name, data in beside.items():
             (Path(folder) / name).write_bytes(data)
-        stage.GetRootLayer().Export(str(inner))
+        _export(pxr, stage, inner)
         # The package must be new, and be named as one.
         made = Path(folder) / "package.usdz"
         pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(inner)), str(made))
-        shutil.copyfile(made, temporary)
+        temporary.write_bytes(made.read_bytes())
+
+
+def _export(pxr: SimpleNamespace, stage: Any, path: Path) -> None:
+    """Write a stage to a file; a full disk is an `OSError`, as it is with other files."""
+    try:
+        words = "" if stage.GetRootLayer().Export(str(path)) else os.strerror(errno.EIO)
+    except pxr.Tf.ErrorException as error:  # thirty lines, in which the system's words are
+        words = str(error)
+    if words:
+        code = next((one for one in WRITE_ERRORS if os.strerror(one) in words), errno.EIO)
+        raise OSError(code, os.strerror(code))

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
 
 import numpy as np
 import pytest
 
 from smplxpp.body.layout import COCO_17, HALPE_26, WHOLE_BODY_133
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.onnx_file import OnnxModel
 from smplxpp.detect import load_detector, mask_box
 from smplxpp.detect.detector import grown
 from smplxpp.detect.model_card import ModelCard, load_card
@@ -154,3 +158,29 @@ def test_boxes_are_those_of_masks_and_stay_in_the_image():
     mask[10:20, 5:9] = 255
     assert mask_box(mask) == (5.0, 10.0, 9.0, 20.0)
     assert grown((5.0, 10.0, 9.0, 20.0), 0.6, (30, 40)) == (0.0, 4.0, 15.0, 26.0)
+
+
+def test_an_interrupt_ends_a_model_that_never_does(tmp_path):
+    """Python sees no Ctrl-C before native code returns; a loop in a model did not."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    def value(name: str, kind: int, *shape: int) -> onnx.ValueInfoProto:
+        return helper.make_tensor_value_info(name, kind, shape)
+
+    nodes = [helper.make_node("Identity", ["go"], ["on"]), helper.make_node("Add", ["x", "x"], ["more"])]
+    inside = [value("k", TensorProto.INT64), value("go", TensorProto.BOOL), value("x", TensorProto.FLOAT, 1)]
+    body = helper.make_graph(
+        nodes, "body", inside, [value("on", TensorProto.BOOL), value("more", TensorProto.FLOAT, 1)]
+    )
+    loop = helper.make_node("Loop", ["", "yes", "start"], ["end"], body=body)
+    true = helper.make_tensor("yes", TensorProto.BOOL, [], [True])
+    ends = [value("start", TensorProto.FLOAT, 1)], [value("end", TensorProto.FLOAT, 1)]
+    graph = helper.make_graph([loop], "endless", *ends, initializer=[true])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), tmp_path / "m.onnx")
+    model = OnnxModel(tmp_path / "m.onnx", kind="model", extra="matting")
+    interrupt = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
+    interrupt.start()
+    with pytest.raises(KeyboardInterrupt):
+        model.run({"start": np.ones(1, np.float32)})
+    interrupt.join()

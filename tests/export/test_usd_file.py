@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.export.usd import write_usd
 from smplxpp.template.template import Template
 from tests.export.templates import open_body_template, random_motion, random_template
+from tests.full_disk import file_size_limit
 
 pxr = pytest.importorskip("pxr")
 from pxr import Usd, UsdGeom, UsdShade, UsdSkel  # noqa: E402
@@ -78,3 +80,12 @@ def test_the_rate_is_the_motions_and_bad_ones_are_refused(tmp_path):
     with pytest.raises(InputError, match="usda"):
         write_usd(tmp_path / "b.fbx", template)
     assert not list(tmp_path.glob("b*"))
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
+def test_a_full_disk_is_an_error_of_the_system_and_leaves_nothing(tmp_path, suffix):
+    """It was a traceback of thirty lines out of USD's own code."""
+    with file_size_limit(4000), pytest.raises(OSError) as caught:
+        write_usd(tmp_path / f"a{suffix}", random_template())
+    assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(tmp_path / f"a{suffix}"))
+    assert list(tmp_path.iterdir()) == []

@@ -3,30 +3,37 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
+import re
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 
-# Errors that only writing raises: no space, quota, file too large, read-only file system.
-_WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors that only writing raises: no space, quota, file too large, read-only file system."""
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary file beside `path`, and move it onto `path` when the block ends without an error.
 
-    The temporary name keeps the suffix, for writers that choose a format by it. System errors name `path`.
+    The temporary name keeps the suffix, for writers that choose a format by it. System errors name `path`. What a
+    killed process left of the same file is removed.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _named(None, path):
         # In the folder of the target, because a rename is atomic only within one file system.
+        _remove_left(path.parent, f".{path.stem}.", path.suffix)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-    os.close(handle)
     temporary = Path(name)
+    # Held until the end, or until the process is killed: the next writer tells by it what is left over.
+    _lock(handle)
     # mkstemp makes private files; give the result the permissions of any new file.
     mask = os.umask(0)
     os.umask(mask)
@@ -37,6 +44,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             # Readers see either the old file or the whole new one.
             os.replace(temporary, path)
     finally:
+        os.close(handle)
         temporary.unlink(missing_ok=True)
 
 
@@ -60,7 +68,10 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _named(None, path):
+        _remove_left(path.parent, f".{path.name}.", "")
         temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+        handle = os.open(temporary, os.O_RDONLY)
+    _lock(handle)
     mask = os.umask(0)
     os.umask(mask)
     temporary.chmod(0o777 & ~mask)
@@ -76,7 +87,36 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             else:
                 os.replace(temporary, path)
     finally:
+        os.close(handle)
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _lock(handle: int) -> bool:
+    """Lock an open file or folder; False: another process has it, or the file system has no locks."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _remove_left(folder: Path, prefix: str, suffix: str) -> None:
+    """Remove temporary files and folders of these names that no process holds."""
+    left = re.compile(re.escape(prefix) + r"[a-z0-9_]{8}" + re.escape(suffix))  # as `tempfile` names them
+    for name in filter(left.fullmatch, _hidden_names(folder)):
+        with suppress(OSError):  # another process was quicker
+            handle = os.open(folder / name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+            try:
+                if _lock(handle):
+                    shutil.rmtree(folder / name) if stat.S_ISDIR(os.fstat(handle).st_mode) else os.unlink(folder / name)
+            finally:
+                os.close(handle)
+
+
+@lru_cache(maxsize=64)  # because thousands of pictures are written to one folder
+def _hidden_names(folder: Path) -> tuple[str, ...]:
+    """Return the names in a folder that begin with a dot, as they were when this process came to it."""
+    return tuple(name for name in os.listdir(folder) if name.startswith("."))
 
 
 @contextmanager
@@ -90,7 +130,7 @@ def _named(temporary: Path | None, path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         name = error.filename
-        if temporary is None or (name is None and error.errno in _WRITE_ERRORS):
+        if temporary is None or (name is None and error.errno in WRITE_ERRORS):
             error.filename = str(path)
         elif isinstance(name, str | os.PathLike) and Path(name).is_relative_to(temporary):
             error.filename = str(path / Path(name).relative_to(temporary))

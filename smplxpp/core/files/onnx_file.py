@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -46,13 +48,14 @@ class OnnxModel:
             self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for every kind of damage
             raise InputError(self.subject, expected="an ONNX model", received=f"{error}"[:400]) from None
+        self._options = onnxruntime.RunOptions
         self.inputs, self.outputs = self._session.get_inputs(), self._session.get_outputs()
-        self._releasing = onnxruntime.RunOptions()
-        self._releasing.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def run(self, values: Mapping[str, np.ndarray], *, release: bool = False) -> list[Any]:
         """Run the model on named inputs; returns its outputs in the order of `outputs`.
+
+        A model may loop for ever: an interrupt ends it.
 
         Args:
             values: inputs by name.
@@ -61,11 +64,26 @@ class OnnxModel:
         Raises:
             InputError: the model cannot compute with these values.
         """
-        options = self._releasing if release else None
+        # In a thread of its own, because Python sees no interrupt before native code returns; the options end the run.
+        options, answer = self._options(), Future[list[Any]]()
+        options.log_severity_level = 4  # fatal alone: errors come out as exceptions
+        if release:
+            options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+        thread = Thread(target=self._answer, args=(dict(values), options, answer), daemon=True)
+        thread.start()
         try:
-            return self._session.run(None, dict(values), options)
+            return answer.result()
         except Exception as error:  # noqa: BLE001  onnxruntime raises classes of its own for whatever a model cannot do
             raise InputError(self.subject, expected="a model that runs", received=f"{error}"[:400]) from None
+        finally:
+            options.terminate = True
+            thread.join(timeout=5.0)  # seconds; the run ends between two operators
+
+    def _answer(self, values: dict[str, np.ndarray], options: Any, answer: Future[list[Any]]) -> None:
+        try:
+            answer.set_result(self._session.run(None, values, options))
+        except Exception as error:  # noqa: BLE001  passed on to the thread that asked
+            answer.set_exception(error)
 
 
 def _with_outputs(model: bytes, names: Sequence[str]) -> bytes:

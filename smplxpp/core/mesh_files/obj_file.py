@@ -222,10 +222,10 @@ def _resolve(
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Materials and texture coordinates of the C corners: names, (C,) material (-1: none), (T, 2) coordinates of the
+    """Materials and texture coordinates of the C corners: (C,) material (-1: none), (T, 2) coordinates of the
     whole file and (C,) their row (-1: none)."""
 
-    materials: dict[str, Material]
+    materials: list[Material]
     used: Int64[np.ndarray, " C"]
     uv: Float64[np.ndarray, "T 2"]
     index: Int64[np.ndarray, " C"]
@@ -244,7 +244,13 @@ def _places(
     if not uses or not libraries:
         return None
     known = read_materials(path, [name for _, name in libraries])
-    names = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in uses))}
+    # Names of one material are one: files have been seen with a name for every face.
+    materials, names = list[Material](), dict[str, int]()
+    places: dict[tuple[object, ...], int] = {}
+    for name in dict.fromkeys(name for _, name in uses):
+        material = known.get(name, Material())
+        names[name] = places.setdefault(material.key, len(materials))
+        materials += [material] * (names[name] == len(materials))
     # The last `usemtl` before the face's line is in force; -1 before the first.
     use = np.searchsorted([line for line, _ in uses], corner_lines) - 1
     used = np.where(use >= 0, np.array([names[name] for _, name in uses])[use], -1)
@@ -253,7 +259,7 @@ def _places(
     uv = np.concatenate([np.empty((0, 2))] + [_first_two(values, counts) for values, counts in rows])
     index = _resolve(uv_references, lines.of_kind(b"vt"), corner_lines)
     index = np.where(index < len(uv), index, -1)
-    return _Places({name: known.get(name, Material()) for name in names}, used, uv, index)
+    return _Places(materials, used, uv, index)
 
 
 def _material_colors(
@@ -273,7 +279,7 @@ def _material_colors(
     order = np.argsort(used, kind="stable")
     bounds = np.searchsorted(used[order], np.arange(len(placed.materials) + 1))
     # One material at a time: texture at the corners' coordinates, else the plain colour.
-    for material, start, end in zip(placed.materials.values(), bounds[:-1], bounds[1:], strict=True):
+    for material, start, end in zip(placed.materials, bounds[:-1], bounds[1:], strict=True):
         chosen = inside[order[start:end]]
         if material.picture is not None:
             picture = pictures.load(path, material.picture)
@@ -295,9 +301,14 @@ def _pictures(path: Path, placed: _Places, corners: Int64[np.ndarray, "M 3"]) ->
     uv, picture = np.zeros((len(corners), 3, 2), np.float32), np.full(len(corners), -1)
     load, wraps = list[Callable[[], np.ndarray]](), list[tuple[str, str]]()
     complete = (placed.index[corners] >= 0).all(axis=1)
-    for k, material in enumerate(placed.materials.values()):
+    # Triangles sorted by material, because a file may have as many materials as faces.
+    used = placed.used[corners[:, 0]]
+    order = np.argsort(used, kind="stable")
+    bounds = np.searchsorted(used[order], np.arange(len(placed.materials) + 1))
+    for material, start, end in zip(placed.materials, bounds[:-1], bounds[1:], strict=True):
         found = None if material.picture is None else file_beside(path, material.picture)
-        faces = np.flatnonzero(complete & (placed.used[corners[:, 0]] == k))
+        faces = order[start:end]
+        faces = faces[complete[faces]]
         if found is None or not len(faces):
             continue
         places = placed.at(corners[faces].ravel(), material)

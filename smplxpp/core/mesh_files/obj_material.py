@@ -38,6 +38,12 @@ class Material:
     offset: tuple[float, float] = (0.0, 0.0)
     clamp: bool = False
 
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What a material looks like: equal for materials of other names that look alike."""
+        color = None if self.color is None else self.color.tobytes()
+        return color, self.picture, self.scale, self.offset, self.clamp
+
 
 def read_materials(path: Path, libraries: list[str]) -> dict[str, Material]:
     """Return the materials of an OBJ file by name; missing files are left out with a warning.

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
+import subprocess
+import sys
 
 import pytest
 
+from smplxpp.core.files import atomic
 from smplxpp.core.files.atomic import atomic_folder, atomic_path, atomic_write_bytes
 from tests.full_disk import file_size_limit
 
@@ -40,3 +44,32 @@ def test_errors_about_other_files_keep_their_names(tmp_path):
     with pytest.raises(OSError) as nameless, atomic_path(tmp_path / "a"):
         raise OSError(errno.ECONNRESET, "reset")
     assert nameless.value.filename is None
+
+
+_KILLED = """
+import os, signal, sys
+from smplxpp.core.files import atomic
+from smplxpp.core.files.atomic import atomic_folder, atomic_path
+with atomic_path(sys.argv[1]) as file, atomic_folder(sys.argv[2]) as folder:
+    file.write_bytes(b"half"), (folder / "x").write_bytes(b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next_and_nothing_else(tmp_path):
+    """A film's `.name.xxxxxxxx.mp4` stayed beside the output for ever."""
+    film, folder = tmp_path / "film.mp4", tmp_path / "frames"
+    done = subprocess.run([sys.executable, "-c", _KILLED, film, folder], timeout=900, check=False)
+    left = sorted(os.listdir(tmp_path))
+    assert done.returncode == -signal.SIGKILL and [name.split(".")[1] for name in left] == ["film", "frames"]
+    (tmp_path / ".film.mp4").write_bytes(b"mine")
+    atomic._hidden_names.cache_clear()
+    # A writer of the same file that runs holds its own; names that are not such are the user's.
+    with atomic_path(film) as first:
+        assert not (tmp_path / left[0]).exists()
+        atomic._hidden_names.cache_clear()
+        atomic_write_bytes(film, b"other")
+        assert first.exists()
+    with atomic_folder(folder):
+        pass
+    assert sorted(os.listdir(tmp_path)) == [".film.mp4", "film.mp4", "frames"]

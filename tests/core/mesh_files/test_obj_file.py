@@ -302,3 +302,17 @@ def test_many_missing_libraries_are_one_warning(tmp_path: Path):
     with pytest.warns(GeometryWarning, match=r"'x0\.mtl' and 999 more are not in its folder") as caught:
         read_raw_mesh(_write(tmp_path, text))
     assert len(caught) == 1
+
+
+def test_materials_that_look_alike_are_one(tmp_path: Path):
+    """A hundred thousand names for one picture took half a minute, a search through all faces for each of them."""
+    Image.fromarray(np.full((4, 4, 3), 90, np.uint8)).save(tmp_path / "t.png")
+    (tmp_path / "m.mtl").write_text(
+        "".join(f"newmtl m{k}\n{look}\n" for k, look in enumerate(["map_Kd t.png"] * 3 + ["Kd 1 0 0"]))
+    )
+    faces = "".join(f"usemtl m{k}\nf 1/1 {k + 2}/2 {k + 3}/3\n" for k in range(4))
+    places = "v 0 0 0\n" + "".join(f"v {k} 1 {k * k}\n" for k in range(6)) + "vt 0 0\nvt 1 0\nvt 1 1\nmtllib m.mtl\n"
+    raw = read_raw_mesh(_write(tmp_path, places + faces))
+    assert raw.pictures is not None and len(raw.pictures.load) == 1
+    np.testing.assert_array_equal(raw.pictures.picture, [0, 0, 0, -1])
+    np.testing.assert_array_equal(raw.vertex_colors[[0, 1, 5]], [[90] * 3, [90] * 3, [255, 0, 0]])
