@@ -95,7 +95,9 @@ class ParamsConvert:
         params.save(self.out)
         if self.joints is not None:
             write_arrays(self.joints, {"joints": self._joints(params), "joint_names": np.array(BODY_JOINTS)})
-        log.info("%s (%s, %d frames) -> %s", self.input, layout, len(params), self.out)
+        rate = f"{params.fps:g} a second" if params.fps else "no frame rate stated: --fps states one"
+        frames = f"{len(params)} frames, {rate}" if len(params) > 1 else "1 frame"
+        log.info("%s (%s, %s) -> %s", self.input, layout, frames, self.out)
         return _summary(self, layout, params) | ({} if skeleton is None else {"skeleton": skeleton.as_dict()})
 
     def _joints(self, params: BodyParams) -> Float64[np.ndarray, "T 22 3"]:

@@ -35,6 +35,7 @@ _SERIES = (".npz", ".json", ".pkl")
 _SUFFIXES = (*_SERIES, ".npy")
 # Files of torch are programs, which only torch reads.
 _TORCH = (".pt", ".pth")
+_SCENES = (".glb", ".gltf", ".vrm", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".blend")
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 # Axis-angle of the rotation about x or z that takes an axis to +y; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
 _Y_UP_FROM: dict[str, tuple[float, float, float]] = {
@@ -377,13 +378,17 @@ def _content(path: Path) -> Any:
     if suffix == ".npy":
         return safe_npy(path)
     if suffix != ".json":
-        remedy = "in Python: `found = torch.load(file, map_location='cpu')`, then `numpy.savez('params.npz', **{name: "
-        remedy += "value.numpy() for name, value in found.items()})`, of the dictionary inside that has `body_pose`"
+        torch = "in Python: `found = torch.load(file, map_location='cpu')`, then `numpy.savez('params.npz', **{name: "
+        torch += "value.numpy() for name, value in found.items()})`, of the dictionary inside that has `body_pose`"
+        scene = (
+            "motions inside of scenes are not read: open it in Blender, choose the skeleton, File > Export > Motion "
+        )
+        scene += "Capture (.bvh), and give that file"
         raise InputError(
             f"file {path}",
-            expected=f"one of {', '.join(_SUFFIXES)}",
+            expected=f"one of {', '.join(_SUFFIXES)} or a .bvh",
             received=f"suffix {suffix!r}",
-            remedy=remedy if suffix in _TORCH else "",
+            remedy=torch if suffix in _TORCH else scene if suffix in _SCENES else "",
         )
     return read_json(path)
 
