@@ -20,7 +20,7 @@ def main() -> int:
     return run()
 
 
-def __getattr__(name: str) -> str:
+def __getattr__(name: str) -> object:
     if name != "__version__":
         raise AttributeError(f"module 'pipelines' has no attribute {name!r}")
     from smplxpp import __version__

@@ -119,3 +119,12 @@ def test_without_the_reader_the_remedies_are_named(tmp_path, monkeypatch):
     write_fbx(tmp_path / "z.fbx", settings(2, (1, -1), 1.0), CORNERS)
     with pytest.raises(MissingExtraError, match=r"z\.fbx.*GLB.*extra fbx"):
         read_mesh(tmp_path / "z.fbx")
+
+
+def test_loose_edges_are_refused_by_name(tmp_path):
+    """It was "assumes triangulated faces", which tells nobody what to do."""
+    write_fbx(tmp_path / "z.fbx", settings(2, (1, -1), 1.0), CORNERS)
+    text = (tmp_path / "z.fbx").read_text().replace("*4 {\na: 0,1,2,-4", "*6 {\na: 0,1,2,-4,0,-3")
+    (tmp_path / "z.fbx").write_text(text)
+    with pytest.raises(InputError, match=r"loose points or lines.*Loose Geometry"):
+        read_mesh(tmp_path / "z.fbx")

@@ -43,6 +43,13 @@ def read_fbx(path: Path) -> RawMesh:
     try:
         scene = assimp_py.import_file(str(path), flags)
     except (RuntimeError, ValueError, OSError) as error:
+        if "triangulated" in str(error):  # assimp's word for faces of one corner or two
+            raise InputError(
+                subject,
+                expected="faces of three corners and more",
+                received="loose points or lines beside them",
+                remedy="in Blender: Select > All by Trait > Loose Geometry, delete, and export again",
+            ) from None
         raise InputError(
             subject,
             expected="an FBX file that assimp reads, version 7.1 or later",
@@ -58,7 +65,6 @@ def read_fbx(path: Path) -> RawMesh:
         mesh = scene.meshes[index]
         points = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
         corners = np.array(mesh.indices, dtype=np.int64).reshape(-1)
-        # Points and lines are meshes of one and two corners a face, which have no surface.
         if mesh.num_faces * 3 != len(corners) or not len(corners):
             continue
         vertices.append((points @ placed[:3, :3].T + placed[:3, 3]) @ to_metres.T)
