@@ -189,7 +189,7 @@ def test_a_dictionary_in_an_npy_is_read(tmp_path):
     np.save(tmp_path / "d.npy", walk(None).as_dict(), allow_pickle=True)
     np.testing.assert_array_equal(load_params(tmp_path / "d.npy").body_pose, walk(None).body_pose)
     (tmp_path / "walk.glb").write_bytes(b"glTF")
-    with pytest.raises(InputError, match=r"motions inside of scenes.*Export > Motion Capture \(\.bvh\)"):
+    with pytest.raises(InputError, match=r"Motions inside of scenes.*Export > Motion Capture \(\.bvh\)"):
         load_params(tmp_path / "walk.glb")
     (tmp_path / "results.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match=r"\.pt.*numpy\.savez"):
