@@ -9,7 +9,7 @@ RUN ?= runs/demo
 # make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 TORCH_INDEX ?=
 
-.PHONY: demo test test-slow test-fuzz coverage lint bench fixture wheel docs clean
+.PHONY: demo test test-slow test-fuzz sanitize coverage lint bench fixture wheel docs clean
 
 $(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -32,6 +32,11 @@ test-slow: $(STAMP)
 # Every reader with 100,000 damaged files: hours. `python -m benchmarks damaged_files --inputs 1000` tries fewer.
 test-fuzz: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m fuzz -n 2
+
+# The native library under the sanitizers of addresses, undefined behaviour and threads, with the tests that call it; part
+# of test-slow, too.
+sanitize: $(STAMP)
+	$(BIN)/python -m pytest -m slow tests/native/test_sanitizers.py
 
 # Counting lines costs a third more CPU time and up, so that `make test` does without.
 coverage: $(STAMP)

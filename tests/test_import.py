@@ -361,7 +361,7 @@ READS: dict[str, set[str]] = {
     },
     "open": {
         *("smplxpp/core/files/array_file.py", "smplxpp/core/files/safe_pickle.py", "smplxpp/core/files/image_file.py"),
-        "smplxpp/core/files/package_file.py",
+        *("smplxpp/core/files/package_file.py", "smplxpp/core/files/atomic.py"),
         *("smplxpp/capture/readers/colmap.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/code.py"),
         *("smplxpp/capture/writers/frame_files.py", "smplxpp/core/params.py", "avatar/formats/ply.py"),  # written
         *("avatar/training/engine/metrics_log.py", "pipelines/runs/folders.py", "pipelines/commands/terminal.py"),

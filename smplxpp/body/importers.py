@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Mapping
@@ -395,7 +396,7 @@ def _content(path: Path) -> Any:
 
 def _frame_files(path: Path) -> list[Path]:
     """The file itself, or the numbered files of a folder in order."""
-    if not path.is_dir():
+    if not os.path.isdir(path):  # False, too, for a name that is too long for the system
         return [path]
     # Files that differ in their numbers alone form one series.
     series: dict[str, list[Path]] = {}

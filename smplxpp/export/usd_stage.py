@@ -14,6 +14,7 @@ from typing import Any
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import WRITE_ERRORS, atomic_path, atomic_write_bytes
+from smplxpp.core.files.paths import read_bytes
 from smplxpp.core.lazy import import_extra
 
 SUFFIXES = (".usdc", ".usda", ".usd", ".usdz")
@@ -81,7 +82,7 @@ def _write_package(pxr: SimpleNamespace, stage: Any, path: Path, beside: Mapping
         # The package must be new, and be named as one.
         made = Path(folder) / "package.usdz"
         pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(inner)), str(made))
-        temporary.write_bytes(made.read_bytes())
+        temporary.write_bytes(read_bytes(made, subject="package"))
 
 
 def _export(pxr: SimpleNamespace, stage: Any, path: Path) -> None:

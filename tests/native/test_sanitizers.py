@@ -1,16 +1,18 @@
-"""The C++ of the rasteriser under the address and undefined-behaviour sanitizers, with scenes made to break it."""
+"""The native library under sanitizers: its rasteriser by hostile scenes, all of it by the tests that call it."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 HERE = Path(__file__).parent
-NATIVE = HERE.parents[1] / "smplxpp" / "native"
+ROOT = HERE.parents[1]
+NATIVE = ROOT / "smplxpp" / "native"
 SANITIZERS = [
     "-fsanitize=address,undefined,float-cast-overflow",
     "-fno-sanitize-recover=all",
@@ -55,3 +57,42 @@ def test_gaussians_through_the_c_interface(compiler, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.endswith("done\n")
     assert "no memory" not in done.stdout
+
+
+# Takes the library of a folder, then runs tests in this process.
+_UNDER = """
+import runpy, sys
+from pathlib import Path
+import smplxpp.native as native
+folder = Path(sys.argv[1])
+native._folders = lambda: [folder]
+import pytest
+callers, sys.argv = sys.argv[2:], ["hostile_values", "1", "30"]
+runpy.run_module("tests.native.hostile_values", run_name="__main__")
+options = ["-q", "-x", "-p", "no:cacheprovider", "-W", "ignore:Module already imported", "-k", "not avx and not levels"]
+sys.exit(pytest.main([*options, *callers]))
+"""
+_CALLERS = (
+    *("tests/runtime/test_player.py", "tests/rendering/test_cpu_kernels.py", "tests/cloth/test_solver.py"),
+    *("tests/cloth/test_hostile.py", "tests/raster", "tests/reconstruct/test_sweep.py"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sanitizers", "runtime"), [("address,undefined", "libasan.so"), ("thread", "libtsan.so")])
+def test_the_whole_library(compiler, tmp_path, sanitizers, runtime):
+    if shutil.which("cmake") is None:
+        pytest.skip("no cmake")
+    configure = ["cmake", "-S", str(ROOT), "-B", str(tmp_path), f"-DSMPLXPP_SANITIZE={sanitizers}"]
+    for command in (configure, ["cmake", "--build", str(tmp_path)]):
+        built = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "CXX": compiler})
+        assert built.returncode == 0, built.stdout[-2000:] + built.stderr
+    # Python itself is not instrumented: the sanitizer's runtime has to come first. Its allocations are never freed.
+    found = subprocess.run([compiler, f"-print-file-name={runtime}"], capture_output=True, text=True, check=True)
+    env = {**os.environ, "LD_PRELOAD": found.stdout.strip(), "OMP_NUM_THREADS": "4", "PYTHONMALLOC": "malloc"}
+    env |= {"ASAN_OPTIONS": "detect_leaks=0", "TSAN_OPTIONS": "halt_on_error=1:ignore_noninstrumented_modules=1"}
+    done = subprocess.run(
+        [sys.executable, "-c", _UNDER, str(tmp_path), *_CALLERS], capture_output=True, text=True, cwd=ROOT, env=env
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    assert " passed" in done.stdout and "Sanitizer" not in done.stderr
