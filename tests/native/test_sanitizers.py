@@ -88,8 +88,14 @@ def test_the_whole_library(compiler, tmp_path, sanitizers, runtime):
         built = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "CXX": compiler})
         assert built.returncode == 0, built.stdout[-2000:] + built.stderr
     # Python itself is not instrumented: the sanitizer's runtime has to come first. Its allocations are never freed.
-    found = subprocess.run([compiler, f"-print-file-name={runtime}"], capture_output=True, text=True, check=True)
-    env = {**os.environ, "LD_PRELOAD": found.stdout.strip(), "OMP_NUM_THREADS": "4", "PYTHONMALLOC": "malloc"}
+    # So has the library of C++, whose exceptions it watches.
+    found = [
+        subprocess.run(
+            [compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        for name in (runtime, "libstdc++.so.6")
+    ]
+    env = {**os.environ, "LD_PRELOAD": " ".join(found), "OMP_NUM_THREADS": "4", "PYTHONMALLOC": "malloc"}
     env |= {"ASAN_OPTIONS": "detect_leaks=0", "TSAN_OPTIONS": "halt_on_error=1:ignore_noninstrumented_modules=1"}
     done = subprocess.run(
         [sys.executable, "-c", _UNDER, str(tmp_path), *_CALLERS], capture_output=True, text=True, cwd=ROOT, env=env
