@@ -97,7 +97,7 @@ class FigureTable:
         """Return the table aligned by spaces, groups over their columns, the caption above.
 
         Args:
-            width: of a line; a wider table goes on below with further columns, each time with the rows' names, and a
+            width: of a line; a wider table continues below with further columns, each time with the rows' names, and a
                 column or a word that alone is wider stays whole. None: one line a row.
         """
         caption = [self.caption] if self.caption else []

@@ -10,7 +10,7 @@ from jaxtyping import Int64
 
 from avatar.runtime.bundle import AvatarBundle
 from smplxpp.body.model import BodyModel
-from smplxpp.body.pose_range import PoseRange
+from smplxpp.body.retarget import PoseRange
 from smplxpp.cloth.driver import ClothDriver, ClothShape, DriverConfig
 from smplxpp.cloth.garment_file import garments_from_arrays
 from smplxpp.cloth.poses import pose_between

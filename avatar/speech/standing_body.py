@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.body.pose_range import PoseRange
-from smplxpp.body.retarget import FEET, Skeleton
+from smplxpp.body.retarget import FEET, PoseRange, Skeleton
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.errors import one_line
 

@@ -50,8 +50,6 @@ from smplxpp.texture.photographs import Painter, Photograph, PhotographPainter, 
 
 # Pixels of the longer side at which photographs are read: two a texel of a person that fills a 2048 texture's views.
 _LONGER_SIDE = 2400
-# Metres: no wall between trouser legs is wider.
-_ANY_WIDTH = 2.0
 
 
 def assemble_parts(
@@ -238,7 +236,8 @@ def _filled(
     parted = FilledHoles()
     if config.width:
         made, walls = part_legs(made, np.isin(part.source_vertex, opened), made.weights.dense() @ legs)
-        made, parted = fill_holes(made, walls, config=replace(config, width=_ANY_WIDTH))
+        any_width = 2.0  # metres: no wall between trouser legs is wider
+        made, parted = fill_holes(made, walls, config=replace(config, width=any_width))
     source = np.concatenate([part.source_vertex, np.full(made.mesh.vertex_count - part.mesh.vertex_count, -1)])
     borders = (before.mesh, before.source_vertex, made.mesh, source)
     holes = cut_holes(*borders, taken=taken)

@@ -52,8 +52,6 @@ _SHARES = {"faces that cut another": (0.0, 1.0), "needles": (0.1, 5.0)}
 # As a build counts: cloth whose weights are right still meets the body where limbs press on it, so that what is deep
 # in a hard pose warns alone.
 _INSIDE_REST, _INSIDE_POSED, _STRETCH = (0.0, 1.0), (25.0, 100.0), (3.0, 10.0)
-_DEEP = 0.01  # metres within the body, from which a place counts in a hard pose
-_SEAM = (1.0, 5.0)  # mm between copies of a vertex: a slit of one is seen at arm's length
 _OFF = "weights off a sum of 1"
 # Rounding to bytes leaves 0.01, and some engines do not divide by the sum; a joint twice is moved right by most.
 _RIG = {_OFF: (0.01, 0.1), "a joint twice at a vertex": (0.0, np.inf)}
@@ -254,10 +252,13 @@ class MeshVerdict:
         chosen = np.flatnonzero(self.parts[name])
         part, used = self.mesh.submesh(chosen)
         skin, skin_used = self.mesh.submesh(self.parts[body])
-        ever = np.zeros(len(used), dtype=bool)
+        ever, deep = (
+            np.zeros(len(used), dtype=bool),
+            0.01,
+        )  # metres within the body, from which a place counts in a pose
         for vertices in posed:
             report = penetration(vertices[used], skin.with_vertices(vertices[skin_used]), clearance=0.0)
-            ever |= report.signed_distance < -_DEEP
+            ever |= report.signed_distance < -deep
         inside = penetration(part.vertices, skin).penetrating
         for fault, where, gate in (
             ("inside the body", inside, _INSIDE_REST),
@@ -287,9 +288,10 @@ class MeshVerdict:
         _, index = welded(part)
         first = used[np.unique(index, return_index=True)[1]][index]
         apart = np.linalg.norm(posed[:, used] - posed[:, first], axis=2).max(axis=0) * 1e3
+        gate = (1.0, 5.0)  # mm between copies of a vertex: a slit of one is seen at arm's length
         wide = np.zeros(self.mesh.vertex_count, dtype=bool)
-        wide[used[apart > _SEAM[0]]] = True
-        self._add(name, "seams that open", float(apart.max()), "mm", _SEAM, self._at(wide))
+        wide[used[apart > gate[0]]] = True
+        self._add(name, "seams that open", float(apart.max()), "mm", gate, self._at(wide))
 
     def _check_solids(self, members: dict[str, np.ndarray]) -> None:
         """Volumes that closed parts share; open ones have none."""

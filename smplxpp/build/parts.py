@@ -184,7 +184,7 @@ def _without_bridges(
     opened = np.unique(part.border_edges)
     # Cloth that passes a hand hangs on the sleeve where the scan has fused them, and would follow it.
     apart = webs_to_hands(fit.mesh, body.weights, part, ruled.settings) & ~ruled.stiff(part, source)
-    # Trouser legs that touch are parted, too. Which leg the cloth goes around is told before that opens its rings.
+    # Trouser legs that touch are parted, too. Which leg the cloth goes around is found before that opens its rings.
     axes = limb_axes(fit.mesh, body.weights, extent(fit.mesh), ruled.settings)
     if axes and ruled.settings.confident is not None and config.rounds:
         limbs = enclosed_by_one(part, axes, body.joint_count)

@@ -203,8 +203,8 @@ def _hidden_hand(mesh: TriangleMesh, own: BodyChart, posed: TriangleMesh, chart:
         return False
     pairs, ends = face_adjacency(mesh.faces)
     border = here[pairs[:, 0]] != here[pairs[:, 1]]
-    beyond = chart.region[np.where(here[pairs[:, 0]], pairs[:, 1], pairs[:, 0])]
-    border &= np.isin(beyond, (TRUNK, LEG))
+    outer = chart.region[np.where(here[pairs[:, 0]], pairs[:, 1], pairs[:, 0])]
+    border &= np.isin(outer, (TRUNK, LEG))
     # A hand on a hip lies in a concave fold, across which a border costs little of its length.
     length = np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
     smooth = edge_weights(mesh, pairs, ends, SmoothingConfig(smoothness=1.0, floor=0.0, eta_convex=0.0))

@@ -16,9 +16,9 @@ from smplxpp.segment.by_body_rings import ARM_START, STEP
 BODY_ELSEWHERE = 0.05
 """Distance, in metres, between body and bare skin from which the body is not the scan's."""
 _LEAST_OFF = 0.006
-"""Square metres of skin off the body that are told, as of the smallest thing in a hand."""
+"""Square metres of skin off the body that are reported, as of the smallest thing in a hand."""
 _BESIDE, _LEAST_BESIDE = 0.08, 0.03
-"""Metres off the body, and square metres there on one side, from which clothes are told as a bag. Of 9 real people
+"""Metres off the body, and square metres there on one side, from which clothes are reported as a bag. Of 9 real people
 without one a jacket at a hand in its pocket has most, 0.023, and a tenth of that on the other side."""
 _BORDERS = {
     "shoe_top": "where shoes or socks end",

@@ -21,7 +21,7 @@ _ELSE: dict[int, dict[int, float]] = {
     LEG: {SKIN.id: 0.04, SHOE.id: 0.01, UPPER.id: 0.02, LOWER.id: 0.04, OUTER.id: 0.003},
     FOOT: {SKIN.id: 0.03, SHOE.id: 0.06, LOWER.id: 0.02, UPPER.id: 0.001},
 }
-_BEYOND = 1e-3  # probability that a garment goes on beyond a border that the surface shows
+_BEYOND = 1e-3  # probability that a garment continues past a border that the surface shows
 
 
 def place_prior(

@@ -131,7 +131,7 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         planes = np.flatnonzero(cut.sum(axis=1) > 2).tolist()
         around = (rings_around(mesh, np.flatnonzero(cut[i]), side[i], axis, i, others) for i in planes)
         rings.append([(i, ring) for i, each in zip(planes, around, strict=True) for ring in each])
-    # Where one leg is told from the other, so is that from it.
+    # Where one leg is distinguished from the other, so is that from it.
     walls = [septum_of(found, len(axis.points)) for found, axis in zip(rings, axes[:-1], strict=True)]
     for k, m in ((0, 1), (1, 0)):
         wall = walls[m]
@@ -146,7 +146,7 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
             if wall is not None and plane >= wall.first and ring.neck is not None and ring.neck.width < 1.0:
                 # This limb's are the vertices on its axis' side of the wall.
                 here = np.full(len(corners), float(plane))
-                corners, single = corners[wall.beyond(mesh.vertices[corners], here) < 0], True
+                corners, single = corners[wall.past(mesh.vertices[corners], here) < 0], True
             if len(corners):
                 # A vertex of a cut face counts the more, the nearer it lies to the plane.
                 near = step / (np.abs(side[plane, corners]) + 0.05 * step)
@@ -259,9 +259,9 @@ def _fill_fused(
         step = float(np.linalg.norm(axis.points[1] - axis.points[0]))
         index = cKDTree(axis.points).query(mesh.vertices)[1]
         plane = index + np.einsum("ij,ij->i", mesh.vertices - axis.points[index], axis.tangents[index]) / step
-        beyond = wall.beyond(mesh.vertices, plane)
-        rows = of_tubes & (plane >= wall.first) & (beyond < np.minimum(nearest, 0.5 * step))
-        limb[rows], at[rows], nearest[rows] = k, plane[rows], beyond[rows]
+        past = wall.past(mesh.vertices, plane)
+        rows = of_tubes & (plane >= wall.first) & (past < np.minimum(nearest, 0.5 * step))
+        limb[rows], at[rows], nearest[rows] = k, plane[rows], past[rows]
     share[np.isfinite(nearest)] = 1.0
 
 

@@ -116,9 +116,9 @@ def _depth(vertices: np.ndarray, legs: list[LimbAxis]) -> Float64[np.ndarray, " 
         index = squared.argmin(axis=1)
         own = squared[np.arange(len(vertices)), index]
         along = np.einsum("ij,ij->i", vertices - axis.points[index], axis.tangents[index])
-        # Between the axis' ends its nearest point says the height, beyond them the continued line.
-        beyond = (index == 0) | (index == len(axis.points) - 1)
-        height = index * row_lengths(axis.points[1:2] - axis.points[:1]) + np.where(beyond, along, 0.0)
+        # Between the axis' ends its nearest point says the height, outside them the continued line.
+        outside = (index == 0) | (index == len(axis.points) - 1)
+        height = index * row_lengths(axis.points[1:2] - axis.points[:1]) + np.where(outside, along, 0.0)
         depth = np.where(own < nearest, height, depth)
         nearest = np.minimum(own, nearest)
     return depth

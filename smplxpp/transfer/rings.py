@@ -142,8 +142,8 @@ class Septum:
     points: Float64[np.ndarray, "K 3"]
     directions: Float64[np.ndarray, "K 3"]
 
-    def beyond(self, points: np.ndarray, plane: np.ndarray) -> Float64[np.ndarray, " N"]:
-        """Return how far points at the given planes lie beyond the wall, metres; negative on the limb's side."""
+    def past(self, points: np.ndarray, plane: np.ndarray) -> Float64[np.ndarray, " N"]:
+        """Return how far points at the given planes lie past the wall, metres; negative on the limb's side."""
         k = np.clip(np.rint(plane).astype(int), 0, len(self.points) - 1)
         return np.einsum("ij,ij->i", points - self.points[k], self.directions[k])
 
@@ -178,7 +178,7 @@ def _fused_from(necks: list[tuple[int, float]]) -> int | None:
     narrow = [i for i, width in necks if width < _NARROW]
     if len(narrow) >= 3:
         return min(narrow)
-    # Pleats hide the groove between the legs of a hakama, which is shallow but goes on from the crotch to the hem.
+    # Pleats hide the groove between the legs of a hakama, which is shallow but runs from the crotch to the hem.
     grooved = [i for i, width in necks if width < _WIDEST]
     if len(grooved) < _LONG:
         return None

@@ -113,9 +113,9 @@ def passed_hands(
 ) -> list[PassedHand]:
     """Find the hands at the sleeves of a part that it passes and is not worn on.
 
-    What is worn on a hand, or ends at it, goes on into the sleeve; cloth of the trunk that a hand lies behind, in front
-    of, or in, goes on into the trunk. The longer of the two borders of the vertices nearest to a hand decides; cloth is
-    then the trunk's where that border is nearer along the surface.
+    What is worn on a hand, or ends at it, continues into the sleeve; cloth of the trunk that a hand lies behind, in
+    front of, or in, continues into the trunk. The longer of the two borders of the vertices nearest to a hand decides;
+    cloth is then the trunk's where that border is nearer along the surface.
 
     Args:
         mesh: the part.
@@ -140,16 +140,16 @@ def passed_hands(
             continue
         # The edges across the border of what is at the hand, and their ends on its other side.
         border = at_hand[edges[:, 0]] != at_hand[edges[:, 1]]
-        beyond = np.where(at_hand[edges[:, 0]], edges[:, 1], edges[:, 0])[border]
-        if length[border] @ ~on_arm[beyond] <= length[border] @ on_arm[beyond]:
+        outer = np.where(at_hand[edges[:, 0]], edges[:, 1], edges[:, 0])[border]
+        if length[border] @ ~on_arm[outer] <= length[border] @ on_arm[outer]:
             continue
         within = at_hand[edges].any(axis=1)
         graph = coo_matrix((length[within], edges[within].T), shape=(mesh.vertex_count,) * 2).tocsr()
         far = [
-            dijkstra(graph, directed=False, indices=np.unique(beyond[ends]), min_only=True)
+            dijkstra(graph, directed=False, indices=np.unique(outer[ends]), min_only=True)
             if ends.any()
             else np.full(mesh.vertex_count, np.inf)
-            for ends in (~on_arm[beyond], on_arm[beyond])
+            for ends in (~on_arm[outer], on_arm[outer])
         ]
         out.append(PassedHand(at_hand & (far[0] <= far[1]), hand, arm))
     return out

@@ -9,7 +9,7 @@ import pytest
 
 from avatar.runtime import load_bundle
 from avatar.runtime.skeleton import pose_range, resampled
-from smplxpp.body.pose_range import MARGIN
+from smplxpp.body.retarget import MARGIN
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from tests.dolls.dancing import dance
 from tests.runtime.bundles import student, write

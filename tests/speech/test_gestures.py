@@ -13,8 +13,7 @@ from avatar.speech.gesture_planner import MIN_BEAT_INTERVAL, find_beats
 from avatar.speech.tracks import RandomTrack, Track
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.body.pose_range import PoseRange
-from smplxpp.body.retarget import FEET, Skeleton
+from smplxpp.body.retarget import FEET, PoseRange, Skeleton
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec, rotvec_from_matrix
 
 BODY = load_body()
