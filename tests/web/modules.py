@@ -13,7 +13,9 @@ import pytest
 WEB = Path(__file__).resolve().parents[2] / "web"
 TOOLS = WEB / "node_modules" / ".bin"
 NEEDS_BUILD = pytest.mark.skipif(
-    shutil.which("node") is None or not (TOOLS / "esbuild").exists(), reason="no node with web/'s tools: npm ci in web/"
+    shutil.which("node") is None
+    or not all((WEB / "node_modules" / name).exists() for name in ("esbuild", "react", "three")),
+    reason="no node with web/'s tools: npm ci in web/",
 )
 
 
