@@ -112,10 +112,8 @@ def test_sound_and_poses_are_on_one_clock_and_typing_stops_both(talking):
     heard, started = page.evaluate("[begins[0], started]")
     now, stage = np.array(page.evaluate("poses"), float).T
     during = (now > heard) & (now < heard + A_CHARACTER * len(LONG) - 0.1)
-    # The sound's sample that leaves now, against the time that the pose is looked up at. On busy cores a page learns
-    # late of the audio's time, so that single poses say less than the middle one.
-    apart = np.abs((now - heard) - (stage - started))[during]
-    assert np.median(apart) < 0.04 and apart.max() < 0.25
+    # The sound's sample that leaves now, against the time that the pose is looked up at.
+    assert np.abs((now - heard) - (stage - started))[during].max() < 0.04
     page.send("Input.insertText", text="w")
     page.until(f"{STAGE}.context.currentTime - lastLoud > 0.3", "typing does not stop it")
     assert page.evaluate(f"{STAGE}.speaking") is False
