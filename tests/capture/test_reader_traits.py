@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.writers.frame_files import save_params_by_row
 from smplxpp.core.errors import InputError
+from tests.capture.calibration_writers import pose2sim as write_calibration
 from tests.capture.scene import make_scene
+from tests.capture.test_calibrations import rig as make_rig
 from tests.capture.writers import (
     write_actorshq,
     write_avatarrex,
@@ -168,22 +171,39 @@ def test_a_calibration_table_without_names_is_refused(tmp_path):
         open_capture(root)
 
 
-def test_an_unknown_folder_is_told_the_nearest_layouts_a_line_each(tmp_path, capsys):
+@pytest.fixture
+def alone(tmp_path) -> Path:
+    """A folder above which, as far as a calibration is looked for, nothing else lies."""
+    folder = tmp_path / "day" / "session" / "take"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def test_an_unknown_folder_is_told_the_nearest_layouts_a_line_each(alone, capsys):
     """All layouts in one line of 700 characters said nothing."""
-    (tmp_path / "images" / "cam1").mkdir(parents=True)
-    (tmp_path / "intri.yml").write_text("%YAML:1.0\n")
+    (alone / "images" / "cam1").mkdir(parents=True)
+    (alone / "intri.yml").write_text("%YAML:1.0\n")
+    write_calibration(make_rig(count=3), _made(alone.parent / "calibration"))
     with pytest.raises(InputError) as found:
-        open_capture(tmp_path)
+        open_capture(alone)
     assert len(str(found.value)) < 300 and len(found.value.__notes__) == 3
     assert found.value.__notes__[0] == "easymocap: intri.yml and extri.yml (there: intri.yml)"
-    assert main(["capture", "check", str(tmp_path)]) == 2
+    assert main(["capture", "check", str(alone)]) == 2
     shown = capsys.readouterr()
     assert "\n  easymocap: intri.yml and extri.yml (there: intri.yml)\n" in shown.out + shown.err
 
 
-def test_videos_without_a_calibration_are_told_so(tmp_path):
-    (tmp_path / "videos").mkdir()
-    (tmp_path / "videos" / "cam1.mp4").write_bytes(b"")
+def test_videos_without_a_calibration_of_theirs_are_told_so(alone):
+    (_made(alone / "videos") / "cam1.mp4").write_bytes(b"")
     with pytest.raises(InputError) as found:
-        open_capture(tmp_path)
+        open_capture(alone)
     assert found.value.__notes__[0].startswith("rig: videos or folders of keypoints are there; a calibration")
+    other = write_calibration(make_rig(count=3), _made(alone.parent / "calibration"))
+    with pytest.raises(InputError) as found:
+        open_capture(alone)
+    assert f"are there, but not of two cameras of {other} (cam_01, " in found.value.__notes__[0]
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder

@@ -97,7 +97,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
 def what_is_missing(root: Path) -> str | None:
     """Return what a folder lacks to be a rig, where something of a rig is there; None elsewhere."""
     calibration = _calibration_near(root)
-    if calibration is not None:
+    if calibration is not None and root in calibration.parents:
         names = ", ".join(list(read_calibration(calibration).cameras)[:6])
         return f"the calibration {calibration.name} is there; keypoints, images or videos named like {names} are not"
     videos = [p for name in _VIDEOS if (root / name).is_dir() for p in (root / name).iterdir()]
@@ -106,6 +106,10 @@ def what_is_missing(root: Path) -> str | None:
     count = count or sum(name.lower().endswith("_json") for name in folders)
     if not count:
         return None
+    if calibration is not None:
+        # It may belong to other recordings of the folder that both lie in.
+        names = ", ".join(list(read_calibration(calibration).cameras)[:6])
+        return f"videos or folders of keypoints are there, but not of two cameras of {calibration} ({names})"
     return "videos or folders of keypoints are there; a calibration (docs/rigs.md) is not: --calibration names it"
 
 
