@@ -1,4 +1,4 @@
-"""Fill the tables of docs/benchmarks.md, docs/real.md and docs/exports.md from the stored results.
+"""Fill the tables of the pages in docs/ from the stored results.
 
     python -m benchmarks.support.page [--check]
 
@@ -27,9 +27,9 @@ from typing import Any
 from benchmarks.support.results import RESULTS, ROOT
 from smplxpp.core.files.atomic import atomic_write_text
 
-PAGE = ROOT / "docs" / "benchmarks.md"
-PAGES = (PAGE, ROOT / "docs" / "real.md", ROOT / "docs" / "exports.md")
+BENCHMARKS = tuple(sorted((ROOT / "docs").glob("benchmarks*.md")))
 DIRECTIVE = re.compile(r"^<!-- table \| (.*) -->$")
+PAGES = tuple(path for path in sorted((ROOT / "docs").glob("*.md")) if "<!-- table | " in path.read_text("utf-8"))
 
 
 def page(text: str, results: Path = RESULTS) -> str:
