@@ -51,7 +51,7 @@ class StudentFilm:
 
 
 def motion_for(bundle: AvatarBundle, path: Path, *, fps: float | None = None) -> BodyParams:
-    """Read a motion, in any layout or a .bvh, for a bundle's body, at its own or a stated rate."""
+    """Read a motion, in any layout or of a skeleton, for a bundle's body, at its own or a stated rate."""
     from avatar.runtime.skeleton import skeleton_body
 
     return Driving().load(path, skeleton_body(bundle), fps=fps)

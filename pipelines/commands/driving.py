@@ -9,12 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.commands.options import OptionalPath
+from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.runs.layout import TEMPLATE
-from smplxpp.body import BodyModel, UpAxis, Whose, load_body, load_motion
-from smplxpp.body.bvh import read_bvh
-from smplxpp.body.bvh_params import MatchedSkeleton, load_bvh, matched_skeleton, named_joints, read_joint_map
+from smplxpp.body import BodyModel, UpAxis, Whose, is_skeleton, load_body, load_motion
 from smplxpp.body.retarget import Skeleton, retarget
+from smplxpp.body.skeleton_params import (
+    MatchedSkeleton,
+    load_skeleton,
+    matched_skeleton,
+    named_joints,
+    read_joint_map,
+    read_skeleton,
+)
 from smplxpp.body.smpl_params import FAMILY_NAMES, retarget_smpl
 from smplxpp.cloth.poses import resampled
 from smplxpp.core import BodyParams, GeometryWarning, InputError, require_positive
@@ -22,7 +28,6 @@ from smplxpp.template.template import Template
 
 log = logging.getLogger(__name__)
 
-BVH = ".bvh"
 OPEN = "open"
 
 
@@ -32,13 +37,15 @@ class Driving:
 
     retarget_from: OptionalPath = None
     """Body that the motion was recorded for, if it is another one: a body model file (with the motion's betas), a run,
-    or `open`. The root translation is then scaled by leg length, and planted feet do not slide. A .bvh has its own
-    skeleton."""
+    or `open`. The root translation is then scaled by leg length, and planted feet do not slide. A .bvh, .glb
+    or .vrm has its own skeleton."""
     joint_map: OptionalPath = None
-    """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
+    """JSON of a skeleton's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
+    clip: OptionalText = None
+    """Name of the motion, for a .glb or .vrm with several (default: the first)."""
     up: UpAxis | None = None
     """Axis that points up in the motion; by default the one that the file states, or z for AMASS, -y for TalkBody4D
-    and y for others, and for a .bvh that along which its skeleton stands at rest."""
+    and y for others, and for a skeleton that along which it stands at rest."""
     whose: Whose = "auto"
     """Whose parameters they are. auto: as the file tells; turns of SMPL, SMPL-H and SMPL-X are brought to an avatar of
     the open body. body: the avatar's own, whatever they look like."""
@@ -59,13 +66,14 @@ class Driving:
         """
         if fps is not None:
             require_positive("option fps", fps)
-        # A .bvh contains a skeleton, so that options for it are refused instead of ignored.
-        if path.suffix.lower() == BVH:
+        # Such a file contains a skeleton, so that options for it are refused instead of ignored.
+        if is_skeleton(path):
             self._refuse("retarget-from", self.retarget_from, f"{path}, which has a skeleton of its own")
             self._refuse("whose", None if self.whose == "auto" else self.whose, f"{path}, which has a skeleton")
             names = None if self.joint_map is None else read_joint_map(self.joint_map)
-            return load_bvh(path, Skeleton.of(body), joint_map=names, up=self.up, fps=fps)
+            return load_skeleton(path, Skeleton.of(body), joint_map=names, up=self.up, fps=fps, clip=self.clip)
         self._refuse("joint-map", self.joint_map, f"{path}, whose joints have SMPL's names")
+        self._refuse("clip", self.clip, f"{path}, which has one motion")
         if self.retarget_from is None:
             return _whole(path, body, self.up, self.whose, fps)
         # Read the motion for its own body, then transfer it to the person's skeleton. `open` says whose it is.
@@ -75,15 +83,15 @@ class Driving:
         return retarget(params, Skeleton.of(source, betas), Skeleton.of(body))
 
     def skeleton(self, path: Path) -> MatchedSkeleton:
-        """Return which joints of a .bvh stand for the body's, and log them.
+        """Return which joints of a skeleton's file stand for the body's, and log them.
 
         Raises:
             InputError: what `load` refuses.
         """
         names = None if self.joint_map is None else read_joint_map(self.joint_map)
-        motion = read_bvh(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", GeometryWarning)  # given when the file is read for use
+            motion = read_skeleton(path, clip=self.clip)
             found = matched_skeleton(motion, named_joints(motion, names, subject=f"motion {path}"), up=self.up)
         log.info("%s: %s", path, ", ".join(f"{ours} = {' + '.join(own)}" for ours, own in found.taken.items()))
         return found

@@ -85,7 +85,7 @@ _OTHERS = {
     ".safetensors": "weights of a model or Gaussians: a stage of a run holds them",
     ".spz": "splats of a pose, for other programs",
     ".usdc": "scene, for other programs",
-    ".bvh": "motion of a skeleton: give it to `smplxpp animate RUN --params`",
+    **dict.fromkeys((".bvh", ".vrma"), "motion of a skeleton: give it to `smplxpp animate RUN --params`"),
     ".wav": "sound",
 }
 """What is known by its ending alone."""

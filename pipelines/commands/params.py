@@ -11,11 +11,11 @@ import tyro
 from jaxtyping import Float64
 from rich.console import Console
 
-from pipelines.commands.driving import BVH, Driving
+from pipelines.commands.driving import Driving
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
-from smplxpp.body import LayoutName, UpAxis, Whose, detect_layout, load_body, load_params, smpl_joints
-from smplxpp.body.bvh_params import read_joint_map
+from smplxpp.body import LayoutName, UpAxis, Whose, detect_layout, is_skeleton, load_body, load_params, smpl_joints
 from smplxpp.body.motion_facts import inspect_motion
+from smplxpp.body.skeleton_params import read_joint_map
 from smplxpp.body.smpl_joints import BODY_JOINTS, is_open_body
 from smplxpp.body.smpl_params import FAMILY_NAMES
 from smplxpp.core import BodyParams, InputError, require_positive
@@ -29,7 +29,8 @@ class ParamsConvert:
     """Options of the command."""
 
     input: tyro.conf.Positional[Path]
-    """npz, json or pkl file, a folder of numbered frames, or a .bvh, whose motion is brought to the body."""
+    """npz, json or pkl file, a folder of numbered frames, or a .bvh, .glb or .vrm, whose motion is brought to the
+    body."""
     out: Path
     """npz file to write: SMPL-X names, stacked frames."""
     layout: LayoutName = "auto"
@@ -45,9 +46,11 @@ class ParamsConvert:
     """Id of the person, for files with several."""
     up: UpAxis | None = None
     """Axis that points up in the input; the output has y up. By default as the input states, z for AMASS, -y for
-    TalkBody4D, for a .bvh that along which its skeleton stands at rest, else y."""
+    TalkBody4D, for a skeleton that along which it stands at rest, else y."""
     joint_map: OptionalPath = None
-    """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
+    """JSON of a skeleton's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
+    clip: OptionalText = None
+    """Name of the motion, for a .glb or .vrm with several (default: the first)."""
     whose: Whose = "auto"
     """Whose parameters the input has. auto: as its counts and keys tell. body: those of --body. Parameters of SMPL,
     SMPL-H or SMPL-X are brought to the open body without their shape, as a start for a registration."""
@@ -69,11 +72,11 @@ class ParamsConvert:
             raise InputError("--joints", expected="a file name ending in .npz", received=str(self.joints))
         if self.fps is not None:
             require_positive("option fps", self.fps)
-        # A .bvh is retargeted to the body; all other layouts are read as they are.
+        # The motion of a skeleton is retargeted to the body; all other layouts are read as they are.
         kept, skeleton = _parse_frames(self.frames), None
-        if self.input.suffix.lower() == BVH:
-            layout = "bvh"
-            driving = Driving(up=self.up, joint_map=self.joint_map)
+        if is_skeleton(self.input):
+            layout = self.input.suffix.lower()[1:]
+            driving = Driving(up=self.up, joint_map=self.joint_map, clip=self.clip)
             params = driving.load(self.input, load_body(self.body), fps=self.fps)
             skeleton = driving.skeleton(self.input)
         else:
@@ -111,7 +114,7 @@ class ParamsInspect:
     """Options of the command."""
 
     input: tyro.conf.Positional[Path]
-    """Body parameters in any layout that `params convert` reads, a folder of numbered frames, or a .bvh."""
+    """Body parameters in any layout that `params convert` reads, a folder of numbered frames, or a skeleton's file."""
     body: OptionalPath = None
     """Body model file that shall move; by default the open body."""
     person: OptionalInt = None
@@ -119,7 +122,9 @@ class ParamsInspect:
     up: UpAxis | None = None
     """Axis that points up in the input, where it is not the one that is found."""
     joint_map: OptionalPath = None
-    """JSON of a .bvh's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
+    """JSON of a skeleton's joints with unusual names, {"LeftUpLeg": "left_hip", ...}."""
+    clip: OptionalText = None
+    """Name of the motion, for a .glb or .vrm with several (default: the first)."""
     json: bool = False
     """Print the facts as JSON."""
 
@@ -131,6 +136,7 @@ class ParamsInspect:
             joint_map=None if self.joint_map is None else read_joint_map(self.joint_map),
             person=self.person,
             up=self.up,
+            clip=self.clip,
         )
         report = {"input": str(self.input), **facts.as_dict()}
         if not self.json:

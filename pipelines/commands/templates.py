@@ -33,7 +33,7 @@ def load_run_template(run: Path) -> Template:
 
 
 def load_params_for(template: Template, path: Path, *, fps: float | None = None) -> BodyParams:
-    """Read a motion, in any layout or as .bvh, for the body of a template, at its own or a stated rate.
+    """Read a motion, in any layout or of a skeleton, for the body of a template, at its own or a stated rate.
 
     Raises:
         InputError: no file of parameters, or of another body.

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.stage import MANIFEST, StageRecord, read_manifest
-from smplxpp.capture.splits import Splits
+from smplxpp.capture.recording import Splits
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_list, as_object, as_text
 

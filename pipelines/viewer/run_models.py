@@ -30,8 +30,6 @@ from pipelines.runs.stage import STATE_RECORD
 from pipelines.stages.build_config import load_build, load_register
 from pipelines.stages.run_inputs import params_in_use
 from smplxpp.body import load_params
-from smplxpp.body.bvh_params import load_bvh
-from smplxpp.body.retarget import Skeleton
 from smplxpp.capture import Capture, open_capture
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core import DEFAULT_FPS, BodyParams, InputError
@@ -319,12 +317,9 @@ def motion_of_run(
         InputError: a file that is given and holds no motion of this body.
     """
     if given is not None:
-        if given.suffix.lower() == ".bvh":
-            params = load_bvh(given, Skeleton.of(template.body), fps=fps)
-        else:
-            # The template has the identity: betas must not move the root's joint a second time.
-            body = replace(template.body, shapedirs=np.zeros_like(template.body.shapedirs))
-            params = load_params(given, body=body).without_shape().with_rate(fps, source=str(given))
+        # The template has the identity: betas must not move the root's joint a second time.
+        body = replace(template.body, shapedirs=np.zeros_like(template.body.shapedirs))
+        params = load_params(given, body=body).without_shape().with_rate(fps, source=str(given))
         return ShownMotion(params, tuple(range(len(params))), params.fps or DEFAULT_FPS, given.name)
     if capture is not None:
         found = {frame: own for frame in capture.frames if (own := capture.params(frame)) is not None}

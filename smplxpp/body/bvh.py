@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from smplxpp.body.skeleton_motion import SkeletonMotion
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import read_text
 
@@ -20,41 +19,7 @@ _EXPECTED = "a BVH file: HIERARCHY, then MOTION"
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 
 
-@dataclass(frozen=True, eq=False)
-class BvhMotion:
-    """A skeleton and its motion, in the file's own units and axes.
-
-    Attributes:
-        names: of the J joints, every parent before its children; end sites are left out.
-        parents: index of each joint's parent, -1 for the root.
-        offsets: of each joint from its parent at rest; that of the root from the origin.
-        rotations: of each joint relative to its parent.
-        root: position of the root.
-        fps: frames a second.
-        positions: position relative to its parent of every other joint that has position channels, which replace its
-            offset, by the joint's index.
-        tips: offset of the end site of every joint that has one, by the joint's index.
-    """
-
-    names: tuple[str, ...]
-    parents: Int64[np.ndarray, " J"]
-    offsets: Float64[np.ndarray, "J 3"]
-    rotations: Float64[np.ndarray, "T J 3 3"]
-    root: Float64[np.ndarray, "T 3"]
-    fps: float
-    positions: Mapping[int, Float64[np.ndarray, "T 3"]] = field(default_factory=dict)
-    tips: Mapping[int, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
-
-    @property
-    def rest(self) -> Float64[np.ndarray, "J 3"]:
-        """The positions of the joints at rest, with the root at its offset."""
-        places = np.zeros_like(self.offsets)
-        for joint, parent in enumerate(self.parents):
-            places[joint] = self.offsets[joint] + (places[parent] if parent >= 0 else 0.0)
-        return places
-
-
-def read_bvh(path: str | Path) -> BvhMotion:
+def read_bvh(path: str | Path) -> SkeletonMotion:
     """Read a BVH file.
 
     Some programs write positions for every joint (Blender's unconnected bones; hips below a root that stands still).
@@ -82,7 +47,7 @@ class _Reader:
         if self._words[:2] != ["HIERARCHY", "ROOT"] or not found:
             raise InputError(subject, expected=_EXPECTED, received=text[:40].strip() or "nothing")
 
-    def read(self) -> BvhMotion:
+    def read(self) -> SkeletonMotion:
         """Parse the skeleton and convert the channels of all frames to rotations and root positions."""
         self._at = 1
         self._skeleton()
@@ -107,7 +72,7 @@ class _Reader:
                     positions[joint] = place
         parents, offsets = np.array(self._parents, dtype=np.int64), np.array(self._offsets, dtype=np.float64)
         _add_offsets(positions, offsets)
-        return BvhMotion(tuple(self._names), parents, offsets, rotations, root, fps, positions, self._tips)
+        return SkeletonMotion(tuple(self._names), parents, offsets, rotations, root, fps, positions, self._tips)
 
     def _skeleton(self) -> None:
         """Parse the hierarchy; `open_joints` is the stack of braces, None for end sites."""
@@ -177,7 +142,7 @@ class _Reader:
             raise self._wrong("Frames: and Frame Time:", " ".join(header)[:40] or "none")
         try:
             # The frame time stands before the motion's numbers, so that it is the first of them.
-            values = np.array(rest.split(), dtype=np.float64)
+            values = np.array(_ascii_numbers(rest).split(), dtype=np.float64)
         except ValueError:
             raise self._wrong("numbers after Frame Time:", "others") from None
         count = int(header[1]) if len(header[1]) < 9 else _MOST_FRAMES + 1
@@ -195,7 +160,7 @@ class _Reader:
 
     def _number(self, word: str) -> float:
         try:
-            value = float(word)
+            value = float(_ascii_numbers(word))
         except ValueError:
             raise self._wrong("a number", word[:40]) from None
         if not abs(value) <= _FARTHEST:
@@ -204,6 +169,17 @@ class _Reader:
 
     def _wrong(self, expected: str, received: str) -> InputError:
         return InputError(self._subject, expected=expected, received=received)
+
+
+def _ascii_numbers(text: str) -> str:
+    """Return a text whose numbers are written in ASCII's digits alone.
+
+    Raises:
+        ValueError: what Python takes for numbers beside: `1_0`, digits of other alphabets.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError("other digits")
+    return text
 
 
 def _add_offsets(positions: dict[int, Float64[np.ndarray, "T 3"]], offsets: Float64[np.ndarray, "J 3"]) -> None:

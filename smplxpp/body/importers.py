@@ -18,6 +18,7 @@ from smplxpp.body.model import BodyModel
 from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, with_valid_frames
 from smplxpp.body.param_records import NotedReads, warn_of_unread, without_gaps
 from smplxpp.body.retarget import Skeleton
+from smplxpp.body.skeleton_params import SKELETON_SUFFIXES, load_skeleton
 from smplxpp.body.smpl_joints import is_open_body
 from smplxpp.body.smpl_params import FAMILY_NAMES, from_smpl, rests_like_smpl, smpl_skeleton
 from smplxpp.core import (
@@ -36,7 +37,7 @@ _SERIES = (".npz", ".json", ".pkl")
 _SUFFIXES = (*_SERIES, ".npy")
 # Files of torch are programs, which only torch reads.
 _TORCH = (".pt", ".pth")
-_SCENES = (".glb", ".gltf", ".vrm", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".blend")
+_SCENES = (".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".blend")
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 # Axis-angle of the rotation about x or z that takes an axis to +y; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
 _Y_UP_FROM: dict[str, tuple[float, float, float]] = {
@@ -67,7 +68,8 @@ def load_params(
 
     Layouts, told apart by their keys: `smplx` (SMPL-X names in npz or pickle: our own files, 4D-Dress), `smpl` (`pose`,
     `shape`), `amass` (SMPL+H and SMPL-X), `easymocap`, `avatarrex` (and THuman4), `talkbody4d`. A folder is read as one
-    frame (or more) a file: all files whose names differ in their numbers alone, in their order; others are ignored.
+    frame (or more) a file: all files whose names differ in their numbers alone, in their order; others are ignored. The
+    motion of a skeleton (BVH, glTF, VRM) is brought to the body (`smplxpp.body.skeleton_params.load_skeleton`).
 
     Parameters of SMPL, SMPL-H and SMPL-X, where counts and keys tell them (docs/inputs.md), are exact for a model of
     that family. For the open body their joint rotations are converted, the pelvis keeps its position, and the shape
@@ -103,6 +105,8 @@ def load_params(
         >>> len(params)
         16
     """
+    if is_skeleton(path):
+        return load_skeleton(path, Skeleton.of(load_body() if body is None else body), up=up)
     parts, name = _read_parts(Path(path), layout, person, filled=None)
     params = _joined(_cut(parts, max_betas), body, up or _OWN_UP.get(name), whose, str(path))
     return params if flat_hand_mean is None else replace(params, flat_hand_mean=flat_hand_mean)
@@ -127,12 +131,19 @@ def load_motion(
         InputError: as `load_params`.
     """
     filled: list[int] = []
+    if is_skeleton(path):
+        return load_skeleton(path, Skeleton.of(body), up=up), None, filled
     parts, name = _read_parts(Path(path), "auto", None, filled=filled)
     family = _family_of(parts, whose)
     # A body with SMPL's joints takes the family's rotations as they are.
     if family is not None and not is_open_body(body) and rests_like_smpl(Skeleton.of(body)):
         family = None
     return _upright(parts, body, up or _OWN_UP.get(name), family, str(path)), family, filled
+
+
+def is_skeleton(path: str | Path) -> bool:
+    """Whether a file's ending says that its motion is one of a skeleton of its own, as that of a .bvh."""
+    return Path(path).suffix.lower() in SKELETON_SUFFIXES
 
 
 def family_of_params(path: str | Path, *, layout: LayoutName = "auto") -> Family | None:
@@ -381,13 +392,10 @@ def _content(path: Path) -> Any:
     if suffix != ".json":
         torch = "in Python: `found = torch.load(file, map_location='cpu')`, then `numpy.savez('params.npz', **{name: "
         torch += "value.numpy() for name, value in found.items()})`, of the dictionary inside that has `body_pose`"
-        scene = (
-            "motions inside of scenes are not read: open it in Blender, choose the skeleton, File > Export > Motion "
-        )
-        scene += "Capture (.bvh), and give that file"
+        scene = "open it in Blender, File > Export > glTF 2.0 (.glb), and give that file"
         raise InputError(
             f"file {path}",
-            expected=f"one of {', '.join(_SUFFIXES)} or a .bvh",
+            expected=f"one of {', '.join((*_SUFFIXES, *SKELETON_SUFFIXES))}",
             received=f"suffix {suffix!r}",
             remedy=torch if suffix in _TORCH else scene if suffix in _SCENES else "",
         )

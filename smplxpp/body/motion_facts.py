@@ -11,12 +11,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.body.bvh import read_bvh
-from smplxpp.body.bvh_params import bvh_params, matched_skeleton, named_joints, warn_of_stretching
-from smplxpp.body.importers import detect_layout, family_of_params, load_params, up_of_params
+from smplxpp.body.importers import detect_layout, family_of_params, is_skeleton, load_params, up_of_params
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
 from smplxpp.body.retarget import FEET, Skeleton
+from smplxpp.body.skeleton_params import (
+    matched_skeleton,
+    named_joints,
+    read_skeleton,
+    skeleton_params,
+    warn_of_stretching,
+)
 from smplxpp.core import DEFAULT_FPS, BodyParams, GeometryWarning, InputError, matrix_from_rotvec
 
 # Metres of the units that files are written in; CMU's library counts in 0.45 of an inch, by 25.4 mm / 0.45.
@@ -34,13 +39,13 @@ class MotionFacts:
     """What a file of motion holds.
 
     Attributes:
-        kind: "bvh" or the layout of the parameters.
+        kind: ending of a skeleton's file, as "bvh", or the layout of the parameters.
         family: of the body that the parameters are of; None: the open body's, or not told.
         frames: number of frames.
         fps: frames a second that the file states; None: none.
         unit: of places, with the length of a leg of a skeleton.
         up: axis that points up in the file, as "y".
-        skeleton: for a .bvh, the file's joints for each of ours, and what is missing; else empty.
+        skeleton: for a skeleton's motion, the file's joints for each of ours, and what is missing; else empty.
         left_out: what the file has and is not read.
         ranges: extents of the travel and heights in metres, speeds in metres a second, turns in degrees.
         mistakes: sentences on what is likely wrong, with remedies.
@@ -74,15 +79,17 @@ def inspect_motion(
     joint_map: Mapping[str, str] | None = None,
     person: int | None = None,
     up: Any = None,
+    clip: str | None = None,
 ) -> MotionFacts:
     """Read a motion and say what was understood of it, what is left out, and what looks wrong.
 
     Args:
-        path: body parameters in any layout, or a .bvh.
+        path: body parameters in any layout, or the motion of a skeleton.
         body: that shall move; None: the open body.
-        joint_map: our name for each of the names of a .bvh.
+        joint_map: our name for each of the names of a skeleton.
         person: id of the person, for files with several.
         up: axis that points up, where the file is wrong.
+        clip: name of the motion, in a skeleton's file with several.
 
     Raises:
         InputError: a file that cannot be read.
@@ -95,8 +102,8 @@ def inspect_motion(
     path, body = Path(path), load_body() if body is None else body
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", GeometryWarning)
-        if path.suffix.lower() == ".bvh":
-            facts, params = _of_bvh(path, Skeleton.of(body), joint_map, up)
+        if is_skeleton(path):
+            facts, params = _of_skeleton(path, Skeleton.of(body), joint_map, up, clip)
         else:
             family = family_of_params(path)
             params = load_params(path, body=body, person=person, up=up)
@@ -113,24 +120,22 @@ def inspect_motion(
     )
 
 
-def _of_bvh(
-    path: Path, body: Skeleton, joint_map: Mapping[str, str] | None, up: str | None
+def _of_skeleton(
+    path: Path, body: Skeleton, joint_map: Mapping[str, str] | None, up: str | None, clip: str | None
 ) -> tuple[MotionFacts, BodyParams | None]:
-    """Return the facts of a BVH file and its motion for the body; None for a skeleton in which no person is found."""
-    motion = read_bvh(path)
+    """Return the facts of a skeleton and its motion for the body; None for a skeleton in which no person is found."""
+    motion, kind = read_skeleton(path, clip=clip), path.suffix.lower()[1:]
     try:
         joints = named_joints(motion, joint_map, subject=f"motion {path}")
     except InputError as error:
         skeleton = {"names": list(motion.names)}
-        facts = MotionFacts("bvh", None, len(motion.root), motion.fps, "unknown", "unknown", skeleton)
+        facts = MotionFacts(kind, None, len(motion.root), motion.fps, "unknown", "unknown", skeleton)
         return replace(facts, mistakes=(str(error),)), None
     found = matched_skeleton(motion, joints, up=up)
     left_out = tuple(f"joint {name}, which turns" for name in found.left_out)
     warn_of_stretching(motion, joints, str(path))
-    facts = MotionFacts(
-        "bvh", None, len(motion.root), motion.fps, _unit(found.leg), found.up, found.as_dict(), left_out
-    )
-    return facts, bvh_params(motion, joints, body, up=up)
+    facts = MotionFacts(kind, None, len(motion.root), motion.fps, _unit(found.leg), found.up, found.as_dict(), left_out)
+    return facts, skeleton_params(motion, joints, body, up=up)
 
 
 def _unit(leg: float) -> str:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.body.bvh import BvhMotion
 from smplxpp.body.joint_words import FINGERS
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.retarget import Skeleton
 from smplxpp.body.skeleton_match import SIDES, Tree, spine_of
+from smplxpp.body.skeleton_motion import SkeletonMotion
 from smplxpp.core import matrix_from_rotvec, rotvec_from_matrix
 
 FINGER_JOINTS = SMPLX_JOINTS[25:]
@@ -47,15 +47,15 @@ class Reference:
     frame: int | None
 
 
-def reference_pose(motion: BvhMotion, joints: Mapping[str, int]) -> Reference:
+def reference_pose(motion: SkeletonMotion, joints: Mapping[str, int]) -> Reference:
     """Return the motion relative to its rest pose or, where that is no standing person, to the frame that stands best.
 
     Some programs write bones along their own axes at rest, or all at one place, and put what makes a person of them
-    into the turns.
+    into the turns; others write some moment of a motion.
     """
     world = _in_world(motion)
     places, rest = _places(motion, world), motion.rest
-    if _stance(rest[None], joints)[0] > _STANDS:
+    if motion.neutral and _stance(rest[None], joints)[0] > _STANDS:
         tips = {joint: rest[joint] + tip for joint, tip in motion.tips.items()}
         return Reference(rest, tips, world, places, None)
     tried = np.unique(np.linspace(0, len(places) - 1, min(len(places), _TRIED)).round().astype(int))
@@ -90,7 +90,7 @@ def trunk_rotations(
     """Return for each joint the rotation from our rest pose to the file's of the part of the body that it is in."""
     if pose.frame is None:
         return dict.fromkeys(OURS, _trunk(pose.rest, joints, body))
-    return _bent_trunk(pose.rest, joints, body)
+    return _bent_trunk(pose, joints, body)
 
 
 def up_axis(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int]) -> str:
@@ -172,7 +172,7 @@ def turned_rig(
 
     Args:
         tree: the file's skeleton, in the pose that the turns start from; any unit.
-        joints: index of its joint for each of ours (`smplxpp.body.bvh_params.named_joints`).
+        joints: index of its joint for each of ours (`smplxpp.body.skeleton_params.named_joints`).
         body: our skeleton at rest.
         whole: turns of our joints in the world.
 
@@ -231,7 +231,7 @@ def _between(a: Float64[np.ndarray, " 3"], b: Float64[np.ndarray, " 3"]) -> Floa
     return turned_to(a[None], b[None])[0]
 
 
-def _in_world(motion: BvhMotion) -> Float64[np.ndarray, "T J 3 3"]:
+def _in_world(motion: SkeletonMotion) -> Float64[np.ndarray, "T J 3 3"]:
     """Return the rotations of all joints in world coordinates."""
     out = motion.rotations.copy()
     for joint, parent in enumerate(motion.parents):
@@ -240,7 +240,7 @@ def _in_world(motion: BvhMotion) -> Float64[np.ndarray, "T J 3 3"]:
     return out
 
 
-def _places(motion: BvhMotion, world: Float64[np.ndarray, "T J 3 3"]) -> Float64[np.ndarray, "T J 3"]:
+def _places(motion: SkeletonMotion, world: Float64[np.ndarray, "T J 3 3"]) -> Float64[np.ndarray, "T J 3"]:
     """Return the positions of all joints by forward kinematics, with the positions that the file states."""
     out = np.empty((len(motion.root), len(motion.names), 3))
     for joint, parent in enumerate(motion.parents):
@@ -283,14 +283,15 @@ def _trunk(rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int], body: Sk
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
-def _bent_trunk(
-    rest: Float64[np.ndarray, "J 3"], joints: Mapping[str, int], body: Skeleton
-) -> dict[str, Float64[np.ndarray, "3 3"]]:
+def _bent_trunk(pose: Reference, joints: Mapping[str, int], body: Skeleton) -> dict[str, Float64[np.ndarray, "3 3"]]:
     """Return the rotation from our rest pose for each joint of a frame in which the trunk may be twisted.
 
     Hips and shoulders tell those of both ends of the trunk; its joints between take their shares of the twist. Feet
-    turn to where the file's point.
+    turn to where the file's point, and dip as much from where they dip with the whole sole on the floor, because ankles
+    lie at other heights over it: this is when the ankle is lowest.
     """
+    rest, frame = pose.rest, pose.frame
+    assert frame is not None, "a frame"
 
     def axes(at: Callable[[str], Float64[np.ndarray, " 3"]], part: str) -> Float64[np.ndarray, "3 3"]:
         """Return the directions to the left, up along the trunk, and to the front, as columns."""
@@ -311,10 +312,23 @@ def _bent_trunk(
     for name in OURS:
         leg = name.partition("_")[2] in ("hip", "knee", "ankle", "foot")
         out[name] = low @ matrix_from_rotvec((0.0 if leg else shares.get(name, 1.0)) * twist)
+    up = upright_rotation(up_axis(rest, joints))[1]
     for side in SIDES:
         if f"{side}_foot" in joints:
             begin, end = body.places[body.at(f"{side}_ankle", f"{side}_foot")]
-            toes = rest[joints[f"{side}_foot"]] - rest[joints[f"{side}_ankle"]]
-            foot = _between(low @ (end - begin), toes) @ low
+            ankle, toes = (pose.places[:, joints[f"{side}_{name}"]] for name in ("ankle", "foot"))
+            dip = _elevation(toes - ankle, up)
+            flat = dip[int(np.argmin(ankle @ up))]
+            ours = low @ (end - begin)
+            level = toes[frame] - ankle[frame]
+            level = level - up * float(up @ level)
+            level = level / max(float(np.linalg.norm(level)), 1e-12)
+            aim = float(_elevation(ours[None], up)[0] + dip[frame] - flat)
+            foot = _between(ours, np.cos(aim) * level + np.sin(aim) * up) @ low
             out |= {f"{side}_ankle": foot, f"{side}_foot": foot}
     return out
+
+
+def _elevation(bones: Float64[np.ndarray, "T 3"], up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " T"]:
+    """Return how far bones point up, in radians."""
+    return np.arcsin(np.clip((bones @ up) / np.maximum(np.linalg.norm(bones, axis=1), 1e-12), -1.0, 1.0))

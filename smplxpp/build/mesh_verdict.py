@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from smplxpp.body import load_body
-from smplxpp.body.bvh import BvhMotion
-from smplxpp.body.bvh_params import named_joints
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.body.rest_pose import turned_rig
 from smplxpp.body.retarget import Skeleton
 from smplxpp.body.skeleton_match import Tree
+from smplxpp.body.skeleton_motion import SkeletonMotion
+from smplxpp.body.skeleton_params import named_joints
 from smplxpp.core import (
     BodyParams,
     Check,
@@ -360,7 +360,7 @@ def stress_posed_rig(rig: FileRig) -> Float64[np.ndarray, "T V 3"]:
     has = rig.parents >= 0
     offsets = places - np.where(has[:, None], places[rig.parents], 0.0)
     still = np.tile(np.eye(3), (1, len(rig.names), 1, 1))
-    joints = named_joints(BvhMotion(rig.names, rig.parents, offsets, still, places[:1], 1.0), subject="rig")
+    joints = named_joints(SkeletonMotion(rig.names, rig.parents, offsets, still, places[:1], 1.0), subject="rig")
     # Turns of our joints in the world, then what they move the file's joints by.
     local = matrix_from_rotvec(stress_poses(BodyParams.rest()).full_pose)
     count = len(body.names)

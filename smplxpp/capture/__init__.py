@@ -4,10 +4,9 @@ from smplxpp.capture.cameras import read_cameras
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.masks import MattingConfig, MattingModel, write_mattes
 from smplxpp.capture.problems import find_problems
-from smplxpp.capture.recording import Problem
+from smplxpp.capture.recording import Problem, Splits
 from smplxpp.capture.reference import ReferenceFrame, find_reference, find_scans, scans_in
 from smplxpp.capture.registry import FORMATS, detect_format, open_capture
-from smplxpp.capture.splits import Splits
 
 __all__ = [
     "FORMATS",

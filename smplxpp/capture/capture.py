@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.keypoints import shown_keypoints
-from smplxpp.capture.recording import KINDS, Problem, Recording
-from smplxpp.capture.splits import Splits
+from smplxpp.capture.recording import KINDS, Problem, Recording, Splits
 from smplxpp.capture.views import ViewReader
 from smplxpp.capture.window import Window
 from smplxpp.core import BodyParams, Camera, Keypoints2D, TriangleMesh, require_choice

@@ -30,8 +30,7 @@ from smplxpp.capture.readers import (
     thuman4,
 )
 from smplxpp.capture.readers.common import ReaderOptions, RigOptions
-from smplxpp.capture.recording import Recording
-from smplxpp.capture.splits import Splits
+from smplxpp.capture.recording import Recording, Splits
 from smplxpp.capture.subject import SubjectKeypoints
 from smplxpp.capture.views import read_alpha
 from smplxpp.capture.window import Window

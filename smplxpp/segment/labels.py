@@ -11,7 +11,7 @@ from jaxtyping import Int64, Num
 from smplxpp.core import LABELS, InputError
 from smplxpp.core.errors import did_you_mean
 from smplxpp.core.files.json_file import as_object, read_json
-from smplxpp.core.files.yaml_file import read_yaml
+from smplxpp.core.files.markup_file import read_yaml
 from smplxpp.segment.label_sets import LABEL_SETS, LabelSet, label_set_of
 
 

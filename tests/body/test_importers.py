@@ -346,8 +346,8 @@ def test_unknown_and_ambiguous_layouts_say_what_was_seen(tmp_path, params):
 def test_unreadable_inputs_are_named(tmp_path, params):
     with pytest.raises(InputError, match=r"none\.json"):
         load_params(tmp_path / "none.json")
-    with pytest.raises(InputError, match=r"suffix '\.bvh'"):
-        load_params(tmp_path / "walk.bvh")
+    with pytest.raises(InputError, match=r"suffix '\.c3d'"):
+        load_params(tmp_path / "walk.c3d")
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(InputError, match=r"x\.json: expected JSON"):
         load_params(tmp_path / "x.json")

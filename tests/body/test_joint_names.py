@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.bvh_params import load_bvh
 from smplxpp.body.layout import NAME_SCHEMES, PROGRAMS, SMPLX_JOINTS, names_of_joints
 from smplxpp.body.retarget import Skeleton
+from smplxpp.body.skeleton_params import load_skeleton
 from smplxpp.core import InputError
 from smplxpp.export.gltf_skin import with_joint_names
 from smplxpp.export.motion_files import write_bvh
@@ -107,7 +107,7 @@ def test_a_motion_with_their_names_plays(tmp_path, scheme):
     motion = replace(random_motion(3, expressions=0, fps=30.0), flat_hand_mean=True, **still)
     names = names_of_joints(body.joint_names, scheme)
     write_bvh(tmp_path / "a.bvh", replace(body, joint_names=names), motion)
-    played = load_bvh(tmp_path / "a.bvh", Skeleton.of(body))
+    played = load_skeleton(tmp_path / "a.bvh", Skeleton.of(body))
     # A reader puts the person on the floor of its own: joints are compared about the pelvis.
     found, expected = (body.forward(params).joints for params in (played, motion))
     found, expected = (joints - joints[:, :1] for joints in (found, expected))

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.commands.params import ParamsConvert
 from smplxpp.body import load_body, load_params
-from smplxpp.body.bvh_params import load_bvh
+from smplxpp.body.skeleton_params import load_skeleton
 from smplxpp.core import BodyParams, GeometryWarning, InputError, matrix_from_rotvec
 from smplxpp.export.motion_files import write_bvh
 from tests.body.walks import FPS, shaped, walk
@@ -45,7 +45,7 @@ def test_smpl_names_are_joints_and_not_their_neighbours(tmp_path, text):
         text = text.replace(f" {ours}\n", f" {theirs}\n")
     (tmp_path / "smpl.bvh").write_text(text)
     assert "L_Ankle" in text and "left_ankle" not in text
-    params = load_bvh(tmp_path / "smpl.bvh", shaped(None))
+    params = load_skeleton(tmp_path / "smpl.bvh", shaped(None))
     np.testing.assert_allclose(joints(params), joints(walk(None)), atol=1e-5)
 
 
@@ -54,7 +54,7 @@ def test_words_of_the_format_in_other_letters_and_as_names(tmp_path, text):
     changed = text.replace("Yposition", "YPosition").replace(" jaw\n", " MOTION_jaw\n")
     (tmp_path / "a.bvh").write_text(changed)
     assert changed != text
-    np.testing.assert_allclose(joints(load_bvh(tmp_path / "a.bvh", shaped(None))), joints(walk(None)), atol=1e-5)
+    np.testing.assert_allclose(joints(load_skeleton(tmp_path / "a.bvh", shaped(None))), joints(walk(None)), atol=1e-5)
 
 
 def test_spines_of_five_joints_keep_the_turn_of_the_last(tmp_path, text):
@@ -67,7 +67,9 @@ def test_spines_of_five_joints_keep_the_turn_of_the_last(tmp_path, text):
     for ours, theirs in SMPL_NAMES.items():
         lines = [line if line.split()[-1:] != [ours] else line.replace(ours, theirs) for line in lines]
     (tmp_path / "five.bvh").write_text("\n".join(lines) + "\n")
-    np.testing.assert_allclose(joints(load_bvh(tmp_path / "five.bvh", shaped(None))), joints(walk(None)), atol=1e-5)
+    np.testing.assert_allclose(
+        joints(load_skeleton(tmp_path / "five.bvh", shaped(None))), joints(walk(None)), atol=1e-5
+    )
 
 
 def below_a_root(text: str, *, positions: str) -> str:
@@ -97,7 +99,7 @@ def test_hips_below_a_root_that_stands_keep_their_way(tmp_path, text, positions)
     With zeros as the positions of all others, which are displacements then, the skeleton stays whole, too.
     """
     (tmp_path / "root.bvh").write_text(below_a_root(text, positions=positions))
-    params = load_bvh(tmp_path / "root.bvh", shaped(None))
+    params = load_skeleton(tmp_path / "root.bvh", shaped(None))
     assert np.ptp(params.transl[:, 2]) > 0.5
     np.testing.assert_allclose(joints(params), joints(walk(None)), atol=1e-5)
 
@@ -115,7 +117,7 @@ def test_bones_that_stretch_are_told(tmp_path, text):
         rows[k] = " ".join(map(str, np.insert(values, 3 * bone + 3, stretched)))
     (tmp_path / "stretch.bvh").write_text(head + "MOTION\n" + "\n".join(rows) + "\n")
     with pytest.warns(GeometryWarning, match=r"1 bones move.*left_knee most, by up to 30 %"):
-        load_bvh(tmp_path / "stretch.bvh", shaped(None))
+        load_skeleton(tmp_path / "stretch.bvh", shaped(None))
 
 
 # --- parameters ------------------------------------------------------------------------------------------------------
@@ -188,9 +190,9 @@ def test_what_is_no_rotation_is_named(tmp_path, change, words):
 def test_a_dictionary_in_an_npy_is_read(tmp_path):
     np.save(tmp_path / "d.npy", walk(None).as_dict(), allow_pickle=True)
     np.testing.assert_array_equal(load_params(tmp_path / "d.npy").body_pose, walk(None).body_pose)
-    (tmp_path / "walk.glb").write_bytes(b"glTF")
-    with pytest.raises(InputError, match=r"Motions inside of scenes.*Export > Motion Capture \(\.bvh\)"):
-        load_params(tmp_path / "walk.glb")
+    (tmp_path / "walk.usdc").write_bytes(b"PXR-USDC")
+    with pytest.raises(InputError, match=r"Open it in Blender, File > Export > glTF 2.0"):
+        load_params(tmp_path / "walk.usdc")
     (tmp_path / "results.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match=r"\.pt.*numpy\.savez"):
         load_params(tmp_path / "results.pt")

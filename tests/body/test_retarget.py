@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.bvh import BvhMotion, read_bvh
-from smplxpp.body.bvh_params import bvh_params, load_bvh, named_joints, read_joint_map
+from smplxpp.body.bvh import read_bvh
 from smplxpp.body.retarget import Skeleton, retarget
+from smplxpp.body.skeleton_motion import SkeletonMotion
+from smplxpp.body.skeleton_params import load_skeleton, named_joints, read_joint_map, skeleton_params
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from smplxpp.export.motion_files import write_bvh
 from tests.body.walks import FPS, betas, rotation_z, shaped, slide, walk
@@ -112,7 +113,7 @@ def same_motion(params: BodyParams, truth: BodyParams, *, degrees: float = 0.01)
 
 
 def test_our_own_file_comes_back(file):
-    params = load_bvh(file, shaped(None))
+    params = load_skeleton(file, shaped(None))
     same_motion(params, walk(None))
     assert params.fps == pytest.approx(FPS, rel=1e-5)
     np.testing.assert_allclose(np.diff(params.transl, axis=0), np.diff(walk(None).transl, axis=0), atol=1e-5)
@@ -142,12 +143,12 @@ def complete_hands(params: BodyParams) -> np.ndarray:
 def test_fingers_come_back_by_anyones_names(tmp_path, change):
     write_bvh(tmp_path / "a.bvh", load_body(), waving())
     motion = change(read_bvh(tmp_path / "a.bvh"))
-    params = bvh_params(motion, named_joints(motion), shaped(None))
+    params = skeleton_params(motion, named_joints(motion), shaped(None))
     np.testing.assert_allclose(complete_hands(params), complete_hands(waving()), atol=2e-4)
     same_motion(params, walk(None))
 
 
-def fingers_named(motion: BvhMotion, way: str) -> BvhMotion:
+def fingers_named(motion: SkeletonMotion, way: str) -> SkeletonMotion:
     def other(name: str) -> str:
         side, _, part = name.rpartition("_")
         if part[:-1] not in ("index", "middle", "pinky", "ring", "thumb"):
@@ -171,7 +172,7 @@ def test_fingers_that_are_bent_at_rest_point_where_the_files_do(tmp_path):
         if parent in bent:
             offsets[k] = turn.T @ offsets[k]
     other = replace(motion, offsets=offsets, rotations=rotations)
-    params = bvh_params(other, named_joints(other), shaped(None))
+    params = skeleton_params(other, named_joints(other), shaped(None))
     body, truth, found = load_body(), waving(), replace(params, transl=waving().transl)
     joints = [body.joint_names.index(f"left_index{bone}") for bone in (1, 2, 3)]
     where = [body.forward(replace(one, betas=np.zeros((len(one), 10)))).joints[:, joints] for one in (truth, found)]
@@ -182,13 +183,13 @@ def test_hands_of_a_file_without_fingers_stay_as_they_are(file):
     motion = read_bvh(file)
     names = named_joints(motion)
     bare = {name: joint for name, joint in names.items() if name in shaped(None).names[:22]}
-    params = bvh_params(motion, bare, shaped(None))
+    params = skeleton_params(motion, bare, shaped(None))
     assert not params.flat_hand_mean and not params.left_hand_pose.any()
 
 
 def test_a_walk_of_another_skeleton_does_not_slide(file):
     target = shaped(2)
-    assert slide(target, load_bvh(file, target)) < 1.5
+    assert slide(target, load_skeleton(file, target)) < 1.5
 
 
 MIXAMO = dict(
@@ -215,11 +216,11 @@ MIXAMO = dict(
 )
 
 
-def renamed(motion: BvhMotion, prefix: str = "mixamorig:") -> BvhMotion:
+def renamed(motion: SkeletonMotion, prefix: str = "mixamorig:") -> SkeletonMotion:
     return replace(motion, names=tuple(prefix + MIXAMO.get(name, name) for name in motion.names))
 
 
-def arms_down(motion: BvhMotion) -> BvhMotion:
+def arms_down(motion: SkeletonMotion) -> SkeletonMotion:
     """The same motion of a skeleton whose arms hang at rest: `G' = G A` with A the turn from hanging to level."""
     names, parents = list(motion.names), motion.parents
     world = np.empty_like(motion.rotations)
@@ -248,7 +249,7 @@ def _below(names: list[str], parents: np.ndarray, joint: int, above: str) -> boo
     return False
 
 
-def z_up(motion: BvhMotion) -> BvhMotion:
+def z_up(motion: SkeletonMotion) -> SkeletonMotion:
     """The same in a world whose third axis points up."""
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     rotations = np.einsum("ab,tjbc,dc->tjad", turn, motion.rotations, turn)
@@ -258,7 +259,7 @@ def z_up(motion: BvhMotion) -> BvhMotion:
 @pytest.mark.parametrize("change", [renamed, arms_down, z_up, lambda m: renamed(arms_down(z_up(m)))])
 def test_other_names_rests_and_axes(file, change):
     motion, body = change(read_bvh(file)), shaped(None)
-    params = bvh_params(motion, named_joints(motion), body)
+    params = skeleton_params(motion, named_joints(motion), body)
     if change is z_up or change is renamed:
         same_motion(params, walk(None))
     else:  # an arm's twist about itself is not told by the direction of its bones
@@ -284,7 +285,7 @@ def test_unknown_joints_are_named_and_a_map_helps(file, tmp_path):
     table = {f"bone{k}": name for k, name in enumerate(motion.names) if name in shaped(None).names[:22]}
     (tmp_path / "map.json").write_text(json.dumps(table))
     found = named_joints(strange, read_joint_map(tmp_path / "map.json"))
-    same_motion(bvh_params(strange, found, shaped(None)), walk(None))
+    same_motion(skeleton_params(strange, found, shaped(None)), walk(None))
     (tmp_path / "map.json").write_text(json.dumps({"bone0": "tail"}))
     with pytest.raises(InputError, match="tail"):
         read_joint_map(tmp_path / "map.json")

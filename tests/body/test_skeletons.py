@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.bvh import BvhMotion, read_bvh
-from smplxpp.body.bvh_params import bvh_params, load_bvh, matched_skeleton, named_joints
+from smplxpp.body.bvh import read_bvh
+from smplxpp.body.skeleton_motion import SkeletonMotion
+from smplxpp.body.skeleton_params import load_skeleton, matched_skeleton, named_joints, skeleton_params
 from smplxpp.core import BodyParams, GeometryWarning, matrix_from_rotvec
 from smplxpp.core.rotations import rotvec_from_matrix
 from smplxpp.export.motion_files import write_bvh
@@ -54,7 +55,7 @@ def lively(frames: int = 9) -> BodyParams:
 
 
 @pytest.fixture(scope="module")
-def motion(tmp_path_factory) -> BvhMotion:
+def motion(tmp_path_factory) -> SkeletonMotion:
     """The lively walk as our exporter writes it, without fingers and face."""
     path = tmp_path_factory.mktemp("bvh") / "lively.bvh"
     write_bvh(path, load_body(), lively())
@@ -70,7 +71,7 @@ def motion(tmp_path_factory) -> BvhMotion:
     )
 
 
-def called(motion: BvhMotion, program: str) -> BvhMotion:
+def called(motion: SkeletonMotion, program: str) -> SkeletonMotion:
     """The motion with the joints' names of another program."""
     table = dict(zip(JOINTS, PROGRAMS[program].split(), strict=True))
 
@@ -81,7 +82,9 @@ def called(motion: BvhMotion, program: str) -> BvhMotion:
     return replace(motion, names=tuple(map(name, motion.names)))
 
 
-def inserted(motion: BvhMotion, name: str, below: str, share: float, turns: np.ndarray | None = None) -> BvhMotion:
+def inserted(
+    motion: SkeletonMotion, name: str, below: str, share: float, turns: np.ndarray | None = None
+) -> SkeletonMotion:
     """The motion with one more joint between `below` and its parent, at a share of the bone, with turns of its own.
 
     What hangs on it keeps its places and its turns in the world only if `turns` is None.
@@ -101,7 +104,7 @@ def inserted(motion: BvhMotion, name: str, below: str, share: float, turns: np.n
     )
 
 
-def rebased(motion: BvhMotion, turns: np.ndarray) -> BvhMotion:
+def rebased(motion: SkeletonMotion, turns: np.ndarray) -> SkeletonMotion:
     """The same places and motion by a skeleton whose bones' axes are others: `G' = G A`, for each joint."""
     world = np.empty_like(motion.rotations)
     offsets, rotations = motion.offsets.copy(), motion.rotations.copy()
@@ -122,7 +125,7 @@ def relative(params: BodyParams) -> np.ndarray:
     return found - found[:, :1]
 
 
-def limbs_of_file(motion: BvhMotion, names: dict[str, str]) -> np.ndarray:
+def limbs_of_file(motion: SkeletonMotion, names: dict[str, str]) -> np.ndarray:
     """(T, 8, 3) unit directions of arms and legs by forward kinematics, frame by frame."""
     places, world = np.zeros((len(motion.root), len(motion.names), 3)), np.empty_like(motion.rotations)
     for k, parent in enumerate(motion.parents):
@@ -153,14 +156,14 @@ def test_joints_of_any_program_are_found(motion, program):
     found = named_joints(theirs)
     assert {ours: motion.names[k] for ours, k in found.items()} == {name: name for name in found}
     assert set(found) == {name for name in motion.names if not name.startswith("spine")}
-    params = bvh_params(theirs, found, shaped(None))
+    params = skeleton_params(theirs, found, shaped(None))
     np.testing.assert_allclose(relative(params), relative(lively()), atol=2e-5)
 
 
 def test_joints_without_names_are_found_by_their_hierarchy(motion):
     strange = replace(motion, names=tuple(f"bone.{k:03d}" for k in range(len(motion.names))))
     np.testing.assert_allclose(
-        relative(bvh_params(strange, named_joints(strange), shaped(None))), relative(lively()), atol=2e-5
+        relative(skeleton_params(strange, named_joints(strange), shaped(None))), relative(lively()), atol=2e-5
     )
 
 
@@ -174,13 +177,13 @@ def test_spines_of_any_length_carry_all_turns(motion, count):
         for below, share in (("J_Bip_C_Chest", 0.4), ("J_Bip_C_UpperChest", 0.7), ("J_Bip_C_Neck", 0.5))[: count - 3]:
             theirs = inserted(theirs, next(names), below, share)
         np.testing.assert_allclose(
-            relative(bvh_params(theirs, named_joints(theirs), shaped(None))), relative(lively()), atol=2e-5
+            relative(skeleton_params(theirs, named_joints(theirs), shaped(None))), relative(lively()), atol=2e-5
         )
     else:
         # Fewer joints: their turns are composed into those that are left, so that what hangs on them keeps its place.
         for gone in ("J_Bip_C_Chest", "J_Bip_C_Spine")[: 3 - count]:
             theirs = without(theirs, gone)
-        found = bvh_params(theirs, named_joints(theirs), shaped(None))
+        found = skeleton_params(theirs, named_joints(theirs), shaped(None))
         truth = limbs_of_body(lively())
         assert degrees(limbs_of_body(found), truth) < 0.01
         stiff = directions_of_trunk(theirs), directions_of_trunk(found)
@@ -188,7 +191,7 @@ def test_spines_of_any_length_carry_all_turns(motion, count):
     assert len(matched_skeleton(theirs, named_joints(theirs)).taken["spine"]) == count
 
 
-def without(motion: BvhMotion, name: str) -> BvhMotion:
+def without(motion: SkeletonMotion, name: str) -> SkeletonMotion:
     """The motion without a joint, whose turns its children take over."""
     at = motion.names.index(name)
     parents, offsets, rotations = motion.parents.copy(), motion.offsets.copy(), motion.rotations.copy()
@@ -206,7 +209,7 @@ def without(motion: BvhMotion, name: str) -> BvhMotion:
     )
 
 
-def directions_of_trunk(of: BvhMotion | BodyParams) -> np.ndarray:
+def directions_of_trunk(of: SkeletonMotion | BodyParams) -> np.ndarray:
     """(T, 3) unit direction from the pelvis to the neck."""
     if isinstance(of, BodyParams):
         line = relative(of)[:, shaped(None).names.index("neck")]
@@ -230,7 +233,7 @@ def test_bones_between_that_bend_turn_the_limb(motion):
         theirs = inserted(theirs, name, below, 0.5, bend)
     found = named_joints(theirs)
     truth = limbs_of_file(theirs, {ours: theirs.names[k] for ours, k in found.items()})
-    assert degrees(limbs_of_body(bvh_params(theirs, found, shaped(None))), truth) < 0.01
+    assert degrees(limbs_of_body(skeleton_params(theirs, found, shaped(None))), truth) < 0.01
     taken = matched_skeleton(theirs, found).taken
     assert taken["left_hip"] == ("thigh_l", "thigh_part_l") and taken["neck"] == ("neck_01", "neck_02")
 
@@ -240,7 +243,7 @@ def test_rest_poses_that_are_no_person_are_understood(motion):
     turns = matrix_from_rotvec(np.random.default_rng(0).normal(0.0, 2.0, (len(motion.names), 3)))
     theirs = rebased(called(motion, "humanik"), turns)
     found = named_joints(theirs)
-    params = bvh_params(theirs, found, shaped(None))
+    params = skeleton_params(theirs, found, shaped(None))
     assert matched_skeleton(theirs, found).frame is not None
     assert degrees(limbs_of_body(params), limbs_of_body(lively())) < 0.01
     np.testing.assert_allclose(relative(params), relative(lively()), atol=0.03)
@@ -262,7 +265,7 @@ def test_joints_that_turn_and_are_no_persons_are_named(tmp_path):
         tmp_path / "a.bvh", load_body(), replace(pose, jaw_pose=np.linspace(0.0, 0.3, len(pose))[:, None] * [1, 0, 0])
     )
     with pytest.warns(GeometryWarning, match="left out: jaw$"):
-        load_bvh(tmp_path / "a.bvh", shaped(None))
+        load_skeleton(tmp_path / "a.bvh", shaped(None))
 
 
 def test_the_stated_axis_wins_and_a_lying_file_is_told(tmp_path):
@@ -271,8 +274,8 @@ def test_the_stated_axis_wins_and_a_lying_file_is_told(tmp_path):
         tmp_path / "a.bvh", load_body(), replace(walk(None), global_orient=np.tile([0.5 * np.pi, 0.0, 0.0], (46, 1)))
     )
     with pytest.warns(GeometryWarning, match="stands along y at rest, and along z in its frames"):
-        lying = load_bvh(tmp_path / "a.bvh", shaped(None))
-    standing = load_bvh(tmp_path / "a.bvh", shaped(None), up="z", fps=12.0)
+        lying = load_skeleton(tmp_path / "a.bvh", shaped(None))
+    standing = load_skeleton(tmp_path / "a.bvh", shaped(None), up="z", fps=12.0)
     up = (
         matrix_from_rotvec(lying.global_orient)[0] @ [0, 1, 0],
         matrix_from_rotvec(standing.global_orient)[0] @ [0, 1, 0],
@@ -283,7 +286,7 @@ def test_the_stated_axis_wins_and_a_lying_file_is_told(tmp_path):
 
 def test_rotations_compose_as_the_mean(motion):
     """The mean of two turns about one axis is half their sum."""
-    from smplxpp.body.bvh_params import _mean_turn
+    from smplxpp.body.skeleton_params import _mean_turn
 
     world = matrix_from_rotvec(np.array([[[0.0, 0.0, 0.2], [0.0, 0.0, 0.8]]]))
     np.testing.assert_allclose(rotvec_from_matrix(_mean_turn(world, [0, 1], [1.0, 1.0])), [[0.0, 0.0, 0.5]], atol=1e-12)

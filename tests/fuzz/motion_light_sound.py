@@ -9,13 +9,15 @@ import numpy as np
 
 from avatar.speech.curves import read_curves
 from smplxpp.body import load_body
-from smplxpp.body.bvh_params import load_bvh, read_joint_map
 from smplxpp.body.retarget import Skeleton
+from smplxpp.body.skeleton_motion import SkeletonMotion
+from smplxpp.body.skeleton_params import load_skeleton, read_joint_map
 from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.core.files.sound_file import Sound, read_sound, wave_bytes
 from smplxpp.core.light import Irradiance
 from smplxpp.core.params import BodyParams
 from smplxpp.export.motion_files import write_bvh
+from tests.body.test_gltf_motion import scene_of
 from tests.core.files.openexr import write_openexr
 from tests.core.files.radiance import write_radiance
 from tests.core.files.test_wave_file import coded, file_of
@@ -26,17 +28,32 @@ from tests.speech.test_curves import LIVE, live_link, waving
 def motion_doors() -> list[Door]:
     """A skeleton of another program with its motion, and names for its joints."""
     body = load_body()
+    skeleton = Skeleton.of(body)
     names = {"Hips": "pelvis", "LeftUpLeg": "left_hip"}
     return [
         Door(
             "motion bvh",
             lambda folder: write_bvh(folder / "m.bvh", body, BodyParams.rest(betas=0, expressions=0)),
-            lambda folder: load_bvh(folder / "m.bvh", Skeleton.of(body)),
+            lambda folder: load_skeleton(folder / "m.bvh", skeleton),
+        ),
+        Door(
+            "motion glb",
+            lambda f: scene_of(_still()).write(f / "m.glb"),
+            lambda f: load_skeleton(f / "m.glb", skeleton),
         ),
         Door(
             "joint map", lambda f: (f / "m.json").write_text(json.dumps(names)), lambda f: read_joint_map(f / "m.json")
         ),
     ]
+
+
+def _still() -> SkeletonMotion:
+    """The open body at rest, in three frames."""
+    skeleton = Skeleton.of(load_body())
+    parents = np.asarray(skeleton.parents)
+    offsets = skeleton.places - np.where(parents[:, None] >= 0, skeleton.places[parents], 0.0)
+    turns = np.tile(np.eye(3), (3, len(parents), 1, 1))
+    return SkeletonMotion(skeleton.names, parents, offsets, turns, np.zeros((3, 3)), 30.0)
 
 
 def light_doors() -> list[Door]:

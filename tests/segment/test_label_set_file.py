@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from smplxpp.core import BACKGROUND, LABELS, InputError, Labels
-from smplxpp.core.files.yaml_file import read_yaml
+from smplxpp.core.files.markup_file import read_yaml
 from smplxpp.segment import LabelSet, SegmentedScan, find_label_set, map_labels, segment_scan
 from tests.segment.views import sphere
 

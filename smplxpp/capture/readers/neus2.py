@@ -13,8 +13,7 @@ from smplxpp.capture.distortion import Distortion
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params, required
 from smplxpp.capture.readers.transforms import NamedImage, find_image, frame_camera, mask_beside, places, same_camera
-from smplxpp.capture.recording import Problem, Recording
-from smplxpp.capture.splits import Splits
+from smplxpp.capture.recording import Problem, Recording, Splits
 from smplxpp.core import Camera, InputError
 from smplxpp.core.files.image_file import image_mode, image_size
 from smplxpp.core.files.json_file import as_list, as_number, as_object, as_text, read_json

@@ -21,9 +21,8 @@ from smplxpp.capture.protocols import (
     read_protocols,
 )
 from smplxpp.capture.readers.common import ReaderOptions
-from smplxpp.capture.recording import TURNTABLE, ParamSource, Problem, Recording
+from smplxpp.capture.recording import TURNTABLE, ParamSource, Problem, Recording, Splits
 from smplxpp.capture.sources import ParamFiles, PosedTopology, find_params
-from smplxpp.capture.splits import Splits
 from smplxpp.core import Camera, InputError
 
 NAME = "simple"

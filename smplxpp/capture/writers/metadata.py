@@ -20,8 +20,7 @@ from smplxpp.capture.distortion import (
     FovDistortion,
     RationalDistortion,
 )
-from smplxpp.capture.recording import Recording
-from smplxpp.capture.splits import Splits
+from smplxpp.capture.recording import Recording, Splits
 from smplxpp.core import Camera, rotvec_from_matrix
 from smplxpp.core.files.atomic import atomic_write_text
 

@@ -1,4 +1,4 @@
-"""Convert a BVH motion to parameters of a body: match joint names and account for its own rest pose."""
+"""Convert the motion of a skeleton to parameters of a body: match joints and account for its own rest pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from smplxpp.body.bvh import BvhMotion, read_bvh
+from smplxpp.body.bvh import read_bvh
+from smplxpp.body.gltf_motion import read_gltf_motion
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.rest_pose import (
     CHILD,
@@ -29,10 +30,13 @@ from smplxpp.body.rest_pose import (
 )
 from smplxpp.body.retarget import FEET, Skeleton, held_feet
 from smplxpp.body.skeleton_match import SIDES, Tree, match_joints, spine_of
+from smplxpp.body.skeleton_motion import SkeletonMotion
 from smplxpp.core import BodyParams, GeometryWarning, InputError, rotvec_from_matrix
 from smplxpp.core.errors import warn_of_left_out
 from smplxpp.core.files.json_file import as_object, as_text, read_json
 
+SKELETON_SUFFIXES = (".bvh", ".glb", ".gltf", ".vrm", ".vrma")
+"""Endings of files whose motion is one of a skeleton of their own."""
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
 NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in _LIMBS))
 # The joint of ours up to which a joint moves the file's bones.
@@ -72,31 +76,54 @@ class MatchedSkeleton:
         }
 
 
-def load_bvh(
+def read_skeleton(path: str | Path, *, clip: str | None = None) -> SkeletonMotion:
+    """Read the motion of a skeleton from a file of any kind in `SKELETON_SUFFIXES`.
+
+    Args:
+        path: of the file.
+        clip: name of the motion, in a file with several; None: the first.
+
+    Raises:
+        InputError: another kind of file, or what `read_bvh` and `read_gltf_motion` refuse.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SKELETON_SUFFIXES:
+        raise InputError(f"motion {path}", expected=f"one of {', '.join(SKELETON_SUFFIXES)}", received=repr(suffix))
+    if suffix != ".bvh":
+        return read_gltf_motion(path, clip=clip)
+    motion = read_bvh(path)
+    if clip is not None:
+        raise InputError(f"motion {path}: option clip", expected="a file with names of motions", received=repr(clip))
+    return motion
+
+
+def load_skeleton(
     path: str | Path,
     body: Skeleton,
     *,
     joint_map: Mapping[str, str] | None = None,
     up: str | None = None,
     fps: float | None = None,
+    clip: str | None = None,
 ) -> BodyParams:
-    """Read a BVH motion for a body: limbs point where the file's do, and steps are scaled by the length of the legs.
+    """Read a skeleton's motion for a body: limbs point where the file's do, and steps are scaled by the legs' length.
 
     Args:
-        path: of the file.
+        path: of a file that `read_skeleton` reads.
         body: skeleton that shall move.
         joint_map: our name for each of the file's names; None: joints are found in the hierarchy.
         up: axis that points up, as "y" or "-z"; None: that along which the skeleton stands.
         fps: frames a second; None: as the file says.
+        clip: name of the motion, in a file with several.
 
     Raises:
-        InputError: what `read_bvh` refuses, or required joints that are missing.
+        InputError: what `read_skeleton` refuses, or required joints that are missing.
 
     Warns:
         GeometryWarning: bones below the pelvis that change their length; joints that turn and that the body has not; a
             skeleton whose frames stand along another axis than its rest pose.
     """
-    motion = read_bvh(path)
+    motion = read_skeleton(path, clip=clip)
     motion = motion if fps is None else replace(motion, fps=fps)
     joints = named_joints(motion, joint_map, subject=f"motion {path}")
     found = matched_skeleton(motion, joints, up=up)
@@ -109,10 +136,10 @@ def load_bvh(
             GeometryWarning,
             stacklevel=2,
         )
-    return bvh_params(motion, joints, body, up=up)
+    return skeleton_params(motion, joints, body, up=up)
 
 
-def matched_skeleton(motion: BvhMotion, joints: Mapping[str, int], *, up: str | None = None) -> MatchedSkeleton:
+def matched_skeleton(motion: SkeletonMotion, joints: Mapping[str, int], *, up: str | None = None) -> MatchedSkeleton:
     """Return which of a file's joints each of ours takes over, and what else was understood of its skeleton.
 
     Args:
@@ -143,7 +170,7 @@ def matched_skeleton(motion: BvhMotion, joints: Mapping[str, int], *, up: str | 
     )
 
 
-def warn_of_stretching(motion: BvhMotion, joints: Mapping[str, int], source: str) -> None:
+def warn_of_stretching(motion: SkeletonMotion, joints: Mapping[str, int], source: str) -> None:
     """Warn of bones below the pelvis that change their length, which a body's cannot."""
     above, joint = set(), joints["pelvis"]
     while joint >= 0:
@@ -182,14 +209,14 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
 
 
 def named_joints(
-    motion: BvhMotion, joint_map: Mapping[str, str] | None = None, *, subject: str = "motion"
+    motion: SkeletonMotion, joint_map: Mapping[str, str] | None = None, *, subject: str = "motion"
 ) -> dict[str, int]:
     """Return the index of the file's joint for each of our joints that it has.
 
     Args:
         motion: the file's skeleton and motion.
         joint_map: our name for each of the file's names, which decides alone. None: our own names, which our writer
-            uses, else joints found in the hierarchy (`smplxpp.body.skeleton_match`).
+            uses, else those that the file states, else joints found in the hierarchy (`smplxpp.body.skeleton_match`).
         subject: the file, for messages.
 
     Raises:
@@ -208,6 +235,8 @@ def named_joints(
         found = {ours: names.index(theirs) for theirs, ours in joint_map.items()}
     elif all(name in names for name in NEEDED):
         found = {name: names.index(name) for name in OURS if name in names}
+    elif all(name in motion.stated for name in NEEDED):
+        found = dict(motion.stated)
     else:
         found = match_joints(names, motion.parents, motion.rest)
         if all(name in found for name in NEEDED):
@@ -233,7 +262,9 @@ def named_joints(
     return found
 
 
-def bvh_params(motion: BvhMotion, joints: Mapping[str, int], body: Skeleton, *, up: str | None = None) -> BodyParams:
+def skeleton_params(
+    motion: SkeletonMotion, joints: Mapping[str, int], body: Skeleton, *, up: str | None = None
+) -> BodyParams:
     """Return the parameters of a body that moves as the skeleton does.
 
     A joint's rotation in world coordinates is the file's, times the rotation from our rest pose to the file's. For
