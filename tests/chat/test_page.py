@@ -101,9 +101,11 @@ def test_sound_and_poses_are_on_one_clock_and_typing_stops_both(talking):
         stage.take = frames => {{ take(frames); if (frames.line) started ??= frames.first / frames.fps; }};
         stage.pose = () => {{
           const out = pose();
-          poses.push([stage.context.currentTime, stage.now]);
+          const before = stage.context.currentTime, at = stage.now, after = stage.context.currentTime;
+          if (after - before < 0.005) poses.push([before, at]); // else another process had the core between them
           return out;
         }};
+        setInterval(() => stage.pose(), 20); // as if pictures were fast on every machine
         stage.unlock(); listen(stage.context, stage.output)"""
     )
     type_in(page, "go")

@@ -3,12 +3,17 @@
 import type { Pose } from "../avatar/avatar.ts";
 import { between } from "../avatar/motion.ts";
 import type { Performer } from "../animator.ts";
+import { Playing } from "../sound/playing.ts";
 import { poseOfRow, type Frames, type Line } from "./wire.ts";
 
 /** Seconds of frames behind the present that are kept; by which the clock may be off before it is set anew. */
 const KEPT = 2, OFF = 0.25;
 /** Seconds ahead of the present at which a sound can still begin. */
 const AHEAD = 0.05;
+/** Seconds by which sound and poses may part before they are brought together: a picture's half. */
+const APART = 0.015;
+/** Seconds after which it is looked again whether a line that is due has begun. */
+const AGAIN = 0.01;
 /** Seconds that a browser may take to wake its sound. */
 const WAKES = 1;
 /** Seconds in which a pose that is replaced goes over into the new one. */
@@ -17,11 +22,11 @@ const FADE = 0.2;
 interface Sounding {
   line: Line;
   /** null: it cannot be heard here. */
-  source: AudioBufferSourceNode | null;
+  playing: Playing | null;
   /** The stage's time of its beginning and end. */
   start: number;
   end: number;
-  /** Of what tells that it has begun. */
+  /** Of what tells that it is heard. */
   timer: number;
 }
 
@@ -73,11 +78,11 @@ export class Stage implements Performer {
   take(frames: Frames): void {
     const start = frames.first / frames.fps;
     this.fps = frames.fps;
+    this.follow();
     const before = this.now;
     const off = this.offset === null || (!this.speaking && Math.abs(frames.now - this.now) > OFF);
     if (off) this.offset = frames.now - this.clock();
-    // A page that was busy begins a sentence later rather than in its middle.
-    if (frames.line && !this.speaking) this.offset! -= Math.max(0, this.now + AHEAD - start);
+    if (frames.line) this.await(start);
     if (this.shown && this.now !== before) this.left = { pose: this.shown, at: this.now };
     for (let k = frames.first; k <= this.last; ++k) this.rows.delete(k);
     for (let k = 0; k < frames.count; ++k) this.rows.set(frames.first + k, frames.rows.subarray(k * frames.width, (k + 1) * frames.width));
@@ -101,8 +106,8 @@ export class Stage implements Performer {
 
   /** Silence at once; what was to be said is not. */
   hush(): void {
-    for (const { source, timer } of this.sounding) {
-      source?.stop();
+    for (const { playing, timer } of this.sounding) {
+      playing?.stop();
       clearTimeout(timer);
     }
     this.sounding = [];
@@ -110,6 +115,7 @@ export class Stage implements Performer {
 
   /** The pose of what is heard now. */
   pose(): Pose | null {
+    this.follow();
     const heard = this.now - (this.context?.outputLatency || 0);
     const at = Math.min(heard * this.fps, this.last), first = Math.floor(at);
     const low = this.row(first), high = this.row(first + 1) ?? low;
@@ -128,18 +134,55 @@ export class Stage implements Performer {
   }
 
   private sound(line: Line, start: number): void {
-    const { context, output } = this, wait = start - this.now + (context?.outputLatency || 0);
-    const timer = window.setTimeout(() => this.onbegin(line), 1000 * Math.max(0, wait));
-    const one: Sounding = { line, source: null, start, end: start, timer };
+    const { context } = this, heard = context?.state === "running";
+    if (heard) this.await(start);
+    const one: Sounding = { line, playing: null, start, end: heard ? start + line.samples.length / line.rate : start, timer: 0 };
     this.sounding = [...this.sounding.filter(({ end }) => end > this.now - KEPT), one];
-    if (!context || !output || context.state !== "running") return;
-    one.end = start + line.samples.length / line.rate;
-    const buffer = context.createBuffer(1, Math.max(line.samples.length, 1), line.rate);
-    buffer.copyToChannel(Float32Array.from(line.samples, (value) => value / 32768), 0);
-    one.source = context.createBufferSource();
-    one.source.buffer = buffer;
-    one.source.connect(output);
-    one.source.start(context.currentTime + Math.max(0, start - this.now), Math.max(0, this.now - start));
+    if (heard) this.schedule(one);
+    this.tell(one);
+  }
+
+  /** A page that was busy begins a sentence later rather than in its middle. */
+  private await(start: number): void {
+    if (!this.speaking) this.offset! -= Math.max(0, this.now + AHEAD - start);
+  }
+
+  /** Begins a line's sound when its time has come. */
+  private schedule(one: Sounding): void {
+    const { samples, rate } = one.line, context = this.context!;
+    one.playing?.stop();
+    one.playing = new Playing(context, [Float32Array.from(samples, (value) => value / 32768)], rate, this.output!);
+    one.playing.start(Math.max(context.currentTime, one.start - this.offset!));
+  }
+
+  /** Tells that a line is heard, as soon as it is. */
+  private tell(one: Sounding): void {
+    this.follow();
+    const { context } = this, left = one.start - this.now + (context?.outputLatency || 0);
+    const silent = one.playing && context?.state === "running" && one.playing.begun() === null;
+    if (left > 0 || silent) one.timer = window.setTimeout(() => this.tell(one), 1000 * Math.max(left, AGAIN));
+    else this.onbegin(one.line);
+  }
+
+  /**
+   * Brings the stage's time to that of the sound which is truly played.
+   *
+   * The audio's thread comes to a sound late where others have the cores, and then plays it from its first sample on. Poses
+   * wait for it, and lines behind it begin as much later.
+   */
+  private follow(): void {
+    const { context, offset } = this;
+    if (context?.state !== "running" || offset === null) return;
+    // The last line that has begun leads, or holds the time up until the next one does.
+    const now = this.clock() + offset, going = this.sounding.filter(({ playing, end }) => playing && end > now);
+    const begun = going.map(({ playing }) => playing!.begun()), count = 1 + begun.reduce((last: number, time, k) => (time === null ? last : k), -1);
+    const due = going[count]?.start < now ? going[count] : null;
+    const change = due ? due.start - now : count ? going[count - 1].start - begun[count - 1]! - offset : 0;
+    if (!due && Math.abs(change) < APART) return;
+    // The pose does not jump with the time.
+    if (this.shown && !this.left && Math.abs(change) > APART) this.left = { pose: this.shown, at: now + change - (context.outputLatency || 0) };
+    this.offset = offset + change;
+    for (const one of going.slice(count)) if (one !== due) this.schedule(one);
   }
 
   /** The audio's clock leads as long as it runs; the stage's time goes on without a jump. */

@@ -6,6 +6,7 @@ import type { SpeakingFace } from "../lips/face.ts";
 import type { LiveLips } from "../lips/lips.ts";
 import { spelt } from "../lips/spelling.ts";
 import { articulate, phonesOf, type Phone, type Viseme } from "../lips/visemes.ts";
+import { Playing } from "../sound/playing.ts";
 import { bytesOf, type Source } from "./source.ts";
 
 /** A sound, the visemes of it, or both; without a sound the mouth moves silently. */
@@ -114,16 +115,12 @@ export class Voice implements Mouth {
         if (this.lips) this.lips.context = context;
         return this.follow((lips) => lips.play(sound, "this sound"), signal, began);
       }
-      const source = context.createBufferSource(), begins = context.currentTime + SOON;
-      source.buffer = sound;
-      source.connect(this.output!);
-      source.start(begins);
-      this.now = { phones, clock: () => Math.max(0, context.currentTime - (context.outputLatency || 0) - begins) };
+      const playing = Playing.of(context, sound, this.output!);
+      playing.start(context.currentTime + SOON);
+      this.now = { phones, clock: () => playing.heard() };
       began();
-      await until(signal, (done) => (source.onended = done));
-      source.onended = null;
-      source.stop();
-      return source.disconnect();
+      await until(signal, (done) => (playing.onended = done));
+      return playing.stop();
     }
     if (!phones) throw new Error("say: expected a text, or {audio, visemes} with one of both at least, received neither");
     const started = performance.now(), over = Math.max(0, ...phones.map(({ end }) => end)) + CLOSES;

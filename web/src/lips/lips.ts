@@ -4,6 +4,7 @@ import type { Pose } from "../avatar/avatar.ts";
 import { unpackTensors, type Piece } from "../bundle/tensors.ts";
 import { Microphone } from "../chat/microphone.ts";
 import { Resampler } from "../chat/resample.ts";
+import { Playing } from "../sound/playing.ts";
 import { SpeakingFace } from "./face.ts";
 import { Ear, HOP, RATE } from "./features.ts";
 import { ARTICULATORS, LipNetwork } from "./network.ts";
@@ -47,15 +48,13 @@ class Hearing {
 }
 
 /** A file that is played. */
-interface Playing {
+interface Played {
   mono: Float32Array;
   rate: number;
   resampler: Resampler;
   /** Samples that have been heard. */
   given: number;
-  /** The context's time of its beginning. */
-  begun: number;
-  node: AudioBufferSourceNode;
+  playing: Playing;
 }
 
 export class LiveLips {
@@ -73,7 +72,7 @@ export class LiveLips {
   private end: () => void = () => {};
   private microphone: Microphone | null = null;
   private hearing: Hearing | null = null;
-  private file: Playing | null = null;
+  private file: Played | null = null;
   private lastLoud = 0;
   private quiet = false;
   /** Counts what was started: an answer that comes late is for nobody. */
@@ -110,7 +109,7 @@ export class LiveLips {
 
   /** Seconds of the file that have been heard. */
   get played(): number {
-    return this.file && this.context ? Math.max(0, this.context.currentTime - (this.context.outputLatency || 0) - this.file.begun) : 0;
+    return this.file?.playing.heard() ?? 0;
   }
 
   /** Listens to a stream, or to the microphone, and returns why it cannot, "" if it does. To be called by a click. */
@@ -161,14 +160,11 @@ export class LiveLips {
     if (!mono.some((value) => Math.abs(value) > LOUD)) return this.say(`${name} is silent`);
     this.output ??= context.createGain();
     this.output.connect(context.destination);
-    const node = context.createBufferSource();
-    node.buffer = buffer;
-    node.connect(this.output);
-    node.onended = () => this.file?.node === node && this.stop(`${name} is over`);
-    const begun = context.currentTime + SOON;
+    const playing = Playing.of(context, buffer, this.output);
+    playing.onended = () => this.file?.playing === playing && this.stop(`${name} is over`);
     this.hearing = new Hearing(new LipNetwork(this.network));
-    this.file = { mono, rate: buffer.sampleRate, resampler: new Resampler(buffer.sampleRate, RATE), given: 0, begun, node };
-    node.start(begun);
+    this.file = { mono, rate: buffer.sampleRate, resampler: new Resampler(buffer.sampleRate, RATE), given: 0, playing };
+    playing.start(context.currentTime + SOON);
     this.begin("file");
     this.onsaid(`Playing ${name}`);
     return "";
@@ -195,7 +191,7 @@ export class LiveLips {
   stop(said = ""): void {
     ++this.turn;
     this.microphone?.stop();
-    this.file?.node.stop();
+    this.file?.playing.stop();
     this.microphone = this.file = this.hearing = null;
     if (this.source) this.ended = performance.now() / 1000;
     this.source = "";
@@ -204,7 +200,7 @@ export class LiveLips {
   }
 
   /** Hears so much of the file that the mouth of what is played is known. */
-  private follow(file: Playing, hearing: Hearing): void {
+  private follow(file: Played, hearing: Hearing): void {
     const { mono, rate, resampler, given } = file;
     file.given = Math.max(given, Math.min(Math.round((this.played + AHEAD) * rate), given + AT_ONCE * rate));
     // Behind its end it is silent.

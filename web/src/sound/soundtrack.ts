@@ -1,6 +1,7 @@
 /** Sound that goes with a motion: its clock leads, so that both stay together at any rate of pictures. */
 
 import type { Clock } from "../animator.ts";
+import { Playing } from "./playing.ts";
 
 /** Seconds ahead of the present at which a sound is begun: what is asked for at once may begin late. */
 const AHEAD = 0.05;
@@ -15,10 +16,7 @@ export class Soundtrack implements Clock {
   /** What everything that is heard passes, for who wants to look at it. */
   output: GainNode | null = null;
   private buffer: AudioBuffer | null = null;
-  private source: AudioBufferSourceNode | null = null;
-  /** The context's time and the sound's at which it began, and its speed. */
-  private begun = 0;
-  private from = 0;
+  private source: Playing | null = null;
   private speed = 1;
   /** What was answered last: another time than that is one that somebody chose. */
   private last = NaN;
@@ -66,26 +64,18 @@ export class Soundtrack implements Clock {
       return time;
     }
     if (!this.source || time !== this.last || speed !== this.speed) this.begin(context, buffer, time, speed);
-    // What is heard now left for the speakers a while ago.
-    const heard = context.currentTime - (context.outputLatency || 0);
-    return (this.last = this.from + Math.max(0, heard - this.begun) * speed);
+    return (this.last = Math.max(time, this.source!.heard()));
   }
 
   private begin(context: AudioContext, buffer: AudioBuffer, time: number, speed: number): void {
     this.silence();
-    this.source = context.createBufferSource();
-    this.source.buffer = buffer;
-    this.source.playbackRate.value = speed;
-    this.source.connect(this.output!);
-    this.begun = context.currentTime + AHEAD;
-    this.from = time;
     this.speed = speed;
-    this.source.start(this.begun, Math.min(time, buffer.duration));
+    this.source = Playing.of(context, buffer, this.output!, speed);
+    this.source.start(context.currentTime + AHEAD, time);
   }
 
   private silence(): void {
     this.source?.stop();
-    this.source?.disconnect();
     this.source = null;
   }
 
