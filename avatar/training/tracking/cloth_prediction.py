@@ -26,8 +26,11 @@ Errors of a simulated swing are a difference of phase, which changes sign within
 ERROR_FLOOR = 1e-3
 """Metres added to every predictor's error; smaller errors are treated as equal."""
 
-Solved = Mapping[int, tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3 3"] | None]]
-"""Displacements of solved frames, metres, and the projection on what photographs determined there; None: everything."""
+Observed = Callable[[], Float[Tensor, "K 3 3"]]
+"""Returns the projection on what a frame's photographs determined; a call, because few of many frames are asked for it."""
+
+Solved = Mapping[int, tuple[Float[Tensor, "K 3"], Observed | None]]
+"""Displacements of solved frames, metres, and what photographs determined there; None: everything."""
 
 Predictor = Callable[[int, Solved], Float[Tensor, "K 3"]]
 """Displacements of a frame, metres, from those of the solved frames."""
@@ -283,6 +286,6 @@ def _until(frame: int, solved: Solved) -> Solved:
     return dict(list(solved.items())[: list(solved).index(frame)])
 
 
-def _observed_part(error: Float[Tensor, "K 3"], observed: Float[Tensor, "K 3 3"] | None) -> Float[Tensor, "K 3"]:
+def _observed_part(error: Float[Tensor, "K 3"], observed: Observed | None) -> Float[Tensor, "K 3"]:
     """Return the components of an error that photographs determined."""
-    return error if observed is None else torch.einsum("kij,kj->ki", observed, error)
+    return error if observed is None else torch.einsum("kij,kj->ki", observed(), error)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -24,7 +25,7 @@ from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import BACK, Session
-from avatar.training.tracking.cloth_prediction import ClothPrediction, simulate_controls
+from avatar.training.tracking.cloth_prediction import ClothPrediction, Observed, simulate_controls
 from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track_uncertainty import expected_errors, structure_tensors, unobserved_weight
 from smplxpp.core import DEFAULT_FPS, InputError
@@ -105,6 +106,7 @@ class TrackTask(PhotometricTask):
         self.prediction = _prediction(sequence, avatar.cage, config) if forward is None else forward.known_prediction()
         self._priors: tuple[int, FramePriors] | None = None
         self._halved_views: tuple[int, dict[tuple[str, int], View]] = (-1, {})
+        self._projections: dict[int, Tensor] = {}  # by row, see `_observed`
         # Results: displacements and structure tensors of all frames, a row each.
         self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
         self.structure = torch.zeros(len(frames), avatar.cage.count, 3, 3, device=sequence.device)
@@ -202,11 +204,11 @@ class TrackTask(PhotometricTask):
         return self._priors[1]
 
     def _compute_priors(self, frame: int) -> FramePriors:
-        # Solved frames, with the projection on the directions that photographs determined: I - W.
-        solved: dict[int, tuple[Tensor, Tensor | None]] = {}
+        # Solved frames, with the directions that photographs determined there.
+        solved: dict[int, tuple[Tensor, Observed | None]] = {}
         for other in (*self.ends, *self.order[: self.order.index(frame)]):
             row = self.row[other]
-            solved[other] = (self.solved[row], self._unit - unobserved_weight(self.structure[row], self._normals))
+            solved[other] = (self.solved[row], partial(self._observed, row))
         # Structure tensors of this frame are taken about its predicted start, where its photographs are compared
         # first.
         start = self.prediction.start(frame, solved) if solved else torch.zeros_like(self.avatar.controls)
@@ -220,6 +222,16 @@ class TrackTask(PhotometricTask):
         # Start at the anchor in the directions that photographs do not determine.
         start = start + torch.einsum("kij,kj->ki", weight, anchor - start)
         return FramePriors(start, self.prediction.rest_shape(frame, solved), anchor, weight)
+
+    def _observed(self, row: int) -> Tensor:
+        """Return the projection I - W on the directions that a solved frame's photographs determined."""
+        # Of many frames a predictor asks for the last few, several times each.
+        kept_frames = 8
+        if row not in self._projections:
+            while len(self._projections) >= kept_frames:
+                self._projections.pop(next(iter(self._projections)))
+            self._projections[row] = self._unit - unobserved_weight(self.structure[row], self._normals)
+        return self._projections[row]
 
     def _structure(self, frame: int, controls: Tensor) -> Tensor:
         """Return the structure tensors of a frame's photographs by all training cameras, about given displacements."""
@@ -253,7 +265,7 @@ class TrackTask(PhotometricTask):
         super().restore(tensors)
         for name, own in self.found().items():
             own.copy_(tensors[name])
-        self._priors = None
+        self._priors, self._projections = None, {}
 
     def known_prediction(self) -> ClothPrediction:
         """Return the predictor with the reference frame's displacements, for the backward pass that ends there."""

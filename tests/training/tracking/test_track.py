@@ -18,8 +18,11 @@ from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.session import Session
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
+from avatar.training.tracking import track as tracking
+from avatar.training.tracking.cloth_prediction import SimulatedControls
 from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track import TrackTask, follow_surface
+from avatar.training.tracking.track_uncertainty import unobserved_weight
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import gaussians, sequence, template, true_vertices, write_dance
 from tests.dolls.tiny import TINY_TEACHER
@@ -149,6 +152,23 @@ def test_a_frame_starts_from_its_neighbours_carried_on(frames, monkeypatch):
     assert torch.equal(made.priors(0).start, torch.zeros_like(first))
     torch.testing.assert_close(made.priors(1).start, first)
     torch.testing.assert_close(made.priors(2).start, second + CONFIG.extrapolation * (second - first))
+
+
+@pytest.mark.parametrize("simulates", [False, True])
+def test_the_work_before_a_frame_does_not_grow_with_the_frames_before_it(frames, monkeypatch, simulates):
+    """Each frame once asked for the directions that photographs determined in all frames before it."""
+    made, asked = task(frames), []
+    if simulates:
+        count = len(made.avatar.controls)
+        still = {frame: torch.zeros(count, 3) for frame in made.order}
+        clothes = SimulatedControls(still, torch.ones(count), torch.ones(count, dtype=torch.int64))
+        made.prediction = replace(made.prediction, simulated=clothes)
+    monkeypatch.setattr(made, "_structure", lambda frame, start: torch.eye(3).expand(len(made.avatar.controls), 3, 3))
+    monkeypatch.setattr(tracking, "unobserved_weight", lambda *args: asked.append(args) or unobserved_weight(*args))
+    for number, frame in enumerate(made.order):
+        made.priors(frame)
+        # Once for the frame's own prior, and once for the frame that was solved last.
+        assert len(asked) <= (2 * number if simulates else number)
 
 
 def test_photographs_are_halved_once_a_frame(frames, monkeypatch):
