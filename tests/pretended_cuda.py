@@ -20,6 +20,8 @@ aten = torch.ops.aten
 
 _COPIES = {aten.copy_.default, aten.copy.default, aten._to_copy.default, aten.lift_fresh.default}
 """Calls that may have tensors of both devices."""
+_WAITS = {aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default}
+"""Calls whose answer the CPU has to know before it goes on."""
 _INDEXED = {
     aten.index.Tensor,
     aten.index_put.default,
@@ -280,3 +282,24 @@ def _rasterize(*tensors: Any) -> Any:
     fields = {field.name: getattr(meta, field.name) for field in dataclasses.fields(meta)}
     moved = {name: value.to(CUDA) if isinstance(value, Tensor) else value for name, value in fields.items()}
     return image.to(CUDA), alpha.to(CUDA), dataclasses.replace(meta, **moved)
+
+
+class CountedWaits(TorchDispatchMode):
+    """Counts calls for which a real device would have to be waited for: numbers, and the indices of a mask.
+
+    Copies to the CPU are not counted, because the pretended gsplat makes them.
+
+    Attributes:
+        count: of such calls, since the mode was entered.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if any(isinstance(one, PretendedTensor) for one in _tensors_in(args)):
+            masks = [one for one in _tensors_in(args[1:2]) if one.dtype == torch.bool]
+            self.count += func in _WAITS or (func in _INDEXED and bool(masks))
+        return func(*args, **kwargs)

@@ -143,7 +143,7 @@ class PhotographTask(PhotometricTask):
             for value in group.parameters.values():
                 value.requires_grad_(True)
 
-    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return the loss of one frame, and its terms as numbers."""
         # With probability `null_share` a pose is shown with the null
         # code, which thereby learns to stand for unseen frames.
@@ -152,4 +152,4 @@ class PhotographTask(PhotometricTask):
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
             pose = pose.without_code()
         total, terms, _ = self.compared(self.model(pose, camera_centers_of(views)), views)
-        return total, {"loss": float(total.detach()), **terms}
+        return total, {"loss": total.detach(), **terms}

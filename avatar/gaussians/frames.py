@@ -50,8 +50,8 @@ def triangle_frames(vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3
     inward and is not unit). q lies in the triangle's plane, so that R is a rotation.
 
     A triangle whose height vanishes in rounding gets an arbitrary normal across its longest direction, constant for
-    gradients, with a GeometryWarning; mean edges below `MIN_EDGE` are clamped. float32 on the CPU goes through the
-    native library.
+    gradients, with a GeometryWarning on the CPU; mean edges below `MIN_EDGE` are clamped. float32 on the CPU goes
+    through the native library.
 
     Args:
         vertices: metres.
@@ -79,7 +79,8 @@ def triangle_frames(vertices: Float[Tensor, "*B V 3"], faces: Int64[Tensor, "F 3
         *arrays, degenerate = FramesFunction.apply(vertices, faces)
     else:
         *arrays, degenerate = triangle_frames_reference(vertices, faces)
-    if degenerate:
+    # On a GPU the answer would have to be waited for.
+    if degenerate.device.type == "cpu" and degenerate:
         warnings.warn(
             f"{int(degenerate)} triangles without area: Gaussians on them get some normal across the longest direction",
             GeometryWarning,

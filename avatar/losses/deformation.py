@@ -36,6 +36,8 @@ class DisplacementLoss:
     def __init__(self, rig: Rig, frame: MapFrame, size: int, unit: float) -> None:
         self.maps = front_back_maps(rig.vertices, rig.faces, frame, size=size)
         self.mask = self.maps.mask
+        # The mask's pixels as indices: finding them in every step would wait for a GPU each time.
+        self._pixels = self.mask.flatten().nonzero().squeeze(1)
         self.unit = unit
 
     def __call__(self, displacements: Float[Tensor, "V 3"], teacher: Float[Tensor, "2 S S 3"]) -> Float[Tensor, ""]:
@@ -48,7 +50,7 @@ class DisplacementLoss:
         # Rasterise the displacements of the vertices to the maps' pixels, (2, S, S, 3); |.| is the L1 norm over x, y,
         # z.
         difference = (self.maps.interpolate(displacements) - teacher).abs().sum(-1)
-        return difference[self.mask].mean() / self.unit
+        return difference.flatten()[self._pixels].mean() / self.unit
 
 
 def vertex_labels(rig: Rig, *, tau: float = TAU) -> Float[Tensor, "V 3"]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from typing import Any
+from typing import Any, overload
 
 import torch
 import torch.nn.functional as F
@@ -110,12 +110,20 @@ def ssim_map_reference(
     return value if batched else value[0]
 
 
-def psnr_from_mse(mean_square: float) -> float:
+@overload
+def psnr_from_mse(mean_square: float) -> float: ...
+@overload
+def psnr_from_mse(mean_square: Float[Tensor, ""]) -> Float[Tensor, ""]: ...
+def psnr_from_mse(mean_square: float | Tensor) -> float | Tensor:
     """Return `-10 log10(mean square error)` of images in [0, 1], in dB.
 
-    Errors below 1e-12 count as 1e-12, so that equal images have 120 dB and means over images stay finite.
+    Errors below 1e-12 count as 1e-12, so that equal images have 120 dB and means over images stay finite. Of a scalar
+    tensor, a tensor on its device.
     """
-    return -10.0 * math.log10(max(mean_square, 1e-12))
+    least = 1e-12
+    if isinstance(mean_square, Tensor):
+        return -10.0 * torch.log10(mean_square.clamp(min=least))
+    return -10.0 * math.log10(max(mean_square, least))
 
 
 class _SsimMean(torch.autograd.Function):

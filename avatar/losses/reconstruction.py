@@ -66,8 +66,8 @@ def reconstruction_loss(
     weights: ReconstructionWeights,
     *,
     perceptual: PerceptualDistance | None = None,
-) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    """Return the weighted sum of the losses, and its terms as numbers.
+) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+    """Return the weighted sum of the losses, and its terms as scalars without gradients on the same device.
 
     D-SSIM is `1 - SSIM`, as in the code of 3DGS. `L_nor = mean |N_t - N_g|_1` over the pixels where the target has a
     normal. Terms without their inputs (normals, a perceptual distance, an image of its minimum size) are left out.
@@ -92,15 +92,13 @@ def reconstruction_loss(
         total = total + weights.perceptual * terms["perceptual"]
     if weights.normal and rendering.normals is not None and target.normals is not None:
         # A zero vector marks a pixel without a normal; the L1 norm is taken over x, y, z.
-        known = (target.normals != 0).any(-1)
-        if bool(known.any()):
+        known = (target.normals != 0).any(-1).flatten().nonzero().squeeze(1)
+        if len(known):
             apart = (rendering.normals - target.normals.float()).abs().sum(-1)
-            terms["normal"] = apart[known].mean()
+            terms["normal"] = apart.flatten()[known].mean()
             total = total + weights.normal * terms["normal"]
     # PSNR of the crop for the log alone, on clamped colours as a display shows them.
     with torch.no_grad():
-        square = float((rendering.image.clamp(0.0, 1.0) - target.image).square().mean())
-    return total, {
-        **{name: float(term.detach()) for name, term in terms.items()},
-        "psnr_crop": psnr_from_mse(square),
-    }
+        square = (rendering.image.clamp(0.0, 1.0) - target.image).square().mean()
+        psnr = psnr_from_mse(square)
+    return total, {**{name: term.detach() for name, term in terms.items()}, "psnr_crop": psnr}

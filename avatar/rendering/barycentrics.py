@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int, Int32
+from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -60,11 +60,21 @@ def interpolate_reference(
     barycentric: Float[Tensor, "*P 3"],
     faces: Int[Tensor, "F 3"],
     face_id: Int32[Tensor, "*P"],
+    covered: Int64[Tensor, " M"],
 ) -> Float[Tensor, "*P D"]:
-    """Interpolate vertex values at the barycentrics of faces; 0 on the background."""
-    hit = face_id >= 0
-    seen = (barycentric[hit][..., None] * values[faces[face_id[hit].long()]]).sum(1)
-    return seen.new_zeros((*face_id.shape, values.shape[1])).index_put(hit.nonzero(as_tuple=True), seen)
+    """Interpolate vertex values at the barycentrics of faces; 0 on the background.
+
+    Args:
+        values: of the vertices.
+        barycentric: of each pixel in its face.
+        faces: vertices of each face.
+        face_id: face of each pixel, -1 on the background.
+        covered: flat indices of the pixels that have a face.
+    """
+    corners = faces[face_id.flatten()[covered].long()]
+    seen = (barycentric.flatten(end_dim=-2)[covered][..., None] * values[corners]).sum(1)
+    flat = seen.new_zeros((face_id.numel(), values.shape[1])).index_put((covered,), seen)
+    return flat.view(*face_id.shape, values.shape[1])
 
 
 class BarycentricFunction(torch.autograd.Function):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -95,6 +96,11 @@ class MeshMapsTensor:
         """The pixels that the mesh covers."""
         return self.face_id >= 0
 
+    @cached_property
+    def _covered(self) -> Int64[Tensor, " M"]:
+        """Flat indices of the covered pixels; a GPU is waited for once, not in every interpolation."""
+        return self.mask.flatten().nonzero().squeeze(1)
+
     def interpolate(self, values: Float[Tensor, "V D"]) -> Float[Tensor, "*B H W D"]:
         """Return vertex values at every pixel, 0 on the background, with gradients to values and barycentrics.
 
@@ -114,7 +120,7 @@ class MeshMapsTensor:
         # float32 on the CPU takes the native kernel; other dtypes and devices take the same sums in torch.
         if is_native(values, self.barycentric):
             return InterpolateFunction.apply(values, self.barycentric, self.faces.int(), self.face_id)
-        return interpolate_reference(values, self.barycentric, self.faces, self.face_id)
+        return interpolate_reference(values, self.barycentric, self.faces, self.face_id, self._covered)
 
 
 def mesh_maps(

@@ -15,7 +15,7 @@ from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.loose_clothes import ClothConfig
 from avatar.training.presets import TrainingPreset, training_preset, with_iterations, with_local_shapes
 from avatar.training.refinement.config import RefineConfig
-from smplxpp.core import InputError, require_choice
+from smplxpp.core import InputError, require_choice, require_positive
 
 log = logging.getLogger(__name__)
 STEPS = ("refine", "fit", "teacher", "cloth", "bake", "compensate")
@@ -49,6 +49,7 @@ class TrainConfig:
         device: "auto", "cpu" or "cuda".
         force: repeat steps that are finished.
         tensorboard: log for TensorBoard too.
+        checkpoint_minutes: between two checkpoints; None: half a minute, or so many that writing takes 2 % of the time.
 
     Raises:
         InputError: a number out of range, an unknown word, or options that exclude each other.
@@ -71,6 +72,7 @@ class TrainConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     force: bool = False
     tensorboard: bool = False
+    checkpoint_minutes: float | None = None
 
     def __post_init__(self) -> None:
         for name, value, least in (
@@ -88,6 +90,8 @@ class TrainConfig:
             )
         if not self.max_minutes > 0:
             raise InputError("option max-minutes", expected="a number above 0", received=f"{self.max_minutes:g}")
+        if self.checkpoint_minutes is not None:
+            require_positive("option checkpoint-minutes", self.checkpoint_minutes)
         for step in self.iterations:
             require_choice("iterations of a step", step, ("fit", *_TRAININGS))
 
@@ -137,6 +141,11 @@ class TrainConfig:
                 remedy="add --refine-poses on",
             )
         return RefineConfig(seed=self.seed, cameras=self.refine_cameras) if wanted else None
+
+    @property
+    def checkpoint_seconds(self) -> float | None:
+        """Seconds between two checkpoints, None: by the time that writing takes."""
+        return None if self.checkpoint_minutes is None else 60.0 * self.checkpoint_minutes
 
     def _changed(self, preset: TrainingPreset) -> TrainingPreset:
         """Return the preset with other iterations and another number of Gaussians."""

@@ -321,6 +321,7 @@ class _Training:
             self._together,
             max(left, 1e-9),  # each call takes one iteration at least
             tensorboard=self.config.tensorboard,
+            checkpoint_seconds=self.config.checkpoint_seconds,
             report=lambda progress: self.report(step, progress),
         )
         with explain_resource_errors(self.folder), atomic_folder(folder) as made:

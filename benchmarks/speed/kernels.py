@@ -222,6 +222,7 @@ def measure_maps(vertices: torch.Tensor, faces: torch.Tensor, camera: Camera) ->
     """Times of one camera in milliseconds."""
     values = torch.rand(len(vertices), CHANNELS, generator=torch.Generator().manual_seed(0))
     maps = mesh_maps(vertices, faces, camera)
+    covered = maps.mask.flatten().nonzero().squeeze(1)
     numbers, corners = vertices.double().numpy(), faces.int().numpy()
 
     def gradients(render: Callable) -> None:
@@ -230,7 +231,7 @@ def measure_maps(vertices: torch.Tensor, faces: torch.Tensor, camera: Camera) ->
 
     def reference(v: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
         barycentric, _ = barycentrics_reference(v, faces, maps.face_id, camera)
-        return interpolate_reference(a, barycentric, faces, maps.face_id)
+        return interpolate_reference(a, barycentric, faces, maps.face_id, covered)
 
     def native(v: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
         return mesh_maps(v, faces, camera, a).attributes

@@ -105,6 +105,8 @@ class Train:
     """Train again even what is up to date, and delete checkpoints. A fit by `smplxpp fit` is kept."""
     tensorboard: bool = False
     """Log for TensorBoard too, into the folders of the stages."""
+    checkpoint_minutes: OptionalFloat = None
+    """Minutes between checkpoints; by default half a minute, or so many that writing takes 2 % of the time."""
     no_report: bool = False
     """Leave report.html as it is."""
     json: bool = False
@@ -151,7 +153,11 @@ class Train:
                 return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
 
             options = TrainOptions(
-                max_seconds=60.0 * self.max_minutes, force=self.force, tensorboard=self.tensorboard, bar=bar
+                max_seconds=60.0 * self.max_minutes,
+                force=self.force,
+                tensorboard=self.tensorboard,
+                checkpoint_seconds=config.checkpoint_seconds,
+                bar=bar,
             )
             records = train(self.run_folder, inputs, scene, recipe, options, together, steps=steps)
             if not together.first:
@@ -206,6 +212,7 @@ class Train:
             seed=self.seed,
             force=self.force,
             tensorboard=self.tensorboard,
+            checkpoint_minutes=self.checkpoint_minutes,
         )
 
     def _finish(self, records: dict[str, StageRecord]) -> dict[str, Any]:

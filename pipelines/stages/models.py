@@ -59,12 +59,14 @@ class TrainOptions:
         max_seconds: time after which training stops, with a checkpoint and the model reached so far.
         force: train again even what is up to date.
         tensorboard: log for TensorBoard into the folders of the stages.
+        checkpoint_seconds: between two checkpoints, see `LoopConfig`.
         bar: called with a stage's name and iterations; shows its progress.
     """
 
     max_seconds: float = float("inf")
     force: bool = False
     tensorboard: bool = False
+    checkpoint_seconds: float | None = None
     bar: Bar = field(default=lambda name, total: nullcontext(lambda progress: None))
 
 
@@ -346,6 +348,7 @@ class Trainer:
             self.together,
             max(left, ONE_STEP),
             tensorboard=self.options.tensorboard,
+            checkpoint_seconds=self.options.checkpoint_seconds,
             preview=preview_writer(self.scene.capture, folder),
         )
 

@@ -115,7 +115,7 @@ def varied(bound: BoundGaussians, seed: int = 0) -> BoundGaussians:
     return replace(bound, **moved)
 
 
-def sequence(capture: Capture | Path, **config) -> AvatarSequence:
+def sequence(capture: Capture | Path, *, device: str = "cpu", **config) -> AvatarSequence:
     """Make what a task is made on."""
     capture = open_capture(capture) if isinstance(capture, Path) else capture
-    return AvatarSequence(capture, template(), SequenceConfig(**config))
+    return AvatarSequence(capture, template(), SequenceConfig(**config), device=device)

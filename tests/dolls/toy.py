@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ class Toy(OptimizationTask):
     Args:
         seed: of the parameters at the start.
         batches: of a step.
-        poison: number of a batch whose loss is NaN.
+        poison: numbers of batches whose loss is NaN.
     """
 
     def __init__(
@@ -28,7 +28,7 @@ class Toy(OptimizationTask):
         *,
         seed: int = 0,
         batches: int = 3,
-        poison: int | None = None,
+        poison: Container[int] = (),
     ) -> None:
         random = torch.Generator().manual_seed(seed)
         shapes = {"first": (3, 16), "second": (16, 2), "odd": (2,), "unused": (4,)}
@@ -49,15 +49,15 @@ class Toy(OptimizationTask):
     def name_of(self, item: int) -> str:
         return f"batch {item}"
 
-    def loss(self, item: int) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: int) -> tuple[Tensor, Mapping[str, Tensor]]:
         x = torch.randn((32, 3), generator=torch.Generator().manual_seed(item))
         y = torch.tanh(x @ self.p["first"]) @ self.p["second"]
         if item % 2:
             y = y + self.p["odd"]
         loss = (y - torch.sin(2.0 * x[:, :2])).square().mean()
-        if item == self.poison:
+        if item in self.poison:
             loss = loss * float("nan")
-        return loss, {"loss": loss.item(), **({"odd_loss": loss.item()} if item % 2 else {})}
+        return loss, {"loss": loss.detach(), **({"odd_loss": loss.detach()} if item % 2 else {})}
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
         with torch.no_grad():

@@ -14,7 +14,7 @@ from avatar.formats.ply import read_splat_ply, write_splat_ply
 from avatar.gaussians.tensor_file import load_bound, save_bound
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.rig.rig import Rig
-from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.metrics_log import read_metrics
 from pipelines.commands.inspect import summarise_run
 from pipelines.report import Report, write_report

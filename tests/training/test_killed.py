@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from avatar.training.engine.loop import METRICS_FILE, STATE_FILE
+from avatar.training.engine.checkpoints import STATE_FILE
+from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from tests.dolls.toy import same_state
 

@@ -18,7 +18,7 @@ from PIL import Image
 
 from avatar.gaussians.tensor_file import save_bound
 from avatar.models.model_file import save_avatar
-from avatar.training.engine.loop import Checkpoint, save_checkpoint
+from avatar.training.engine.checkpoints import Checkpoint, save_checkpoint
 from pipelines.cli import main
 from pipelines.commands import view as view_command
 from pipelines.runs.layout import GAUSSIANS, STUDENT

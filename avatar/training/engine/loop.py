@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -12,85 +11,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from safetensors.torch import save
+import torch
 from torch import Tensor
 
-from avatar.gaussians.tensor_file import open_tensor_file
+from avatar.training.engine.checkpoints import STATE_FILE, Checkpoint, CheckpointWriter, load_checkpoint
 from avatar.training.engine.metrics_log import TensorboardLog, append_metrics, truncate_metrics
+from avatar.training.engine.optimization_task import DivergedError
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import explain_resource_errors
-from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.json_file import as_integer, as_number, shown
 
-SCHEMA = 1
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """State of a training after `iteration` steps.
-
-    Attributes:
-        iteration: number of finished steps.
-        seconds: their time over all sessions.
-        key: digest of configuration and inputs; a training continues only from a checkpoint of its own key.
-        tensors: parameters and the optimiser's state by name.
-    """
-
-    iteration: int
-    seconds: float
-    key: str
-    tensors: Mapping[str, Tensor]
-
-
-def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint as safetensors, atomically: a kill or a full disk leaves the one before."""
-    # One metadata entry, because safetensors writes several in an order that differs from run to run.
-    about = {"iteration": checkpoint.iteration, "seconds": checkpoint.seconds, "key": checkpoint.key}
-    tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
-    atomic_write_bytes(path, save(tensors, metadata={"training": json.dumps({"schema": SCHEMA, **about})}))
-
-
-def load_checkpoint(path: str | Path, *, key: str) -> Checkpoint | None:
-    """Return the checkpoint in a file; None where there is none or it cannot be read, which is logged.
-
-    Raises:
-        InputError: one of another training or of another version of the format. It may hold hours of work, so that
-            only the user may delete it.
-    """
-    path = Path(path)
-    if not path.exists():
-        return None
-    try:
-        # A checkpoint of this key and version is read with checks of its header.
-        file = open_tensor_file(path, subject=f"checkpoint {path}", header="training")
-        schema, found = file.about["schema"], file.about.get("key")
-        if schema == SCHEMA and found == key:
-            iteration = as_integer(file.about.get("iteration"), subject="iteration", least=0)
-            seconds = as_number(file.about.get("seconds"), subject="seconds", least=0.0)
-            return Checkpoint(iteration, seconds, key, file.tensors())
-    except (InputError, KeyError) as error:
-        log.warning("%s cannot be read (%s): the training starts over", path, error)
-        return None
-    # A readable checkpoint that does not fit is never overwritten silently.
-    if schema != SCHEMA:
-        raise InputError(
-            f"checkpoint {path}",
-            expected=f"version {SCHEMA} of the format",
-            received=f"version {shown(schema)}",
-            remedy="continue with the smplxpp that wrote it; to start again, delete it (--force does)",
-        )
-    raise InputError(
-        f"checkpoint {path}",
-        expected="one of these options, inputs and code",
-        received=f"one of others, at iteration {shown(file.about.get('iteration'))}",
-        remedy="give the options that it was made with, or take another run folder; to start again, delete it "
-        "(--force does)",
-    )
-
-
-STATE_FILE = "state.safetensors"
 METRICS_FILE = "metrics.jsonl"
 TENSORBOARD_FOLDER = "tensorboard"
 
@@ -105,7 +37,7 @@ class Task(Protocol):
     distributed: Distributed
 
     def step(self, iteration: int) -> Mapping[str, Any]:
-        """Take step number `iteration`, counted from 0; return its metrics."""
+        """Take step number `iteration`, counted from 0; return its metrics: JSON values and scalar tensors."""
 
     def evaluate(self, iteration: int) -> Mapping[str, Any]:
         """Return figures of the state after `iteration` steps, as JSON values."""
@@ -116,6 +48,9 @@ class Task(Protocol):
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Continue from tensors that `state` returned."""
 
+    def halve_rates(self) -> None:
+        """Halve all learning rates from now on."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConfig:
@@ -125,7 +60,7 @@ class LoopConfig:
         iterations: number of all steps.
         log_every: steps between lines of metrics, which also come at the end.
         evaluate_every: steps between evaluations, which also come at the start and at the end.
-        checkpoint_seconds: a kill loses at most the steps of this time.
+        checkpoint_seconds: of steps between two checkpoints; None: 30, or so many that writing takes 2 % of the time.
         max_seconds: stop with a checkpoint when this session's steps took this time.
         keep_end: keep a checkpoint of the end too, for stages in which another training follows.
         tensorboard: log for TensorBoard too.
@@ -134,7 +69,7 @@ class LoopConfig:
     iterations: int
     log_every: int = 10
     evaluate_every: int = 250
-    checkpoint_seconds: float = 30.0
+    checkpoint_seconds: float | None = None
     max_seconds: float = float("inf")
     keep_end: bool = False
     tensorboard: bool = False
@@ -175,6 +110,8 @@ def run_training(
 
     `folder` gets `metrics.jsonl` and, until the last step, `state.safetensors`. The time of evaluations is not counted.
     Of several processes all start from the first one's state and use its clock; it alone reads, evaluates and writes.
+    A step whose loss or gradient is not finite is left out with a warning, and the first one halves the learning rates.
+    Three in a row, or more than 3 and a hundredth of all steps, end the training.
 
     Args:
         task: the training.
@@ -187,8 +124,8 @@ def run_training(
         The progress at the end: before the last step only when `max_seconds` was over.
 
     Raises:
-        InputError: a checkpoint of another key or version, which stays as it is; memory or disk ran out, or the task
-            diverged (`DivergedError`), and the last checkpoint is kept.
+        InputError: a checkpoint of another key or version, which stays as it is; memory or disk ran out, or too many
+            steps diverged (`DivergedError`), and the last checkpoint is kept.
         MissingExtraError: a log for TensorBoard without tensorboard.
     """
     processes = task.distributed
@@ -220,13 +157,17 @@ def run_training(
         log("evaluation", figures)
         report(progress(figures))
 
-    def save() -> None:
-        save_checkpoint(state, Checkpoint(done, spent_before + spent, key, task.state()))
+    def save() -> float:
+        return writer.write(Checkpoint(done, spent_before + spent, key, task.state(), divergence.count))
 
     with explain_resource_errors(folder), ExitStack() as stack:
         # Start from the checkpoint, or evaluate the initial state.
-        done, spent_before = _begin(task, state, metrics, key)
+        begun = _begin(task, state, metrics, key)
+        done, spent_before = begun.iteration, begun.seconds
+        divergence = Divergence(task, config.iterations, begun.diverged)
         first, spent, unsaved = done, 0.0, 0.0
+        writer = stack.enter_context(closing(CheckpointWriter(state)))
+        interval = writer.least_seconds if config.checkpoint_seconds is None else config.checkpoint_seconds
         processes.run_on_rank0(open_events)
         if not done:
             processes.run_on_rank0(evaluate)
@@ -234,26 +175,73 @@ def run_training(
         while done < config.iterations and spent < config.max_seconds:
             # The first process's clock counts for all, so that all stop at the same step.
             begin = time.perf_counter()
-            values = task.step(done)
+            values = divergence.step(done)
             took = processes.run_on_rank0(lambda: time.perf_counter() - begin)  # noqa: B023  called at once
             done, spent, unsaved = done + 1, spent + took, unsaved + took
             last = done == config.iterations
             if done % config.log_every == 0 or last:
-                logged = values
+                logged = _as_numbers(values)
                 processes.run_on_rank0(log_step)
             if done % config.evaluate_every == 0 or last:
                 processes.run_on_rank0(evaluate)
-            if unsaved >= config.checkpoint_seconds and not last:
-                processes.run_on_rank0(save)
+            if unsaved >= interval and not last:
+                due = processes.run_on_rank0(save)
+                interval = due if config.checkpoint_seconds is None else config.checkpoint_seconds
                 unsaved = 0.0
         # A checkpoint of an unfinished training, and of the end on request.
         if done < config.iterations or (config.keep_end and done > first):
             processes.run_on_rank0(save)
+        processes.run_on_rank0(writer.finish)
         return progress()
 
 
-def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float]:
-    """Restore every process to the checkpoint or the first one's state; return finished steps and their seconds."""
+class Divergence:
+    """Takes a task's steps and leaves out those that diverge, as long as they are few.
+
+    Args:
+        task: the training.
+        iterations: number of all its steps.
+        count: of steps that were left out before.
+    """
+
+    def __init__(self, task: Task, iterations: int, count: int) -> None:
+        self.task, self.count, self._in_a_row = task, count, 0
+        self._values: Mapping[str, Any] = {}
+        # A hundredth: batches with one damaged view of a hundred.
+        self._most = 3 + iterations // 100
+        if count:
+            task.halve_rates()
+
+    def step(self, iteration: int) -> Mapping[str, Any]:
+        """Take a step; one that is left out repeats the metrics of the step before, with the number of those left out.
+
+        Raises:
+            DivergedError: of three steps in a row, which no single view explains, or of too many.
+        """
+        try:
+            values = self.task.step(iteration)
+        except DivergedError as error:
+            self.count, self._in_a_row = self.count + 1, self._in_a_row + 1
+            if self._in_a_row == 3 or self.count > self._most:
+                raise
+            if self.count == 1:
+                self.task.halve_rates()
+            rates = "; learning rates are halved" if self.count == 1 else ""
+            log.warning("%s is left out: its loss or a gradient is %s%s", error.subject, error.received, rates)
+            return {**self._values, "diverged": self.count}
+        self._in_a_row, self._values = 0, values
+        return values
+
+
+def _as_numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return metrics with all scalar tensors as numbers, in one transfer."""
+    names = [name for name, value in values.items() if isinstance(value, Tensor)]
+    numbers = torch.stack([values[name].float() for name in names]).tolist() if names else []
+    return {**values, **dict(zip(names, numbers, strict=True))}
+
+
+def _begin(task: Task, state: Path, metrics: Path, key: str) -> Checkpoint:
+    """Restore every process to the checkpoint or the first one's state, and return it."""
 
     def start() -> Checkpoint:
         state.parent.mkdir(parents=True, exist_ok=True)
@@ -271,4 +259,4 @@ def _begin(task: Task, state: Path, metrics: Path, key: str) -> tuple[int, float
     # All processes restore the same tensors, also at a new start, so that they begin with equal bits.
     checkpoint = task.distributed.run_on_rank0(start)
     task.restore(checkpoint.tensors)
-    return checkpoint.iteration, checkpoint.seconds
+    return checkpoint

@@ -183,14 +183,19 @@ class OptimizationTask(ABC, Generic[Batch]):
             fused=True,
         )
         self.mean = MeanOfSteps(self.learned, config.iterations, config.averaged)
+        self._rate_share = 1.0
 
     @abstractmethod
     def micro_batches(self, iteration: int) -> Sequence[Batch]:
         """Return the micro-batches of a step: one or more, decided by its number alone, the same on every process."""
 
     @abstractmethod
-    def loss(self, item: Batch) -> tuple[Tensor, Mapping[str, float]]:
-        """Return the loss of a micro-batch, a scalar with gradients, and its terms as numbers for the log."""
+    def loss(self, item: Batch) -> tuple[Tensor, Mapping[str, Tensor]]:
+        """Return the loss of a micro-batch, a scalar with gradients, and its terms for the log, scalars without.
+
+        Terms stay on the device, because each transfer of a number would wait for the GPU; `run_training` transfers
+        those of the steps that it logs.
+        """
 
     def lr_factor(self, iteration: int, group: ParameterGroup) -> float:
         """Return the share of a group's rate that is left at a step: the configuration's schedule."""
@@ -213,7 +218,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         """Take one step of Adam on the mean over the micro-batches.
 
         Returns:
-            Means of the losses' numbers, each over the items that gave it, and the items' names.
+            Means of the losses' terms, each over the items that gave it, and the items' names.
 
         Raises:
             DivergedError: a loss or gradient is not finite, on any process; nothing has changed.
@@ -222,7 +227,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         # Rates of this step by the schedule; fused Adam reads them from its groups.
         items = self.micro_batches(iteration)
         for group, own in zip(self.optimiser.param_groups, self.groups, strict=True):
-            group["lr"] = own.lr * self.lr_factor(iteration, own)
+            group["lr"] = own.lr * self.lr_factor(iteration, own) * self._rate_share
         # Gradients of the micro-batches, shared among the processes and summed over them.
         self.optimiser.zero_grad(set_to_none=True)
         outcomes = self.distributed.share_out(items, lambda item: self._backward(item, len(items)))
@@ -275,13 +280,20 @@ class OptimizationTask(ABC, Generic[Batch]):
                     if content is not None
                 }
 
-    def _backward(self, item: Batch, count: int) -> Mapping[str, float] | None:
-        """Backpropagate a micro-batch's share of the loss; return its figures, None if anything is not finite."""
+    def halve_rates(self) -> None:
+        """Halve all learning rates from now on."""
+        self._rate_share *= 0.5
+
+    def _backward(self, item: Batch, count: int) -> Mapping[str, Tensor] | None:
+        """Backpropagate a micro-batch's share of the loss; return its terms, None if anything is not finite."""
         # Divided by the number of micro-batches, so that the sum of all gradients is that of the mean loss.
         loss, figures = self.loss(item)
         (loss / count).backward()
         gradients = (value.grad for value in self.learned.values() if value.grad is not None)
-        return figures if _finite((loss, *gradients)) else None
+        if not _finite((loss, *gradients)):
+            return None
+        # Messages between processes do not carry tensors of a GPU.
+        return figures if self.distributed.world_size == 1 else {name: one.cpu() for name, one in figures.items()}
 
 
 def _copy_in_layout(content: Tensor, parameter: Tensor) -> Tensor:
@@ -292,8 +304,10 @@ def _copy_in_layout(content: Tensor, parameter: Tensor) -> Tensor:
 
 
 def _finite(values: Iterable[Tensor]) -> bool:
-    """Return whether all values are finite: a sum is NaN or infinite when any of its terms is."""
-    return bool(torch.isfinite(torch.stack([value.detach().sum() for value in values]).sum()))
+    """Return whether all values are finite: the largest magnitude is NaN or infinite when any of them is."""
+    # One call for all tensors, which is a few launches on a GPU, and one transfer of the answer.
+    largest = torch._foreach_norm([value.detach() for value in values], ord=torch.inf)
+    return bool(torch.isfinite(torch.stack(largest)).all())
 
 
 def _diverged(iteration: int, item: str) -> DivergedError:
@@ -305,10 +319,10 @@ def _diverged(iteration: int, item: str) -> DivergedError:
     )
 
 
-def _means(outcomes: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the mean of every number over the outcomes that have it, in the order of first appearance."""
-    columns: dict[str, list[float]] = {}
+def _means(outcomes: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Return the mean of every term over the outcomes that have it, in the order of first appearance."""
+    columns: dict[str, list[Tensor]] = {}
     for figures in outcomes:
         for name, value in figures.items():
             columns.setdefault(name, []).append(value)
-    return {name: math.fsum(values) / len(values) for name, values in columns.items()}
+    return {name: torch.stack(values).mean() if values[1:] else values[0] for name, values in columns.items()}

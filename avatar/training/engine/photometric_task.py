@@ -188,7 +188,7 @@ class PhotometricTask(OptimizationTask[Item]):
         return now
 
     @abstractmethod
-    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return the mean loss over the item's views, and its terms."""
 
     def views(self, item: Item) -> list[View]:
@@ -208,7 +208,7 @@ class PhotometricTask(OptimizationTask[Item]):
         targets: Sequence[Target] | None = None,
         *,
         extra: Float[Tensor, "N D"] | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, float], list[Rendering]]:
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor], list[Rendering]]:
         """Return the mean reconstruction loss of a pose over views, its terms, and the renderings.
 
         Args:
@@ -224,7 +224,7 @@ class PhotometricTask(OptimizationTask[Item]):
             scaled = weights.perceptual * self.config.perceptual_every
             weights = replace(weights, perceptual=scaled)
         total = posed.vertices.new_zeros(())
-        terms: list[dict[str, float]] = []
+        terms: list[dict[str, Tensor]] = []
         renderings: list[Rendering] = []
         # Mean over the views.
         for index, view in enumerate(views):
@@ -242,7 +242,7 @@ class PhotometricTask(OptimizationTask[Item]):
         total = total + self._attribute_penalties()
         # Each term's mean over the views that have it.
         names = {name: None for figures in terms for name in figures}
-        means = {name: float(np.mean([f[name] for f in terms if name in f])) for name in names}
+        means = {name: torch.stack([f[name] for f in terms if name in f]).mean() for name in names}
         return total, means, renderings
 
     def _attribute_penalties(self) -> Float[Tensor, ""] | float:

@@ -31,6 +31,7 @@ class Session:
         distributed: the processes that train together.
         max_seconds: stop with a checkpoint after this time.
         tensorboard: log for TensorBoard too.
+        checkpoint_seconds: see `LoopConfig`.
         report: called after logged steps and evaluations.
         preview: called at evaluations with rendered images.
     """
@@ -41,6 +42,7 @@ class Session:
     distributed: Distributed | None = None
     max_seconds: float = float("inf")
     tensorboard: bool = False
+    checkpoint_seconds: float | None = None
     report: Callable[[Progress], None] = lambda progress: None
     preview: Preview = lambda images: None
 
@@ -63,6 +65,7 @@ class Session:
             max_seconds=self.max_seconds,
             keep_end=keep_end,
             tensorboard=self.tensorboard,
+            checkpoint_seconds=self.checkpoint_seconds,
         )
         return run_training(make(), loop, self.folder, key=self.key, report=self.report)
 

@@ -187,11 +187,11 @@ class FitTask(PhotometricTask):
         """Return the name of the step's view."""
         return f"view {' '.join(item.cameras)}"
 
-    def loss(self, item: Item) -> tuple[Tensor, dict[str, float]]:
+    def loss(self, item: Item) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of a view, rendered, and its terms."""
         views = self.views(item)
         total, terms, _ = self.compared(self.student(self.sequence.pose(item.frame), camera_centers_of(views)), views)
-        return total, {"loss": float(total.detach()), **terms}
+        return total, {"loss": total.detach(), **terms}
 
     def head_box_of(self, view: View) -> Box | None:
         """Return the box of the head in a view."""

@@ -14,6 +14,7 @@ from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
 from avatar.losses.deformation import TAU, DisplacementLoss, semantic_labels, vertex_labels
 from avatar.models.networks.deformation_field import show_null_code
+from avatar.models.networks.pose_dependence import PoseRegression
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rendering.avatar_view import Rendering
@@ -131,7 +132,7 @@ class BakeTask(PhotometricTask):
                 else semantic_labels(sequence.rig, student.gaussians(), tau=config.tau)
             )
 
-    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return `L_rec + nonrigid L_non + semantic L_sem` of one frame and its terms."""
         pose = self._augmented_pose(self.sequence.pose(item.frame), item.frame)
         views = self.views(item)
@@ -139,7 +140,7 @@ class BakeTask(PhotometricTask):
         # Without a teacher: the photometric loss on photographs alone.
         if self.targets is None:
             total, terms, _ = self.compared(posed, views)
-            return total, {"loss": float(total.detach()), **terms}
+            return total, {"loss": total.detach(), **terms}
         # L_rec on the teacher's images or on photographs.
         semantic, imitates = bool(self.config.semantic), self.config.images == "teacher"
         shown = self.targets.of_views(item.frame, views) if semantic or imitates else []
@@ -151,14 +152,14 @@ class BakeTask(PhotometricTask):
         if semantic:
             drawn = self._mesh_labels(posed, views) if self.of_mesh else map(_labels, renderings)
             differences = [(own - one.labels).abs().mean() for own, one in zip(drawn, shown, strict=True)]
-            terms["semantic"] = float(torch.stack(differences).mean().detach())
+            terms["semantic"] = torch.stack(differences).mean().detach()
             total = total + self.config.semantic * torch.stack(differences).mean()
         # L_non: distance of the mesh's displacement from the teacher's maps.
         if self.config.nonrigid and posed.displacements is not None:
             nonrigid = self.displacement_loss(posed.displacements, self.targets.displacements(item.frame))
-            terms["nonrigid"] = float(nonrigid.detach())
+            terms["nonrigid"] = nonrigid.detach()
             total = total + self.config.nonrigid * nonrigid
-        return total, {"loss": float(total.detach()), **terms}
+        return total, {"loss": total.detach(), **terms}
 
     def _mesh_labels(self, posed: PosedAvatar, views: Sequence[View]) -> Iterator[Tensor]:
         """Yield the semantic map of the student's mesh in each view, with gradients to its vertices."""
@@ -231,7 +232,7 @@ def bake(
             return made.eval(), progress
         session = session.after(progress)
         if config.regression:
-            made.regression = together.run_on_rank0(lambda: regress_poses(made, sequence))
+            made.regression = _regressed(made, sequence, together)
         elif config.null_share:
             show_null_code(made)  # also on the processes that waited for the pretraining
     # Train on images, then fit the regression to the trained field.
@@ -239,5 +240,12 @@ def bake(
     context = with_surface_normals(session.context, sequence, tracked)
     progress = session.run(lambda: BakeTask(sequence, made, config, context, teacher=teacher), config)
     if config.regression and made.field is not None:
-        made.regression = together.run_on_rank0(lambda: regress_poses(made, sequence))
+        made.regression = _regressed(made, sequence, together)
     return made.eval(), progress
+
+
+def _regressed(student: Student, sequence: AvatarSequence, together: Distributed) -> PoseRegression:
+    """Return the regression that the first process fits, on each process's own device."""
+    # Tensors of a GPU would arrive on the first process's in all of them.
+    found = together.run_on_rank0(lambda: regress_poses(student, sequence).to("cpu"))
+    return found.to(student.rig.device)

@@ -195,7 +195,7 @@ class CompensateTask(PhotometricTask):
         if config.coherence:
             self.coherence = Coherence(student.rig, student.gaussians().select(shapes.active), shapes.U)
 
-    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return `L_rec` and the weighted coherence of one frame, and the terms."""
         views = self.views(item)
         # A share of the poses is shown as new ones.
@@ -209,8 +209,8 @@ class CompensateTask(PhotometricTask):
             # The coherence has its own random stream, so that it does not change which poses are shown as new.
             apart = self.coherence(self.shapes.U, self.generator(item.frame, 1))
             total = total + self.config.coherence * apart
-            terms["coherence"] = float(apart.detach())
-        return total, {"loss": float(total.detach()), **terms}
+            terms["coherence"] = apart.detach()
+        return total, {"loss": total.detach(), **terms}
 
 
 def compensate(

@@ -73,7 +73,7 @@ class PretrainFieldTask(PretrainTask):
         """Return the name of a batch for messages: its frames."""
         return "poses " + " ".join(str(self.sequence.train_frames[k]) for k in item)
 
-    def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return the weighted mean distance of a batch of poses, in units of the maps."""
         frames = self.sequence.train_frames
         # A share of the poses is shown with the null code.
@@ -85,7 +85,7 @@ class PretrainFieldTask(PretrainTask):
         )
         apart = (self.field.at_points(pose, self.codes(shown)) - known).abs().sum(-1)
         loss = (weight * apart).sum() / weight.sum() / self.teacher.config.position_scale
-        return loss, {"loss": float(loss.detach())}
+        return loss, {"loss": loss.detach()}
 
     def _training_pair(self, number: int) -> tuple[Tensor, ...]:
         """Return theta (63,), known displacements (K, 3) at the field's points, metres, and their weights (K,)."""

@@ -55,7 +55,7 @@ class PretrainTeacherTask(PretrainTask):
         """Return the name of a batch for messages: its frames."""
         return "frames " + " ".join(str(self.sequence.train_frames[k]) for k in item)
 
-    def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: tuple[int, ...]) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return the loss of a batch of frames, in units of the maps."""
         frames = [self.sequence.train_frames[k] for k in item]
         # Without a track: the mean size of all residuals.
@@ -63,7 +63,7 @@ class PretrainTeacherTask(PretrainTask):
             maps = [self._all_residuals(frame) for frame in frames]
             sizes = [m.shape.float().abs().mean() + m.colour.float().abs().mean() for m in maps]
             loss = sum(sizes[1:], sizes[0]) / len(maps)
-            return loss, {"loss": float(loss.detach())}
+            return loss, {"loss": loss.detach()}
         # With a track: weighted L1 distance at the Gaussians.
         inputs, known, weights = zip(*(self._training_pair(frame, self.track) for frame in frames), strict=True)
         with self.autocast():
@@ -71,7 +71,7 @@ class PretrainTeacherTask(PretrainTask):
         units = torch.stack(known) / self.teacher.config.position_scale
         apart, weight = (self.teacher.sampler(found.float()) - units).abs().sum(-1), torch.stack(weights)
         loss = (weight * apart).sum() / weight.sum()
-        return loss, {"loss": float(loss.detach())}
+        return loss, {"loss": loss.detach()}
 
     def _training_pair(self, frame: int, track: Track) -> tuple[Tensor, ...]:
         """Return the input map of a frame, the Gaussians' known displacements (N, 3) and their weights (N,).
@@ -144,7 +144,7 @@ class TeacherTask(PhotometricTask):
         super().__init__(sequence, teacher, config, [networks], context)
         self.teacher = teacher
 
-    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return the loss of one frame; the networks run once for all its cameras."""
         views = self.views(item)
         pose, camera_centers = self.sequence.pose(item.frame), camera_centers_of(views)
@@ -156,7 +156,7 @@ class TeacherTask(PhotometricTask):
             # Penalty of large displacements: where photographs determine nothing, Gaussians stay on the skinned mesh.
             moved = maps.shape[..., :3].square().mean()
             total = total + self.config.displacement * moved
-        return total, {"loss": float(total.detach()), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
+        return total, {"loss": total.detach(), **terms, "displacement_mm": _millimetres(posed, self.teacher)}
 
     def _maps(self, item: Item, camera_centers: Tensor) -> Residuals:
         """Return the residual maps of a frame, with noise on the camera centres of the colour network."""
@@ -172,10 +172,10 @@ class TeacherTask(PhotometricTask):
         return Residuals(maps.shape.float(), maps.colour.float(), maps.position_scale)
 
 
-def _millimetres(posed: PosedAvatar, teacher: TeacherAvatar) -> float:
+def _millimetres(posed: PosedAvatar, teacher: TeacherAvatar) -> Tensor:
     """Return the mean length of the Gaussians' displacement, mm."""
     with torch.no_grad():
-        return 1e3 * float((posed.bound.offset - teacher.gaussians.offset).norm(dim=-1).mean())
+        return 1e3 * (posed.bound.offset - teacher.gaussians.offset).norm(dim=-1).mean()
 
 
 def fit_teacher(

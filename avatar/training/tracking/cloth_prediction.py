@@ -27,7 +27,7 @@ ERROR_FLOOR = 1e-3
 """Metres added to every predictor's error; smaller errors are treated as equal."""
 
 Observed = Callable[[], Float[Tensor, "K 3 3"]]
-"""Returns the projection on what a frame's photographs determined; a call, because few of many frames are asked for it."""
+"""Returns the projection on what photographs determined; a call, because few of many frames are asked for it."""
 
 Solved = Mapping[int, tuple[Float[Tensor, "K 3"], Observed | None]]
 """Displacements of solved frames, metres, and what photographs determined there; None: everything."""

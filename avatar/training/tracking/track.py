@@ -163,7 +163,7 @@ class TrackTask(PhotometricTask):
             cached[view.name, times] = self._halved(view, frame, times - 1).halved()
         return cached[view.name, times]
 
-    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return the loss of a frame and its terms; see `avatar.training.tracking` for the equation."""
         views = self.views(item)
         posed = self.avatar(self.sequence.pose(item.frame), camera_centers_of(views))
@@ -182,7 +182,7 @@ class TrackTask(PhotometricTask):
         if self.track_config.body_motion_weight and not cage.off_clothes.all():
             left = cage.motion_off_clothes(controls, reach=self.track_config.tight_reach)
             total = total + self.track_config.body_motion_weight * left
-        return total, {"loss": float(total.detach()), **terms}
+        return total, {"loss": total.detach(), **terms}
 
     def step(self, iteration: int) -> Mapping[str, Any]:
         """Take one step of the current frame; its first step sets the start and clears the optimiser's moments."""

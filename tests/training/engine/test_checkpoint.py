@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from smplxpp.core.errors import InputError
 
 

@@ -8,19 +8,29 @@ import json
 import math
 import os
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from avatar.training.engine import checkpoints
 from avatar.training.engine import loop as module
+from avatar.training.engine.checkpoints import (
+    STATE_FILE,
+    Checkpoint,
+    CheckpointWriter,
+    load_checkpoint,
+    save_checkpoint,
+)
 from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.metrics_log import append_metrics, read_metrics, truncate_metrics
 from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError, MissingExtraError
-from tests.dolls.toy import Toy
+from tests.dolls.toy import Toy, same_state
 
 
 class Walk:
@@ -119,17 +129,75 @@ def test_a_checkpoint_of_another_key_stops_before_anything_is_lost(tmp_path):
 
 def test_what_a_kill_left_half_written_is_cleared(tmp_path):
     run_training(Walk(), config(max_seconds=1e-12), tmp_path, key="k")
-    (tmp_path / f".{module.STATE_FILE.replace('.', '.x7_a.')}").write_bytes(b"half")
+    (tmp_path / f".{STATE_FILE.replace('.', '.x7_a.')}").write_bytes(b"half")
     (tmp_path / ".metrics.12ab.jsonl").write_text("half")
     run_training(Walk(), config(), tmp_path, key="k")
-    assert {path.name for path in tmp_path.iterdir()} == {module.METRICS_FILE, module.STATE_FILE}
+    assert {path.name for path in tmp_path.iterdir()} == {module.METRICS_FILE, STATE_FILE}
 
 
-def test_diverging_keeps_the_last_checkpoint(tmp_path):
-    optimiser = OptimiserConfig(iterations=25)
-    with pytest.raises(DivergedError, match="step 6, batch 20"):
-        run_training(Toy(optimiser, poison=20), config(), tmp_path, key="k")
-    assert module.load_checkpoint(tmp_path / module.STATE_FILE, key="k").iteration == 6
+@pytest.mark.parametrize(
+    ("poison", "words", "kept"),
+    [
+        (range(20, 99), "step 8, batch 24", 8),  # the third step in a row
+        ({3, 9, 15, 21}, "step 7, batch 21", 7),  # four of 25 steps
+    ],
+)
+def test_diverging_often_keeps_the_last_checkpoint(tmp_path, poison, words, kept):
+    with pytest.raises(DivergedError, match=words):
+        run_training(Toy(OptimiserConfig(iterations=25), poison=poison), config(), tmp_path, key="k")
+    assert load_checkpoint(tmp_path / STATE_FILE, key="k").iteration == kept
+
+
+def test_a_step_that_diverges_is_left_out_and_halves_the_rates_once(tmp_path, caplog):
+    class Counted(Toy):
+        halved = 0
+
+        def halve_rates(self) -> None:
+            self.halved += 1
+            super().halve_rates()
+
+    optimiser, poison = OptimiserConfig(iterations=25), (10, 40)
+    whole = Counted(optimiser, poison=poison)
+    assert run_training(whole, config(), tmp_path / "whole", key="k").finished
+    assert whole.halved == 1
+    said = [record.message for record in caplog.records if "left out" in record.message]
+    assert len(said) == 2
+    assert said[0].startswith("training step 3, batch 10 is left out") and said[0].endswith("rates are halved")
+    assert not said[1].endswith("rates are halved")
+    # A training that was stopped after the first of them goes on with the halved rates.
+    stopped = run_training(Toy(optimiser, poison=poison), config(max_seconds=1e-12), tmp_path / "parts", key="k")
+    while not stopped.finished:
+        part = Toy(optimiser, poison=poison)
+        stopped = run_training(part, config(max_seconds=1e-12), tmp_path / "parts", key="k")
+    assert same_state(part.state(), whole.state())
+    steady = Toy(optimiser)
+    run_training(steady, config(), tmp_path / "steady", key="k")
+    assert not same_state(steady.state(), whole.state())
+
+
+def test_a_checkpoint_is_of_its_moment_though_the_steps_go_on(tmp_path, monkeypatch):
+    slow = threading.Event()
+
+    def delayed(path, checkpoint):
+        assert slow.wait(60)
+        save_checkpoint(path, checkpoint)
+
+    monkeypatch.setattr(checkpoints, "save_checkpoint", delayed)
+    writer, place = CheckpointWriter(tmp_path / STATE_FILE), torch.ones(3)
+    writer.write(Checkpoint(5, 1.0, "k", {"place": place}))
+    place += 1.0
+    slow.set()
+    writer.finish()
+    writer.close()
+    assert torch.equal(load_checkpoint(tmp_path / STATE_FILE, key="k").tensors["place"], torch.ones(3))
+
+
+def test_checkpoints_take_a_share_of_the_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "save_checkpoint", lambda path, checkpoint: time.sleep(0.02))
+    writer = CheckpointWriter(tmp_path / STATE_FILE, share=0.02, least_seconds=0.5)
+    first, second = (writer.write(Checkpoint(k, 1.0, "k", {})) for k in (1, 2))
+    writer.close()
+    assert 0.5 <= first and 1.0 <= second
 
 
 def too_much_memory(empty) -> Exception:
@@ -151,7 +219,7 @@ def test_running_out_of_memory_says_what_to_do_and_keeps_the_last_checkpoint(tmp
         run_training(Walk(9, errors[kind]), config(), tmp_path, key="k")
     assert "smaller preset" in caught.value.remedy and caught.value.received and "\n" not in caught.value.received
     whole, second = Walk(), Walk()
-    assert module.load_checkpoint(tmp_path / module.STATE_FILE, key="k").iteration == 9
+    assert load_checkpoint(tmp_path / STATE_FILE, key="k").iteration == 9
     run_training(second, config(), tmp_path, key="k")
     run_training(whole, config(), tmp_path / "whole", key="k")
     assert torch.equal(whole.place, second.place)
@@ -178,8 +246,8 @@ def test_a_full_disk_says_so_and_keeps_the_last_checkpoint(tmp_path, monkeypatch
         patch.setattr(Path, "write_bytes", full)
         run_training(Walk(), config(), tmp_path, key="k")
     assert str(tmp_path) in caught.value.subject and "free some space" in caught.value.remedy
-    assert sorted(path.name for path in tmp_path.iterdir()) == [module.METRICS_FILE, module.STATE_FILE]
-    assert module.load_checkpoint(tmp_path / module.STATE_FILE, key="k").iteration == 7
+    assert sorted(path.name for path in tmp_path.iterdir()) == [module.METRICS_FILE, STATE_FILE]
+    assert load_checkpoint(tmp_path / STATE_FILE, key="k").iteration == 7
     whole, second = Walk(), Walk()
     run_training(second, config(), tmp_path, key="k")
     run_training(whole, config(), tmp_path / "whole", key="k")

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.optimization_task import EVERY, MeanOfSteps, OptimiserConfig
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy, copied, same_state

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.training.engine.loop import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.training.engine.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig, OptimizationTask, ParameterGroup
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy, copied, same_state
@@ -28,7 +28,7 @@ class Single(OptimizationTask):
 
     def loss(self, item: int):
         loss = self.of(self.value)
-        return loss, {"loss": loss.item()}
+        return loss, {"loss": loss.detach()}
 
 
 def test_micro_batches_are_one_step_on_their_mean():
@@ -112,7 +112,7 @@ def test_clipping_shortens_all_gradients_together(max_grad_norm):
 
 
 def test_a_loss_that_is_not_a_number_changes_nothing_and_names_the_batch():
-    task, clean = Toy(CONFIG, poison=13), Toy(CONFIG)
+    task, clean = Toy(CONFIG, poison=(13,)), Toy(CONFIG)
     for k in range(4):
         task.step(k), clean.step(k)
     before = copied(task.state())
@@ -120,7 +120,7 @@ def test_a_loss_that_is_not_a_number_changes_nothing_and_names_the_batch():
         task.step(4)
     assert "learning rates" in caught.value.remedy
     assert same_state(before, task.state())
-    task.poison = None
+    task.poison = ()
     task.step(4), clean.step(4)
     assert same_state(clean.state(), task.state())
 

@@ -65,7 +65,7 @@ def main(folder: Path) -> None:
         keep(train(folder / "parts", together), folder / f"parts_{together.rank}")
         train(folder / "other", together, limited)
         report = {
-            "diverged": refusal(lambda: train(folder / "diverged", together, poison=22)),
+            "diverged": refusal(lambda: train(folder / "diverged", together, poison=range(22, 99))),
             "few": refusal(lambda: train(folder / "few", together, batches=1)),
             "key": refusal(lambda: train(folder / "other", together, key="another")),
         }
