@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from avatar.baselines.outer_template import outer_template
+from avatar.baselines.build import outer_template
 from avatar.data.sequence import AvatarSequence
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.model_file import load_avatar, save_avatar

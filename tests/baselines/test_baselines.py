@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from avatar.baselines.avatar_base import PhotographConfig, PhotographTask
-from avatar.baselines.build import make_baseline
-from avatar.baselines.outer_template import outer_template
+from avatar.baselines.build import make_baseline, outer_template
 from avatar.baselines.point_mlp import PointMLPConfig
 from avatar.baselines.textured_mesh import TexturedMeshConfig
 from avatar.baselines.uv_unet import UVUNetConfig

@@ -282,7 +282,9 @@ def test_a_perceptual_term_of_every_second_step_counts_twice(frames):
     for k, weight in ((0, 0.5), (1, 0.0)):
         total, terms = task.loss(task.micro_batches(k)[0])
         assert ("perceptual" in terms) == bool(weight)
-        assert float(total.detach()) == pytest.approx(terms["l1"] + weight * terms.get("perceptual", 0.0), rel=1e-5)
+        assert float(total.detach()) == pytest.approx(
+            float(terms["l1"] + weight * terms.get("perceptual", 0.0)), rel=1e-5
+        )
 
 
 def test_held_out_views_and_poses_are_measured_and_shown(frames):
