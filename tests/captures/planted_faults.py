@@ -104,7 +104,20 @@ def describe(**entries) -> Callable[[Path], None]:
     return lambda root: edit_json(root / "capture.json", lambda content: content.update(entries))
 
 
+def tagged(root: Path, orientation: int) -> None:
+    """An image as a phone stores it: pixels that lie, and a tag that asks for a turn; half a turn keeps its size."""
+    path = root / image("B", 1)
+    with Image.open(path) as found:
+        pixels = np.array(found)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    turned = np.rot90(pixels, {6: 1, 8: -1}.get(orientation, 0))
+    Image.fromarray(np.ascontiguousarray(turned)).save(path, exif=exif, quality=95)
+
+
 FILE_FAULTS = {
+    "an image that asks for a quarter turn": (lambda r: tagged(r, 6), "image-turned", "tion 6 asks for a turn or a"),
+    "an image that asks for half a turn": (lambda r: tagged(r, 3), "image-turned", "which is not made"),
     "a truncated image": (truncate, "file-damaged", image("B", 1)),
     "a mask of another size": (wider, "file-size", mask("A", 2)),
     "a folder that is not calibrated": (uncalibrated, "camera-uncalibrated", "rgbs/A"),

@@ -110,18 +110,19 @@ def check_view(
 
 
 def _turned(capture: Capture, camera: str, frame: int, image: np.ndarray | None) -> Iterator[Finding]:
-    """Find images and masks that ask for a turn, by their EXIF orientation, which is not made."""
+    """Find images and masks that ask for a turn by their EXIF orientation, and say whether it is made."""
     for kind in ("image", "mask"):
         path = capture.file(camera, frame, kind)
         if path is None or image is None:
             continue
         tag, source = image_orientation(path), capture.reader(camera).camera
+        words = f"{kind} {path}: EXIF orientation {tag} asks for a turn or a mirroring of the stored pixels"
         # A quarter turn that brings the image to the calibration's size is made (`smplxpp.capture.views.check_size`).
         if tag >= 5 and image_size(path) != (source.width, source.height):
-            continue
-        if tag != 1:
-            words = f"{kind} {path}: EXIF orientation {tag} asks for a turn or a mirroring of the stored pixels"
-            yield Finding("image-turned", words, camera, frame)
+            advice = "nothing, if the calibration was made on the turned pictures, whose width and height it has"
+            yield Finding("image-turned", f"{words}, which is made", camera, frame, advice)
+        elif tag != 1:
+            yield Finding("image-turned", f"{words}, which is not made", camera, frame)
 
 
 def _wrong_mask(mask: Bool[np.ndarray, "H W"], silhouette: Bool[np.ndarray, "H W"] | None) -> tuple[str, str] | None:
