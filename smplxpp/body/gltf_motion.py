@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from smplxpp.body.layout import PROGRAM_NAMES
 from smplxpp.body.skeleton_motion import SkeletonMotion, chosen_clip, rate_of_keys
 from smplxpp.core.errors import InputError, warn_of_left_out
+from smplxpp.core.files.json_file import as_object
 from smplxpp.core.mesh_files.gltf_document import GltfDocument
 from smplxpp.core.mesh_files.gltf_skins import Node, world_nodes
 
@@ -120,18 +121,18 @@ def _channels(
     samplers = document.items(animation, "samplers")
     found: dict[tuple[int, str], _Channel] = {}
     others: set[str] = set()
-    for channel in document.items(animation, "channels"):
+    for channel in (as_object(one, subject=subject) for one in document.items(animation, "channels")):
         target = document.part(channel, "target")
         kind = target.get("path")
-        if kind not in _PATHS or "node" not in target:
-            others.add("morph targets (faces)" if kind == "weights" else str(kind)[:40])
+        if not isinstance(kind, str) or kind not in _PATHS or "node" not in target:
+            others.add("morph targets (faces)" if kind == "weights" else repr(kind)[:40])
             continue
         node, index = document.number(target, "node"), document.number(channel, "sampler")
         if node not in nodes:
             continue
         if index >= len(samplers):
             raise InputError(subject, expected=f"a sampler below {len(samplers)}", received=str(index))
-        sampler = samplers[index]
+        sampler = as_object(samplers[index], subject=subject)
         times = document.accessor(sampler.get("input")).astype(np.float64).reshape(-1)
         values = document.accessor(sampler.get("output")).astype(np.float64)
         interpolation = sampler.get("interpolation", "LINEAR")
@@ -154,9 +155,8 @@ def _channels(
 def _joints(document: GltfDocument, nodes: dict[int, Node], channels: dict[tuple[int, str], _Channel]) -> list[int]:
     """Return the nodes of the skeleton that moves, parents before children, from the scene's root on."""
     moving = {node for node, kind in channels if kind == "rotation"}
-    skins = [
-        set(document.items(document.entry("skins", k), "joints")) & nodes.keys() for k in _range(document, "skins")
-    ]
+    skins = [document.items(document.entry("skins", k), "joints") for k in _range(document, "skins")]
+    skins = [{node for node in skin if isinstance(node, int) and node in nodes} for skin in skins]
     skins += [{node for node in _bones(document).values() if node in nodes}]
     # The skin whose joints move most, with all that moves below the node that all of them hang on.
     chosen = max(skins, key=lambda skin: len(skin & moving))
@@ -204,8 +204,9 @@ def _bones(document: GltfDocument) -> dict[str, int]:
         bones = document.part(document.part(document.part(extensions, name), "humanoid"), "humanBones")
         if bones:
             return {bone: document.number(document.part(bones, bone), "node") for bone in bones}
-    older = document.part(document.part(extensions, "VRM"), "humanoid")
-    return {str(one.get("bone")): document.number(one, "node") for one in document.items(older, "humanBones")}
+    older = document.items(document.part(document.part(extensions, "VRM"), "humanoid"), "humanBones")
+    bones = [as_object(one, subject=document.subject) for one in older]
+    return {str(one.get("bone")): document.number(one, "node") for one in bones}
 
 
 def _human_bones(document: GltfDocument, joints: list[int]) -> dict[str, int]:
@@ -232,7 +233,7 @@ def _bound(document: GltfDocument, joints: list[int]) -> dict[int, Float64[np.nd
         if inverse.shape != (len(own), 16):
             continue
         for node, matrix in zip(own, inverse.reshape(-1, 4, 4).transpose(0, 2, 1), strict=True):
-            if node in joints and abs(float(np.linalg.det(matrix[:3, :3]))) > 0.0:
+            if isinstance(node, int) and node in joints and abs(float(np.linalg.det(matrix[:3, :3]))) > 0.0:
                 bound.setdefault(node, np.linalg.inv(matrix))
     return bound
 

@@ -39,7 +39,7 @@ def motion_doors() -> list[Door]:
         Door(
             "motion glb",
             lambda f: scene_of(_still()).write(f / "m.glb"),
-            lambda f: load_skeleton(f / "m.glb", skeleton),
+            lambda f: load_skeleton(f, skeleton),
         ),
         Door(
             "joint map", lambda f: (f / "m.json").write_text(json.dumps(names)), lambda f: read_joint_map(f / "m.json")
