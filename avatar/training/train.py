@@ -156,7 +156,7 @@ def _refine(scene: TrainScene, config: Any, session: Session, folder: Path) -> P
     def show(step: str, share: float) -> None:
         session.report(Progress(round(100 * share), 100, 0.0, 0.0))
 
-    refine_capture(scene, config, folder, progress=show)
+    refine_capture(scene, config, folder, work=session.folder / session.key[:16], progress=show)
     return Progress(1, 1, 0.0, 0.0)
 
 

@@ -93,10 +93,14 @@ def refine(
         code=(__name__,),
         libraries=TRAINING,
         seed=config.seed,
+        resumable=True,
     )
     with own_run_folder(run, (REFINE_STAGE, "report")):
         return run_stage(
-            run, stage, lambda folder: _work(scene, inputs, config, folder, progress, held_out=held_out), force=force
+            run,
+            stage,
+            lambda folder: _work(scene, inputs, config, folder, run / stage.work_name, progress, held_out=held_out),
+            force=force,
         )
 
 
@@ -105,6 +109,7 @@ def _work(
     inputs: TrainInputs,
     config: RefineConfig,
     folder: Path,
+    state: Path,
     progress: ProgressCallback,
     *,
     held_out: bool,
@@ -112,7 +117,7 @@ def _work(
     """Refine, write the files with pictures, and measure against the gates."""
     begin = time.perf_counter()
     # Frames whose loss rose keep their initial poses; a warning names them.
-    refined = refine_capture(scene, config, folder, held_out=held_out, progress=progress)
+    refined = refine_capture(scene, config, folder, held_out=held_out, work=state, progress=progress)
     found = refined.training
     if found.kept:
         log.warning("frames %s keep their poses: refined ones fit worse", " ".join(map(str, found.kept)))

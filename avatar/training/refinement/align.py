@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +20,7 @@ from avatar.training.refinement.photometric import Linearization, PhotometricLos
 from avatar.training.refinement.posing import PosedTemplate
 from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_prior
 from avatar.training.refinement.variables import CentreJacobian, Variables
+from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.register import BodyState
 
 Views = Callable[[int], Sequence[View]]
@@ -55,6 +59,23 @@ class Scene:
     config: RefineConfig
     cameras: CameraCorrections | None = None
     fps: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Carried:
+    """What a pass hands to the next one of its level.
+
+    Attributes:
+        damping: Levenberg-Marquardt damping of every frame.
+        best: least loss of every frame so far.
+        kept: poses of those losses.
+        normal: normal equations about them; None before the first pass.
+    """
+
+    damping: Float64[np.ndarray, " F"]
+    best: Float64[np.ndarray, " F"]
+    kept: BodyState
+    normal: Normal | None
 
 
 class Alignment:
@@ -99,10 +120,34 @@ class Alignment:
         self._groups = torch.tensor(labels, dtype=torch.int64)[gaussians.face_index]
         self._jacobian = CentreJacobian(scene.posed, gaussians, self.variables)
 
-    def run(self, levels: Sequence[Level], on_frame: Callable[[], None] = lambda: None) -> None:
-        """Run the passes of all levels; `on_frame` is called after every frame of a pass."""
+    def run(
+        self, levels: Sequence[Level], on_frame: Callable[[], None] = lambda: None, *, file: Path | None = None
+    ) -> None:
+        """Run the passes of all levels, each one more than steps, because the result of the last step is evaluated too.
+
+        Args:
+            levels: from coarse to fine.
+            on_frame: called after every frame of a pass.
+            file: written after every pass; where it exists, the run goes on from it, to the same bits.
+        """
+        done, carried = self._restore(file) if file is not None and file.is_file() else (0, None)
+        number = 0
         for level in levels:
-            self._run_level(level, on_frame)
+            for step in range(level.steps + 1):
+                number += 1
+                if number <= done:
+                    for _ in self.frames:
+                        on_frame()
+                    continue
+                carried = self._pass(level, self._begin() if carried is None or step == 0 else carried, on_frame)
+                # One step each of poses and of cameras; nothing follows the last pass of a level.
+                if step < level.steps:
+                    assert carried.normal is not None
+                    self.state = self._stepped(carried.normal, carried.damping)
+                    if self.scene.cameras is not None:
+                        self.scene.cameras.step()
+                if file is not None:
+                    self._save(file, number, carried)
 
     def losses(self, state: BodyState, on_frame: Callable[[], None] = lambda: None) -> Float64[np.ndarray, " F"]:
         """Return `PhotometricLoss.rigid_loss` of every frame in a state, at the size of the finest level."""
@@ -115,45 +160,74 @@ class Alignment:
             on_frame()
         return np.array(out)
 
-    def _run_level(self, level: Level, on_frame: Callable[[], None]) -> None:
-        """Run the passes of a level: one more than steps, because the result of the last step is evaluated too."""
-        # Levenberg-Marquardt damping: initial and least value, factors after a good and after a bad pass. The loss of a
-        # bad frame grew by more than `worse`; less may come from the change of the shared colours.
-        initial_damping, least_damping, good_factor, bad_factor, worse = 1e-2, 1e-4, 0.3, 10.0, 1.01
-        F = len(self.frames)
-        damping, best = np.full(F, initial_damping), np.full(F, np.inf)
-        kept, normal = self.state, None
-        for step in range(level.steps + 1):
-            # Linearise the photometric loss of every frame about the current poses.
-            appearance = AppearanceUpdate(self._groups, self._jacobian.rigidity)
-            losses, gradients, curvatures = [], [], []
-            for row in range(F):
-                linear, gradient, curvature = self._linearize(row, level.halvings)
-                appearance.add(linear)
-                losses.append(linear.loss)
-                gradients.append(gradient)
-                curvatures.append(curvature)
-                on_frame()
-            found, loss = Normal(np.stack(gradients), np.stack(curvatures)), np.array(losses)
-            # Reset frames whose loss grew, with their earlier normal equations, and damp them more.
-            bad = loss > worse * best
-            if normal is not None:
-                self.state = _mixed(kept, self.state, bad)
-                found = Normal(
-                    np.where(bad[:, None], normal.gradient, found.gradient),
-                    np.where(bad[:, None, None], normal.curvature, found.curvature),
-                )
-                damping = np.where(bad, damping * bad_factor, np.maximum(damping * good_factor, least_damping))
-            best = np.where(bad, best, loss)
-            kept, normal = self.state, found
-            self.history.append(PassReport(level.halvings, float(loss.mean()), int(bad.sum())))
-            # One step each of colours and depths, of poses, and of cameras.
-            if self.learns_appearance:
-                self.gaussians = appearance.stepped(self.gaussians, F)
-            if step < level.steps:
-                self.state = self._stepped(found, damping)
-                if self.scene.cameras is not None:
-                    self.scene.cameras.step()
+    def _begin(self) -> _Carried:
+        """Return what a level's first pass starts from."""
+        initial_damping, count = 1e-2, len(self.frames)
+        return _Carried(np.full(count, initial_damping), np.full(count, np.inf), self.state, None)
+
+    def _pass(self, level: Level, before: _Carried, on_frame: Callable[[], None]) -> _Carried:
+        """Evaluate all frames, reset those whose loss grew, and take a step of colours and depths."""
+        # Levenberg-Marquardt damping: least value, factors after a good and after a bad pass. The loss of a bad frame
+        # grew by more than `worse`; less may come from the change of the shared colours.
+        least_damping, good_factor, bad_factor, worse = 1e-4, 0.3, 10.0, 1.01
+        # Linearise the photometric loss of every frame about the current poses.
+        appearance = AppearanceUpdate(self._groups, self._jacobian.rigidity)
+        if self.scene.cameras is not None:
+            self.scene.cameras.clear()
+        losses, gradients, curvatures = [], [], []
+        for row in range(len(self.frames)):
+            linear, gradient, curvature = self._linearize(row, level.halvings)
+            appearance.add(linear)
+            losses.append(linear.loss)
+            gradients.append(gradient)
+            curvatures.append(curvature)
+            on_frame()
+        found, loss = Normal(np.stack(gradients), np.stack(curvatures)), np.array(losses)
+        # Reset frames whose loss grew, with their earlier normal equations, and damp them more.
+        bad, damping = loss > worse * before.best, before.damping
+        if before.normal is not None:
+            self.state = _mixed(before.kept, self.state, bad)
+            found = Normal(
+                np.where(bad[:, None], before.normal.gradient, found.gradient),
+                np.where(bad[:, None, None], before.normal.curvature, found.curvature),
+            )
+            damping = np.where(bad, damping * bad_factor, np.maximum(damping * good_factor, least_damping))
+        self.history.append(PassReport(level.halvings, float(loss.mean()), int(bad.sum())))
+        if self.learns_appearance:
+            self.gaussians = appearance.stepped(self.gaussians, len(self.frames))
+        return _Carried(damping, np.where(bad, before.best, loss), self.state, found)
+
+    def _save(self, file: Path, number: int, carried: _Carried) -> None:
+        """Write everything that the passes after this number depend on, whole or not at all."""
+        assert carried.normal is not None
+        arrays: dict[str, Any] = {
+            "number": np.int64(number),
+            "history": np.array([[one.halvings, one.loss, one.bad] for one in self.history]),
+            "dc": self.gaussians.dc.numpy(),
+            "normal_offset": self.gaussians.normal_offset.numpy(),
+            "damping": carried.damping,
+            "best": carried.best,
+            "gradient": carried.normal.gradient,
+            "curvature": carried.normal.curvature,
+        }
+        if self.scene.cameras is not None:
+            arrays["cameras"] = self.scene.cameras.motions
+        for name, state in (("state", self.state), ("kept", carried.kept)):
+            arrays |= {f"{name}.{field.name}": getattr(state, field.name) for field in fields(state)}
+        write_arrays(file, arrays, packing=zipfile.ZIP_STORED)
+
+    def _restore(self, file: Path) -> tuple[int, _Carried]:
+        """Read what `_save` wrote; return the number of finished passes and what the last one hands on."""
+        arrays: Mapping[str, np.ndarray] = read_arrays(file, subject="state of the refinement")
+        names = [field.name for field in fields(self.state)]
+        self.state, kept = (BodyState(*(arrays[f"{one}.{name}"] for name in names)) for one in ("state", "kept"))
+        dc, depth = torch.from_numpy(arrays["dc"]), torch.from_numpy(arrays["normal_offset"])
+        self.gaussians = replace(self.gaussians, dc=dc, normal_offset=depth)
+        self.history = [PassReport(int(halvings), float(loss), int(bad)) for halvings, loss, bad in arrays["history"]]
+        if self.scene.cameras is not None:
+            self.scene.cameras.motions = arrays["cameras"]
+        normal = Normal(arrays["gradient"], arrays["curvature"])
+        return int(arrays["number"]), _Carried(arrays["damping"], arrays["best"], kept, normal)
 
     def _linearize(
         self, row: int, halvings: int

@@ -93,7 +93,7 @@ class CameraCorrections:
     def __init__(self, names: Sequence[str], center: Float64[np.ndarray, " 3"], config: RefineConfig) -> None:
         self.names, self.center, self.config = tuple(names), center, config
         self.motions: Float64[np.ndarray, "C 6"] = np.zeros((len(self.names), 6))
-        self._sums = np.zeros((len(self.names), 6)), np.zeros((len(self.names), 6, 6))
+        self.clear()
 
     def matrix(self, name: str) -> Float64[np.ndarray, "4 4"]:
         """Return X of a camera as a matrix."""
@@ -125,10 +125,13 @@ class CameraCorrections:
             moved = (own * rigidity[:, None, None]) @ J
             curvature[row] += (J.reshape(-1, 6).T @ moved.reshape(-1, 6)).double().numpy()
 
+    def clear(self) -> None:
+        """Begin the sums of a pass."""
+        self._sums = np.zeros((len(self.names), 6)), np.zeros((len(self.names), 6, 6))
+
     def step(self) -> None:
-        """Take one Gauss-Newton step of all cameras, with a Gaussian prior about no correction, and clear the sums."""
+        """Take one Gauss-Newton step of all cameras, with a Gaussian prior about no correction."""
         gradient, curvature = self._sums
-        self._sums = np.zeros_like(gradient), np.zeros_like(curvature)
         # Prior: Gaussian about no correction.
         sigma = np.repeat([np.radians(self.config.camera_rotation_sigma), self.config.camera_translation_sigma], [3, 3])
         prior = np.diag(1.0 / sigma**2)

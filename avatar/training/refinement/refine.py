@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -61,6 +62,7 @@ def refine_poses(
     *,
     reference: int | None = None,
     frames: Sequence[int] | None = None,
+    state: Path | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> Refinement:
     """Refine training frames: the reference frame first, then all together, with the colours of the Gaussians.
@@ -73,6 +75,7 @@ def refine_poses(
         config: of the refinement; None: the defaults.
         reference: frame that colours start from; None: the first.
         frames: some of the training frames; None: all.
+        state: file that is written after every pass over the frames. Where it exists, the same call goes on from it.
         progress: called with the finished share of the frames' evaluations.
 
     Raises:
@@ -93,13 +96,19 @@ def refine_poses(
     # Refine the reference frame alone, which sharpens the colours.
     counter = _EvaluationCounter(progress, config, len(chosen))
     view = _training_views(sequence)
-    alone = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
-    alone.run(config.reference_levels, counter.step)
+    if state is None or not state.is_file():
+        alone = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
+        alone.run(config.reference_levels, counter.step)
+        gaussians = alone.gaussians
+    else:
+        for _ in range(sum(level.steps + 1 for level in config.reference_levels)):
+            counter.step()
     # One frame determines cameras poorly: their corrections start from zero again with all frames.
     if scene.cameras is not None:
         scene = replace(scene, cameras=_corrections(sequence, config))
     # Refine all frames together.
-    return _finish(Alignment(scene, alone.gaussians, chosen, _state(posed, start), view), start, sequence, counter)
+    together = Alignment(scene, gaussians, chosen, _state(posed, start), view)
+    return _finish(together, start, sequence, counter, state)
 
 
 def refine_held_out(
@@ -108,6 +117,7 @@ def refine_held_out(
     config: RefineConfig | None = None,
     *,
     frames: Sequence[int] | None = None,
+    state: Path | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> Refinement:
     """Refine the poses of held-out frames on the photographs of training cameras; everything else stays.
@@ -120,6 +130,7 @@ def refine_held_out(
         gaussians: with the colours of a refinement of training frames, on the CPU.
         config: of the refinement; None: the defaults. Cameras are not corrected.
         frames: some held-out frames; None: all.
+        state: as of `refine_poses`.
         progress: called with the finished share of the frames' evaluations.
 
     Raises:
@@ -135,7 +146,7 @@ def refine_held_out(
     view = _training_views(sequence)
     alignment = Alignment(scene, gaussians, chosen, _state(scene.posed, start), view, learns_appearance=False)
     counter = _EvaluationCounter(progress, replace(config, reference_levels=()), len(chosen))
-    return _finish(alignment, start, sequence, counter)
+    return _finish(alignment, start, sequence, counter, state)
 
 
 class _EvaluationCounter:
@@ -153,11 +164,15 @@ class _EvaluationCounter:
 
 
 def _finish(
-    alignment: Alignment, start: BodyParams, sequence: AvatarSequence, counter: _EvaluationCounter
+    alignment: Alignment,
+    start: BodyParams,
+    sequence: AvatarSequence,
+    counter: _EvaluationCounter,
+    state: Path | None,
 ) -> Refinement:
     """Run an alignment of all frames, and keep for each frame the better of its start and its result."""
     scene, frames = alignment.scene, alignment.frames
-    alignment.run(scene.config.levels, counter.step)
+    alignment.run(scene.config.levels, counter.step, file=state)
     # Losses of start and result with the same, final colours.
     before = alignment.losses(alignment.start, counter.step)
     after = alignment.losses(alignment.state, counter.step)

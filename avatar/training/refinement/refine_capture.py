@@ -24,6 +24,7 @@ from smplxpp.template.template import Template
 
 PARAMS_FILE, HELD_OUT_PARAMS_FILE, CAMERAS_FILE = "params.npz", "params_held_out.npz", "cameras.json"
 GAUSSIANS_FILE = "gaussians.safetensors"
+TRAINING_STATE, HELD_OUT_STATE = "training_frames.npz", "held_out_frames.npz"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,7 @@ def refine_capture(
     folder: Path,
     *,
     held_out: bool = True,
+    work: Path | None = None,
     progress: ProgressCallback = ignore_progress,
 ) -> RefinedCapture:
     """Refine the poses of a capture on the photographs of its training cameras, and write them.
@@ -66,13 +68,17 @@ def refine_capture(
         config: choices of the refinement.
         folder: an existing folder for the files.
         held_out: whether held-out frames are refined too.
+        work: folder of the state, from which the same call continues after a kill; None: none is kept.
         progress: called with the share of the frames' evaluations that are done.
 
     Raises:
         InputError: a frame without parameters or photographs.
     """
     sequence = AvatarSequence(scene.capture, scene.template, SequenceConfig(normals=False))
-    found = refine_poses(sequence, config, reference=scene.frame, progress=progress)
+    if work is not None:
+        work.mkdir(parents=True, exist_ok=True)
+    training, apart_state = (None, None) if work is None else (work / TRAINING_STATE, work / HELD_OUT_STATE)
+    found = refine_poses(sequence, config, reference=scene.frame, state=training, progress=progress)
     capture, template = scene.capture, scene.template
     _write_params(folder / PARAMS_FILE, _rows(capture, template, [found]))
     if found.cameras:
@@ -81,7 +87,7 @@ def refine_capture(
         sequence.capture = with_cameras(capture, found.cameras)
     apart = None
     if held_out and capture.splits.novel_pose_frames:
-        apart = refine_held_out(sequence, found.gaussians, config)
+        apart = refine_held_out(sequence, found.gaussians, config, state=apart_state)
         _write_params(folder / HELD_OUT_PARAMS_FILE, _rows(capture, template, [found, apart]))
     save_bound(found.gaussians, folder / GAUSSIANS_FILE)
     return RefinedCapture(sequence, found, apart)

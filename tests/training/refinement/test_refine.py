@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.sampling import SamplingConfig
@@ -59,6 +60,31 @@ def test_disturbed_poses_come_back(found, start):
     assert (found.after < found.before).all() and found.kept == ()
 
 
+@pytest.mark.parametrize("cameras", [False, True])
+def test_a_killed_refinement_goes_on_to_the_same_bits(frames, tmp_path, cameras):
+    """In the first pass of the second level, after the passes of the first one."""
+    config = replace(QUICK, levels=(Level(1, 1), Level(1, 1)), cameras=cameras)
+    whole = refine_poses(frames, config)
+
+    def killed(step: str, share: float) -> None:
+        # The reference frame is looked at twice; five frames four times, and twice more at the end.
+        if share >= (2 + 2.5 * 5) / (2 + 6 * 5):
+            raise KeyboardInterrupt
+
+    file = tmp_path / "state.npz"
+    with pytest.raises(KeyboardInterrupt):
+        refine_poses(frames, config, state=file, progress=killed)
+    shares = []
+    again = refine_poses(frames, config, state=file, progress=lambda step, share: shares.append(share))
+    np.testing.assert_array_equal(again.params.body_pose, whole.params.body_pose)
+    np.testing.assert_array_equal(again.params.transl, whole.params.transl)
+    assert torch.equal(again.gaussians.dc, whole.gaussians.dc)
+    assert torch.equal(again.gaussians.normal_offset, whole.gaussians.normal_offset)
+    assert again.history == whole.history and shares[-1] == 1.0
+    for name, pose in whole.cameras.items():
+        np.testing.assert_array_equal(again.cameras[name], pose)
+
+
 def test_what_changed_is_told(found, start):
     assert found.frames == (0, 1, 2, 3, 4) and found.turned.shape == (5, len(found.joints))
     apart = 1e3 * np.linalg.norm(found.params.transl - start.select(list(found.frames)).transl, axis=1)
@@ -68,7 +94,7 @@ def test_what_changed_is_told(found, start):
 
 
 def test_frames_whose_photographs_like_the_start_better_keep_it(frames, found, start, monkeypatch):
-    def astray(self, levels, on_frame):
+    def astray(self, levels, on_frame, *, file):
         self.state = replace(self.state, transl=self.state.transl + [0.1, 0.0, 0.0])
 
     monkeypatch.setattr(Alignment, "run", astray)
