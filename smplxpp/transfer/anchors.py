@@ -66,7 +66,8 @@ def point_admissibility(
     admissible: Float[np.ndarray, "N J"], weights: Float[np.ndarray, "S J"]
 ) -> Float64[np.ndarray, "N S"]:
     """Return how much each point of the body, by its weights, may count for each vertex."""
-    return np.maximum(admissible @ weights.T, LEAST_ADMISSIBILITY)
+    out = admissible @ weights.T
+    return np.maximum(out, LEAST_ADMISSIBILITY, out=out)
 
 
 def anchor_share(

@@ -119,14 +119,25 @@ def check_placement(source: TriangleMesh, target: TriangleMesh, distance: Float[
 
 
 def _axes_remedy(source: TriangleMesh, points: np.ndarray, better: float) -> str:
-    """Return a remedy if other axes bring the points nearer than `better` (median distance), else an empty string."""
+    """Return a remedy if other axes bring the points nearer than `better` (median distance), else an empty string.
+
+    Other axes that put more of the points into the body are not those of what is worn: a tutu, which stands off the
+    hips all round, would be nearer to a body that it cuts from head to foot.
+    """
     sample = points[:: max(1, len(points) // 500)]
+    inside = _share_inside(source, sample) + 0.15
     for name, axes, sign in _AXES:
         turned = np.ascontiguousarray(sample[:, axes] * sign)
         squared, _, _ = igl.point_mesh_squared_distance(turned, source.vertices, source.faces)
-        if np.sqrt(np.median(squared)) < better:
+        if np.sqrt(np.median(squared)) < better and _share_inside(source, turned) <= inside:
             return f"the axes differ: the target seems to have {name}; both need +Y up"
     return ""
+
+
+def _share_inside(source: TriangleMesh, points: np.ndarray) -> float:
+    """Return the share of points inside a surface, by generalised winding numbers."""
+    winding = igl.fast_winding_number(source.vertices, source.faces, np.ascontiguousarray(points))
+    return float((winding > 0.5).mean())
 
 
 def consistent_winding(mesh: TriangleMesh, *, subject: str) -> TriangleMesh:

@@ -13,7 +13,7 @@ from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.core.topology import component_labels
 from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.rings import Ring, Septum, rings_around, septum_of
+from smplxpp.transfer.rings import Septum, heights, rings_around, septum_of
 
 _SPACING = 0.01
 """Distance of the planes along a limb, as a share of the body's extent: less than a ring of a coarse garment."""
@@ -120,17 +120,7 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
     alone, other = np.zeros((len(axes), n)), np.zeros((len(axes), n))
     place = np.zeros((len(axes), n))
     # Each limb's rings.
-    rings: list[list[tuple[int, Ring]]] = []
-    for k, axis in enumerate(axes[:-1]):
-        others = [a for m, a in enumerate(axes) if m != k]
-        side = _heights(axis, mesh)
-        # The faces that each plane cuts.
-        a, b, c = ((side > 0)[:, mesh.faces[:, corner]].astype(np.int8) for corner in range(3))
-        count = a + b + c
-        cut = (count > 0) & (count < 3)
-        planes = np.flatnonzero(cut.sum(axis=1) > 2).tolist()
-        around = (rings_around(mesh, np.flatnonzero(cut[i]), side[i], axis, i, others) for i in planes)
-        rings.append([(i, ring) for i, each in zip(planes, around, strict=True) for ring in each])
+    rings = [rings_around(mesh, axis, [a for a in axes if a is not axis]) for axis in axes[:-1]]
     # Where one leg is distinguished from the other, so is that from it.
     walls = [septum_of(found, len(axis.points)) for found, axis in zip(rings, axes[:-1], strict=True)]
     for k, m in ((0, 1), (1, 0)):
@@ -140,9 +130,9 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
     for k, (axis, wall) in enumerate(zip(axes[:-1], walls, strict=True)):
         if not rings[k]:
             continue
-        side, step = _heights(axis, mesh), np.linalg.norm(axis.points[1] - axis.points[0])
+        side, step = heights(axis, mesh), np.linalg.norm(axis.points[1] - axis.points[0])
         for plane, ring in rings[k]:
-            corners, single = ring.corners, ring.single
+            corners, single = ring.corners, not ring.holds
             if wall is not None and plane >= wall.first and ring.neck is not None and ring.neck.width < 1.0:
                 # This limb's are the vertices on its axis' side of the wall.
                 here = np.full(len(corners), float(plane))
@@ -263,11 +253,6 @@ def _fill_fused(
         rows = of_tubes & (plane >= wall.first) & (past < np.minimum(nearest, 0.5 * step))
         limb[rows], at[rows], nearest[rows] = k, plane[rows], past[rows]
     share[np.isfinite(nearest)] = 1.0
-
-
-def _heights(axis: LimbAxis, mesh: TriangleMesh) -> Float64[np.ndarray, "K N"]:
-    """Return the height of each vertex over each of a limb's planes, metres."""
-    return axis.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", axis.tangents, axis.points)[:, None]
 
 
 def _mean(vertices: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -78,12 +78,12 @@ def extend_weights(
         admissible_share: (N,) share of the kernel that is admissible, 1 without `admissible`.
     """
     # Leave out samples that hardly count for any point, so that they take no neighbour's place.
-    per_sample = None
+    per_sample, column = None, np.arange(len(samples.points))
     if admissible is not None:
         per_sample = point_admissibility(admissible, samples.weights)
         used = per_sample.max(axis=0) > 0.02
         if used.any():
-            per_sample = per_sample[:, used]
+            column = np.flatnonzero(used)
             samples = WeightSamples(samples.points[used], samples.normals[used], samples.weights[used], samples.area)
     # Integrate the kernel over the disc about the closest point. Everything is multiplied by d^(p-2), so that a
     # distance of zero is no special case.
@@ -105,7 +105,7 @@ def extend_weights(
     if admissible is not None and per_sample is not None:
         whole = near + far.sum(axis=1)
         near = near * np.maximum((admissible * copied).sum(axis=1), LEAST_ADMISSIBILITY)
-        far *= np.take_along_axis(per_sample, index, axis=1)
+        far *= np.take_along_axis(per_sample, column[index], axis=1)
         admissible_share = (near + far.sum(axis=1)) / whole
     # Take the mean of the closest points' and the samples' weights.
     rows = np.repeat(np.arange(len(points)), count)

@@ -11,6 +11,9 @@ from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 
+_TOGETHER = 500
+"""Rows up to which pieces share a factorisation: one of less takes about the time of the call."""
+
 
 def fit_smoothly(
     mesh: TriangleMesh,
@@ -62,19 +65,22 @@ def fit_smoothly(
 
 def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
     """Solve a symmetric positive definite system (n, J) piece by piece, each for the joints that occur in it."""
-    # Sort the rows by connected component of the matrix, which makes it block diagonal.
-    piece = sp.csgraph.connected_components(matrix, directed=False)[1]
+    # Sort the rows by connected component of the matrix, which makes it block diagonal; small pieces are solved
+    # together.
+    count, piece = sp.csgraph.connected_components(matrix, directed=False)
     order = np.argsort(piece, kind="stable")
-    matrix, right = matrix[order][:, order], right[order]
+    if count > 1:
+        matrix, right = matrix[order][:, order], right[order]
     out = np.zeros_like(right)
-    start = np.concatenate([[0], np.cumsum(np.bincount(piece))])
+    ends = np.cumsum(np.bincount(piece))
+    start = np.concatenate([[0], ends[np.append(np.diff(ends // _TOGETHER) > 0, True)]])
     no_rows = np.zeros(0, np.int64)
     # Solve each block by a sparse Cholesky factorisation in minimum-degree order.
     for low, high in itertools.pairwise(start):
         occurring = right[low:high].any(axis=0)
         no_values = np.zeros((0, int(occurring.sum())))
         solver = igl.min_quad_with_fixed_data()
-        block = sp.csc_matrix(matrix[low:high, low:high])
+        block = sp.csc_matrix(matrix if high - low == len(right) else matrix[low:high, low:high])
         igl.min_quad_with_fixed_precompute(block, no_rows, sp.csc_matrix((0, high - low)), True, solver)
         linear = np.ascontiguousarray(-right[low:high, occurring])
         out[low:high, occurring] = igl.min_quad_with_fixed_solve(solver, linear, no_values, no_values)

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from smplxpp.core import TriangleMesh, normalize_rows
+from smplxpp.core.topology import component_labels
 
 if TYPE_CHECKING:
     from smplxpp.transfer.enclosed import LimbAxis
@@ -43,66 +42,76 @@ class Neck:
 
 @dataclass(frozen=True, eq=False)
 class Ring:
-    """A ring around a limb's axis: the vertices of its faces, whether it goes around that alone, and its neck."""
+    """A ring around a limb's axis: the vertices of its faces, which others it goes around, too, and its neck."""
 
     corners: np.ndarray
-    single: bool
+    holds: tuple[int, ...]
     neck: Neck | None
 
 
 def rings_around(
     mesh: TriangleMesh,
-    cut: np.ndarray,
-    side: np.ndarray,
     axis: LimbAxis,
-    index: int,
     others: list[LimbAxis],
     *,
     closed: float = _CLOSED,
-) -> Iterator[Ring]:
-    """Yield each ring that goes around an axis.
+) -> list[tuple[int, Ring]]:
+    """Return the rings around a limb's axis in which the planes across it cut a part, each with its plane's number.
 
     Args:
         mesh: the part.
-        cut: faces that the plane across the axis at point `index` cuts.
-        side: height of each vertex over that plane.
-        axis: the limb's.
-        index: of the axis' point.
+        axis: the limb's; plane i goes through its point i.
         others: axes of other limbs and of the trunk.
         closed: least share of a turn about the axis that a ring makes.
     """
-    point, tangent = axis.points[index], axis.tangents[index]
-    faces, above = mesh.faces[cut], side[mesh.faces[cut]] > 0
+    # The faces that each plane cuts, of all planes at once: one graph is quicker than many.
+    side = heights(axis, mesh)
+    count = np.add.reduce([(side > 0)[:, mesh.faces[:, corner]] for corner in range(3)], dtype=np.int8)
+    cut = (count > 0) & (count < 3)
+    plane, face = np.nonzero(cut & (cut.sum(axis=1) > 2)[:, None])
+    if not len(plane):
+        return []
+    faces = mesh.faces[face]
+    above = side[plane[:, None], faces] > 0
     # The two edges of each face that cross the plane: those at the corner that is alone on its side.
     odd = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    rows = np.arange(len(cut))
+    rows = np.arange(len(plane))
     a, b, c = faces[rows, odd], faces[rows, (odd + 1) % 3], faces[rows, (odd + 2) % 3]
     flip = above[rows, odd]
-    p, q = _crossing(mesh.vertices, side, a, b), _crossing(mesh.vertices, side, a, c)
-    # Segments hang together where they share a crossed edge.
-    key = np.sort(np.stack([np.stack([a, b], 1), np.stack([a, c], 1)], 1), axis=2) @ [mesh.vertex_count, 1]
-    edges, node = np.unique(key, return_inverse=True)
-    node = node.reshape(-1, 2)
-    count, ring = connected_components(coo_matrix((np.ones(len(cut)), node.T), shape=(len(edges),) * 2), directed=False)
-    ring = ring[node[:, 0]]
+    p, q = (_crossing(mesh.vertices, side, plane, a, end) for end in (b, c))
+    # Segments hang together where they share a crossed edge of one plane.
+    key = np.stack([np.minimum(a, end) * mesh.vertex_count + np.maximum(a, end) for end in (b, c)], axis=1)
+    node = np.unique(plane[:, None] * mesh.vertex_count**2 + key, return_inverse=True)[1].reshape(-1, 2)
+    ring = component_labels(node, int(node.max()) + 1)[node[:, 0]]
     # The angle of every ring as seen from the axis, wound in one sense all around.
     start, end = np.where(flip[:, None], p, q), np.where(flip[:, None], q, p)
-    turn = np.abs(np.bincount(ring, _angle(start - point, end - point, tangent), minlength=count))
-    around = turn > closed * 2 * np.pi
-    if not around.any():
-        return
+    tangent = axis.tangents[plane]
+    turn = np.bincount(ring, _angle(start - axis.points[plane], end - axis.points[plane], tangent))
+    around = np.abs(turn) > closed * 2 * np.pi
+    chosen = around[ring]
+    ring, plane, faces, start, end, tangent = (x[chosen] for x in (ring, plane, faces, start, end, tangent))
     # Another axis is within the ring if that goes around it, too, be it with a gap where the plane grazes a hem.
-    held: dict[int, list[np.ndarray]] = {k: [] for k in np.flatnonzero(around).tolist()}
-    for other in others:
-        for at in piercings(other.whole, point, tangent):
-            turn = np.abs(np.bincount(ring, _angle(start - at, end - at, tangent), minlength=count))
-            for k in held:
-                held[k] += [at] if turn[k] > np.pi else []
+    held: dict[int, list[tuple[int, np.ndarray]]] = {k: [] for k in np.flatnonzero(around).tolist()}
+    for number, other in enumerate(others):
+        for at in _piercings_of_planes(other.whole, axis):
+            seen = np.flatnonzero(np.isfinite(at[plane, 0]))
+            point = at[plane[seen]]
+            turn = np.bincount(ring[seen], _angle(start[seen] - point, end[seen] - point, tangent[seen]))
+            for k in np.flatnonzero(np.abs(turn) > np.pi).tolist():
+                held[k].append((number, at[plane[np.argmax(ring == k)]]))
+    out = []
     for k, inside in held.items():
-        neck = None
+        own = np.flatnonzero(ring == k)
+        i, neck = int(plane[own[0]]), None
         if len(inside) == 1:
-            neck = _neck(np.concatenate([p[ring == k], q[ring == k]]), point, inside[0], tangent)
-        yield Ring(np.unique(faces[ring == k]), not inside, neck)
+            neck = _neck(np.concatenate([start[own], end[own]]), axis.points[i], inside[0][1], axis.tangents[i])
+        out.append((i, Ring(np.unique(faces[own]), tuple(number for number, _ in inside), neck)))
+    return sorted(out, key=lambda pair: pair[0])
+
+
+def heights(axis: LimbAxis, mesh: TriangleMesh) -> Float64[np.ndarray, "K N"]:
+    """Return the height of each vertex over each of a limb's planes, metres."""
+    return axis.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", axis.tangents, axis.points)[:, None]
 
 
 def _neck(points: np.ndarray, own: np.ndarray, other: np.ndarray, tangent: np.ndarray) -> Neck | None:
@@ -189,10 +198,24 @@ def _fused_from(necks: list[tuple[int, float]]) -> int | None:
     return grooved[0] if whole else None
 
 
-def _crossing(vertices: np.ndarray, side: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return where the edges from a to b cross the plane."""
-    t = side[a] / (side[a] - side[b])
+def _crossing(vertices: np.ndarray, side: np.ndarray, plane: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return where the edges from a to b cross their planes."""
+    t = side[plane, a] / (side[plane, a] - side[plane, b])
     return vertices[a] + t[:, None] * (vertices[b] - vertices[a])
+
+
+def _piercings_of_planes(points: np.ndarray, axis: LimbAxis) -> Iterator[np.ndarray]:
+    """Yield where a polyline crosses the planes across an axis (K, 3) for the first time, the second, and so on."""
+    side = (points @ axis.tangents.T - np.einsum("ij,ij->i", axis.tangents, axis.points)).T
+    crossed = (side[:, :-1] > 0) != (side[:, 1:] > 0)
+    while crossed.any():
+        out = np.full((len(side), 3), np.nan)
+        rows = np.flatnonzero(crossed.any(axis=1))
+        k = crossed[rows].argmax(axis=1)
+        t = side[rows, k] / (side[rows, k] - side[rows, k + 1])
+        out[rows] = points[k] + t[:, None] * (points[k + 1] - points[k])
+        crossed[rows, k] = False
+        yield out
 
 
 def piercings(points: np.ndarray, point: np.ndarray, tangent: np.ndarray) -> np.ndarray:
@@ -204,5 +227,5 @@ def piercings(points: np.ndarray, point: np.ndarray, tangent: np.ndarray) -> np.
 
 
 def _angle(u: np.ndarray, v: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return the signed angle from u to v about the axis, both across it."""
-    return np.arctan2(np.cross(u, v) @ axis, np.einsum("ij,ij->i", u, v))
+    """Return the signed angles from u to v about the axes, all across them."""
+    return np.arctan2(np.einsum("ij,ij->i", np.cross(u, v), axis), np.einsum("ij,ij->i", u, v))

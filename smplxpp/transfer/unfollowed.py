@@ -81,7 +81,8 @@ def unfollowed_arms(
     if empty_tubes(mesh, axes, size).any():
         hidden = [side for _, side in bare]
     else:
-        hidden, worn = [side for k, side in bare if _covers(mesh, axes[-1], axes[k])], [*worn, "shoulder"]
+        covered = _covered(mesh, axes[-1], [axes[k] for k, _ in bare])
+        hidden, worn = [side for (_, side), own in zip(bare, covered, strict=True) if own], [*worn, "shoulder"]
     for k, name in enumerate(names):
         out[k] = name.startswith(tuple(hidden)) and not any(word in name for word in worn)
     return out
@@ -181,18 +182,10 @@ def webs_to_hands(
     return web
 
 
-def _covers(mesh: TriangleMesh, trunk: LimbAxis, arm: LimbAxis) -> bool:
-    """Return whether enough rings of a part about the trunk go around an arm, too."""
-    side = trunk.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", trunk.tangents, trunk.points)[:, None]
-    count = sum((side > 0)[:, mesh.faces[:, c]].astype(np.int8) for c in range(3))
-    cut = (count > 0) & (count < 3)
-    both = 0
-    for i in np.flatnonzero(cut.sum(axis=1) > 2):
-        both += any(
-            not ring.single
-            for ring in rings_around(mesh, np.flatnonzero(cut[i]), side[i], trunk, int(i), [arm], closed=_OPEN)
-        )
-    return both >= _COVERED
+def _covered(mesh: TriangleMesh, trunk: LimbAxis, arms: list[LimbAxis]) -> list[bool]:
+    """Return for each arm whether enough rings of a part about the trunk go around it, too."""
+    rings = rings_around(mesh, trunk, arms, closed=_OPEN)
+    return [len({plane for plane, ring in rings if k in ring.holds}) >= _COVERED for k in range(len(arms))]
 
 
 def _holds_an_axis(ring: np.ndarray, axes: list[LimbAxis]) -> bool:

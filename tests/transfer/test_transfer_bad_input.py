@@ -8,9 +8,14 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from smplxpp.body import load_body
 from smplxpp.core import GeometryWarning, InputError, TriangleMesh, concatenate_meshes
+from smplxpp.people.garments.loose import layered_garments, loose_garments
+from smplxpp.people.garments.mannequin import Mannequin, lowered
+from smplxpp.people.garments.wardrobe import shape_betas
 from smplxpp.transfer import TransferConfig, transfer_weights
-from smplxpp.transfer.checks import consistent_winding
+from smplxpp.transfer.checks import check_placement, consistent_winding
+from smplxpp.transfer.correspond import closest_points
 from smplxpp.transfer.inpaint import edge_lengths, laplacian_and_mass, mollify
 
 
@@ -162,6 +167,17 @@ def test_other_axes_are_named():
     swapped = cap.with_vertices(cap.vertices[:, [0, 2, 1]] * [1, -1, 1])
     with pytest.raises(InputError, match=r"\+Z up"):
         transfer_weights(SOURCE, WEIGHTS, swapped)
+
+
+def test_a_wide_flat_skirt_has_no_other_axes():
+    """A tutu on a heavy person would lie nearer to a body that it cut from head to foot, and was refused."""
+    body = load_body()
+    heavy = Mannequin.of(body, shape_betas(body, "heavy and tall"))
+    tutu = next(garment for garment in loose_garments(heavy) + layered_garments(heavy) if garment.name == "tutu").cloth
+    source = body.mesh(body.forward(lowered(heavy, 50.0)).vertices[0])
+    # Its outer part alone is as far off as a scan of it, whose vertices are spread evenly.
+    rim = tutu.mesh.submesh(np.linalg.norm(tutu.mesh.face_centers[:, [0, 2]], axis=1) > 0.25)[0]
+    check_placement(source, rim, closest_points(source, rim).distance)
 
 
 def test_another_place_is_refused():
