@@ -9,7 +9,7 @@ import numpy as np
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.surface_points import SurfacePoints
-from smplxpp.register.locate.persons import heads, largest_piece, people_apart
+from smplxpp.register.locate.persons import heads, largest_piece, others_carried, people_apart, share_beyond
 from smplxpp.register.locate.search import Found
 
 
@@ -31,6 +31,12 @@ class LocateBounds:
         good_bare: mean distance of hands, face and feet to the surface at which the confidence is half, metres. Chosen
             on bodies in 18 procedural people and 17 real scans: right ones end at 22 mm, however wide the clothes are;
             other facings and poses begin at 25 mm.
+        least_head: visible share of the head below which it is cut off: 145 right bodies have .55 and more, people
+            without a head at most .08.
+        least_carried: share of the surface from which a piece with a head of its own is somebody: a child of 0.4 of a
+            person's size has .15, a ball of 22 cm in a hand .05; no right body has a head on a piece of .05.
+        most_beyond: share of the body outside the hull of the surface from which this is a part of a person; a head
+            is .06 to .09, both arms .16, legs alone .27, halves .38 and more; right bodies have at most .004.
     """
 
     least_covered: float = 0.5
@@ -41,6 +47,9 @@ class LocateBounds:
     margin: float = 4.0
     doubtful_cost: float = 18.0
     good_bare: float = 0.024
+    least_head: float = 0.3
+    least_carried: float = 0.1
+    most_beyond: float = 0.2
 
 
 _BOUNDS = LocateBounds()
@@ -80,13 +89,16 @@ def is_doubtful(found: Found) -> bool:
     )
 
 
-def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tuple[tuple[str, ...], float]:
+def findings_of(
+    mesh: TriangleMesh, surface: SurfacePoints, best: Found, posed: TriangleMesh
+) -> tuple[tuple[str, ...], float]:
     """Describe what a surface shows besides one whole person; return it with a factor for the confidence.
 
     Args:
         mesh: the surface.
         surface: points of it, which the best body was compared with.
         best: the body.
+        posed: its visible surface.
     """
     out, trust = [], 1.0
     # Several people: pieces of their size beside each other, or two heads in the upper half.
@@ -104,14 +116,27 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
         out.append(
             f"{len(upper)} heads, {heights} m above the lowest point: two people, or something round that is held"
         )
-    # Half a person: no head anywhere, or neither legs nor feet.
+    carried = others_carried(mesh, surface, best.misfit.unexplained, least=_BOUNDS.least_carried)
+    if carried:
+        trust = 0.1
+    for piece, height in carried if not out else ():
+        out.append(
+            f"a head of its own, {height:.2f} m above the lowest point, on {piece.share:.0%} of the surface, in one "
+            f"piece of {piece}, that is no part of the body found: a child, a doll or an animal"
+        )
+    # Half a person: no head anywhere, or neither legs nor feet. A hood shows some of a head; a cut shows nothing.
     if not len(seen) and best.misfit.parts["head"] < _HEAD_SHOWN:
-        trust = min(trust, 0.3)
-        out.append("no head: it may be cut off above, or hidden by a hood")
+        cut = best.misfit.parts["head"] < _BOUNDS.least_head
+        trust = min(trust, 0.1 if cut else 0.3)
+        out.append("no head: it is cut off above" if cut else "no head: it may be cut off above, or hidden by a hood")
     legs = [f"{side} {part}" for side in ("left", "right") for part in ("lower leg", "foot")]
     if all(best.misfit.parts[part] < 0.2 for part in legs):
         trust = min(trust, 0.3)
         out.append("neither lower legs nor feet: it may be cut off below")
+    beyond = share_beyond(mesh, posed)
+    if beyond > _BOUNDS.most_beyond:
+        trust = min(trust, 0.1)
+        out.append(f"{beyond:.0%} of the body found lies outside of the surface: a part of a person")
     elsewhere = "" if out else limb_elsewhere(surface, best)
     if elsewhere:
         trust = min(trust, 0.1)
@@ -120,7 +145,7 @@ def findings_of(mesh: TriangleMesh, surface: SurfacePoints, best: Found) -> tupl
         return tuple(out), trust
     # Something large that is no part of a body.
     piece = largest_piece(surface, best.misfit.unexplained)
-    if piece is not None and piece.share > 0.1:
+    if piece is not None and piece.share > 0.1 and not carried:
         what = "furniture, another person, something held or a wide garment"
         out.append(f"{piece.share:.0%} of the surface, in one piece of {piece}, is no part of the body found: {what}")
     if float(high - low) < 1.2:
@@ -175,7 +200,7 @@ def missing_parts(found: Found) -> list[str]:
 
     Skirts hide lower legs, which are therefore never missing.
     """
-    least = {"head": 0.3, "foot": 0.4, "forearm": 0.2, "hand": 0.2, "leg": 0.0}
+    least = {"head": _BOUNDS.least_head, "foot": 0.4, "forearm": 0.2, "hand": 0.2, "leg": 0.0}
     shown = found.misfit.parts
     out = [part for part, share in shown.items() if share < least[part.split()[-1]]]
     lost = [f"{side} hand" for side in _SIDES if f"{side} forearm" in out and shown[f"{side} hand"] < _OPEN_HAND]

@@ -157,7 +157,7 @@ def locate_body(
     if not reason:
         best = settle_feet(search, best)
     others = tuple(found[1:])
-    findings, trust = findings_of(mesh, search.fine, best)
+    findings, trust = findings_of(mesh, search.fine, best, search.outer.mesh(search.kinematics.posture(best.state, 0)))
     located = LocatedBody(
         best.state.to_params(body),
         0.0 if reason else trust * confidence_of(best, others),

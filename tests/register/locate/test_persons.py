@@ -97,12 +97,42 @@ def test_the_largest_piece_that_no_body_explains_has_the_size_of_what_is_held(pe
     assert largest_piece(surface, np.zeros(4000, dtype=bool)) is None
 
 
+def _judged(mesh: TriangleMesh, **turns: tuple[float, float, float]) -> tuple[float, str]:
+    """Confidence and findings of the body with lowered arms in a surface; `turns` has other rotation vectors."""
+    pose = next(vectors for name, vectors in standing_poses(BODY.joint_count) if name == "arms lowered, legs apart")
+    pose = pose.copy()
+    for joint, vector in turns.items():
+        pose[BODY.joint_names.index(joint)] = vector
+    rotations = matrix_from_rotvec(pose)[None]
+    state = BodyState(rotations, np.zeros((1, 3)), np.zeros(BODY.num_betas), np.zeros((1, BODY.num_expressions)))
+    search = Search(Kinematics(BODY), mesh, LocateConfig(coarse_points=400), None, ignore_progress)
+    best = search.polished("lowered", state, None, steps=0)
+    posed = search.outer.mesh(search.kinematics.posture(state, 0))
+    findings, trust = findings_of(mesh, search.fine, best, posed)
+    return trust * confidence_of(best, []), "; ".join(findings)
+
+
+def test_a_child_in_arms_and_a_part_of_a_person_are_refused(person):
+    """A child of half of a person's size at the chest had a confidence of .94, somebody without a head .12."""
+    low, high = person.vertices[:, 1].min(), person.vertices[:, 1].max()
+    confidence, words = _judged(_together(person, _moved(person, 0.5, (0.0, 0.25, 0.25))))
+    assert confidence < LEAST_CONFIDENCE and words.startswith("a head of its own, 1.5") and "a child" in words
+    headless = person.submesh(person.face_centers[:, 1] < low + 0.84 * (high - low))[0]
+    confidence, words = _judged(headless)
+    assert confidence < LEAST_CONFIDENCE and words == "no head: it is cut off above"
+    legs = person.submesh(person.face_centers[:, 1] < low + 0.5 * (high - low))[0]
+    confidence, words = _judged(legs)
+    assert confidence < LEAST_CONFIDENCE and "lies outside of the surface: a part of a person" in words
+    # A box of the same size and place is something held or furniture: it is named, and no child.
+    corners = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.2, 0.5) for z in (0.2, 0.35)])
+    hull = ConvexHull(corners)
+    box = TriangleMesh(corners, hull.simplices.astype(np.int64))
+    confidence, words = _judged(_together(person, box))
+    assert confidence > LEAST_CONFIDENCE and "a head" not in words and "is no part of the body found" in words
+
+
 def test_an_arm_in_the_air_beside_one_that_no_body_explains_is_refused(person):
     """One wrong arm had a confidence of .35 and went on to a template; an arm that is cut off is no such fault."""
-    config = LocateConfig(coarse_points=400, fine_points=2000)
-    pose = next(vectors for name, vectors in standing_poses(BODY.joint_count) if name == "arms lowered, legs apart")
-    right, raised = matrix_from_rotvec(pose)[None], matrix_from_rotvec(pose)[None]
-    raised[0, BODY.joint_names.index("left_shoulder")] = matrix_from_rotvec(np.array([0.0, 0.0, 1.2]))
     follows = [
         name.startswith(
             ("left_elbow", "left_wrist", *(f"left_{one}" for one in ("thumb", "index", "middle", "ring", "pinky")))
@@ -110,17 +140,11 @@ def test_an_arm_in_the_air_beside_one_that_no_body_explains_is_refused(person):
         for name in BODY.joint_names
     ]
     arm = (BODY.weights[:, follows].sum(axis=1) > 0.5)[person.faces].all(axis=1)
-    found = {}
-    for name, rotations, mesh in (
-        ("right", right, person),
-        ("raised", raised, person),
-        ("cut", right, person.submesh(~arm)[0]),
-    ):
-        search = Search(Kinematics(BODY), mesh, config, None, ignore_progress)
-        state = BodyState(rotations, np.zeros((1, 3)), np.zeros(BODY.num_betas), np.zeros((1, BODY.num_expressions)))
-        best = search.polished(name, state, None, steps=0)
-        findings, trust = findings_of(mesh, search.fine, best)
-        found[name] = (trust * confidence_of(best, []), "; ".join(findings))
+    found = {
+        "right": _judged(person),
+        "raised": _judged(person, left_shoulder=(0.0, 0.0, 1.2)),
+        "cut": _judged(person.submesh(~arm)[0]),
+    }
     assert found["raised"][0] < LEAST_CONFIDENCE < found["cut"][0] < found["right"][0]
     assert found["raised"][1].startswith("left arm not where the body has it, and ")
     assert not found["right"][1] and "not where" not in found["cut"][1]
