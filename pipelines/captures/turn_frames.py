@@ -12,13 +12,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import laplace
 
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from smplxpp.capture.video_files import ffmpeg_program
+from smplxpp.capture.video_files import ffmpeg_program, probe_video
 from smplxpp.core import InputError, spread
 from smplxpp.core.files.image_file import open_image
 
@@ -91,7 +91,7 @@ def last_number(path: Path) -> int | None:
 
 
 def decoded_frames(video: Path, folder: Path, most: int) -> list[TurnFrame]:
-    """Decode the sharpest frames of equal intervals of a video into PNG files, upright as its rotation flag says.
+    """Decode the sharpest frames of equal times of a video into PNG files, upright as its rotation flag says.
 
     Raises:
         MissingExtraError: imageio-ffmpeg is not installed.
@@ -99,38 +99,41 @@ def decoded_frames(video: Path, folder: Path, most: int) -> list[TurnFrame]:
     """
     # Of a frame that is judged: finer detail is noise of the sensor, and minutes have 2000 frames.
     sharpness_pixels = 256
-    program = ffmpeg_program()
+    program, times = ffmpeg_program(), probe_video(video).times
     # All frames, small and grey, show which of them are sharp; those that are chosen are decoded whole.
     side = sharpness_pixels
     small = _ffmpeg(program, video, f"scale={side}:{side},format=gray", "-f", "rawvideo", "-")
     grey = np.frombuffer(small, np.uint8)
-    chosen = sharpest_of_intervals(grey[: len(grey) // side**2 * side**2].reshape(-1, side, side), most)
-    if not chosen:
+    if not len(frames := grey[: len(grey) // side**2 * side**2].reshape(-1, side, side)):
         raise InputError(f"video {video}", expected="frames that can be decoded", received="none")
+    # A damaged file has fewer frames than stamps.
+    times = times[: len(frames)] if len(times) >= len(frames) else np.arange(len(frames), dtype=np.float64)
+    chosen = sharpest_of_intervals(frames, times, most)
     picked = "+".join(f"eq(n\\,{number})" for number in chosen)
     _ffmpeg(program, video, f"select={picked},format=rgb24", str(folder / "%06d.png"))
     return [TurnFrame(path, last_number(path)) for path in sorted(folder.glob("*.png"))]
 
 
-def sharpest_of_intervals(frames: UInt8[np.ndarray, "T H W"], most: int) -> list[int]:
-    """Return the sharpest frame of each of `most` equal intervals, by the variance of the Laplacian.
+def sharpest_of_intervals(frames: UInt8[np.ndarray, "T H W"], times: Float64[np.ndarray, " T"], most: int) -> list[int]:
+    """Return the sharpest frame of each of `most` intervals of equal time, by the variance of the Laplacian.
 
-    Candidates are the middle halves of the intervals, so that neighbours of the choice are 0.5 to 1.5 intervals apart.
+    Candidates are the middle halves of the intervals, so that neighbours of the choice are 0.5 to 1.5 intervals apart;
+    where a video has none there, the frame nearest to the middle.
 
     Args:
         frames: all of a video, grey.
+        times: of the frames, ascending; a phone's rate varies, a turn goes by the clock.
         most: number of frames to choose; all are taken where there are no more.
     """
     if len(frames) <= most:
         return list(range(len(frames)))
     sharp = np.array([laplace(frame.astype(np.float32)).var() for frame in frames])
-    ends = np.linspace(0, len(frames), most + 1)
-    chosen = []
+    ends, chosen = np.linspace(times[0], times[-1] + np.median(np.diff(times)), most + 1), set()
     for first, last in pairwise(ends):
-        quarter = (last - first) / 4
-        low = int(first + quarter)
-        chosen.append(low + int(sharp[low : max(low + 1, int(np.ceil(last - quarter)))].argmax()))
-    return chosen
+        near = np.flatnonzero(np.abs(times - 0.5 * (first + last)) <= (last - first) / 4)
+        middle = np.abs(times - 0.5 * (first + last)).argmin()
+        chosen.add(int(near[sharp[near].argmax()] if len(near) else middle))
+    return sorted(chosen)
 
 
 def _ffmpeg(program: str, video: Path, filters: str, *output: str) -> bytes:
@@ -140,13 +143,10 @@ def _ffmpeg(program: str, video: Path, filters: str, *output: str) -> bytes:
         InputError: a file that is no video.
     """
     command = [program, "-nostdin", "-v", "error", "-i", str(video), "-vf", filters, "-fps_mode", "passthrough"]
-    ffmpeg_seconds = 900
-    done = subprocess.run([*command, *output], capture_output=True, timeout=ffmpeg_seconds, check=False)
+    done = subprocess.run([*command, *output], capture_output=True, timeout=900, check=False)
     if done.returncode:
-        message = done.stderr.decode(errors="replace").strip().splitlines()
-        raise InputError(
-            f"video {video}", expected="a video that can be decoded", received=(message or ["nothing"])[0][:200]
-        )
+        message = done.stderr.decode(errors="replace").strip()[:200].partition("\n")[0] or "nothing"
+        raise InputError(f"video {video}", expected="a video that can be decoded", received=message)
     return done.stdout
 
 

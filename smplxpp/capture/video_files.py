@@ -6,6 +6,7 @@ import re
 import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ class Video:
         path: of the file.
         width: of a frame as it is shown, after the rotation that the file asks for.
         height: of such a frame.
-        fps: frames a second.
+        fps: frames a second, on average.
         seconds: duration.
         turned: whether the file asks for a quarter turn, so that stored frames have the other orientation.
         sound: whether it has sound.
@@ -47,6 +48,22 @@ class Video:
     def count(self) -> int:
         """Number of frames, by duration and rate."""
         return max(1, round(self.seconds * self.fps))
+
+    @cached_property
+    def times(self) -> Float64[np.ndarray, " T"]:
+        """Seconds of all frames after the first, as the file stamps them: phones film at a rate that varies.
+
+        Files without stamps have frames at equal intervals.
+        """
+        # Packets are listed without being decoded, in the order in which they are stored.
+        command = [ffmpeg_program(), "-v", "error", "-i", str(self.path), "-map", "0:v:0", "-c", "copy"]
+        found = subprocess.run([*command, "-f", "framecrc", "-"], capture_output=True, check=False)
+        text = found.stdout.decode(errors="replace")
+        base, stamps = re.search(r"#tb 0: (\d+)/(\d+)", text), re.findall(r"^0,\s*-?\w+,\s*(\d+),", text, re.MULTILINE)
+        seconds = np.sort(np.array(stamps, dtype=np.float64))
+        if base is None or len(seconds) < 2 or (np.diff(seconds) <= 0).any():
+            return np.arange(self.count) / self.fps
+        return (seconds - seconds[0]) * int(base[1]) / int(base[2])
 
 
 def probe_video(path: str | Path) -> Video:

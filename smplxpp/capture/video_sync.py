@@ -42,8 +42,8 @@ class Timeline:
 def timeline(videos: Mapping[str, Video], offsets: Mapping[str, float]) -> Timeline:
     """Return the frames of the time that all videos share, at the lowest of their rates.
 
-    Frame n is at `t_0 + n / fps` with the latest start t_0, and shows in each video the frame nearest to it: number
-    `(t - offset) fps_c`.
+    Frame n is at `t_0 + n / fps` with the latest start t_0, and shows in each video the frame whose time in the file is
+    nearest to it.
 
     Args:
         videos: by camera.
@@ -55,7 +55,7 @@ def timeline(videos: Mapping[str, Video], offsets: Mapping[str, float]) -> Timel
     starts = {name: offsets.get(name, 0.0) for name in videos}
     fps = min(video.fps for video in videos.values())
     first = max(starts.values())
-    last = min(starts[name] + (video.count - 1) / video.fps for name, video in videos.items())
+    last = min(starts[name] + video.times[-1] for name, video in videos.items())
     count = int(np.floor((last - first) * fps + 1e-6)) + 1
     if count < 1:
         raise InputError(
@@ -64,11 +64,12 @@ def timeline(videos: Mapping[str, Video], offsets: Mapping[str, float]) -> Timel
             received=f"the last one starts at {first:.2f} s, the first one ends at {last:.2f} s",
         )
     times = first + np.arange(count) / fps
-    sources = {
-        name: np.clip(np.rint((times - starts[name]) * video.fps).astype(np.int64), 0, video.count - 1)
-        for name, video in videos.items()
-    }
-    return Timeline(fps, sources)
+    return Timeline(fps, {name: _nearest(video.times, times - starts[name]) for name, video in videos.items()})
+
+
+def _nearest(times: Float64[np.ndarray, " T"], wanted: Float64[np.ndarray, " F"]) -> Int64[np.ndarray, " F"]:
+    """Return the numbers of the nearest of some ascending times; halfway between two, of the earlier."""
+    return np.searchsorted(0.5 * (times[1:] + times[:-1]), wanted - 1e-6)
 
 
 def found_offsets(videos: Mapping[str, Video], by: str) -> dict[str, float]:
@@ -180,11 +181,11 @@ def _motion(video: Video) -> Float64[np.ndarray, " N"]:
     scale = small / max(video.width, video.height)
     size = (max(2, round(video.width * scale)), max(2, round(video.height * scale)))
     before, change, times = None, [], []
-    for number, frame in video_frames(video, range(video.count), size):
+    for number, frame in video_frames(video, range(len(video.times)), size):
         grey = frame.mean(axis=2)
         if before is not None:
             change.append(float(np.abs(grey - before).mean()))
-            times.append((number - 0.5) / video.fps)
+            times.append(float(video.times[number - 1 : number + 1].mean()))
         before = grey
     if len(change) < 2:
         return np.zeros(0)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipelines.captures.turn_frames import sharpest_of_intervals
 from pipelines.commands.capture import CaptureConvertCommand
 from smplxpp.capture import open_capture
 from smplxpp.capture.video_files import Video, probe_video, video_frames
@@ -127,6 +128,23 @@ def test_a_timeline_takes_the_common_time_at_the_lowest_rate():
     np.testing.assert_array_equal(times.sources["b"][:3], [0, 1, 2])
     with pytest.raises(InputError, match="a time that all of them show"):
         timeline({"a": video(60.0, 2.0), "b": video(30.0, 2.0)}, {"b": 2.5})
+
+
+def test_frames_of_a_phone_are_where_their_stamps_say(tmp_path):
+    """Frames of a film at a varying rate were taken for frames at its mean rate, .7 s off in 2.4."""
+    stamps = np.r_[np.arange(20) * 0.02, 0.4 + np.arange(20) * 0.1]
+    program, path = ffmpeg.get_ffmpeg_exe(), tmp_path / "phone.mp4"
+    source = ["-f", "rawvideo", "-pix_fmt", "gray", "-s", "64x48", "-r", "20", "-i", "-"]
+    late = ["-vf", "settb=1/1000,setpts=if(lt(N\\,20)\\,N*0.02\\,0.4+(N-20)*0.1)/TB", "-fps_mode", "passthrough"]
+    command = [program, "-v", "error", *source, *late, "-enc_time_base", "1/1000", "-pix_fmt", "yuv420p", str(path)]
+    subprocess.run(command, input=bytes(40 * 64 * 48), check=True, timeout=900)
+    video = probe_video(path)
+    np.testing.assert_allclose(video.times, stamps, atol=0.002)
+    shown = timeline({"phone": video}, {}).sources["phone"]
+    assert np.abs(video.times[shown] - np.arange(len(shown)) / video.fps).max() < 0.052
+    # A turn goes by the clock: frames that are taken of it are evenly spaced in time.
+    chosen = sharpest_of_intervals(np.zeros((40, 8, 8), np.uint8), video.times, 8)
+    assert 0.14 < np.diff(video.times[chosen]).min() and np.diff(video.times[chosen]).max() < 0.46
 
 
 def convert(take: Path, out: Path, **options: object) -> dict:

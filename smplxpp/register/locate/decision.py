@@ -119,10 +119,10 @@ def findings_of(
     carried = others_carried(mesh, surface, best.misfit.unexplained, least=_BOUNDS.least_carried)
     if carried:
         trust = 0.1
-    for piece, height in carried if not out else ():
+    for other, height in carried if not out else ():
         out.append(
-            f"a head of its own, {height:.2f} m above the lowest point, on {piece.share:.0%} of the surface, in one "
-            f"piece of {piece}, that is no part of the body found: a child, a doll or an animal"
+            f"a head of its own, {height:.2f} m above the lowest point, on {other.share:.0%} of the surface, in one "
+            f"piece of {other}, that is no part of the body found: a child, a doll or an animal"
         )
     # Half a person: no head anywhere, or neither legs nor feet. A hood shows some of a head; a cut shows nothing.
     if not len(seen) and best.misfit.parts["head"] < _HEAD_SHOWN:
