@@ -49,7 +49,7 @@ class TrainConfig:
         device: "auto", "cpu" or "cuda".
         force: repeat steps that are finished.
         tensorboard: log for TensorBoard too.
-        checkpoint_minutes: between two checkpoints; None: half a minute, or so many that writing takes 2 % of the time.
+        checkpoint_minutes: between two checkpoints; None: half a minute, or longer for writing to take 2 %.
 
     Raises:
         InputError: a number out of range, an unknown word, or options that exclude each other.

@@ -106,7 +106,7 @@ class Train:
     tensorboard: bool = False
     """Log for TensorBoard too, into the folders of the stages."""
     checkpoint_minutes: OptionalFloat = None
-    """Minutes between checkpoints; by default half a minute, or so many that writing takes 2 % of the time."""
+    """Minutes between checkpoints; by default half a minute, or longer for writing to take 2 % of the time."""
     no_report: bool = False
     """Leave report.html as it is."""
     json: bool = False

@@ -60,7 +60,7 @@ class LoopConfig:
         iterations: number of all steps.
         log_every: steps between lines of metrics, which also come at the end.
         evaluate_every: steps between evaluations, which also come at the start and at the end.
-        checkpoint_seconds: of steps between two checkpoints; None: 30, or so many that writing takes 2 % of the time.
+        checkpoint_seconds: of steps between two checkpoints; None: 30, or longer for writing to take 2 % of the time.
         max_seconds: stop with a checkpoint when this session's steps took this time.
         keep_end: keep a checkpoint of the end too, for stages in which another training follows.
         tensorboard: log for TensorBoard too.

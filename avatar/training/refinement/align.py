@@ -128,7 +128,7 @@ class Alignment:
         Args:
             levels: from coarse to fine.
             on_frame: called after every frame of a pass.
-            file: written after every pass; where it exists, the run goes on from it, to the same bits.
+            file: written after every pass; where it exists, the run continues from it, to the same bits.
         """
         done, carried = self._restore(file) if file is not None and file.is_file() else (0, None)
         number = 0

@@ -75,7 +75,7 @@ def refine_poses(
         config: of the refinement; None: the defaults.
         reference: frame that colours start from; None: the first.
         frames: some of the training frames; None: all.
-        state: file that is written after every pass over the frames. Where it exists, the same call goes on from it.
+        state: file that is written after every pass over the frames. Where it exists, the same call continues from it.
         progress: called with the finished share of the frames' evaluations.
 
     Raises:
