@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from avatar.speech.standing_body import StandingBody
 from smplxpp.body.layout import SMPLX_JOINTS
@@ -121,7 +121,15 @@ class GestureLexicon:
 
     def is_path_clear(self, start: Float64[np.ndarray, " 22"], end: Float64[np.ndarray, " 22"]) -> bool:
         """Return whether hands stay clear of the body and each other on the straight path between two states."""
-        return _is_path_clear(self.body, start, end, self.rest)
+        return bool(_are_paths_clear(self.body, start[None], end[None], self.rest)[0])
+
+    def clear_paths(self) -> Bool[np.ndarray, "Q Q"]:
+        """Return between which gestures hands stay clear on the straight path; Q = P + 1, the last one is rest."""
+        ends = np.concatenate([self.states, self.rest[None]])
+        first, second = np.triu_indices(len(ends), 1)
+        clear = np.eye(len(ends), dtype=bool)
+        clear[first, second] = _are_paths_clear(self.body, ends[first], ends[second], self.rest)
+        return clear | clear.T
 
 
 def pose_arms(
@@ -195,7 +203,7 @@ def _raise_until_clear(
     """Abduct the upper arms in small steps until the path from rest is clear; None where five steps do not suffice."""
     step = np.radians(4.0)
     for _ in range(5):
-        if _is_path_clear(body, rest, state, rest):
+        if _are_paths_clear(body, rest[None], state[None], rest)[0]:
             return state
         state = np.array(state)
         # State entries 0 and 9 begin the shoulders' rotation vectors; abduction is about z, mirrored on the right.
@@ -205,14 +213,15 @@ def _raise_until_clear(
     return None
 
 
-def _is_path_clear(
+def _are_paths_clear(
     body: StandingBody,
-    start: Float64[np.ndarray, " 22"],
-    end: Float64[np.ndarray, " 22"],
+    starts: Float64[np.ndarray, "M 22"],
+    ends: Float64[np.ndarray, "M 22"],
     rest: Float64[np.ndarray, " 22"],
-) -> bool:
-    """Test seven states: hands keep 2 cm of clearance, or at most 5 mm less than hanging arms have."""
+) -> Bool[np.ndarray, " M"]:
+    """Test seven states a path: hands keep 2 cm of clearance, or at most 5 mm less than hanging arms have."""
     # The last row is the person at rest, whose clearance is the reference: wide clothes may leave less than 2 cm.
-    path = start + np.linspace(0.0, 1.0, 7)[:, None] * (end - start)
-    distance = body.hand_clearance(pose_arms(body.standing, np.concatenate([path, rest[None]]), rest))
-    return bool((distance[:-1] >= min(0.02, float(distance[-1]) - 0.005)).all())
+    paths = starts[:, None] + np.linspace(0.0, 1.0, 7)[:, None] * (ends - starts)[:, None]
+    states = np.concatenate([paths.reshape(-1, STATE_SIZE), rest[None]])
+    distance = body.hand_clearance(pose_arms(body.standing, states, rest))
+    return (distance[:-1].reshape(-1, 7) >= min(0.02, float(distance[-1]) - 0.005)).all(axis=1)

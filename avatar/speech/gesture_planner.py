@@ -23,7 +23,7 @@ MIN_BEAT_INTERVAL = 0.42
 
 
 @dataclass(frozen=True)
-class _GestureTiming:
+class GestureTiming:
     """Timing and size of gestures. The values were set by eye on the embedded body; no measurement backs them.
 
     Attributes:
@@ -65,7 +65,7 @@ class _GestureTiming:
     memory: float = 60.0
 
 
-_TIMING = _GestureTiming()
+TIMING = GestureTiming()
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,9 @@ def find_beats(speech: Speech, rng: np.random.Generator) -> list[Beat]:
         # 40 ms after the vowel's onset: its loudness has risen by then.
         time = min(one.start + 0.04, 0.5 * (one.start + one.end))
         own_phrase = int(np.searchsorted(starts, one.start + 1e-6)) - 1
-        stroke = time - last >= wait or (own_phrase != phrase and time - last >= _TIMING.stroke_interval[0])
+        stroke = time - last >= wait or (own_phrase != phrase and time - last >= TIMING.stroke_interval[0])
         if stroke:
-            last, wait, phrase = time, float(rng.uniform(*_TIMING.stroke_interval)), own_phrase
+            last, wait, phrase = time, float(rng.uniform(*TIMING.stroke_interval)), own_phrase
         weight = float(np.clip((one.end - one.start) / usual, 0.6, 1.4) / 1.4)
         out.append(Beat(time, weight, stroke))
     return out
@@ -168,19 +168,19 @@ class GesturePlanner:
         strokes = [one.time for one in rhythm if one.stroke]
         free = start
         for k, time in enumerate(strokes):
-            arrival = time - _TIMING.lead
-            held = time + float(self._rng.uniform(*_TIMING.hold))
+            arrival = time - TIMING.lead
+            held = time + float(self._rng.uniform(*TIMING.hold))
             later = strokes[k + 1] if k + 1 < len(strokes) else np.inf
-            if arrival - free < _TIMING.min_preparation:
+            if arrival - free < TIMING.min_preparation:
                 continue
             self._plan_stroke(arrival, free)
             free = held
             # Retract the hands where the next stroke is far away, or after the last one.
             stays_up = more and later == np.inf
-            if not stays_up and later - held > _TIMING.max_wait:
+            if not stays_up and later - held > TIMING.max_wait:
                 end = max(held, min(start + speech.seconds - 0.2, held + 0.8))
                 self.retract(end if later == np.inf else held)
-                free = self._arms.end if later - self._arms.end > _TIMING.min_preparation else held
+                free = self._arms.end if later - self._arms.end > TIMING.min_preparation else held
 
     def retract(self, start: float) -> None:
         """Lower the hands to rest from a time on, unless they already rest."""
@@ -189,23 +189,23 @@ class GesturePlanner:
             return
         # A slightly different rest each time, because people never return to the same pose. The forearms stop marking
         # beats.
-        jitter = self._size * 0.5 * _TIMING.jitter * self._rng.normal(size=18).clip(-1.5, 1.5)
+        jitter = self._size * 0.5 * TIMING.jitter * self._rng.normal(size=18).clip(-1.5, 1.5)
         rest = self.lexicon.rest + np.concatenate([jitter, np.zeros(4)])
-        end = start + max(_TIMING.retraction * away / _TIMING.speed, 0.8)
-        self._arms.move(rest if away > _TIMING.raised else self.lexicon.rest, start, end)
+        end = start + max(TIMING.retraction * away / TIMING.speed, 0.8)
+        self._arms.move(rest if away > TIMING.raised else self.lexicon.rest, start, end)
         self._raised.move(np.zeros(2), start, start + 0.4)
 
     @property
     def resting(self) -> bool:
         """Whether the hands rest or are being retracted."""
-        return largest_rotation(self._arms.target, self.lexicon.rest) < 4.0 * _TIMING.jitter
+        return largest_rotation(self._arms.target, self.lexicon.rest) < 4.0 * TIMING.jitter
 
     def discard_from(self, start: float) -> None:
         """Discard the plan from a time on; a move that has begun is finished unless another begins."""
         for track in (self._arms, self._raised):
             track.discard_from(start)
-            track.discard_before(start - _TIMING.memory)
-        self._beats = [one for one in self._beats if start - _TIMING.memory < one.time < start + _TIMING.rise]
+            track.discard_before(start - TIMING.memory)
+        self._beats = [one for one in self._beats if start - TIMING.memory < one.time < start + TIMING.rise]
         self.strokes = [one for one in self.strokes if one[0] < start]
 
     def at(
@@ -218,9 +218,9 @@ class GesturePlanner:
         # Beats move the joints of raised arms on top of their gesture.
         for k, sign in ((0, 1.0), (1, -1.0)):
             beat = beat_curve * raised[:, k] * self._size
-            states[:, 9 * k] += _TIMING.beat_shoulder * beat
-            states[:, 9 * k + 4] += sign * _TIMING.beat_elbow * beat
-            states[:, 9 * k + 8] -= sign * _TIMING.beat_wrist * beat
+            states[:, 9 * k] += TIMING.beat_shoulder * beat
+            states[:, 9 * k + 4] += sign * TIMING.beat_elbow * beat
+            states[:, 9 * k + 8] -= sign * TIMING.beat_wrist * beat
         return pose_arms(standing, states, self.lexicon.rest), beat_curve * self._size
 
     def _beat_curve(self, times: Float64[np.ndarray, " T"]) -> Float64[np.ndarray, " T"]:
@@ -228,7 +228,7 @@ class GesturePlanner:
         out = np.zeros(len(times))
         for one in self._beats:
             # Each beat is a short pulse: a quintic rise with a dip before it, then (1 - u^2)^3.
-            before, after = (times - one.time) / _TIMING.rise, (times - one.time) / _TIMING.fall
+            before, after = (times - one.time) / TIMING.rise, (times - one.time) / TIMING.fall
             rise = np.where((before > -1.0) & (before <= 0.0), _anticipation(before), 0.0)
             fall = np.where((after > 0.0) & (after < 1.0), (1.0 - after**2) ** 3, 0.0)
             out += one.weight * (rise + fall)
@@ -240,10 +240,10 @@ class GesturePlanner:
         rest, chosen, goal = self.lexicon.rest, -1, self.lexicon.rest
         # Try gestures until one can be reached in time, on a path clear of the body.
         for k in shuffle_recent_last(len(self.lexicon.pairs), self._recent, self._rng):
-            size = self._size * float(self._rng.uniform(*_TIMING.sizes))
+            size = self._size * float(self._rng.uniform(*TIMING.sizes))
             target = rest + size * (self.lexicon.states[k] - rest)
-            target[:18] += self._size * _TIMING.jitter * self._rng.normal(size=18).clip(-1.5, 1.5)
-            if largest_rotation(now, target) / _TIMING.speed > 1.6 * (arrival - free):
+            target[:18] += self._size * TIMING.jitter * self._rng.normal(size=18).clip(-1.5, 1.5)
+            if largest_rotation(now, target) / TIMING.speed > 1.6 * (arrival - free):
                 continue
             if self.lexicon.is_path_clear(now, target):
                 chosen, goal = k, target
@@ -251,12 +251,12 @@ class GesturePlanner:
         if chosen < 0:
             return
         # Start as late as the speed allows, so that the hands rest or hold until then.
-        start = max(free, arrival - max(largest_rotation(now, goal) / _TIMING.speed, _TIMING.min_move))
+        start = max(free, arrival - max(largest_rotation(now, goal) / TIMING.speed, TIMING.min_move))
         self._arms.move(goal, start, arrival)
-        far = [np.linalg.norm((goal - rest)[9 * k : 9 * k + 9]) > _TIMING.raised for k in (0, 1)]
+        far = [np.linalg.norm((goal - rest)[9 * k : 9 * k + 9]) > TIMING.raised for k in (0, 1)]
         self._raised.move(np.array(far, np.float64), start, arrival)
         self._recent = [*self._recent[-200:], chosen]
-        self.strokes.append((arrival + _TIMING.lead, self.lexicon.pairs[chosen]))
+        self.strokes.append((arrival + TIMING.lead, self.lexicon.pairs[chosen]))
 
 
 def _anticipation(u: Float64[np.ndarray, " T"]) -> Float64[np.ndarray, " T"]:

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
 
+from avatar.driving import rows_of
 from avatar.speech import SpeechAnimator
 from avatar.speech.voice import SynthesizedSpeech
 from smplxpp.body.model import BodyModel
@@ -139,9 +139,3 @@ class FrameQueue:
     def _push(self, first: int, motion: BodyParams, more: dict[str, np.ndarray], about: dict[str, object]) -> None:
         header = {"first": first, "fps": self.fps, "now": round(self.now, 4), **about}
         self._send(pack_tensors({"rows": rows_of(self._body, motion), **more}, header))
-
-
-def rows_of(body: BodyModel, motion: BodyParams) -> Float32[np.ndarray, "T W"]:
-    """Return frames as rows for the page: axis-angle vectors of all joints, translation, expressions."""
-    rotations = body.axis_angles(motion).reshape(len(motion), -1)
-    return np.concatenate([rotations, motion.transl, motion.expression], axis=1).astype(np.float32)

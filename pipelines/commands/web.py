@@ -33,12 +33,14 @@ PAGES = (".html", ".htm")
 
 
 def live_lips(bundle: AvatarBundle) -> bytes | None:
-    """Return what moves a bundle's mouth by live sound in a page; None for a face whose mouth cannot speak."""
-    from avatar.driving import face_of_bundle
+    """Return what moves mouth and hands of a speaker in a page; None for a face whose mouth cannot speak."""
+    from avatar.driving import person_of_bundle, stance_of
+    from avatar.runtime.skeleton import skeleton_body
     from pipelines.web.page import lips_of
 
     try:
-        return lips_of(face_of_bundle(bundle))
+        face, body = person_of_bundle(bundle)
+        return lips_of(face, stance_of(face, body, skeleton_body(bundle)))
     except InputError:
         return None
 

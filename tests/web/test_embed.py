@@ -9,21 +9,26 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from avatar.runtime import AvatarPlayer
+from avatar.runtime import AvatarPlayer, load_bundle
 from avatar.speech import Face, Speech, articulate
+from avatar.speech.gesture_lexicon import ARM_JOINTS
+from avatar.speech.gesture_planner import GesturePlanner
 from avatar.speech.phonemes import Phoneme
 from pipelines.web.page import PageContent, page_files
 from pipelines.web.server import PageServer
 from smplxpp.body.blendshapes import ARKIT
+from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core.files.sound_file import wave_bytes
+from smplxpp.core.files.tensor_bytes import unpack_tensors
 from tests.web.avatars import BACKGROUND, NAME, asked, camera, decibels, motion
 from tests.web.chromium import Page, find_chromium
 from tests.web.modules import NEEDS_BUILD, TOOLS, WEB, node
-from tests.web.test_lips import babble, dolls_lips
+from tests.web.test_lips import babble, dolls_lips, standing_body
 
 NEEDS_BROWSER = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
 EXAMPLES = WEB.parent / "examples" / "web"
@@ -151,6 +156,21 @@ def test_what_is_said_moves_the_mouth(browser, site):
     assert browser.evaluate("Math.max(...jaws) > 0.05")
     assert browser.evaluate("jaws.length = 0, guide.say(sound())") is True
     assert browser.evaluate("Math.max(...jaws) > 0.02")
+    # In the motion's place it stands, breathes, and its hands go with what it says.
+    watched = "left_shoulder left_elbow right_elbow spine3".split()
+    browser.evaluate(
+        f"window.looks = []; window.at = {json.dumps(watched)}.map(name => 3 * guide.summary.jointNames.indexOf(name));"
+        "window.looking = setInterval(() => { const {rotations} = guide.player.pose(0);"
+        " looks.push(at.map(k => [...rotations.slice(k, k + 3)])); }, 50); guide.stand()"
+    )
+    assert browser.evaluate("guide.player.performer !== null && !guide.player.playing")
+    browser.evaluate("new Promise(done => setTimeout(done, 1000)).then(() => { looks.length = 0; })")
+    syllables = "Array.from({length: 16}, (_, k) => ({viseme: k % 2 ? 'aa' : 'PP', start: k / 4, end: k / 4 + 0.2}))"
+    assert browser.evaluate(f"guide.say({syllables})") is True
+    shoulder, *elbows, spine = np.ptp(np.array(browser.evaluate("looks")), axis=0)
+    assert np.max([shoulder, *elbows]) > 0.3 and spine.max() > 1e-3
+    browser.evaluate("clearInterval(looking); guide.play()")
+    assert browser.evaluate("guide.player.performer === null && guide.player.playing")
     assert "damaged" in failure(browser, "guide.say(new ArrayBuffer(9))")
     assert "one of" in failure(browser, "guide.say([{viseme: 'QQ', start: 0}])")
     assert "neither" in failure(browser, "guide.say({})")
@@ -342,3 +362,53 @@ def test_a_face_with_names_of_arkit_needs_no_lips():
     expression, jaw = Face.of(ARKIT, ["pelvis", "jaw"]).pose(mouths, np.zeros(4))
     np.testing.assert_allclose(found, np.column_stack([expression, jaw[:, 0]]), atol=1e-9)
     assert np.ptp(expression) > 0.3
+
+
+@NEEDS_BUILD
+def test_hands_gesture_as_those_of_python(avatar, tmp_path):
+    """With the middle of every draw, the same phonemes give the same arms; between speeches it is Python's idle body."""
+    about, (lips, _) = load_bundle(avatar).about, unpack_tensors(dolls_lips(avatar), subject="lips")
+    names = 3 * "AA T IY SIL S OW N D AH T AY SIL K EH T UW M AA L".split()
+    lengths = [{"SIL": 0.5}.get(name, 0.09 + 0.03 * (k % 5)) for k, name in enumerate(names)]
+    ends = np.cumsum(lengths)
+    phones = [{"name": n, "start": e - d, "end": e} for n, e, d in zip(names, ends, lengths, strict=True)]
+    times = np.arange(0.0, ends[-1] + 4.0, 0.05)
+    script = """const lips = m.unpackTensors(Uint8Array.from(readFileSync(given.lips)), "lips");
+      const middle = { uniform: (a, b) => (a + b) / 2, normal: () => 0, shuffled: n => [...Array(n).keys()] };
+      const sound = new Float32Array(Uint8Array.from(readFileSync(given.sound)).buffer);
+      const names = given.joints, standing = m.Standing.of(lips, names, given.expressions);
+      const arms = new m.Arms(standing.arms.lexicon, m.numbersOf(lips.about.gestures), middle);
+      arms.plan(given.phones, 1);
+      const all = given.times.map(t => arms.at(t + 1)), idle = given.frames.map(t => standing.poseAt(t));
+      const result = { states: all.map(({ state }) => [...state]), beats: all.map(({ beat }) => beat),
+        heard: m.syllablesOf({ sampleRate: 16000, length: sound.length, numberOfChannels: 1, getChannelData: () => sound }),
+        idle: idle.map(({ rotations, translation, expression }) => [...rotations, ...translation, ...expression]) };"""
+    frames = [k / 15.0 for k in (0, 40, 200, 359)]
+    (tmp_path / "lips").write_bytes(dolls_lips(avatar))
+    given = {"lips": str(tmp_path / "lips"), "joints": about.joint_names, "expressions": len(about.expression_names)}
+    given["sound"] = str(tmp_path / "sound")
+    (tmp_path / "sound").write_bytes(babble(3.0, 16_000).samples.astype("<f4").tobytes())
+    found = node(script, given={**given, "phones": phones, "times": times.tolist(), "frames": frames})
+    middle = SimpleNamespace(
+        uniform=lambda low, high: 0.5 * (low + high), normal=lambda size: np.zeros(size), permutation=np.arange
+    )
+    planner = GesturePlanner(standing_body())
+    planner._rng = middle
+    planner.plan(Speech(tuple(Phoneme(**one) for one in phones), float(ends[-1])), 1.0, more=False)
+    assert len(planner.strokes) >= 2
+    moved, beats = planner.at(planner.lexicon.body.standing, times + 1.0)
+    rows = [SMPLX_JOINTS.index(f"{side}_{name}") - 1 for side in ("left", "right") for name in ARM_JOINTS]
+    expected = np.asarray(moved.body_pose).reshape(len(times), -1, 3)[:, rows].reshape(len(times), -1)
+    np.testing.assert_allclose(np.array(found["states"])[:, :18], expected, atol=1e-6)
+    np.testing.assert_allclose(found["beats"], beats, atol=1e-9)
+    assert np.ptp(expected, axis=0).max() > 0.5
+    # Between speeches: the table's frames, arms hanging.
+    whole = np.tile(lips["body.standing"].astype(float), (4, 1))
+    whole[:, lips["body.columns"]] = lips["body.idle"][[0, 40, 200, 359]].astype(float)
+    got = np.array(found["idle"])
+    others = np.setdiff1d(np.arange(whole.shape[1]), np.add.outer(3 * np.array(rows) + 3, np.arange(3)).ravel())
+    np.testing.assert_allclose(got[:, others], whole[:, others], atol=2e-3)
+    assert np.ptp(got, axis=0).max() > 0.01
+    # Of a sound alone syllables are heard: the babble has one every 0.4 s from 0.2 s on, 0.28 s long.
+    heard = np.array([one["start"] + 0.04 for one in found["heard"] if one["name"] == "AH"])
+    assert 6 <= len(heard) <= 8 and ((heard - 0.2) % 0.4 < 0.3).all()

@@ -5,18 +5,23 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from avatar.speech import ARTICULATORS, Face
+from avatar.driving import stance_of
+from avatar.runtime import load_bundle
+from avatar.speech import ARTICULATORS, Face, StandingBody
 from avatar.speech.audio_features import FRAME, RATE, log_mel
 from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, smooth_mouth
 from pipelines.commands.talk import write_talking_page
 from pipelines.web.page import PageContent, lips_of, page_files, single_page
 from pipelines.web.server import PageServer
 from smplxpp.body import load_body
+from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.body.retarget import Skeleton
 from smplxpp.core.files.sound_file import Sound, wave_bytes
 from smplxpp.core.params import BodyParams
 from tests.dolls.dancing import dance
@@ -111,19 +116,31 @@ def test_the_page_moves_a_face_as_python_does(tmp_path, jaw):
         node(script.replace("piece, 52, 1", "piece, 50, 1"), given={"path": str(path), "mouths": []})
 
 
-def dolls_lips(data: Path) -> bytes:
+def dolls_face(data: Path) -> Face:
     """A face for the doll's expressions: its jaw alone opens, its first expression presses."""
-    from avatar.runtime import load_bundle
-
     count = len(load_bundle(data).about.expression_names)
     basis = np.zeros((6, count))
     basis[PRESS, 0] = 0.7
     zeros = np.zeros(count)
-    face = Face(
+    return Face(
         **{"arkit": np.zeros((52, count)), "basis": basis, "blink": zeros, "neutral": zeros, "lowest": zeros},
         **{"highest": zeros + 1.0, "jaw": np.zeros(3), "jaw_reach": 0.15},
     )
-    return lips_of(face)
+
+
+@cache
+def standing_body() -> StandingBody:
+    """The open body with hanging arms: the doll's legs are points, on which nobody stands."""
+    body, pose = load_body(), np.zeros((21, 3))
+    pose[[SMPLX_JOINTS.index("left_shoulder") - 1, SMPLX_JOINTS.index("right_shoulder") - 1], 2] = -0.9, 0.9
+    return StandingBody.of(Skeleton.of(body), replace(BodyParams.rest(), body_pose=pose.reshape(1, 63)))
+
+
+@cache
+def dolls_lips(data: Path) -> bytes:
+    """How the doll's mouth speaks and its hands gesture, for a page."""
+    face = dolls_face(data)
+    return lips_of(face, stance_of(face, standing_body(), load_body()))
 
 
 @pytest.fixture(scope="module")

@@ -161,6 +161,14 @@ export class Animator {
     this.update();
   }
 
+  /** Lets somebody act in the motion's place, null: nobody; the pose goes over in so many seconds. */
+  perform(performer: Performer | null, fade: number): void {
+    if (performer === this.performer) return;
+    if (fade > 0 && this.summary) this.left = { pose: this.pose(this.time), at: performance.now(), fade: 1000 * fade };
+    this.performer = performer;
+    this.update();
+  }
+
   /** Something that is shown has changed. */
   update(): void {
     this.changed = true;

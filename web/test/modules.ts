@@ -2,6 +2,9 @@
 export { Deformer, RECORD } from "../src/avatar/deform.ts";
 export { poseAt, restPose, turned } from "../src/avatar/motion.ts";
 export { Resampler } from "../src/chat/resample.ts";
+export { Arms, numbersOf } from "../src/stance/arms.ts";
+export { beatsOf, syllablesOf } from "../src/stance/beats.ts";
+export { Standing } from "../src/stance/standing.ts";
 export { SpeakingFace } from "../src/lips/face.ts";
 export { Ear } from "../src/lips/features.ts";
 export { spelt } from "../src/lips/spelling.ts";

@@ -9,9 +9,13 @@ import { LiveLips } from "../lips/lips.ts";
 import type { Viseme } from "../lips/visemes.ts";
 import { Dialogue } from "../chat/dialogue.ts";
 import { Soundtrack } from "../sound/soundtrack.ts";
+import { Standing } from "../stance/standing.ts";
 import type { Summary } from "../worker/protocol.ts";
 import { bytesOf, type Source } from "./source.ts";
 import { Voice, type BrowserVoice, type TextToSpeech, type Utterance } from "./voice.ts";
+
+/** Seconds in which it goes over from a motion's pose to standing. */
+const STANDS = 0.5;
 
 export type { Summary, Source, Utterance, TextToSpeech, BrowserVoice };
 
@@ -30,6 +34,8 @@ export interface AvatarOptions extends AvatarFiles, AvatarSettings {
   voice?: TextToSpeech | BrowserVoice;
   /** Plays the file's motion as soon as it is there, and again and again; a motion with a sound waits for `play`. Default: true. */
   autoplay?: boolean;
+  /** Stands, breathes and moves its hands with what it says where no motion plays; `lips` tells how. Default: true. */
+  gestures?: boolean;
   /** Address of the package's worker.js, for pages whose policy has no `worker-src blob:`. */
   worker?: string | URL;
   /** Disposes of the avatar. */
@@ -111,6 +117,7 @@ export class Avatar<P extends Animator = Animator> {
   private readonly listeners = new Map<string, Set<(detail: never) => void>>();
   private sound: Soundtrack | null = null;
   private dialogue: Dialogue | null = null;
+  private standing: Standing | null = null;
 
   /** @param make makes what animates the avatar. */
   constructor(make: (options: AvatarOptions) => Promise<P> | P, private readonly options: AvatarOptions = {}) {
@@ -130,7 +137,7 @@ export class Avatar<P extends Animator = Animator> {
   }
 
   private async load(url: Source, { lips = null, sound = null }: AvatarFiles): Promise<Summary> {
-    const player = this.alive(await this.started()), { signal } = this.disposing, { autoplay = true } = this.options;
+    const player = this.alive(await this.started()), { signal } = this.disposing, { autoplay = true, gestures = true } = this.options;
     const data = await bytesOf(url, signal), [ofLips, ofSound] = await Promise.all([lips, sound].map((one) => one && bytesOf(one, signal)));
     this.hush();
     this.dialogue?.close();
@@ -142,16 +149,21 @@ export class Avatar<P extends Animator = Animator> {
     this.sound = ofSound ? new Soundtrack(ofSound, (message) => this.emit("error", new AvatarError("sound", message))) : null;
     player.clock = this.sound;
     player.playing = autoplay && !this.sound;
+    player.perform(null, 0);
+    this.standing = null;
     let deaf = "", hearing: LiveLips | null = null;
     try {
       hearing = ofLips ? new LiveLips(ofLips, expressionNames.length, jointNames) : null;
+      this.standing = hearing && gestures ? Standing.of(hearing.network, jointNames, expressionNames.length) : null;
     } catch (error) {
       deaf = (error as Error).message;
     }
     player.lips = this.voice.lips = hearing;
     this.voice.face = hearing?.face ?? SpeakingFace.named(expressionNames, jaw);
     player.voice = this.voice;
+    this.voice.hands = this.standing;
     this.summary = summary;
+    if (!this.sound && (!player.playing || !player.duration)) this.act(0);
     this.emit("ready", summary);
     if (deaf) this.emit("error", new AvatarError("lips", deaf));
     return summary;
@@ -167,10 +179,12 @@ export class Avatar<P extends Animator = Animator> {
     this.sound?.unlock();
     const player = await this.opened();
     if (player !== this.player || !player) return;
-    if (motion) {
+    const played = motion && motionOf(motion, this.summary!);
+    if (player.performer === this.standing) player.perform(null, fade);
+    if (played) {
       player.clock?.at(false, 0, 1);
       player.clock = null;
-      player.begin(motionOf(motion, this.summary!), fade);
+      player.begin(played, fade);
     }
     if (loop !== undefined) player.loop = loop;
     if (speed !== undefined) player.speed = speed;
@@ -183,6 +197,23 @@ export class Avatar<P extends Animator = Animator> {
     if (!this.player) return;
     this.player.playing = false;
     this.player.update();
+  }
+
+  /** Stands, breathes and looks about in the motion's place, and moves its hands with what it says. @throws Error it cannot. */
+  async stand(): Promise<void> {
+    const player = await this.opened();
+    if (player !== this.player || !player) return;
+    if (!this.standing) throw new Error("this avatar does not stand by itself; give createAvatar `lips`: the lips.safetensors that smplxpp web writes beside the avatar");
+    player.playing = false;
+    this.act(STANDS);
+  }
+
+  /** Stands where it is, unless somebody acts for it. */
+  private act(fade: number): void {
+    const player = this.player!;
+    if (!this.standing || player.performer) return;
+    this.standing.standAt(player.pose(player.time).translation);
+    player.perform(this.standing, fade);
   }
 
   /** Holds joints, expressions and the place of the body, whatever the motion does; null lets go of all. @throws Error no such joint or expression. */
@@ -219,6 +250,7 @@ export class Avatar<P extends Animator = Animator> {
     await before;
     await this.opened();
     if (!this.player || turn !== this.turn) return false;
+    if (!this.player.playing) this.act(STANDS);
     let complete = false, began = false;
     try {
       return (complete = await this.voice.say(said, () => {
@@ -293,7 +325,7 @@ export class Avatar<P extends Animator = Animator> {
     this.player?.clock?.at(false, 0, 1);
     void this.sound?.context?.close();
     this.player?.dispose();
-    this.player = this.summary = this.sound = this.dialogue = null;
+    this.player = this.summary = this.sound = this.dialogue = this.standing = null;
     this.listeners.clear();
   }
 

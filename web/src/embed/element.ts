@@ -56,6 +56,10 @@ export class AvatarElement extends HTMLElement {
     this.shown().pause();
   }
 
+  stand(): Promise<void> {
+    return this.shown().stand();
+  }
+
   pose(params: PoseParams | null): Promise<void> {
     return this.shown().pose(params);
   }

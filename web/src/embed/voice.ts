@@ -7,6 +7,7 @@ import type { LiveLips } from "../lips/lips.ts";
 import { spelt } from "../lips/spelling.ts";
 import { articulate, phonesOf, type Phone, type Viseme } from "../lips/visemes.ts";
 import { Playing } from "../sound/playing.ts";
+import { syllablesOf } from "../stance/beats.ts";
 import { bytesOf, type Source } from "./source.ts";
 
 /** A sound, the visemes of it, or both; without a sound the mouth moves silently. */
@@ -32,8 +33,17 @@ export interface BrowserVoice {
 const SOON = 0.06, WAKES = 1, LISTED = 1.5, BEGINS = 10;
 /** Seconds in which the mouth closes after the last viseme of a speech without sound. */
 const CLOSES = 0.15;
+/** Seconds by which a browser's word may come at another time than hands were told. */
+const APART = 0.3;
 const NEEDS_LIPS = "give createAvatar `lips`: the lips.safetensors that smplxpp web writes beside the avatar";
 const NEEDS_CLICK = "this browser plays no sound before somebody has clicked or typed: call say from such an event";
+
+/** Who moves her hands with what is said. */
+export interface Hands {
+  /** Plans gestures for what is said from now on, of which so many seconds are heard already. */
+  plan(phones: readonly Phone[], heard: number): void;
+  retract(): void;
+}
 
 /** What is said now. */
 interface Now {
@@ -45,6 +55,7 @@ interface Now {
 export class Voice implements Mouth {
   lips: LiveLips | null = null;
   face: SpeakingFace | null = null;
+  hands: Hands | null = null;
   tts: TextToSpeech | BrowserVoice = {};
   context: AudioContext | null = null;
   /** What everything that is heard passes, for who wants to look at it. */
@@ -97,6 +108,7 @@ export class Voice implements Mouth {
   }
 
   private clear(): void {
+    if (this.halt) this.hands?.retract();
     this.now = this.halt = this.spoken = null;
   }
 
@@ -113,11 +125,15 @@ export class Voice implements Mouth {
       signal.throwIfAborted();
       if (!phones) {
         if (this.lips) this.lips.context = context;
-        return this.follow((lips) => lips.play(sound, "this sound"), signal, began);
+        return this.follow((lips) => lips.play(sound, "this sound"), signal, () => {
+          this.hands?.plan(syllablesOf(sound), this.lips?.played ?? 0);
+          began();
+        });
       }
       const playing = Playing.of(context, sound, this.output!);
       playing.start(context.currentTime + SOON);
       this.now = { phones, clock: () => playing.heard() };
+      this.hands?.plan(phones, -SOON);
       began();
       await until(signal, (done) => (playing.onended = done));
       return playing.stop();
@@ -125,6 +141,7 @@ export class Voice implements Mouth {
     if (!phones) throw new Error("say: expected a text, or {audio, visemes} with one of both at least, received neither");
     const started = performance.now(), over = Math.max(0, ...phones.map(({ end }) => end)) + CLOSES;
     this.now = { phones, clock: () => (performance.now() - started) / 1000 };
+    this.hands?.plan(phones, 0);
     began();
     await until(signal, (done) => setTimeout(done, 1000 * over));
   }
@@ -162,12 +179,16 @@ export class Voice implements Mouth {
           clearTimeout(patience);
           begun = performance.now();
           this.now = { phones: spelt(text, 0, 0, rate), clock };
+          this.hands?.plan(this.now.phones, 0);
           began();
         };
         spoken.onboundary = ({ name: what, charIndex }) => {
           if (what === "sentence" || !this.now) return;
-          const now = clock(), before = this.now.phones.filter(({ start }) => start < now);
-          this.now.phones = [...before.map((one) => ({ ...one, end: Math.min(one.end, now) })), ...spelt(text, charIndex, now, rate)];
+          const now = clock(), before = this.now.phones.filter(({ start }) => start < now), after = spelt(text, charIndex, now, rate);
+          // Hands are told of words that come at other times than was guessed.
+          const guessed = this.now.phones[this.now.phones.length - after.length]?.start ?? now;
+          this.now.phones = [...before.map((one) => ({ ...one, end: Math.min(one.end, now) })), ...after];
+          if (Math.abs(guessed - now) > APART) this.hands?.plan(after.map((one) => ({ ...one, start: one.start - now, end: one.end - now })), 0);
         };
         spoken.onend = done;
         spoken.onerror = ({ error }) => fail(new Error(error === "not-allowed" ? NEEDS_CLICK : `the browser's voice failed: ${error}`));

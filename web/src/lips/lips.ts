@@ -65,7 +65,8 @@ export class LiveLips {
   context: AudioContext | null = null;
   /** What a file is heard through, for who wants to look at it. */
   output: GainNode | null = null;
-  private readonly network: Piece;
+  /** The network, and what the file says of face and stance. */
+  readonly network: Piece;
   readonly face: SpeakingFace;
   /** Settled when what is listened to is over. */
   over: Promise<void> = Promise.resolve();
