@@ -224,4 +224,5 @@ def _are_paths_clear(
     paths = starts[:, None] + np.linspace(0.0, 1.0, 7)[:, None] * (ends - starts)[:, None]
     states = np.concatenate([paths.reshape(-1, STATE_SIZE), rest[None]])
     distance = body.hand_clearance(pose_arms(body.standing, states, rest))
-    return (distance[:-1].reshape(-1, 7) >= min(0.02, float(distance[-1]) - 0.005)).all(axis=1)
+    lowest = np.min(distance[:-1].reshape(-1, 7), axis=1, keepdims=True)
+    return (lowest >= min(0.02, float(distance[-1]) - 0.005))[:, 0]

@@ -366,7 +366,7 @@ def test_a_face_with_names_of_arkit_needs_no_lips():
 
 @NEEDS_BUILD
 def test_hands_gesture_as_those_of_python(avatar, tmp_path):
-    """With the middle of every draw, the same phonemes give the same arms; between speeches it is Python's idle body."""
+    """With the middle of every draw, the same phonemes give the same arms; between speeches the body is Python's."""
     about, (lips, _) = load_bundle(avatar).about, unpack_tensors(dolls_lips(avatar), subject="lips")
     names = 3 * "AA T IY SIL S OW N D AH T AY SIL K EH T UW M AA L".split()
     lengths = [{"SIL": 0.5}.get(name, 0.09 + 0.03 * (k % 5)) for k, name in enumerate(names)]
@@ -376,12 +376,13 @@ def test_hands_gesture_as_those_of_python(avatar, tmp_path):
     script = """const lips = m.unpackTensors(Uint8Array.from(readFileSync(given.lips)), "lips");
       const middle = { uniform: (a, b) => (a + b) / 2, normal: () => 0, shuffled: n => [...Array(n).keys()] };
       const sound = new Float32Array(Uint8Array.from(readFileSync(given.sound)).buffer);
+      const buffer = { sampleRate: 16000, length: sound.length, numberOfChannels: 1, getChannelData: () => sound };
       const names = given.joints, standing = m.Standing.of(lips, names, given.expressions);
       const arms = new m.Arms(standing.arms.lexicon, m.numbersOf(lips.about.gestures), middle);
       arms.plan(given.phones, 1);
       const all = given.times.map(t => arms.at(t + 1)), idle = given.frames.map(t => standing.poseAt(t));
       const result = { states: all.map(({ state }) => [...state]), beats: all.map(({ beat }) => beat),
-        heard: m.syllablesOf({ sampleRate: 16000, length: sound.length, numberOfChannels: 1, getChannelData: () => sound }),
+        heard: m.syllablesOf(buffer),
         idle: idle.map(({ rotations, translation, expression }) => [...rotations, ...translation, ...expression]) };"""
     frames = [k / 15.0 for k in (0, 40, 200, 359)]
     (tmp_path / "lips").write_bytes(dolls_lips(avatar))
