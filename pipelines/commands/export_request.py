@@ -28,7 +28,7 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "spz": (".spz",),
     "sog": (".sog",),
     "glb": (".glb",),
-    "usd": (".usdc", ".usda", ".usd"),
+    "usd": (".usdc", ".usda", ".usd", ".usdz"),
     "fbx": (".fbx",),
     "vrm": (".vrm",),
     "obj": (".obj",),
@@ -198,8 +198,9 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         InputError: options that do not go together, a source that lacks what is asked for, parameters of another body.
         MissingExtraError: a package of an extra that is not installed.
     """
-    # Find the module that writes this format; OBJ, FBX and VRM hold the template, splats are always the student's.
-    model = "template" if request.format in ("obj", "fbx", "vrm") else request.model
+    # Find the module that writes this format; OBJ, FBX, VRM and USDZ hold the template, splats are the student's.
+    model = "template" if request.out.suffix.lower() in (".obj", ".fbx", ".vrm", ".usdz") else request.model
+    model = "template" if request.format == "obj" else model  # a series
     if model == "auto":
         of_either = ("template", request.format) in _BY_MODEL
         trained = request.source.is_file() or (request.source / STUDENT).is_file()

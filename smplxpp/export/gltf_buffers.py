@@ -57,8 +57,8 @@ class BufferBuilder:
     def add_sparse(self, array: Float32[np.ndarray, "N 3"], rows: Int[np.ndarray, " n"]) -> int:
         """Store the given rows of a (N, 3) float32 array that is zero elsewhere; the bounds are always stated.
 
-        Few moved rows are stored with their indices, many as a full array, whichever is smaller; none at all take no
-        bytes.
+        Few moved rows are stored with their indices, many as a full array, whichever is smaller; of none at all one
+        row of zeros, because assimp reads no accessor without any bytes.
 
         Args:
             array: (N, 3) float32.
@@ -66,6 +66,7 @@ class BufferBuilder:
         """
         kept = np.zeros_like(array)
         kept[rows] = array[rows]
+        rows = rows if len(rows) else np.zeros(min(1, len(array)), np.int64)
         indices = rows.astype(index_dtype(len(array)))
         # Sparse storage pays only while indices and values together take less than the full array.
         if indices.nbytes + array[rows].nbytes >= array.nbytes:
@@ -78,7 +79,7 @@ class BufferBuilder:
                 indices=pygltflib.AccessorSparseIndices(
                     bufferView=self._view(indices), componentType=_COMPONENT_TYPES[indices.dtype]
                 ),
-                values=pygltflib.AccessorSparseValues(bufferView=self._view(array[rows])),
+                values=pygltflib.AccessorSparseValues(bufferView=self._view(kept[rows])),
             )
         return self._append(accessor)
 

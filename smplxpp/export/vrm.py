@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from smplxpp.body.blendshapes import ARKIT, both_sides, transfer_blendshapes
+from smplxpp.body.blendshapes import ARKIT, both_sides, transfer_blendshapes, with_arkit_names
 from smplxpp.body.layout import FINGERS, OWN_NAMES, PROGRAM_NAMES
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
@@ -174,6 +174,11 @@ def write_vrm(
     template = in_vrm_pose(template).on_floor()
     template = replace(template, weights=template.weights.pruned(INFLUENCES))
     shapes = preset_displacements(template)
+    # ARKit's expressions, of numbered ones as far as they are reached; the numbers themselves say nothing to a player.
+    body = with_arkit_names(template.body)
+    told = [k for k, name in enumerate(body.expression_names) if not name.startswith("expression_")]
+    names = tuple(body.expression_names[k] for k in told)
+    template = replace(template, body=replace(body, exprdirs=body.exprdirs[..., told], expression_names=names))
     named = bool(set(ARKIT) & set(template.body.expression_names))
     gltf, buffers, joint_nodes, part_nodes = rigged_gltf(
         with_joint_names(template, joint_names), morph_targets=named, shapes=shapes

@@ -140,8 +140,7 @@ def is_finger(name: str) -> bool:
 
 def visible_vertices(body: BodyModel) -> Int64[np.ndarray, " n"]:
     """Return the vertices that images and scans can show, which are all but those of eyes, teeth and tongue."""
-    hidden = [k for k, name in enumerate(body.part_label_names) if any(w in name for w in ("eye", "teeth", "tongue"))]
-    return np.flatnonzero(~np.isin(body.part_labels, hidden))
+    return np.flatnonzero(body.outer_skin)
 
 
 def _place(body: BodyModel, joints: dict[str, int], name: str) -> int | _Mean | None:
