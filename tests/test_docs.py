@@ -117,3 +117,24 @@ def test_the_version_is_the_same_in_every_file():
         name for name in re.findall(r"^## (.+)$", (ROOT / HISTORY).read_text(), re.MULTILINE) if name != "Unreleased"
     ]
     assert (cited[1], released[0]) == (project, project)
+
+
+def test_locks_hold_the_pinned_versions_with_hashes():
+    """What `make` installs is what was tested, by digest; torch, of which each index has builds of its own, apart."""
+    pinned = dict(re.findall(r"(?m)^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text()))
+    locked: dict[str, set[str]] = {}
+    for path in sorted((ROOT / "locks").glob("*.lock")):
+        text = path.read_text()
+        entries = re.split(r"(?m)^(?=[a-z])", text)[1:]
+        assert entries and all(re.search(r"--hash=sha256:[0-9a-f]{64}\b", entry) for entry in entries)
+        assert "://" not in text  # no registry of its own
+        for name, version in (re.match(r"([\w.-]+)==(\S+)", entry).groups() for entry in entries):
+            locked.setdefault(name, set()).add(version)
+    without = {"torch", "uv"}
+    for name in pinned.keys() - without:
+        assert locked[name.lower()] == {pinned[name]}, name
+    assert not {"torch", "triton"} & locked.keys()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    wanted = [one for group in project["dependency-groups"].values() for one in group]
+    wanted += project["project"]["dependencies"]
+    assert {re.match(r"[\w-]+", one)[0].lower() for one in wanted} <= locked.keys()
