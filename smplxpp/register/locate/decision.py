@@ -9,7 +9,7 @@ import numpy as np
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.surface_points import SurfacePoints
-from smplxpp.register.locate.persons import heads, largest_piece, others_carried, people_apart, share_beyond
+from smplxpp.register.locate.persons import Piece, heads, largest_piece, others_carried, people_apart, share_beyond
 from smplxpp.register.locate.search import Found
 
 
@@ -35,8 +35,9 @@ class LocateBounds:
             without a head at most .08.
         least_carried: share of the surface from which a piece with a head of its own is somebody: a child of 0.4 of a
             person's size has .15, a ball of 22 cm in a hand .05; no right body has a head on a piece of .05.
-        most_beyond: share of the body outside the hull of the surface from which this is a part of a person; a head
-            is .06 to .09, both arms .16, legs alone .27, halves .38 and more; right bodies have at most .004.
+        most_beyond: share of the body outside the silhouettes of the surface from which this is a part of a person: a
+            head is .07 to .10, both arms .16, shins and feet .20, what a search puts into legs or a bust on a stand .26
+            and more, halves .39 and more; right bodies have at most .007.
     """
 
     least_covered: float = 0.5
@@ -49,7 +50,7 @@ class LocateBounds:
     good_bare: float = 0.024
     least_head: float = 0.3
     least_carried: float = 0.1
-    most_beyond: float = 0.2
+    most_beyond: float = 0.18
 
 
 _BOUNDS = LocateBounds()
@@ -116,7 +117,10 @@ def findings_of(
         out.append(
             f"{len(upper)} heads, {heights} m above the lowest point: two people, or something round that is held"
         )
-    carried = others_carried(mesh, surface, best.misfit.unexplained, least=_BOUNDS.least_carried)
+    # Beside somebody whose hands, face and feet are there; crossed boards have round places, too.
+    carried: tuple[tuple[Piece, float], ...] = ()
+    if best.misfit.bare < _BOUNDS.good_bare:
+        carried = others_carried(mesh, surface, best.misfit.unexplained, least=_BOUNDS.least_carried)
     if carried:
         trust = 0.1
     for other, height in carried if not out else ():
@@ -196,15 +200,17 @@ def confidence_of(best: Found, others: Sequence[Found]) -> float:
 
 def missing_parts(found: Found) -> list[str]:
     """Return the parts of the body that the surface does not show: less than 0.4 of a foot, 0.3 of the head (hair hides
-    it), 0.2 of a forearm (wide sleeves hide it) or of a hand, or 0.4 of a hand whose forearm is missing, too.
+    it), 0.2 of a forearm (wide sleeves hide it) or of a hand, or 0.4 of both, of an arm that is hidden in the trunk.
 
     Skirts hide lower legs, which are therefore never missing.
     """
     least = {"head": _BOUNDS.least_head, "foot": 0.4, "forearm": 0.2, "hand": 0.2, "leg": 0.0}
     shown = found.misfit.parts
-    out = [part for part, share in shown.items() if share < least[part.split()[-1]]]
-    lost = [f"{side} hand" for side in _SIDES if f"{side} forearm" in out and shown[f"{side} hand"] < _OPEN_HAND]
-    return [part for part in shown if part in {*out, *lost}]
+    out = {part for part, share in shown.items() if share < least[part.split()[-1]]}
+    for side in _SIDES:
+        if max(shown[f"{side} forearm"], shown[f"{side} hand"]) < _OPEN_HAND:
+            out |= {f"{side} forearm", f"{side} hand"}
+    return [part for part in shown if part in out]
 
 
 def closed_hands(found: Found) -> list[str]:
