@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
+import json
 import os
 import re
 import runpy
@@ -43,6 +44,8 @@ SHORT = {"00_main_job": ("--share", "0.02")}
 """Arguments that make an example shorter."""
 FACES = {"hair": 400, "shoe": 400, "upper": 1500, "lower": 1500}
 GAUSSIANS = 6000
+NOTEBOOKS = {"avatar": {"me.avatar", "training"}, "metrics": set(), "template": {"me.glb", "me.npz"}}
+"""What each writes beside itself."""
 BY_COMMAND = "03_metrics"
 """The one that runs in a process of its own; imports of the libraries cost each of those seconds."""
 
@@ -85,6 +88,50 @@ def _in_a_process(name: str, out: Path, *arguments: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def read_notebook(name: str) -> dict:
+    """Return a notebook as Jupyter stores it."""
+    return json.loads((ROOT / "examples" / "notebooks" / f"{name}.ipynb").read_text())
+
+
+def code_of_notebook(name: str) -> list[str]:
+    """Return the sources of a notebook's code cells."""
+    return ["".join(cell["source"]) for cell in read_notebook(name)["cells"] if cell["cell_type"] == "code"]
+
+
+def test_notebooks_hold_code_alone() -> None:
+    """No output of somebody's machine is stored, and every cell has an id, as version 4.5 of the format asks for."""
+    assert {path.stem for path in (ROOT / "examples" / "notebooks").iterdir()} == set(NOTEBOOKS)
+    for name in NOTEBOOKS:
+        book = read_notebook(name)
+        assert (book["nbformat"], book["nbformat_minor"]) == (4, 5)
+        ids = [cell["id"] for cell in book["cells"]]
+        assert len(set(ids)) == len(ids) and book["cells"][0]["cell_type"] == "markdown"
+        for cell in book["cells"]:
+            assert cell.get("outputs", []) == [] and cell.get("execution_count") is None
+        for source in code_of_notebook(name):
+            ast.parse(source)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebook_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
+    printed, names = io.StringIO(), {}
+    with (
+        contextlib.chdir(tmp_path),
+        contextlib.redirect_stdout(printed),
+        mock.patch.object(smplxpp, "build_template", _small_template),
+        mock.patch.dict(TRAINING_PRESETS, demo=QUICK),
+    ):
+        for source in code_of_notebook(name):
+            exec(compile(source, name, "exec"), names)
+    assert {path.name for path in tmp_path.iterdir()} == NOTEBOOKS[name]
+    if name == "metrics":
+        whole, visible = numbers(r"P2S (\S+) mm of the whole, (\S+) mm of what", printed.getvalue())
+        assert visible < whole
+    if name == "avatar":
+        assert numbers(r"(\S+) dB over the whole", printed.getvalue())[0] > 20.0  # black around her helps
 
 
 def numbers(pattern: str, text: str) -> list[float]:
