@@ -101,6 +101,25 @@ def test_every_page_and_file_in_backticks_exists(page):
     assert not missing, f"{page.name} names files that are not there: {', '.join(missing)}"
 
 
+def test_messages_of_the_troubleshooting_page_are_those_of_the_code():
+    """Parts between "..." and words that stand for names occur in the sources, strings that are cut in two joined."""
+    sources = (
+        " ".join(path.read_text().split())
+        for package in ("smplxpp", "avatar", "pipelines")
+        for path in (ROOT / package).rglob("*.py")
+    )
+    code = re.sub(r'"\s+f?"', "", " ".join(sources))
+    rows = (ROOT / "docs" / "troubleshooting.md").read_text().split("## By message")[1].splitlines()
+    messages = [one for row in rows if row.startswith("| `") for one in re.findall(r"`([^`]+)`", row.split("|")[1])]
+    parts = {
+        part.strip(" :")
+        for one in messages
+        for part in re.split(r"\.\.\.|\b[A-Z]{4,}\b|\b\d[\d.]*|\bto\b|expected ", one)
+    }
+    assert len(messages) > 15
+    assert not [part for part in parts if part not in code]
+
+
 def test_the_checks_find_what_is_wrong(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("See `smplxpp.no_such_room`, `avatar.gaussians.binding` and `RUN/smplxpp.npz`.\n")

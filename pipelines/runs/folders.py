@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,7 @@ from pipelines.runs.layout import (
     REGISTER_FILE,
 )
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.core.files.atomic import atomic_write_bytes, try_lock
 from smplxpp.core.files.paths import absolute, read_bytes, same_place
 
 RUNS_OF_A_CAPTURE = "runs"
@@ -84,7 +83,7 @@ def refuse_old_run(folder: Path) -> None:
 
 def _at_once(path: str, flags: int) -> int:
     """Open a file without blocking, so that a pipe without a reader is an error."""
-    return os.open(path, flags | os.O_NONBLOCK, 0o666)
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
 
 
 @contextmanager
@@ -113,15 +112,13 @@ def own_run_folder(run: Path, names: Sequence[str]) -> Iterator[None]:
         ) from None
     # The lock does not wait: a second build in the same run is refused at once.
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not try_lock(lock.fileno()):
             raise InputError(
                 f"run folder {run}",
                 expected="no other build in it",
                 received="a running one",
                 remedy="wait for its end, or choose another folder",
-            ) from None
+            )
         for name in names:
             # Temporary files of a killed build are incomplete, and under the lock no other process can be writing them.
             for left in run.glob(f".{name}.*"):

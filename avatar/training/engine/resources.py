@@ -5,12 +5,16 @@ from __future__ import annotations
 import ctypes
 import errno
 import logging
-import resource
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+
+try:
+    import resource
+except ModuleNotFoundError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 import torch
 
@@ -24,12 +28,12 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _NEVER = -1, -3, 1 << 30
 
 
 def peak_memory(device: str = "cpu") -> dict[str, int]:
-    """Return the peak memory of this process, bytes: of the machine, and of the GPU where it uses one."""
+    """Return the peak memory of this process, bytes: of the machine (Windows does not tell), and of the GPU it uses."""
     unit = 1 if sys.platform == "darwin" else 1024
-    host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-    if not device.startswith("cuda"):
-        return {"host": host}
-    return {"host": host, "device": torch.cuda.max_memory_allocated(device)}
+    found = {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit} if resource else {}
+    if device.startswith("cuda"):
+        found["device"] = torch.cuda.max_memory_allocated(device)
+    return found
 
 
 def keep_freed_memory() -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import shutil
@@ -13,6 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows, where an open file cannot be moved: nothing is held there
+    fcntl = None  # type: ignore[assignment]
 
 WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors that only writing raises: no space, quota, file too large, read-only file system."""
@@ -33,7 +37,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
     temporary = Path(name)
     # Held until the end, or until the process is killed: the next writer tells by it what is left over.
-    _lock(handle)
+    held = _hold(handle)
     # mkstemp makes private files; give the result the permissions of any new file.
     mask = os.umask(0)
     os.umask(mask)
@@ -44,7 +48,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             # Readers see either the old file or the whole new one.
             os.replace(temporary, path)
     finally:
-        os.close(handle)
+        if held:
+            os.close(handle)
         temporary.unlink(missing_ok=True)
 
 
@@ -70,8 +75,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     with _named(None, path):
         _remove_left(path.parent, f".{path.name}.", "")
         temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-        handle = os.open(temporary, os.O_RDONLY)
-    _lock(handle)
+        handle = os.open(temporary, os.O_RDONLY) if fcntl else None
+    held = handle is not None and _hold(handle)
     mask = os.umask(0)
     os.umask(mask)
     temporary.chmod(0o777 & ~mask)
@@ -87,27 +92,44 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             else:
                 os.replace(temporary, path)
     finally:
-        os.close(handle)
+        if held and handle is not None:
+            os.close(handle)
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _lock(handle: int) -> bool:
-    """Lock an open file or folder; False: another process has it, or the file system has no locks."""
+def try_lock(handle: int) -> bool:
+    """Lock an open file or folder until it is closed; False: another process has it. Windows has no such locks: True.
+
+    Raises:
+        OSError: the file system has no locks.
+    """
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        if fcntl:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         return False
     return True
 
 
+def _hold(handle: int) -> bool:
+    """Lock an open file or folder, if its file system can; where the system has no such locks, close it at once."""
+    with suppress(OSError):
+        try_lock(handle)
+    if not fcntl:
+        os.close(handle)
+    return fcntl is not None
+
+
 def _remove_left(folder: Path, prefix: str, suffix: str) -> None:
     """Remove temporary files and folders of these names that no process holds."""
+    if not fcntl:  # who holds a file cannot be told
+        return
     left = re.compile(re.escape(prefix) + r"[a-z0-9_]{8}" + re.escape(suffix))  # as `tempfile` names them
     for name in filter(left.fullmatch, _hidden_names(folder)):
         with suppress(OSError):  # another process was quicker
             handle = os.open(folder / name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
             try:
-                if _lock(handle):
+                if try_lock(handle):
                     shutil.rmtree(folder / name) if stat.S_ISDIR(os.fstat(handle).st_mode) else os.unlink(folder / name)
             finally:
                 os.close(handle)

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -73,3 +74,28 @@ def test_what_a_killed_process_left_is_removed_by_the_next_and_nothing_else(tmp_
     with atomic_folder(folder):
         pass
     assert sorted(os.listdir(tmp_path)) == [".film.mp4", "film.mp4", "frames"]
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_where_no_locks_are_nothing_is_open_when_it_is_moved(tmp_path, monkeypatch, kind):
+    """Windows refuses to move what is open, and opens no folders."""
+    moved = []
+
+    def move(source, target, move=os.replace):
+        if Path(source).name.startswith("."):
+            held = {os.path.realpath(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd")}
+            assert str(source) not in held
+            moved.append(Path(target))
+        move(source, target)
+
+    monkeypatch.setattr(atomic, "fcntl", None)
+    monkeypatch.setattr(os, "replace", move)
+    path = tmp_path / "wanted"
+    for text in ("first", "second"):
+        if kind == "file":
+            atomic.atomic_write_text(path, text)
+        else:
+            with atomic.atomic_folder(path) as folder:
+                (folder / "inner").write_text(text)
+    assert (path if kind == "file" else path / "inner").read_text() == "second"
+    assert moved == [path, path] and [one.name for one in tmp_path.iterdir()] == ["wanted"]
