@@ -40,8 +40,8 @@ class Animate:
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `smplxpp build` wrote, or a bundle NAME.avatar that `smplxpp export` wrote."""
     params: Path
-    """A motion: body parameters in any layout that `smplxpp params convert` reads, or a skeleton's (.bvh, .glb, .vrm).
-    Their shape is ignored: the template has one."""
+    """A motion: body parameters in any layout that `smplxpp params convert` reads, or a skeleton's (.bvh, .glb, .vrm,
+    .fbx). Their shape is ignored: the template has one."""
     out: Path
     """Result: .mp4, .gif, .glb, or a name without a suffix for a folder of PNG pictures."""
     model: Literal["auto", "template", "student"] = "auto"

@@ -12,15 +12,9 @@ import numpy as np
 from pipelines.commands.options import OptionalPath, OptionalText
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.body import BodyModel, UpAxis, Whose, is_skeleton, load_body, load_motion
+from smplxpp.body.motion_facts import skeleton_of_file
 from smplxpp.body.retarget import Skeleton, retarget
-from smplxpp.body.skeleton_params import (
-    MatchedSkeleton,
-    load_skeleton,
-    matched_skeleton,
-    named_joints,
-    read_joint_map,
-    read_skeleton,
-)
+from smplxpp.body.skeleton_params import MatchedSkeleton, load_skeleton, read_joint_map
 from smplxpp.body.smpl_params import FAMILY_NAMES, retarget_smpl
 from smplxpp.cloth.poses import resampled
 from smplxpp.core import BodyParams, GeometryWarning, InputError, require_positive
@@ -83,16 +77,9 @@ class Driving:
         return retarget(params, Skeleton.of(source, betas), Skeleton.of(body))
 
     def skeleton(self, path: Path) -> MatchedSkeleton:
-        """Return which joints of a skeleton's file stand for the body's, and log them.
-
-        Raises:
-            InputError: what `load` refuses.
-        """
+        """Return which joints of a skeleton's file stand for the body's, and log them; raises what `load` raises."""
         names = None if self.joint_map is None else read_joint_map(self.joint_map)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", GeometryWarning)  # given when the file is read for use
-            motion = read_skeleton(path, clip=self.clip)
-            found = matched_skeleton(motion, named_joints(motion, names, subject=f"motion {path}"), up=self.up)
+        found = skeleton_of_file(path, joint_map=names, up=self.up, clip=self.clip)
         log.info("%s: %s", path, ", ".join(f"{ours} = {' + '.join(own)}" for ours, own in found.taken.items()))
         return found
 

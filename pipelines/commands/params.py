@@ -29,8 +29,7 @@ class ParamsConvert:
     """Options of the command."""
 
     input: tyro.conf.Positional[Path]
-    """npz, json or pkl file, a folder of numbered frames, or a .bvh, .glb or .vrm, whose motion is brought to the
-    body."""
+    """npz, json or pkl file, a folder of numbered frames, or a skeleton's file (.bvh, .glb, .vrm, .fbx)."""
     out: Path
     """npz file to write: SMPL-X names, stacked frames."""
     layout: LayoutName = "auto"

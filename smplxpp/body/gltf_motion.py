@@ -15,7 +15,13 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body.layout import PROGRAM_NAMES
-from smplxpp.body.skeleton_motion import SkeletonMotion, chosen_clip, rate_of_keys
+from smplxpp.body.skeleton_motion import (
+    SkeletonMotion,
+    chosen_clip,
+    moving_skeleton,
+    rate_of_keys,
+    rest_transforms,
+)
 from smplxpp.core.errors import InputError, warn_of_left_out
 from smplxpp.core.files.json_file import as_object
 from smplxpp.core.mesh_files.gltf_document import GltfDocument
@@ -100,11 +106,11 @@ def read_gltf_motion(path: str | Path, *, clip: str | None = None) -> SkeletonMo
     warn_of_left_out(subject, sorted(left_out), reason="animated, and not read")
     joints = _joints(document, nodes, channels)
     times, fps = rate_of_keys([one.times for one in channels.values()], len(joints), subject)
-    bound = _bound(document, joints)
+    bound, standing = _bound(document, joints), {node: nodes[node].world for node in joints}
     motion = SkeletonMotion.from_transforms(
         _names(nodes, joints),
         np.array([joints.index(nodes[k].parent) if nodes[k].parent in joints else -1 for k in joints]),
-        _rest(nodes, joints, bound),
+        rest_transforms(joints, {node: one.parent for node, one in nodes.items()}, standing, bound),
         _world(nodes, joints, channels, times),
         fps=fps,
         stated=_human_bones(document, joints),
@@ -153,34 +159,12 @@ def _channels(
 
 
 def _joints(document: GltfDocument, nodes: dict[int, Node], channels: dict[tuple[int, str], _Channel]) -> list[int]:
-    """Return the nodes of the skeleton that moves, parents before children, from the scene's root on."""
+    """Return the nodes of the skeleton that moves, parents before children."""
     moving = {node for node, kind in channels if kind == "rotation"}
     skins = [document.items(document.entry("skins", k), "joints") for k in _range(document, "skins")]
     skins = [{node for node in skin if isinstance(node, int) and node in nodes} for skin in skins]
     skins += [{node for node in _bones(document).values() if node in nodes}]
-    # The skin whose joints move most, with all that moves below the node that all of them hang on.
-    chosen = max(skins, key=lambda skin: len(skin & moving))
-    chosen = chosen if chosen & moving else moving
-    lines = [_above(nodes, node) for node in chosen]
-    shared = set(lines[0]).intersection(*lines[1:])
-    top = next((node for node in lines[0] if node in shared), None)
-    if top is not None:
-        chosen = {node for node in moving.union(*skins) if top in _above(nodes, node)}
-    else:
-        # Joints under several roots: the root with most of them.
-        roots = [line[-1] for line in lines]
-        chosen = {node for node in chosen if _above(nodes, node)[-1] == max(roots, key=roots.count)}
-    whole = {above for node in chosen for above in _above(nodes, node)}
-    return [node for node in nodes if node in whole]
-
-
-def _above(nodes: dict[int, Node], node: int) -> list[int]:
-    """Return a node and all above it, up to its root."""
-    found = []
-    while node >= 0:
-        found.append(node)
-        node = nodes[node].parent
-    return found
+    return moving_skeleton({node: one.parent for node, one in nodes.items()}, skins, moving)
 
 
 def _range(document: GltfDocument, kind: str) -> range:
@@ -236,41 +220,6 @@ def _bound(document: GltfDocument, joints: list[int]) -> dict[int, Float64[np.nd
             if isinstance(node, int) and node in joints and abs(float(np.linalg.det(matrix[:3, :3]))) > 0.0:
                 bound.setdefault(node, np.linalg.inv(matrix))
     return bound
-
-
-def _rest(
-    nodes: dict[int, Node], joints: list[int], bound: dict[int, Float64[np.ndarray, "4 4"]]
-) -> Float64[np.ndarray, "J 4 4"]:
-    """Return where the joints stand at rest: as the skin is bound, in the scene's axes, else as the nodes stand.
-
-    Nodes may stand in the first frame of a motion instead. Bind matrices are those of the mesh's own space, which may
-    have other axes and another unit than the scene: one similarity takes all of them there.
-    """
-    standing = {node: nodes[node].world for node in joints}
-    if not bound:
-        return np.stack([standing[node] for node in joints])
-    # Where the nodes stand as they are bound, all of them ask for the same similarity.
-    to_scene = np.stack([standing[node] @ np.linalg.inv(matrix) for node, matrix in bound.items()])
-    scale = np.cbrt(abs(float(np.linalg.det(to_scene[0, :3, :3]))))
-    same = 1e-3  # rounding of single precision, as a share of the scale
-    if np.abs(to_scene[:, :3, :3] - to_scene[0, :3, :3]).max() < same * scale:
-        return np.stack([standing[node] for node in joints])
-    # Else the axes' part of the turn between both: what is left of it is the pose's.
-    group = Rotation.create_group("O")
-    axes = min(group, key=lambda one: float(np.linalg.norm(one.as_matrix() - to_scene[0, :3, :3] / scale)))
-    similarity = np.eye(4)
-    similarity[:3, :3] = scale * axes.as_matrix()
-    rest: dict[int, Float64[np.ndarray, "4 4"]] = {}
-    for node in joints:
-        parent = nodes[node].parent
-        if node in bound:
-            rest[node] = similarity @ bound[node]
-        elif parent in rest:
-            rest[node] = rest[parent] @ np.linalg.inv(standing[parent]) @ standing[node]
-        else:
-            rest[node] = standing[node]
-    # Joints above the bound ones stay where they stand: their turns and places are the pelvis' way.
-    return np.stack([rest[node] for node in joints])
 
 
 def _world(

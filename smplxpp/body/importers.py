@@ -37,7 +37,7 @@ _SERIES = (".npz", ".json", ".pkl")
 _SUFFIXES = (*_SERIES, ".npy")
 # Files of torch are programs, which only torch reads.
 _TORCH = (".pt", ".pth")
-_SCENES = (".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".blend")
+_SCENES = (".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".blend")
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 # Axis-angle of the rotation about x or z that takes an axis to +y; z: (x, y, z) -> (x, z, -y), -y: (x, -y, -z).
 _Y_UP_FROM: dict[str, tuple[float, float, float]] = {

@@ -16,6 +16,7 @@ from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
 from smplxpp.body.retarget import FEET, Skeleton
 from smplxpp.body.skeleton_params import (
+    MatchedSkeleton,
     matched_skeleton,
     named_joints,
     read_skeleton,
@@ -118,6 +119,19 @@ def inspect_motion(
         left_out=(*facts.left_out, *(note for note in notes if note not in facts.mistakes)),
         mistakes=(*facts.mistakes, *mistakes),
     )
+
+
+def skeleton_of_file(
+    path: str | Path, *, joint_map: Mapping[str, str] | None = None, up: str | None = None, clip: str | None = None
+) -> MatchedSkeleton:
+    """Return which joints of a skeleton's file stand for the body's; arguments and errors are those of `load_skeleton`.
+
+    Its warnings are given when the file is read for use.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)
+        motion = read_skeleton(path, clip=clip)
+        return matched_skeleton(motion, named_joints(motion, joint_map, subject=f"motion {path}"), up=up)
 
 
 def _of_skeleton(

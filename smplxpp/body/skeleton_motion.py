@@ -8,12 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.spatial.transform import Rotation
 
 from smplxpp.core import DEFAULT_FPS, GeometryWarning, InputError
-
-# Joints times frames of a motion that is made of keys: an hour of a hundred joints, and half a gigabyte of transforms.
-# It bounds small files whose keys lie far apart.
-_MOST_TRANSFORMS = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +150,12 @@ def rate_of_keys(
         near = 0.1  # of a frame
         fps = count / span if np.abs(grid - grid.round()).max() < near else DEFAULT_FPS
     frames = round(span * fps) + 1
-    if frames * joints > _MOST_TRANSFORMS:
+    # Joints times frames: 20 minutes of a hundred joints, half a gigabyte. It bounds small files with keys far apart.
+    most = 1 << 22
+    if frames * joints > most:
         raise InputError(
             subject,
-            expected=f"at most {_MOST_TRANSFORMS // joints} frames of {joints} joints",
+            expected=f"at most {most // joints} frames of {joints} joints",
             received=f"{frames} in {span:.6g} seconds",
             remedy="cut the motion in the program that wrote it",
         )
@@ -190,3 +189,81 @@ def chosen_clip(names: Sequence[str], clip: str | None, subject: str) -> int:
             stacklevel=3,
         )
     return 0
+
+
+def moving_skeleton(parents: Mapping[int, int], skins: Sequence[set[int]], moving: set[int]) -> list[int]:
+    """Return the nodes of the skeleton in a scene that moves, from the scene's root on, parents before children.
+
+    It is that of the skin whose joints move most, with all that moves, or is skinned to, below the node that all of
+    these joints hang on; without such a skin, what moves.
+
+    Args:
+        parents: parent of each node of the scene, parents before children; none of them for a root.
+        skins: joints of each skin.
+        moving: nodes that turn, one at least.
+    """
+    chosen = max(skins, key=lambda skin: len(skin & moving), default=set())
+    chosen = chosen if chosen & moving else moving
+    lines = [_above(parents, node) for node in chosen]
+    shared = set(lines[0]).intersection(*lines[1:])
+    top = next((node for node in lines[0] if node in shared), None)
+    if top is not None:
+        chosen = {node for node in moving.union(*skins) if top in _above(parents, node)}
+    else:
+        # Joints under several roots: the root with most of them.
+        roots = [line[-1] for line in lines]
+        chosen = {node for node in chosen if _above(parents, node)[-1] == max(roots, key=roots.count)}
+    whole = {above for node in chosen for above in _above(parents, node)}
+    return [node for node in parents if node in whole]
+
+
+def _above(parents: Mapping[int, int], node: int) -> list[int]:
+    """Return a node and all above it, up to its root."""
+    found = []
+    while node in parents:
+        found.append(node)
+        node = parents[node]
+    return found
+
+
+def rest_transforms(
+    joints: Sequence[int],
+    parents: Mapping[int, int],
+    standing: Mapping[int, Float64[np.ndarray, "4 4"]],
+    bound: Mapping[int, Float64[np.ndarray, "4 4"]],
+) -> Float64[np.ndarray, "J 4 4"]:
+    """Return where joints stand at rest: as the skin is bound, in the scene's axes, else as the nodes stand.
+
+    Nodes may stand in the first frame of a motion instead. Skins are bound in the mesh's own space, which may have
+    other axes and another unit than the scene: one similarity takes all of them there.
+
+    Args:
+        joints: the J joints, parents before children.
+        parents: parent of each node.
+        standing: transform of each joint to the world, as the nodes stand.
+        bound: transform of each joint to the mesh's space as the skin is bound; may be empty.
+    """
+    if not bound:
+        return np.stack([standing[node] for node in joints])
+    # Where the nodes stand as they are bound, all of them ask for the same similarity.
+    to_scene = np.stack([standing[node] @ np.linalg.inv(matrix) for node, matrix in bound.items()])
+    scale = np.cbrt(abs(float(np.linalg.det(to_scene[0, :3, :3]))))
+    same = 1e-3  # rounding of single precision, as a share of the scale
+    if np.abs(to_scene[:, :3, :3] - to_scene[0, :3, :3]).max() < same * scale:
+        return np.stack([standing[node] for node in joints])
+    # Else the axes' part of the turn between both: what is left of it is the pose's.
+    group = Rotation.create_group("O")
+    axes = min(group, key=lambda one: float(np.linalg.norm(one.as_matrix() - to_scene[0, :3, :3] / scale)))
+    similarity = np.eye(4)
+    similarity[:3, :3] = scale * axes.as_matrix()
+    rest: dict[int, Float64[np.ndarray, "4 4"]] = {}
+    for node in joints:
+        parent = parents[node]
+        if node in bound:
+            rest[node] = similarity @ bound[node]
+        elif parent in rest:
+            rest[node] = rest[parent] @ np.linalg.inv(standing[parent]) @ standing[node]
+        else:
+            rest[node] = standing[node]
+    # Joints above the bound ones stay where they stand: their turns and places are the pelvis' way.
+    return np.stack([rest[node] for node in joints])

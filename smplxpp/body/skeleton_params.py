@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from smplxpp.body.bvh import read_bvh
+from smplxpp.body.fbx_motion import read_fbx_motion
 from smplxpp.body.gltf_motion import read_gltf_motion
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.rest_pose import (
@@ -35,7 +36,7 @@ from smplxpp.core import BodyParams, GeometryWarning, InputError, rotvec_from_ma
 from smplxpp.core.errors import warn_of_left_out
 from smplxpp.core.files.json_file import as_object, as_text, read_json
 
-SKELETON_SUFFIXES = (".bvh", ".glb", ".gltf", ".vrm", ".vrma")
+SKELETON_SUFFIXES = (".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx")
 """Endings of files whose motion is one of a skeleton of their own."""
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
 NEEDED = ("pelvis", *(f"{side}_{name}" for side in ("left", "right") for name in _LIMBS))
@@ -84,11 +85,13 @@ def read_skeleton(path: str | Path, *, clip: str | None = None) -> SkeletonMotio
         clip: name of the motion, in a file with several; None: the first.
 
     Raises:
-        InputError: another kind of file, or what `read_bvh` and `read_gltf_motion` refuse.
+        InputError: another kind of file, or what `read_bvh`, `read_gltf_motion` and `read_fbx_motion` refuse.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SKELETON_SUFFIXES:
         raise InputError(f"motion {path}", expected=f"one of {', '.join(SKELETON_SUFFIXES)}", received=repr(suffix))
+    if suffix == ".fbx":
+        return read_fbx_motion(path, clip=clip)
     if suffix != ".bvh":
         return read_gltf_motion(path, clip=clip)
     motion = read_bvh(path)

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from smplxpp.capture.calibrations.names import matched_names
 from smplxpp.capture.distortion import Distortion
-from smplxpp.capture.files import subfolders
+from smplxpp.capture.files import matched_names, subfolders
 from smplxpp.capture.keypoint_files import (
     KeypointFormat,
     KeypointOptions,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from smplxpp.capture.calibrations import FORMATS, find_calibration, format_of, read_calibration
-from smplxpp.capture.calibrations.names import matched_names
 from smplxpp.capture.calibrations.xml_files import read_vicon
+from smplxpp.capture.files import matched_names
 from smplxpp.core import Camera, InputError
 from smplxpp.core.files.markup_file import read_toml, read_xml
 from tests.capture.calibration_writers import DIST, WRITERS, Z_UP, Rig, opencv_K, pose_in

@@ -17,6 +17,7 @@ from smplxpp.core.files.sound_file import Sound, read_sound, wave_bytes
 from smplxpp.core.light import Irradiance
 from smplxpp.core.params import BodyParams
 from smplxpp.export.motion_files import write_bvh
+from tests.body.test_fbx_motion import scene_of as fbx_of
 from tests.body.test_gltf_motion import scene_of
 from tests.core.files.openexr import write_openexr
 from tests.core.files.radiance import write_radiance
@@ -41,6 +42,7 @@ def motion_doors() -> list[Door]:
             lambda f: scene_of(_still()).write(f / "m.glb"),
             lambda f: load_skeleton(f, skeleton),
         ),
+        Door("motion fbx", lambda f: fbx_of(_still(), f / "m.fbx"), lambda f: load_skeleton(f, skeleton)),
         Door(
             "joint map", lambda f: (f / "m.json").write_text(json.dumps(names)), lambda f: read_joint_map(f / "m.json")
         ),

@@ -17,9 +17,9 @@ import numpy as np
 from smplxpp.capture.calibrations import camera_files, data_set_files, xml_files
 from smplxpp.capture.calibrations.camera_files import read_opencv_yaml
 from smplxpp.capture.calibrations.file_camera import AXES, FileCamera, RigFile, scaled_intrinsics
-from smplxpp.capture.calibrations.names import matched_names
 from smplxpp.capture.calibrations.world import UNITS, metres_of, upright_from_world
 from smplxpp.capture.distortion import Distortion
+from smplxpp.capture.files import matched_names
 from smplxpp.capture.readers.common import pinhole
 from smplxpp.core import Camera
 from smplxpp.core.errors import InputError, require_choice

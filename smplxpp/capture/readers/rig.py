@@ -8,8 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from smplxpp.capture.calibrations import find_calibration, read_calibration
-from smplxpp.capture.calibrations.names import matched_names
-from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FileSeries, subfolders
+from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FileSeries, matched_names, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoints import KeypointFiles, find_places
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params
