@@ -216,7 +216,7 @@ def read_fbx_motion(path: str | Path, *, clip: str | None = None) -> SkeletonMot
     most_bytes = 1 << 30
     scene = _Scene(_Parser(read_bytes(path, subject="motion", most=most_bytes), subject).nodes(), subject)
     parents = _parents(scene)
-    clips = {}
+    clips: dict[str, _Curves] = {}
     for stack in scene.of("AnimationStack"):
         curves = _curves(scene, stack, parents)
         if any(name == "Lcl Rotation" for _, name in curves):

@@ -161,8 +161,8 @@ def _channels(
 def _joints(document: GltfDocument, nodes: dict[int, Node], channels: dict[tuple[int, str], _Channel]) -> list[int]:
     """Return the nodes of the skeleton that moves, parents before children."""
     moving = {node for node, kind in channels if kind == "rotation"}
-    skins = [document.items(document.entry("skins", k), "joints") for k in _range(document, "skins")]
-    skins = [{node for node in skin if isinstance(node, int) and node in nodes} for skin in skins]
+    listed = [document.items(document.entry("skins", k), "joints") for k in _range(document, "skins")]
+    skins = [{node for node in skin if isinstance(node, int) and node in nodes} for skin in listed]
     skins += [{node for node in _bones(document).values() if node in nodes}]
     return moving_skeleton({node: one.parent for node, one in nodes.items()}, skins, moving)
 
@@ -189,8 +189,8 @@ def _bones(document: GltfDocument) -> dict[str, int]:
         if bones:
             return {bone: document.number(document.part(bones, bone), "node") for bone in bones}
     older = document.items(document.part(document.part(extensions, "VRM"), "humanoid"), "humanBones")
-    bones = [as_object(one, subject=document.subject) for one in older]
-    return {str(one.get("bone")): document.number(one, "node") for one in bones}
+    named = [as_object(one, subject=document.subject) for one in older]
+    return {str(one.get("bone")): document.number(one, "node") for one in named}
 
 
 def _human_bones(document: GltfDocument, joints: list[int]) -> dict[str, int]:
