@@ -11,6 +11,7 @@ import pytest
 from smplxpp.core.files.sound_file import Sound, wave_bytes
 from tests.chat.actors import A_CHARACTER, Script, Words, cast, doll
 from tests.chat.test_listening import sound
+from tests.chat.test_server import NEEDS_NGINX, PROXIED, behind_nginx
 from tests.web.chromium import Page, find_chromium
 from tests.web.ear import LISTEN
 from tests.web.modules import NEEDS_BUILD, node
@@ -135,6 +136,43 @@ def test_what_is_spoken_into_the_microphone_is_answered(talking):
     page.click(".microphone")
     page.until("!conversation.microphone.on")
     assert page.errors == []
+
+
+@pytest.mark.slow
+@NEEDS_NGINX
+def test_behind_https_it_hears_who_lets_it(tmp_path):
+    """The page, its socket and its microphone behind the proxy of the examples: refused first, then allowed."""
+    samples = sound(("quiet", 1.0), ("tone", 0.6), ("quiet", 120.0)).astype(np.float32) / 32768
+    (tmp_path / "said.wav").write_bytes(wave_bytes(Sound(samples, 16_000).at_rate(48_000)))
+    flags = [
+        *(f"--host-resolver-rules=MAP {PROXIED} 127.0.0.1", "--ignore-certificate-errors"),
+        *("--use-fake-device-for-media-stream", f"--use-file-for-fake-audio-capture={tmp_path / 'said.wav'}%noloop"),
+    ]
+    partner, words = Script(("I heard that.",)), Words("are you there")
+    with (
+        behind_nginx(tmp_path, partner=partner, recogniser=words) as it,
+        Page(tmp_path / "profile", size=(390, 844), flags=flags) as page,
+    ):
+
+        def allow(setting: str) -> None:
+            permission = {"permission": {"name": "microphone"}, "setting": setting, "origin": it.base}
+            page.send("Browser.setPermission", **permission)
+
+        page.go(f"{it.base}/talk/?token={it.token}")
+        page.evaluate("smplxppPlayer.talking.then(it => { window.conversation = it; })")
+        page.until("document.querySelector('.times').textContent", "the server says nothing")
+        secure = page.evaluate("[location.href, isSecureContext, crossOriginIsolated]")
+        assert secure == [f"{it.base}/talk/", True, True]
+        assert page.evaluate("conversation.connection.socket.url").startswith(f"wss://{PROXIED}:{it.port}/talk/")
+        allow("denied")
+        page.click(".microphone")
+        page.until("/cannot be used/.test(document.querySelector('.note').textContent)", "nothing is said")
+        type_in(page, "hello")
+        page.until("document.querySelector('.theirs')?.textContent == 'I heard that.'", "no answer to what is typed")
+        allow("granted")
+        page.click(".microphone")
+        page.until("[...document.querySelectorAll('.mine')].at(-1)?.textContent == 'are you there'", "it hears nothing")
+        assert page.errors == []
 
 
 def test_a_lost_server_is_said(talking):

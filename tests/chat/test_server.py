@@ -12,9 +12,11 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import which
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -261,44 +263,39 @@ http {{
 }}"""
 
 
-@pytest.mark.skipif(not (which("nginx") and which("openssl")), reason="no nginx, or no openssl (apt-get install nginx)")
-def test_the_nginx_of_the_examples_offers_it_by_https(tmp_path):
-    """The site as it is written, with another port, certificate and folder."""
-    name, folder = "me.example.org", tmp_path
+NEEDS_NGINX = pytest.mark.skipif(
+    not (which("nginx") and which("openssl")), reason="no nginx, or no openssl (apt-get install nginx)"
+)
+PROXIED = "me.example.org"
+"""The name of the site that the examples write."""
+
+
+@contextmanager
+def behind_nginx(folder: Path, **changes: Any) -> Iterator[SimpleNamespace]:
+    """The site of the examples as it is written, with another port, certificate and folder, before a conversation."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     made = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2".split()
-    made += ["-subj", f"/CN={name}", "-addext", f"subjectAltName=DNS:{name}"]
+    made += ["-subj", f"/CN={PROXIED}", "-addext", f"subjectAltName=DNS:{PROXIED}"]
     made += ["-keyout", str(folder / "key.pem"), "-out", str(folder / "cert.pem")]
     subprocess.run(["openssl", *made], check=True, capture_output=True)
-    base, token = f"https://{name}:{port}", new_token()
-    data, body = doll(tmp_path)
-    server = ChatServer(data, cast(body), name="Doll", access=Access(public_url=f"{base}/talk/", token=token))
+    base, token = f"https://{PROXIED}:{port}", new_token()
+    data, body = doll(folder)
+    access = Access(public_url=f"{base}/talk/", token=token)
+    server = ChatServer(data, cast(body, **changes), name="Doll", access=access)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     site = (ROOT / "examples" / "deploy" / "nginx.conf").read_text()
     for written, here in (
         ("listen 443", f"listen 127.0.0.1:{port}"),
         ("127.0.0.1:8091", f"127.0.0.1:{server.server_address[1]}"),
-        (f"/etc/letsencrypt/live/{name}/fullchain.pem", str(folder / "cert.pem")),
-        (f"/etc/letsencrypt/live/{name}/privkey.pem", str(folder / "key.pem")),
+        (f"/etc/letsencrypt/live/{PROXIED}/fullchain.pem", str(folder / "cert.pem")),
+        (f"/etc/letsencrypt/live/{PROXIED}/privkey.pem", str(folder / "key.pem")),
         ("/var/log/nginx", str(folder)),
     ):
         assert written in site
         site = site.replace(written, here)
     (folder / "nginx.conf").write_text(NGINX.format(folder=folder, site=site))
-    trusted = ssl.create_default_context(cafile=folder / "cert.pem")
-
-    def get(path: str, **headers: str) -> http.client.HTTPResponse:
-        connection = http.client.HTTPSConnection(name, port, timeout=LIMIT, context=trusted)
-        stream = socket.create_connection(("127.0.0.1", port), timeout=LIMIT)
-        connection.sock = trusted.wrap_socket(stream, server_hostname=name)
-        connection.request("GET", path, headers=headers)
-        reply = connection.getresponse()
-        reply.content = reply.read()
-        connection.close()
-        return reply
-
     command = ["nginx", "-p", str(folder), "-c", str(folder / "nginx.conf"), "-e", str(folder / "errors.log")]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as nginx:
         try:
@@ -306,31 +303,50 @@ def test_the_nginx_of_the_examples_offers_it_by_https(tmp_path):
             while True:  # until it listens
                 try:
                     assert nginx.poll() is None and time.monotonic() < end, (folder / "errors.log").read_text()
-                    moved = get(f"/talk/?token={token}")
+                    socket.create_connection(("127.0.0.1", port)).close()
                     break
                 except ConnectionError:
                     time.sleep(0.02)
-            assert moved.status == 303 and get("/talk/").status == 403 and get("/other").status == 404
-            cookie = moved.headers["Set-Cookie"].split(";")[0]
-            page = get("/talk/", Cookie=cookie)
-            assert f"wss://{name}:{port}" in page.content.decode()
-            assert get("/talk/me.avatar", Cookie=cookie).content == data
-            secret = re.search('data-chat="([^"]+)"', page.content.decode())[1]
-
-            def open_socket(origin: str) -> Any:
-                stream = socket.create_connection(("127.0.0.1", port))
-                options: dict[str, Any] = {"additional_headers": {"Cookie": cookie}, "max_size": None, "ssl": trusted}
-                return connect(f"wss://{name}:{port}/talk/{secret}", sock=stream, origin=origin, **options)
-
-            with pytest.raises(InvalidStatus, match="403"):
-                open_socket("https://evil.example")
-            with open_socket(base) as talk:
-                talk.send(json.dumps({"kind": "say", "text": "hello"}))
-                assert told(talk, "heard")["text"] == "hello"
+            yield SimpleNamespace(base=base, port=port, token=token, data=data, server=server)
         finally:
             nginx.terminate()
             server.shutdown()
-    assert token not in (folder / "smplxpp.log").read_text()  # the log does not let its readers in
+
+
+@NEEDS_NGINX
+def test_the_nginx_of_the_examples_offers_it_by_https(tmp_path):
+    with behind_nginx(tmp_path) as it:
+        trusted = ssl.create_default_context(cafile=tmp_path / "cert.pem")
+
+        def get(path: str, **headers: str) -> http.client.HTTPResponse:
+            connection = http.client.HTTPSConnection(PROXIED, it.port, timeout=LIMIT, context=trusted)
+            stream = socket.create_connection(("127.0.0.1", it.port), timeout=LIMIT)
+            connection.sock = trusted.wrap_socket(stream, server_hostname=PROXIED)
+            connection.request("GET", path, headers=headers)
+            reply = connection.getresponse()
+            reply.content = reply.read()
+            connection.close()
+            return reply
+
+        moved = get(f"/talk/?token={it.token}")
+        assert moved.status == 303 and get("/talk/").status == 403 and get("/other").status == 404
+        cookie = moved.headers["Set-Cookie"].split(";")[0]
+        page = get("/talk/", Cookie=cookie)
+        assert f"wss://{PROXIED}:{it.port}" in page.content.decode()
+        assert get("/talk/me.avatar", Cookie=cookie).content == it.data
+        secret = re.search('data-chat="([^"]+)"', page.content.decode())[1]
+
+        def open_socket(origin: str) -> Any:
+            stream = socket.create_connection(("127.0.0.1", it.port))
+            options: dict[str, Any] = {"additional_headers": {"Cookie": cookie}, "max_size": None, "ssl": trusted}
+            return connect(f"wss://{PROXIED}:{it.port}/talk/{secret}", sock=stream, origin=origin, **options)
+
+        with pytest.raises(InvalidStatus, match="403"):
+            open_socket("https://evil.example")
+        with open_socket(it.base) as talk:
+            talk.send(json.dumps({"kind": "say", "text": "hello"}))
+            assert told(talk, "heard")["text"] == "hello"
+    assert it.token not in (tmp_path / "smplxpp.log").read_text()  # the log does not let its readers in
 
 
 @pytest.mark.parametrize("path", [b"/\xff\xfe", b"http://["])
