@@ -145,8 +145,10 @@ def _range_of_money(match: Match[str]) -> str:
 
 
 def _quantity(match: Match[str]) -> str:
-    amount = match[1]
-    return f"{spell_number(amount)} {_UNITS[match[2]][amount != '1']}"
+    amount, before = match[1], match.string[: match.start()][-3:]
+    # A quantity that describes a thing has its unit in the singular: a five kilometer run.
+    describes = re.search(r"\b[Aa]n?\s$", before) and re.match(r"\s[a-z]", match.string[match.end() :])
+    return f"{spell_number(amount)} {_UNITS[match[2]][amount != '1' and not describes]}"
 
 
 def _address(match: Match[str]) -> str:
@@ -195,6 +197,8 @@ _RULES: list[tuple[re.Pattern[str], Replacement]] = [
         (r"\b(\d)'\s?(\d\d?)(?:\"|\b)", lambda m: f"{spell_cardinal(m[1])} foot {spell_cardinal(m[2])}"),
         (rf"({_NUMBER})\s?in\.(?=\s[a-z])", lambda m: f"{spell_number(m[1])} {'inch' if m[1] == '1' else 'inches'}"),
         (r"\b24/7\b", "twenty four seven"),
+        (r"(?<=\d)\s?x\s?(?=\d)", " by "),
+        (r"(?<=\d)x\b", " times"),
         (r"(?<=[\w)])\^(?=\d)", " to the power of "),
         (r"\b(\d{3})-(\d{4})\b", lambda m: f"{spell_digits(m[1])}, {spell_digits(m[2])}"),
         (rf"({_NUMBER})\s?[-\u2013]\s?(?={_NUMBER})", r"\1 to "),
