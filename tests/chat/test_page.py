@@ -15,6 +15,7 @@ from tests.chat.test_server import NEEDS_NGINX, PROXIED, behind_nginx
 from tests.web.chromium import Page, find_chromium
 from tests.web.ear import LISTEN
 from tests.web.modules import NEEDS_BUILD, node
+from tests.web.test_embed import anybody_can_use
 
 pytest.importorskip("websockets", reason="extra chat")
 
@@ -23,6 +24,7 @@ from pipelines.chat.server import ChatServer
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
 STAGE = "window.conversation.stage"
 LONG = "This sentence is long enough that there is time to stop it even where pictures are slow, " * 2
+SIZE = (320, 400)
 MARKUP = "<img src=x onerror=alert(1)>"
 
 
@@ -36,7 +38,7 @@ def browser(tmp_path_factory) -> Iterator[Page]:
         *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
         f"--use-file-for-fake-audio-capture={folder / 'said.wav'}%noloop",
     ]
-    with Page(folder / "profile", size=(320, 400), flags=flags) as page:
+    with Page(folder / "profile", size=SIZE, flags=flags) as page:
         yield page
 
 
@@ -76,6 +78,8 @@ def test_what_is_typed_is_answered_and_nothing_becomes_markup(talking):
     assert page.evaluate("document.querySelectorAll('.chat img').length") == 0
     page.until("/picture [0-9.]+ s/.test(document.querySelector('.times').textContent)", "no latency is shown")
     assert page.evaluate("conversation.microphone.on") is False  # Enter is no click on it
+    anybody_can_use(page)
+    page.resize(*SIZE)
     assert page.errors == []
 
 
@@ -181,6 +185,11 @@ def test_a_lost_server_is_said(talking):
     page.until("/lost/.test(document.querySelector('.note').textContent)", "nothing is said")
     type_in(page, "hello")
     assert "Nobody" in page.evaluate("document.querySelector('.note').textContent")
+    # A card of its own: notes were light letters on whatever the avatar wears.
+    ground, width = page.evaluate(
+        "(look => [look.backgroundColor, look.width])(getComputedStyle(document.querySelector('.note')))"
+    )
+    assert float(ground.rsplit(",", 1)[1].rstrip(")")) > 0.85 and float(width.rstrip("px")) < SIZE[0]
 
 
 def test_a_dropped_connection_comes_back(talking):

@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -117,6 +117,7 @@ def test_a_page_without_any_build_has_two_avatars_and_loses_nothing_of_its_own(b
         ".then(() => new Promise(done => guide.on('end', done)))"
     )
     assert browser.evaluate("guide.player.motion.rotations[1] > 0.39 && !guide.player.playing")
+    anybody_can_use(browser)
     assert browser.errors == []
     # Nothing is left running, however often.
     browser.evaluate(f"{other}.remove(), guide.dispose()")
@@ -205,9 +206,24 @@ CONTRAST = """(one => {
 })(document.querySelector(".speak"))"""
 
 
+SIZES = [(1280, 800, 24), (390, 844, 44)]
+"""CSS pixels of a window, and those that a finger needs."""
+
+
+def anybody_can_use(page: Page, sizes: Sequence[tuple[int, int, int]] = SIZES) -> None:
+    """Fail where axe-core, if it is there, finds something, or a finger misses, on a page as it is now."""
+    if not AXE.exists():
+        return
+    page.evaluate(AXE.read_text() + ";0")
+    for width, height, least in sizes:
+        page.resize(width, height)
+        assert page.evaluate(FINDINGS) == []
+        assert page.evaluate(SMALL.replace("LEAST", str(least))) == []
+
+
 @NEEDS_BROWSER
 @pytest.mark.skipif(not AXE.exists(), reason="no axe-core: npm ci in web/")
-@pytest.mark.parametrize(("width", "height", "least"), [(1280, 800, 24), (390, 844, 44)])
+@pytest.mark.parametrize(("width", "height", "least"), SIZES)
 def test_the_players_page_is_for_keys_fingers_and_screen_readers(browser, avatar, width, height, least):
     """The first button was black on black, tabs knew no arrows, and a card lay below the settings."""
     files = page_files(
@@ -267,6 +283,7 @@ def test_a_react_page_mounts_it_twice_and_keeps_one(browser, site):
     assert canvas == NAME
     browser.click("button")
     browser.until("document.querySelector('[role=status]').textContent === 'Said'", "nothing is said")
+    anybody_can_use(browser)
     assert browser.errors == []
 
 
@@ -324,6 +341,7 @@ def test_in_a_scene_of_three_js_it_is_drawn_as_python_draws_it_with_depth(browse
     image, alpha = player.draw(seen, background=BACKGROUND)
     assert (alpha > 0.5).sum() > 200
     assert decibels(alone / 255.0, np.clip(image, 0.0, 1.0), alpha > 0.5) > 33.0  # eight bits after each splat
+    anybody_can_use(browser)
     browser.evaluate("person.dispose()")
     assert browser.evaluate("[running.size, renderer.info.memory.geometries]") == [0, 3]
     assert browser.errors == []

@@ -1,7 +1,7 @@
-/* smplxpp player, Apache-2.0; web/ of the project has its sources 51911d1f7b1bb36307fd72ef672e70ad34463116e0ca3129cbc12c10cc120e11 */
+/* smplxpp player, Apache-2.0; web/ of the project has its sources 79450da0ffecb20d03b29b63511fb2daf9eeae0efe91dba502715adc56eb853f */
 var Ut=`:root {
   --ground: #121418;
-  --raised: rgba(28, 31, 37, 0.86);
+  --raised: rgba(28, 31, 37, 0.9);
   --line: rgba(255, 255, 255, 0.08);
   --text: #e7e9ee;
   --faint: #a3a9b6;
@@ -69,13 +69,18 @@ button { border: 0; background: none; padding: 0; cursor: pointer; border-radius
 .thinking i:nth-child(2) { animation-delay: 0.2s; }
 .thinking i:nth-child(3) { animation-delay: 0.4s; }
 @keyframes think { 0%, 60%, 100% { opacity: 0.25; } 30% { opacity: 1; } }
-.said .mine { align-self: flex-end; background: rgba(143, 180, 255, 0.22); }
+.said .mine { align-self: flex-end; background: #2c3c5fe6; }
 .talk { display: flex; gap: 8px; padding: 6px 6px 6px 18px; border-radius: 999px; background: var(--raised); border: 1px solid var(--line); backdrop-filter: blur(14px); }
 .talk input { flex: 1; min-width: 40px; border: 0; background: none; font-size: 14px; outline: none; }
 .talk:focus-within { border-color: var(--accent); }
 .microphone.on { background: #ff6b5e; color: #121418; }
-.note { min-height: 18px; text-align: center; color: #ffd9a8; font-size: 12px; overflow-wrap: anywhere; }
-.times { text-align: center; color: var(--faint); font-size: 11px; font-variant-numeric: tabular-nums; }
+.note, .times { text-align: center; overflow-wrap: anywhere; }
+.note { min-height: 18px; color: #ffd9a8; font-size: 12px; }
+.times { color: #c3c8d2; font-size: 11px; font-variant-numeric: tabular-nums; }
+/* A card, which is read on any ground. */
+.note:not(:empty), .times:not(:empty) {
+  width: fit-content; margin: 0 auto; padding: 4px 12px; border-radius: 12px; background: #121418e6; border: 1px solid var(--line);
+}
 
 .panel {
   position: fixed; top: 62px; right: 22px; width: 292px; max-height: calc(100vh - 150px); z-index: 2;
