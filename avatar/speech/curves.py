@@ -18,6 +18,7 @@ from smplxpp.body.blendshapes import ARKIT
 from smplxpp.core import DEFAULT_FPS, InputError
 from smplxpp.core.files import as_list, as_number, as_numbers, as_object, as_text, read_arrays, read_json, read_text
 from smplxpp.core.files.onnx_file import OnnxModel
+from smplxpp.core.files.paths import ascii_numbers
 from smplxpp.core.files.sound_file import Sound
 
 BLINK = ("eyeBlinkLeft", "eyeBlinkRight")
@@ -198,7 +199,7 @@ def _columns(names: Sequence[str], subject: str) -> list[tuple[int, int]]:
 
 def _floats(texts: Sequence[str], subject: str) -> np.ndarray:
     try:
-        return np.array([float(text or 0.0) for text in texts])
+        return np.array([float(ascii_numbers(text) or 0.0) for text in texts])
     except ValueError as error:
         raise InputError(subject, expected="numbers", received=str(error)[:120]) from None
 
@@ -214,7 +215,7 @@ def _clock(texts: Sequence[str], subject: str) -> np.ndarray:
     whole: list[float] = []
     counted: list[float] = []
     for text in texts:
-        found = re.fullmatch(r"\s*(\d{1,3}):(\d{1,2}):(\d{1,2})[:;.](\d{1,3}(?:\.\d{1,9})?)\s*", text)
+        found = re.fullmatch(r"(?a)\s*(\d{1,3}):(\d{1,2}):(\d{1,2})[:;.](\d{1,3}(?:\.\d{1,9})?)\s*", text)
         if not found:
             raise InputError(subject, expected="hours:minutes:seconds:frames", received=repr(text[:40]))
         hours, minutes, seconds, frames = (float(one) for one in found.groups())

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from smplxpp.body.skeleton_motion import SkeletonMotion
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.paths import read_text
+from smplxpp.core.files.paths import ascii_numbers, read_text
 
 # Limits that no motion reaches, so that damaged files are refused before they fill the memory.
 _MOST_BYTES, _MOST_JOINTS, _MOST_FRAMES, _FARTHEST = 1 << 29, 1000, 1_000_000, 1e6
@@ -142,7 +142,7 @@ class _Reader:
             raise self._wrong("Frames: and Frame Time:", " ".join(header)[:40] or "none")
         try:
             # The frame time stands before the motion's numbers, so that it is the first of them.
-            values = np.array(_ascii_numbers(rest).split(), dtype=np.float64)
+            values = np.array(ascii_numbers(rest).split(), dtype=np.float64)
         except ValueError:
             raise self._wrong("numbers after Frame Time:", "others") from None
         count = int(header[1]) if len(header[1]) < 9 else _MOST_FRAMES + 1
@@ -160,7 +160,7 @@ class _Reader:
 
     def _number(self, word: str) -> float:
         try:
-            value = float(_ascii_numbers(word))
+            value = float(ascii_numbers(word))
         except ValueError:
             raise self._wrong("a number", word[:40]) from None
         if not abs(value) <= _FARTHEST:
@@ -169,17 +169,6 @@ class _Reader:
 
     def _wrong(self, expected: str, received: str) -> InputError:
         return InputError(self._subject, expected=expected, received=received)
-
-
-def _ascii_numbers(text: str) -> str:
-    """Return a text whose numbers are written in ASCII's digits alone.
-
-    Raises:
-        ValueError: what Python takes for numbers beside: `1_0`, digits of other alphabets.
-    """
-    if "_" in text or not text.isascii():
-        raise ValueError("other digits")
-    return text
 
 
 def _add_offsets(positions: dict[int, Float64[np.ndarray, "T 3"]], offsets: Float64[np.ndarray, "J 3"]) -> None:

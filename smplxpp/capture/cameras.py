@@ -13,6 +13,7 @@ from smplxpp.capture.distortion import OPENCV, Distortion
 from smplxpp.capture.readers.common import inverted, pinhole, required
 from smplxpp.core import Camera, InputError, matrix_from_rotvec
 from smplxpp.core.files import as_integer, as_list, as_numbers, as_text, read_json, read_text, regular_file
+from smplxpp.core.files.paths import ascii_numbers
 
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 
@@ -82,7 +83,7 @@ def _read_actorshq(path: Path) -> list[tuple[Camera, Distortion | None]]:
     try:
         rows = list(csv.DictReader(io.StringIO(read_text(path, subject="camera file"))))
         names = [row[_CSV_FIELDS[0]] or "" for row in rows]
-        numbers = [{key: float(row[key]) for key in _CSV_FIELDS[1:]} for row in rows]
+        numbers = [{key: float(ascii_numbers(row[key])) for key in _CSV_FIELDS[1:]} for row in rows]
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise InputError(
             f"camera file {path}",

@@ -304,6 +304,9 @@ def test_unknown_joints_are_named_and_a_map_helps(file, tmp_path):
         (lambda text: text.replace("Frame Time: 0.0", "Frame Time: -0.0"), "positive frame time"),
         (lambda text: text.replace("OFFSET", "OFFSET nan", 1), "within"),
         (lambda text: text.rsplit(" ", 1)[0] + " inf\n", "within"),
+        # What Python takes for numbers, and no other program does.
+        (lambda text: text.rsplit(" ", 1)[0] + " 1_0\n", "numbers after Frame Time"),
+        (lambda text: text.replace("OFFSET ", "OFFSET \u0661", 1), "a number, received \u0661"),
     ],
 )
 def test_damaged_files_are_refused(file, tmp_path, change, words):

@@ -157,7 +157,14 @@ def test_hostile_binaries_are_refused(tmp_path, file, content):
 
 @pytest.mark.parametrize(
     "line",
-    ["7 PINHOLE 80 60 1 2 3", "7 PINHOLE 80 1e400 1 2 3 4", f"{'9' * 5000} PINHOLE 80 60 1 2 3 4", "7 PINHOLE", "\0"],
+    [
+        "7 PINHOLE 80 60 1 2 3",
+        "7 PINHOLE 80 1e400 1 2 3 4",
+        f"{'9' * 5000} PINHOLE 80 60 1 2 3 4",
+        "7 PINHOLE",
+        "\0",
+        "7 PINHOLE 80 60 1_0 2 3 4",
+    ],
 )
 def test_hostile_texts_are_refused(tmp_path, line):
     root = write_model(tmp_path, "PINHOLE", TWO, binary=False)

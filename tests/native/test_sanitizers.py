@@ -69,7 +69,7 @@ native._folders = lambda: [folder]
 import pytest
 callers, sys.argv = sys.argv[2:], ["hostile_values", "1", "30"]
 runpy.run_module("tests.native.hostile_values", run_name="__main__")
-options = ["-q", "-x", "-p", "no:cacheprovider", "-W", "ignore:Module already imported", "-k", "not avx and not levels"]
+options = ["-x", "-p", "no:cacheprovider", "-W", "ignore:Module already imported", "-k", "not avx and not levels"]
 sys.exit(pytest.main([*options, *callers]))
 """
 _CALLERS = (

@@ -14,7 +14,7 @@ import numpy as np
 
 from smplxpp.capture.calibrations.file_camera import FileCamera, RigFile, entry, file_camera
 from smplxpp.core.errors import InputError
-from smplxpp.core.files.paths import read_text
+from smplxpp.core.files.paths import ascii_numbers, read_text
 from smplxpp.core.files.safe_pickle import dense_array, safe_load
 
 _KEY = re.compile(r"^(?P<key>[^\s:#%-][^:]*):\s*(?P<value>.*)$")
@@ -47,7 +47,7 @@ def _value(key: str, block: list[str], path: Path) -> np.ndarray | list[str] | f
         return _matrix(key, " ".join(block[1:]), path)
     if len(block) == 1 and block[0] and not block[0].startswith("["):
         try:
-            return float(block[0])
+            return float(ascii_numbers(block[0]))
         except ValueError:
             return block[0].strip('"')
     if block[0].startswith("["):
@@ -65,7 +65,7 @@ def _matrix(key: str, text: str, path: Path) -> np.ndarray:
         if data is None or rows is None or cols is None:
             raise ValueError("one of them is missing")
         # OpenCV writes `.Nan` and `.Inf`, which float() reads without the dot.
-        values = [float(re.sub(r"\.(?=[NI])", "", item)) for item in data[1].split(",")]
+        values = [float(re.sub(r"\.(?=[NI])", "", item)) for item in ascii_numbers(data[1]).split(",")]
         return np.array(values).reshape(int(rows[1]), int(cols[1]))
     except ValueError as error:
         raise InputError(

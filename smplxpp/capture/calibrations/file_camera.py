@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from smplxpp.capture.distortion import OPENCV
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_numbers
+from smplxpp.core.files.paths import ascii_numbers
 from smplxpp.core.rotations import matrix_from_rotvec
 
 AXES: Mapping[str, tuple[float, float, float]] = {
@@ -129,7 +130,7 @@ def numbers_of(value: Any, *, subject: str) -> np.ndarray:
     """
     if isinstance(value, str):
         try:
-            value = [float(part) for part in value.replace(",", " ").split()]
+            value = [float(part) for part in ascii_numbers(value).replace(",", " ").split()]
         except ValueError:
             raise InputError(subject, expected="numbers", received=value[:80]) from None
     return np.asarray(as_numbers(value, subject=subject), dtype=np.float64)

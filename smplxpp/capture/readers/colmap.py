@@ -21,7 +21,7 @@ from smplxpp.capture.readers.common import ReaderOptions, camera_names, chosen_p
 from smplxpp.capture.recording import Recording
 from smplxpp.core.errors import InputError, warn_of_left_out
 from smplxpp.core.files import as_numbers, regular_file
-from smplxpp.core.files.paths import path_inside
+from smplxpp.core.files.paths import ascii_numbers, path_inside
 
 T = TypeVar("T")
 
@@ -167,6 +167,7 @@ def _cameras_txt(path: Path) -> dict[int, ColmapCamera]:
                 continue
             # CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]
             number, model, width, height, *params = line.split()
+            ascii_numbers(" ".join((number, width, height, *params)))
             if model not in dict(MODELS):
                 raise _unknown(path, model[:80])
             if len(params) != dict(MODELS)[model]:
@@ -183,6 +184,7 @@ def _images_txt(path: Path) -> list[ColmapImage]:
             fields = line.split(maxsplit=9)
             if not fields or fields[0].startswith("#"):
                 continue
+            ascii_numbers(" ".join(fields[:9]))
             images.append(_image(path, [float(f) for f in fields[1:8]], int(fields[8]), fields[9].strip()))
             next(file, "")  # the line of the image's points, which may be empty
     return images

@@ -119,3 +119,18 @@ def same_place(one: Path, other: Path) -> bool:
 def lies_in(path: Path, folder: Path) -> bool:
     """Return whether a path lies in a folder as it is written, or where its links lead."""
     return absolute(path).is_relative_to(absolute(folder)) or path.resolve().is_relative_to(folder.resolve())
+
+
+def ascii_numbers(text: str) -> str:
+    """Return a text whose numbers are written in ASCII's digits alone, so that `float` and numpy may read them.
+
+    Raises:
+        ValueError: what Python takes for numbers beside: `1_0`, digits of other alphabets.
+
+    Example:
+        >>> float(ascii_numbers("-1.5e2"))
+        -150.0
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"no number: {text[:40]!r}")
+    return text
