@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("*.md")])
+PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("*.md"), *ROOT.glob(".github/*.md")])
 PACKAGES = "smplxpp|avatar|pipelines|tools|benchmarks"
 DOTTED = re.compile(rf"(?<![\w./-])(?:{PACKAGES})(?:\.[A-Za-z_]\w*)+(?![\w/])")
 FILES = {".csv", ".gif", ".glb", ".gz", ".json", ".md", ".mp4", ".npy", ".npz", ".obj", ".ply", ".py", ".safetensors"}
