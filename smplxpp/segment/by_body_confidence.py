@@ -158,6 +158,7 @@ def notes_on_worn_things(
         side = "left" if left > right else "right"
         out.append(
             f"{1e4 * max(left, right):.0f} cm2 of clothes stand more than {1e2 * _BESIDE:.0f} cm off the {side} side "
-            "alone: a bag may be worn there; label it object (`smplxpp label`)"
+            "alone: a bag may be worn there; label it object (`smplxpp label`) and build with --rules object "
+            "rigid:pelvis, or it follows a hand that touches it"
         )
     return out
