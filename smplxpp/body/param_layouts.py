@@ -139,9 +139,11 @@ def _read_talkbody4d(content: Mapping[str, Any], person: int | None) -> Frames:
 def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
     """AMASS: `poses` of SMPL+H (156) or of SMPL-X (165), complete hands, z up by definition; SMPL's 72 in its names.
 
-    Our own files state the body that they are of and their axis (`body`, `up`), which other programs may do as well.
+    Without `poses` its parts are read, of which only those of the root and the body must be there. Our own files state
+    the body that they are of and their axis (`body`, `up`), which other programs may do as well.
     """
-    poses = np.atleast_2d(axis_angle_rows(np.asarray(content["poses"], np.float64), _WHOLE, subject="poses"))
+    whole = content["poses"] if "poses" in content else _poses_of_parts(content)
+    poses = np.atleast_2d(axis_angle_rows(np.asarray(whole, np.float64), _WHOLE, subject="poses"))
     families: dict[int, Family] = {72: "smpl", 156: "smplh", 165: "smplx"}
     family = families.get(poses.shape[-1])
     if family is None:
@@ -159,6 +161,20 @@ def _read_amass(content: Mapping[str, Any], person: int | None) -> Frames:
     )
     up = _text(content, "up", "up_axis")
     return Frames(params, family=_family(content, family), up=up or (None if family == "smpl" else "z"))
+
+
+def _poses_of_parts(content: Mapping[str, Any]) -> np.ndarray:
+    """Return the whole poses of SMPL-X from AMASS' parts of them; zero where a part is missing."""
+    parts = []
+    for name, joints in (("root_orient", 1), ("pose_body", 21), ("pose_jaw", 1), ("pose_eye", 2), ("pose_hand", 30)):
+        if name in content:
+            given = np.asarray(content[name], np.float64)
+            parts.append(np.atleast_2d(axis_angle_rows(given, [joints], subject=name)))
+        else:
+            parts.append(np.zeros((len(parts[0]), 3 * joints)))
+    if len({len(part) for part in parts}) > 1:
+        raise InputError("parts of poses", expected="as many frames in each", received=f"{[len(p) for p in parts]}")
+    return np.concatenate(parts, axis=1)
 
 
 def _read_smpl(content: Mapping[str, Any], person: int | None) -> Frames:
@@ -286,7 +302,13 @@ LAYOUTS: dict[str, Layout] = {
             ),
             _read_smpl,
         ),
-        Layout("amass", lambda keys, is_list: {"poses", "trans", "betas"} <= keys and not is_list, _read_amass),
+        Layout(
+            "amass",
+            lambda keys, is_list: (
+                {"trans", "betas"} <= keys and ("poses" in keys or {"root_orient", "pose_body"} <= keys) and not is_list
+            ),
+            _read_amass,
+        ),
         Layout(
             "easymocap",
             lambda keys, is_list: {"poses", "shapes", "Rh", "Th"} <= keys or "annots" in keys,

@@ -394,6 +394,24 @@ def test_speech_motion_beside_amass_keys_keeps_its_face(tmp_path, name):
     np.testing.assert_array_equal(load_params(tmp_path / "a.npz", whose="body", up="y").expression, face)
 
 
+def test_parts_of_amass_poses_alone_are_read(tmp_path):
+    """Retargeting tools write `root_orient` and `pose_body` without `poses`, often without hands: it was refused."""
+    rows, rng = 4, np.random.default_rng(0)
+    parts = {name: rng.normal(0, 0.1, (rows, n)) for name, n in (("root_orient", 3), ("pose_body", 63))}
+    others = dict(trans=np.zeros((rows, 3)), betas=np.zeros(10), mocap_frame_rate=50.0)
+    hands = rng.normal(0, 0.1, (rows, 90))
+    np.savez(tmp_path / "a.npz", **parts, **others)
+    np.savez(tmp_path / "b.npz", **parts, **others, pose_hand=hands)
+    for name, hand in (("a.npz", np.zeros((rows, 45))), ("b.npz", hands[:, 45:])):
+        read = load_params(tmp_path / name, whose="body", up="y")
+        np.testing.assert_array_equal(read.body_pose, parts["pose_body"])
+        np.testing.assert_array_equal(read.right_hand_pose, hand)
+        assert read.fps == 50.0
+    np.savez(tmp_path / "c.npz", **parts, **others, pose_hand=hands[1:])
+    with pytest.raises(InputError, match="as many frames in each"):
+        load_params(tmp_path / "c.npz")
+
+
 def test_arrays_that_nobody_reads_are_named_once(tmp_path):
     rows = 3
     poses, place = np.zeros((rows, 165)), np.zeros((rows, 3))
