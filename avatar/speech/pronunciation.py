@@ -79,6 +79,15 @@ def check_text(text: str) -> str:
     return text
 
 
+# By the script as Unicode names it: languages that are written in it, and how Piper's voices of them begin.
+_VOICES = {
+    **{"CYRILLIC": "Russian (ru_RU), Ukrainian (uk_UA) or Serbian (sr_RS)", "GREEK": "Greek (el_GR)"},
+    **{"ARABIC": "Arabic (ar_JO) or Persian (fa_IR)", "DEVANAGARI": "Hindi (hi_IN) or Nepali (ne_NP)"},
+    **{"HIRAGANA": "Japanese", "KATAKANA": "Japanese", "HANGUL": "Korean", "CJK": "Chinese (zh_CN)"},
+    **{"GEORGIAN": "Georgian (ka_GE)", "MALAYALAM": "Malayalam (ml_IN)", "TELUGU": "Telugu (te_IN)"},
+}
+
+
 def pronounce(text: str, *, language: str = "en-us") -> Pronunciation:
     """Return the pronunciation of a text.
 
@@ -106,12 +115,16 @@ def pronounce(text: str, *, language: str = "en-us") -> Pronunciation:
 
 
 def no_words_error(text: str) -> InputError:
-    """Return the error for a text without a word that can be pronounced."""
+    """Return the error for a text without a word that can be pronounced: it names the voices that a script needs."""
+    names = " ".join(unicodedata.name(one, "") for one in text)
+    needed = next((voices for script, voices in _VOICES.items() if script in names), "the text's language")
     return InputError(
         "text",
         expected="words that the voice's language has",
         received=repr(text[:40]),
-        remedy="give a recording, whose sounds are followed in any language (--audio), or another --voice",
+        remedy=f"give a voice of {needed} with --voice NAME.onnx, NAME.onnx.json beside it (Piper's are at "
+        "https://huggingface.co/rhasspy/piper-voices; the program espeak-ng pronounces their languages), or a recording"
+        ", whose sounds are followed in any language, with --audio",
     )
 
 

@@ -1,6 +1,6 @@
 """Time each part of an answer in a conversation with a synthetic voice, and the offset of sound and poses.
 
-    python -m benchmarks chat --avatar me.avatar
+    python -m benchmarks chat --avatar me.avatar [--parts spoken typed long]
 
 A Piper voice (extra `[chat]`) says short sentences into a websocket of `smplxpp chat`'s server, as a microphone would:
 in pieces of 64 ms, in real time. Rules answer. The client is no browser: "heard" is when the message with the sound has
@@ -9,34 +9,42 @@ which the server finds out only after a pause that it is set to wait for. How ma
 
 Then the same sentences are typed, by one page and by ten at a time, which all wait for their answer: seconds from a
 message until the sound of its answer has come, and the memory of the process.
+
+In a long talk a page of headless Chromium types 200 messages, each once the answer to the last begins to be heard:
+seconds until it is, memory of the server and of the page's objects after some and after all of them. Parts that are
+left out keep the figures of their last measurement.
 """
 
 from __future__ import annotations
 
 import difflib
+import gzip
 import json
 import os
 import re
+import tempfile
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import tyro
 
 from avatar.runtime import AvatarPlayer
 from avatar.speech.voice import PiperVoice
-from benchmarks.support.results import store_results
+from benchmarks.support.results import RESULTS, store_results
 from pipelines.chat.conversation import ChatParts
 from pipelines.chat.hearing import BLOCK, RATE
 from pipelines.chat.server import ChatServer
 from pipelines.commands.chat import Chat
 from pipelines.figures import fit_cameras
+from pipelines.web.page import PLAYER
 from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.files.tensor_bytes import unpack_tensors
+from tests.web.chromium import Page
 
 SENTENCES = (
     "What is your name?",
@@ -55,6 +63,8 @@ SILENCE = 2.0
 """Seconds between two sentences at least."""
 PAGES = 10
 """Pages that type at a time: more than a small machine has cores, by far."""
+EXCHANGES, SOME = 200, 40
+"""Messages of a long talk, and those after which everything that is kept for good should be there."""
 
 
 @dataclass(frozen=True)
@@ -64,47 +74,58 @@ class ChatBenchmark:
     avatar: Path
     """A bundle, NAME.avatar."""
 
+    parts: tuple[Literal["spoken", "typed", "long"], ...] = ("spoken", "typed", "long")
+    """What is measured."""
+
     def run(self) -> None:
         """Print and store the figures."""
-        command = Chat(self.avatar)
         import avatar
 
-        bundle = avatar.open_bundle(self.avatar)
+        command, bundle = Chat(self.avatar), avatar.open_bundle(self.avatar)
         cast = command.engines(bundle, command.partner())
         cast.voice.say("Hello.")
-        turns: list[dict[str, float]] = []
-        server = ChatServer(
-            self.avatar.read_bytes(), cast, name="benchmark", report=lambda turn: turns.append(turn.marks)
-        )
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        page = _Page(server, self.avatar)
-        right = words = 0
-        for sentence in SENTENCES:
-            heard = page.speak(PiperVoice(threads=1).say(sentence).sound)
-            wanted = re.findall(r"[a-z']+", sentence.lower())
-            matcher = difflib.SequenceMatcher(None, wanted, heard.split(), autojunk=False)
-            right += sum(block.size for block in matcher.get_matching_blocks())
-            words += len(wanted)
-            print(f"{sentence:40s} {heard:40s} {turns[-1]}")
-        page.close()
-        server.shutdown()
-        figures: dict[str, Any] = {
-            "sentences": len(SENTENCES),
-            "words recognised": f"{right} of {words}",
-            "seconds from the end of the speech": {
-                part: {
-                    "median": round(float(np.median([turn[part] for turn in turns])), 3),
-                    "worst": round(max(turn[part] for turn in turns), 3),
-                }
-                for part in turns[0]
-            },
-            "typed": {f"{pages} at a time": _typed(self.avatar, cast, pages) for pages in (1, PAGES)},
-            "seconds of CPU": _cpu(cast, page),
-            "gaussians": bundle.sizes["N"],
-        }
+        kept = RESULTS / "chat.json"
+        figures: dict[str, Any] = json.loads(kept.read_text())["figures"] if kept.exists() else {}
+        if "spoken" in self.parts:
+            figures |= _spoken(self.avatar, cast)
+        if "typed" in self.parts:
+            figures["typed"] = {f"{pages} at a time": _typed(self.avatar, cast, pages) for pages in (1, PAGES)}
+        if "long" in self.parts:
+            figures["a long talk"] = {"all": _long_talk(self.avatar, cast)}
+        figures["gaussians"] = bundle.sizes["N"]
         for name, value in figures.items():
             print(f"{name:38s} {value}")
         print(f"stored {store_results('chat', 'python -m benchmarks chat --avatar me.avatar', figures).name}")
+
+
+def _spoken(avatar: Path, cast: ChatParts) -> dict[str, Any]:
+    """Speak the sentences and wait for the answers; return seconds by part, words recognised and seconds of CPU."""
+    turns: list[dict[str, float]] = []
+    server = ChatServer(avatar.read_bytes(), cast, name="benchmark", report=lambda turn: turns.append(turn.marks))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    page = _Page(server, avatar)
+    right = words = 0
+    for sentence in SENTENCES:
+        heard = page.speak(PiperVoice(threads=1).say(sentence).sound)
+        wanted = re.findall(r"[a-z']+", sentence.lower())
+        matcher = difflib.SequenceMatcher(None, wanted, heard.split(), autojunk=False)
+        right += sum(block.size for block in matcher.get_matching_blocks())
+        words += len(wanted)
+        print(f"{sentence:40s} {heard:40s} {turns[-1]}")
+    page.close()
+    server.shutdown()
+    return {
+        "sentences": len(SENTENCES),
+        "words recognised": f"{right} of {words}",
+        "seconds from the end of the speech": {
+            part: {
+                "median": round(float(np.median([turn[part] for turn in turns])), 3),
+                "worst": round(max(turn[part] for turn in turns), 3),
+            }
+            for part in turns[0]
+        },
+        "seconds of CPU": _cpu(cast, page),
+    }
 
 
 def _connect(server: ChatServer) -> Any:
@@ -145,17 +166,68 @@ def _typed(avatar: Path, cast: ChatParts, pages: int) -> dict[str, Any]:
     for thread in threads:
         thread.join()
     used = time.process_time() - began
-    resident = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    resident = _resident()
     server.shutdown()
-    assert len(seconds) == pages * len(SENTENCES) and resident is not None
+    assert len(seconds) == pages * len(SENTENCES)
     return {
         "messages": len(seconds),
         "median": round(float(np.median(seconds)), 3),
         "worst": round(max(seconds), 3),
         "CPU seconds a message": round(used / len(seconds), 3),
-        "resident MB": int(resident[1]) // 1024,
+        "resident MB": resident,
         "load of the machine": round(os.getloadavg()[0], 1),
     }
+
+
+def _long_talk(avatar: Path, cast: ChatParts) -> dict[str, Any]:
+    """Let a page of Chromium type many messages; return latencies, memory, the page's sizes and its first picture."""
+    server = ChatServer(avatar.read_bytes(), cast, name="benchmark")
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    resident, heap, seconds = list[int](), list[float](), list[float]()
+    first = "setInterval(() => { if (window.smplxppPlayer?.player?.pictures) window.first ??= performance.now(); }, 5)"
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Page(Path(folder), size=(320, 400), flags=["--enable-precise-memory-info"]) as page,
+    ):
+        page.send("Page.addScriptToEvaluateOnNewDocument", source=first)
+        page.go(server.address)
+        page.until("window.first && document.querySelector('.times').textContent")
+        page.click(".talk input")
+        page.evaluate("smplxppPlayer.talking.then(({dialogue}) => { window.dialogue = dialogue; })")
+        for k in range(EXCHANGES):
+            began = (
+                f"new Promise(done => {{ const from = performance.now(), end = dialogue.on('answer', () => {{ end();"
+                f" done((performance.now() - from) / 1000); }}); dialogue.type({json.dumps(SENTENCES[k % 8])}); }})"
+            )
+            seconds.append(page.evaluate(began))
+            if (k + 1) % SOME == 0:
+                page.send("HeapProfiler.collectGarbage")
+                heap.append(page.evaluate("performance.memory.usedJSHeapSize / 1e6"))
+                resident.append(_resident())
+                print(f"{k + 1} messages: {resident[-1]} MB resident, {heap[-1]:.1f} MB of objects", flush=True)
+        shown, errors = page.evaluate("window.first / 1000"), page.errors
+    server.shutdown()
+    assert not errors, errors
+    return {
+        "messages": EXCHANGES,
+        "median": round(float(np.median(seconds)), 3),
+        "worst": round(max(seconds), 3),
+        f"resident MB after {SOME}": resident[0],
+        "resident MB": resident[-1],
+        f"MB of the page after {SOME}": round(heap[0], 1),
+        "MB of the page": round(heap[-1], 1),
+        "seconds to the first picture": round(shown, 2),
+        "kB of the player": len(PLAYER.read_bytes()) // 1000,
+        "kB of it compressed": len(gzip.compress(PLAYER.read_bytes())) // 1000,
+        "load of the machine": round(os.getloadavg()[0], 1),
+    }
+
+
+def _resident() -> int:
+    """Return the memory of this process, MB."""
+    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert found is not None
+    return int(found[1]) // 1024
 
 
 class _Page:

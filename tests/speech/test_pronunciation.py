@@ -192,11 +192,15 @@ def test_words_of_the_dictionary_and_others():
             pronounce("Guten Tag", language="de")
 
 
-@pytest.mark.parametrize("text", ["Привет, как дела?", "你好 世界!", "Καλημέρα"])
-def test_letters_that_english_does_not_have_are_no_words_of_it(text):
+@pytest.mark.parametrize(
+    ("text", "voice"),
+    [("Привет, как дела?", "ru_RU"), ("你好 世界!", "zh_CN"), ("Καλημέρα", "el_GR"), ("สวัสดี", "text's")],
+)
+def test_letters_that_english_does_not_have_are_no_words_of_it(text, voice):
     """The voice said "chinese letter" for each of them, or, by the dictionary, ended in a ValueError."""
-    with pytest.raises(InputError, match="voice's language"):
+    with pytest.raises(InputError, match="voice's language") as caught:
         pronounce(text)
+    assert voice in str(caught.value) and "rhasspy/piper-voices" in str(caught.value)
 
 
 @pytest.mark.parametrize("program", [None, shutil.which("espeak-ng")])
