@@ -17,6 +17,7 @@ left out keep the figures of their last measurement.
 
 from __future__ import annotations
 
+import datetime
 import difflib
 import gzip
 import json
@@ -92,6 +93,8 @@ class ChatBenchmark:
             figures["typed"] = {f"{pages} at a time": _typed(self.avatar, cast, pages) for pages in (1, PAGES)}
         if "long" in self.parts:
             figures["a long talk"] = {"all": _long_talk(self.avatar, cast)}
+        today = datetime.date.today().isoformat()
+        figures["dates"] = {**figures.get("dates", {}), **dict.fromkeys(self.parts, today)}
         figures["gaussians"] = bundle.sizes["N"]
         for name, value in figures.items():
             print(f"{name:38s} {value}")
