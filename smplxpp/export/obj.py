@@ -15,8 +15,9 @@ def write_obj(path: str | Path, template: Template) -> None:
     """Write the T-pose as an OBJ file with a group a part, whole or not at all.
 
     Colours follow the coordinates (`v x y z r g b`), sRGB in [0, 1], as MeshLab and Blender read them. Vertices keep
-    the template's order, in metres to a tenth of a micrometre; indices count from 1 through all groups. A texture has
-    its coordinates as `vt`, and a material a picture in an MTL file beside; the pictures lie there, too.
+    the template's order, in metres to a tenth of a micrometre, each with its normal, without which programs show every
+    face flat; indices count from 1 through all groups. A texture has its coordinates as `vt`, and a material a picture
+    in an MTL file beside; the pictures lie there, too.
 
     Args:
         path: of the file.
@@ -25,6 +26,7 @@ def write_obj(path: str | Path, template: Template) -> None:
     path, texture = Path(path), template.texture
     rows = np.hstack([template.vertices, template.vertex_colors / 255.0])
     text = [_lines("v %.7f %.7f %.7f %.4f %.4f %.4f\n", rows)]
+    text.append(_lines("vn %.4f %.4f %.4f\n", template.mesh.vertex_normals))
     if texture is not None:
         # Pictures and materials first, so that no OBJ names files that are not there.
         files = picture_files(texture, path.stem)
@@ -37,10 +39,12 @@ def write_obj(path: str | Path, template: Template) -> None:
         chosen = template.part_faces(name)
         faces = template.faces[chosen] + 1
         if texture is None:
-            text += [f"g {name}\n", _lines("f %d %d %d\n", faces)]
+            corners = faces.repeat(2, axis=1)
+            text += [f"g {name}\n", _lines("f %d//%d %d//%d %d//%d\n", corners)]
         else:
-            corners = np.stack([faces, texture.face_uv[chosen] + 1], axis=2).reshape(-1, 6)
-            text += [f"g {name}\nusemtl picture_{texture.picture[index]}\n", _lines("f %d/%d %d/%d %d/%d\n", corners)]
+            corners = np.stack([faces, texture.face_uv[chosen] + 1, faces], axis=2).reshape(-1, 9)
+            text.append(f"g {name}\nusemtl picture_{texture.picture[index]}\n")
+            text.append(_lines("f %d/%d/%d %d/%d/%d %d/%d/%d\n", corners))
     atomic_write_text(path, "".join(text))
 
 

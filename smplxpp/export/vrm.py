@@ -188,8 +188,8 @@ def write_vrm(
     }
     expressions: dict[str, Any] = {"preset": {name: _bound(targets, name) for name in shapes}}
     if named:
-        body = {node: names for node, names in targets.items() if gltf.nodes[node].name == BODY_PART}
-        expressions["custom"] = {name: _bound(body, name) for name in _moving(template) if name in ARKIT}
+        own = {node: names for node, names in targets.items() if gltf.nodes[node].name == BODY_PART}
+        expressions["custom"] = {name: _bound(own, name) for name in _moving(template) if name in ARKIT}
     gltf.extensions = {
         EXTENSION: {
             "specVersion": "1.0",
