@@ -2,8 +2,8 @@
 
     python tests/export/foreign_readers.py READER FILE
 
-READER is assimp (assimp_py), ufbx, bpy, usd (usd-core) or trimesh. Exit 3: it is not installed. `load_three.mjs` does the
-same with the loaders of three.js.
+READER is assimp (assimp_py), ufbx, bpy, usd (usd-core) or trimesh. Exit 3: it is not installed. `load_three.mjs` does
+the same with the loaders of three.js.
 """
 
 from __future__ import annotations
@@ -169,8 +169,9 @@ READERS: dict[str, Callable[[Path], dict]] = {
 
 if __name__ == "__main__":
     try:
-        print("FOUND " + json.dumps(READERS[sys.argv[1]](Path(sys.argv[2]))), flush=True)
+        sys.stdout.write("FOUND " + json.dumps(READERS[sys.argv[1]](Path(sys.argv[2]))) + "\n")
+        sys.stdout.flush()
         os._exit(0)  # ufbx 0.0.5 crashes when its scene is freed
     except ModuleNotFoundError as error:
-        print(error, file=sys.stderr)
+        sys.stderr.write(f"{error}\n")
         sys.exit(3)

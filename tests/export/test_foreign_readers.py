@@ -86,8 +86,7 @@ def test_everything_arrives(reader, suffix, dressed, files):
     if suffix not in files:
         pytest.skip("neither bpy nor Blender is installed, which write FBX")
     found = read(reader, files[suffix])
-    with np.printoptions(precision=3):
-        print(f"\n| {reader} | {suffix} |", " | ".join(f"{value}" for value in found.values()), "|")
+    sys.stdout.write(f"| {reader} | {suffix} | {' | '.join(map(str, found.values()))} |\n")
     template = in_vrm_pose(dressed) if suffix == ".vrm" else dressed
     size = np.ptp(template.vertices, axis=0)
     assert abs(found["height"] - size[1]) < 1e-5 and abs(found["soles"]) < 1e-5

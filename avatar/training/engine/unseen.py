@@ -1,18 +1,23 @@
-"""Gaussians that no training photograph shows keep their initial attributes: their gradients are cleared."""
+"""Gaussians that no training photograph shows keep their attributes, and skin under clothes gets the skin's colour."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from weakref import WeakKeyDictionary
 
+import igl
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from avatar.data.sequence import FrameSequence
 from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapes
+from avatar.models.student import Student
+from avatar.rendering.avatar_view import render_view
 from smplxpp.core.spread import spread_inside
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.mouth import inside_of_mouth, shown_mouth
@@ -97,6 +102,88 @@ def hold_unseen(sequence: FrameSequence, gaussians: LearnedGaussians, shapes: Bl
         rows = hidden[shapes.active].nonzero()[:, 0]
         for basis in (shapes.U, shapes.C):
             _clear_gradients(basis, rows)
+
+
+@torch.no_grad()
+def color_clothed_skin(sequence: FrameSequence, model: Student) -> Bool[Tensor, " N"]:
+    """Give skin under clothes the colour of bare skin nearby, and return which Gaussians these are.
+
+    They learn the colours of the clothes, with which they fill gaps between the clothes' own Gaussians; in a player
+    that takes clothes off the body would wear their smear. Under clothes is skin with clothes within 3 cm before it,
+    and skin of which the clothes leave less than 0.3 of what the training views would show of the body alone. The
+    training that follows closes the gaps, if it holds these colours (`hold_colors`).
+
+    Args:
+        sequence: of the training frames.
+        model: with the template's Gaussians; its colours are changed.
+    """
+    near, least_shown = 0.03, 0.3  # metres; share
+    # Metres about clothes where bare skin may have their colours, as far as poses are exact.
+    run_in = 0.015
+    blended, power = 256, 3.0  # places whose colours are weighed by distance ^ -power: so many show no borders
+    rig, gaussians = sequence.rig, model.gaussians
+    template, face = rig.template, gaussians.face_index.cpu().numpy()
+    corners = template.faces[face]
+    outer = template.vertex_part == 0
+    outer[: template.body.vertex_count] &= template.body.outer_skin
+    skin = outer[corners].all(axis=1) & ~inside_of_mouth(template)[corners].any(axis=1)
+    worn = template.vertex_part[template.faces[:, 0]] > 0
+    hidden = np.zeros(len(face), dtype=bool)
+    if not skin.any() or not worn.any():
+        return torch.tensor(hidden, device=gaussians.face_index.device)
+    # Clothes before the skin at rest: the nearest point of them lies outwards.
+    places = template.vertices[corners].mean(axis=1)
+    tree = igl.AABB()
+    tree.init(template.vertices, template.faces[worn])
+    squared, _, at = tree.squared_distance(template.vertices, template.faces[worn], places)
+    away = np.sqrt(np.asarray(squared).reshape(-1))
+    outwards = np.einsum("nd,nd->n", at - places, template.mesh.face_normals[face]) > 0.3 * away
+    shown, alone = _blending_weights(sequence, model, skin)
+    hidden = skin & ((outwards & (away < near)) | ((alone > 0.0) & (shown < least_shown * alone)))
+    known, rows = np.flatnonzero(skin & ~hidden), np.flatnonzero(hidden)
+    if len(known) and len(rows):
+        clear = cKDTree(places[rows]).query(places[known])[0] > run_in
+        known = known[clear] if clear.any() else known
+        apart, nearest = cKDTree(places[known]).query(places[rows], k=range(1, min(blended, len(known)) + 1))
+        weight = np.maximum(apart, 1e-4)[..., None] ** -power
+        colors = gaussians.dc.cpu().numpy()[known[nearest]]
+        mean = (weight * colors).sum(axis=1) / weight.sum(axis=1)
+        gaussians.dc[rows] = torch.tensor(mean).to(gaussians.dc)
+        gaussians.sh[rows] = 0.0
+    return torch.tensor(hidden, device=gaussians.face_index.device)
+
+
+def _blending_weights(
+    sequence: FrameSequence, model: Student, skin: Bool[np.ndarray, " N"]
+) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+    """Return the sums over up to 72 training views of each Gaussian's weight in the pixels, and that of skin alone."""
+    most_frames, most_cameras = 6, 12
+    shown, alone = np.zeros(len(skin)), np.zeros(len(skin))
+    opaque = torch.tensor(skin, device=model.gaussians.dc.device)
+    for frame in spread_inside(sequence.train_frames, most_frames):
+        for camera in spread_inside(sequence.train_cameras, most_cameras):
+            view = sequence.view(camera, frame)
+            posed = model(sequence.pose(frame), view.position[None])
+            world = posed.gaussians
+            naked = replace(world, opacities=torch.where(opaque, world.opacities, torch.zeros_like(world.opacities)))
+            for total, gaussians in ((shown, world), (alone, naked)):
+                # The derivative of the sum of a picture by the Gaussians' values is their weight in it.
+                with torch.enable_grad():
+                    value = torch.ones_like(world.means[:, :1]).requires_grad_()
+                    drawn = render_view(replace(posed, gaussians=gaussians), 0, view, sequence.background, extra=value)
+                    assert drawn.extra is not None
+                    (weight,) = torch.autograd.grad(drawn.extra.sum(), value)
+                total += weight[:, 0].double().cpu().numpy()
+    return shown, alone
+
+
+def hold_colors(gaussians: LearnedGaussians, shapes: BlendShapes | None, held: Bool[Tensor, " N"]) -> None:
+    """Clear the gradients of the colours of some Gaussians, blend shapes included; they may move and grow."""
+    rows = held.nonzero()[:, 0]
+    for learned in (gaussians.dc, gaussians.sh):
+        _clear_gradients(learned, rows)
+    if shapes is not None:
+        _clear_gradients(shapes.C, held[shapes.active].nonzero()[:, 0])
 
 
 def _clear_gradients(parameter: nn.Parameter, rows: Int64[Tensor, " K"]) -> None:

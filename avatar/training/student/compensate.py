@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
@@ -26,6 +26,7 @@ from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
+from avatar.training.engine.unseen import color_clothed_skin, hold_colors
 from avatar.training.student.prune import pruned_to
 from avatar.training.student.unseen_motion import with_held_face
 from avatar.training.tracking.surface_normals import with_surface_normals
@@ -160,6 +161,7 @@ class CompensateTask(PhotometricTask):
         student: with blend shapes.
         config: of the compensation.
         context: perceptual distance, processes, previews.
+        held: Gaussians that keep their colours.
 
     Raises:
         InputError: a student without blend shapes.
@@ -169,7 +171,13 @@ class CompensateTask(PhotometricTask):
     sequence: AvatarSequence
 
     def __init__(
-        self, sequence: AvatarSequence, student: Student, config: CompensateConfig, context: TaskContext = ALONE
+        self,
+        sequence: AvatarSequence,
+        student: Student,
+        config: CompensateConfig,
+        context: TaskContext = ALONE,
+        *,
+        held: Bool[Tensor, " N"] | None = None,
     ) -> None:
         shapes = student.blend_shapes
         if shapes is None:
@@ -190,6 +198,8 @@ class CompensateTask(PhotometricTask):
         ]
         super().__init__(sequence, student, config, groups, context)
         self.student = student
+        if held is not None:
+            hold_colors(student.gaussians, shapes, held)
         # The coherence term is relative to the present U.
         self.shapes, self.coherence = shapes, None
         if config.coherence:
@@ -245,9 +255,11 @@ def compensate(
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
+    # Only where the Gaussians learn on: they close what the colours of skin leave open between the clothes' own.
+    held = color_clothed_skin(sequence, made) if config.attributes else None
     tracked = teacher.track if config.surface_normals and teacher is not None else None
     context = with_surface_normals(session.context, sequence, tracked)
-    progress = session.run(lambda: CompensateTask(sequence, made, config, context), config)
+    progress = session.run(lambda: CompensateTask(sequence, made, config, context, held=held), config)
     return with_held_face(made, expressions, jaws).eval(), progress
 
 

@@ -11,11 +11,13 @@ import torch
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
+from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
-from avatar.training.engine.unseen import hold_unseen, unseen
+from avatar.training.engine.unseen import color_clothed_skin, hold_colors, hold_unseen, unseen
 from smplxpp.body import load_body
 from smplxpp.core.params import BodyParams
 from smplxpp.template.mouth import inside_of_mouth
+from tests.dolls import dancing
 from tests.dolls.dancing import template as doll
 from tests.dolls.doll import place_camera
 from tests.template.test_template import template_of
@@ -111,3 +113,26 @@ def test_what_is_held_gets_no_gradient(rig, bound):
     for basis in (shapes.U, shapes.C):
         moves = basis.grad.flatten(1).abs().amax(dim=1)
         assert not moves[held[shapes.active]].any() and moves[~held[shapes.active]].all()
+
+
+def test_skin_under_clothes_takes_the_colour_of_bare_skin_and_keeps_it(tmp_path):
+    """In a player that takes clothes off the body wore their smear; places, sizes and the clothes learn on."""
+    sequence = dancing.sequence(dancing.write_dance(tmp_path / "dance"))
+    bound = dancing.gaussians(600)
+    corners = bound.face_index.numpy()
+    template = sequence.rig.template
+    skin = template.vertex_part[template.faces[corners][:, 0]] == 0
+    height = template.vertices[template.faces[corners]][..., 1].mean(axis=1)
+    # Trained colours: a white head, and the smear of the dress on the torso.
+    colors = np.where(skin & (height > 0.6), 0.9, 0.1)[:, None].repeat(3, axis=1)
+    student = Student(StudentConfig(field=None), sequence.rig, replace(bound, dc=torch.tensor(colors).float()), ())
+    held = color_clothed_skin(sequence, student).numpy()
+    assert held[skin & (height < 0.45)].mean() > 0.8 and not held[~skin].any() and not held[height > 0.7].any()
+    assert np.median(student.gaussians.dc.detach().numpy()[held & (height < 0.45)]) > 0.6, (
+        "of the head, not of the smear"
+    )
+    np.testing.assert_array_equal(student.gaussians.dc.detach().numpy()[~held], colors[~held].astype(np.float32))
+    hold_colors(student.gaussians, None, torch.tensor(held))
+    sum(getattr(student.gaussians, name).sum() for name in ("dc", "sh", "offset")).backward()
+    assert not student.gaussians.dc.grad[held].any() and student.gaussians.dc.grad[~held].all()
+    assert not student.gaussians.sh.grad[held].any() and student.gaussians.offset.grad.all()
