@@ -1,4 +1,4 @@
-"""Rigged files opened by programs that are not ours: bones, expressions, places in the texture, pictures, size, normals.
+"""Rigged files opened by other programs: bones, expressions, texture coordinates, pictures, size, normals.
 
 Readers that this Python lacks are looked for in the Pythons of $FOREIGN_PYTHONS (`a/bin/python:b/bin/python`), three.js
 in NODE_PATH; others are skipped. `pytest -m slow -s tests/export/test_foreign_readers.py` prints the table of
