@@ -79,8 +79,9 @@ def _as_bytes(values: np.ndarray) -> UInt8[np.ndarray, "H W"]:
 
 
 def _warn_of_ids(path: Path, what: str) -> None:
+    # Not the camera's own folder, so that sixty cameras say it once.
     warnings.warn(
-        f"masks in {path.parent}: {what} are no opacities; all that is not black is taken for the person",
+        f"masks below {path.parent.parent}: {what} are no opacities; all that is not black is taken for the person",
         GeometryWarning,
         stacklevel=3,
     )
