@@ -11,7 +11,7 @@ def main() -> int:
     Returns:
         The exit status of `pipelines.cli.main`; 130 after an interrupt.
     """
-    # Nothing of the package is imported before the guard: its modules take half a second. What Python itself does before
+    # Nothing of the package is imported before the guard: its modules take half a second. What Python does before them
     # (`site`, 20 ms) is not guarded.
     try:
         from pipelines.cli import main as run
