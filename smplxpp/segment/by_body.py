@@ -45,7 +45,7 @@ from smplxpp.core import (
 )
 from smplxpp.core.topology import face_adjacency
 from smplxpp.raster import outer_visible_points
-from smplxpp.segment.by_body_chart import FOOT, LEG, TRUNK, BodyChart, chart_of_scan, in_arm, in_column
+from smplxpp.segment.by_body_chart import FOOT, LEG, TRUNK, BodyChart, chart_of_scan, in_arm, in_column, settled_body
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
 from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_shoes, on_heels, roughness
@@ -186,7 +186,7 @@ def weigh_evidence(
 ) -> Evidence:
     """Return the unary costs of all labels at all faces with their ingredients; `lab` is (M, 3) colours in OKLab."""
     # The misfit of the body is the robust spread (1.4826 MAD) of the distances of face and hands.
-    chart = chart_of_scan(mesh, body, params)
+    chart = chart_of_scan(mesh, body, params, posed=settled_body(mesh, body, params))
     pairs, ends = face_adjacency(mesh.faces)
     # What the person holds says nothing about her clothes, so that it has no area in the steps that follow. A body that
     # is not even at the face, where nothing is held, would make a thing of her own arm. Where it is at the hands, a hat

@@ -3,7 +3,7 @@
 A hem is where cloth ends over skin or over other cloth: within a centimetre or two the surface comes nearer to the
 body by the cloth's thickness and play, on all sides of the limb. Folds, pockets and muscles make such steps on one
 side alone, and the misfit of the body changes slowly along a limb. So the step is measured in sectors about the limb,
-above the slopes around it, and the median over the sectors counts.
+above the slopes beside it, and the median over the sectors counts.
 """
 
 from __future__ import annotations
@@ -103,19 +103,18 @@ def _cells(
 
 
 def _steps(mean: np.ndarray, known: np.ndarray) -> Float64[np.ndarray, "R1 S"]:
-    """Return the steps between two rings on each side of each start of a ring, above the slopes 6 cm before and after.
+    """Return the steps between two rings on each side of each start of a ring, above the slopes 3 cm before and after.
 
-    Where the slope changes, as where a skirt begins to flare, what either slope explains is no step. NaN where no ring
-    beside it has faces.
+    What the steepest of these slopes explains is no step: a skirt that begins to flare, and a limb of another form than
+    the body's, whose distance rises and falls over 10 cm. NaN where no ring beside it has faces.
     """
     count = len(mean)
     out = np.full((count + 1, mean.shape[1]), np.nan)
     slope = np.diff(mean, axis=0)
     for k in range(2, count - 1):
-        before = 2.0 * np.median(slope[max(0, k - 6) : max(1, k - 2)], axis=0)
-        after = 2.0 * np.median(slope[min(count - 2, k + 1) : k + 5], axis=0)
+        beside = 2.0 * np.concatenate([slope[max(0, k - 4) : max(1, k - 2)], slope[min(count - 2, k + 1) : k + 3]])
         step = 0.5 * (mean[k] + mean[k + 1] - mean[k - 1] - mean[k - 2])
-        out[k] = step - np.clip(step, np.minimum(before, after), np.maximum(before, after))
+        out[k] = step - np.clip(step, beside.min(axis=0), beside.max(axis=0))
     near = maximum_filter1d(known.astype(np.int64), 3, axis=0) > 0
     out[:-1][~near] = np.nan
     return out

@@ -41,6 +41,15 @@ def test_a_step_all_round_is_a_hem_and_one_on_a_side_is_none():
     assert flare.outwards.max() < 0.5
 
 
+def test_a_limb_that_swells_and_thins_has_no_hems():
+    """A bare man whose arms and trunk no shape of the body has wore shirt and trousers: every swelling was a hem."""
+    swollen = tube(lambda place, turn: 0.006 * np.sin(2.0 * np.pi * place / 0.22))
+    assert max(swollen.outwards[3:-3].max(), swollen.inwards[3:-3].max()) < 0.5
+    # A cuff of 10 mm on the same arm remains one.
+    cuff = tube(lambda place, turn: 0.006 * np.sin(2.0 * np.pi * place / 0.22) + 0.01 * (place < 0.36))
+    assert 22 <= int(cuff.inwards.argmax()) <= 26 and cuff.inwards.max() > 2.0
+
+
 def test_a_hem_may_lie_higher_on_one_side():
     tilted = tube(lambda place, turn: 0.012 * (place > 0.3 + 0.012 * np.sin(turn)))
     assert tilted.outwards[19:22].max() > 3.0
