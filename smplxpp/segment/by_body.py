@@ -7,8 +7,9 @@ unary cost is the negative log posterior of a label at a face,
 
 The terms are found one after the other:
 
-1. `by_body_chart`: every face gets a place on the body (region, height along the column of feet, legs and trunk, reach
-   along the arm, azimuth, signed distance) from the body vertex that is nearest in position and normal.
+1. `by_body_chart`: the body's limbs are moved onto the scan, then every face gets a place on the body (region, height
+   along the column of feet, legs and trunk, reach along the arm, azimuth, signed distance) from the body vertex that is
+   nearest in position and normal.
 2. `by_body_colors`: a palette of the scan (k-means in OKLab), and a normal distribution of this person's skin colour
    from the face and the hands, whose log-likelihood ratio tells skin from other colours.
 3. `by_body_objects`: things in hands, by a cut of their own; they are left out of all other steps.
@@ -49,7 +50,7 @@ from smplxpp.segment.by_body_chart import FOOT, LEG, TRUNK, BodyChart, chart_of_
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
 from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_shoes, on_heels, roughness
-from smplxpp.segment.by_body_layers import Layers, find_layers
+from smplxpp.segment.by_body_layers import Layers, find_layers, open_coat_by_shape
 from smplxpp.segment.by_body_objects import FoundObjects, find_objects
 from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
@@ -234,7 +235,8 @@ def weigh_evidence(
     heels = on_heels(mesh, body, params)
     if lab is None:
         used = np.where(layers.hair | layers.coat, 0.0, area)
-        outfit = outfit_by_shape(_shape_evidence(mesh, chart, column, arm, area=used, chest=chest, heels=heels))
+        shape = _shape_evidence(mesh, chart, column, arm, area=used, chest=chest, heels=heels)
+        outfit = outfit_by_shape(shape)
     else:
         outfit = find_outfit(column, arm, config.outfit, misfit=misplaced, chest=chest, heels=heels)
         if heels:
@@ -248,6 +250,10 @@ def weigh_evidence(
         layers = replace(layers, bib=False)
     elif lab is not None:
         waist = None
+    if lab is None:
+        upper = chart.height > outfit.upper_start
+        upper = upper if waist is None else np.where(waist.faces, waist.upper, upper)
+        layers = replace(layers, coat=open_coat_by_shape(chart, area, outfit, column, shape.apart, upper=upper) & worn)
     prior = place_prior(
         chart, outfit, layers, softness=config.softness, body_softness=config.body_softness, waist=waist
     )
@@ -294,7 +300,7 @@ def _shape_evidence(
     legs, arms = np.isin(chart.region, (LEG, FOOT)), in_arm(chart)
     left = chart.side > 0
 
-    def hems(place: np.ndarray, tubes: tuple[np.ndarray, ...], rings: Rings) -> Hems:
+    def hems(place: np.ndarray, tubes: tuple[np.ndarray, ...], rings: Rings, *, strict: bool) -> Hems:
         return Hems.of(
             place,
             chart.turn,
@@ -303,13 +309,16 @@ def _shape_evidence(
             area=area,
             start=rings.start,
             count=len(rings),
+            strict=strict,
         )
 
+    tubes = legs & left, legs & ~left, chart.region == TRUNK
+    along = hems(chart.height, tubes, column, strict=True)
     return ShapeEvidence(
         column,
         arm,
-        hems(chart.height, (legs & left, legs & ~left, chart.region == TRUNK), column),
-        hems(chart.reach, (arms & left, arms & ~left), arm),
+        along.about_shoes(hems(chart.height, tubes, column, strict=False), column.places),
+        hems(chart.reach, (arms & left, arms & ~left), arm, strict=False),
         _HEELED if heels else nats_for_shoes(chart, area),
         (
             roughness(mesh, (chart.region == TRUNK) & (chart.height > 1.0) & (chart.height < 1.3) & (area > 0)),
