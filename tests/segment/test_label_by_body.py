@@ -12,7 +12,7 @@ import pytest
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.core.errors import InputError
-from smplxpp.core.labels import HAIR, LABELS, LOWER, SHOE, SKIN, UPPER
+from smplxpp.core.labels import HAIR, LABELS, LOWER, OUTER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
@@ -198,6 +198,25 @@ def test_a_jacket_ends_at_its_hem_and_not_at_the_waist(body, open_by):
         own = ((y > low) & (y < high) & trunk & part)[mesh.faces].all(axis=1)
         area = mesh.face_areas[own]
         assert area @ (labels.face_labels[own] == label.id) > 0.9 * area.sum(), label.name
+
+
+@pytest.mark.parametrize("half", [0.0, 0.05])
+def test_an_open_jacket_is_told_from_a_closed_one_by_its_lips(body, half):
+    """Without colours every open jacket was a shirt, and a coat's tails were trousers."""
+    params = BodyParams.rest()
+    posed = body.forward(params)
+    mesh = body.mesh(posed.vertices[0])
+    joint = {name: posed.joints[0, k] for k, name in enumerate(body.joint_names)}
+    x, y, z = mesh.vertices.T
+    hem, sleeve = joint["left_hip"][1] - 0.06, np.abs(x) < joint["left_wrist"][0] - 0.02
+    worn = (y > hem) & (y < joint["neck"][1] - 0.03) & sleeve
+    strip = worn & (np.abs(x) < half) & (z > 0)
+    above = np.where(strip, 0.006, np.where(worn, 0.03, np.where(sleeve & (y < hem), 0.01, 0.0)))
+    scan = mesh.with_vertices(mesh.vertices + above[:, None] * mesh.vertex_normals)
+    labels = label_by_body(scan, body, params).face_labels
+    for part, label in ((worn & ~strip, OUTER if half else UPPER), (strip, UPPER)):
+        own = (part & (y > hem + 0.03))[mesh.faces].all(axis=1)
+        assert scan.face_areas[own] @ (labels[own] == label.id) >= 0.9 * scan.face_areas[own].sum(), label.name
 
 
 @pytest.mark.parametrize("hem", [0.0, 0.015])
