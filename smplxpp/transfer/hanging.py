@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
+from scipy.sparse import coo_matrix
+from scipy.spatial import cKDTree
 
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.transfer.anchors import smooth_step
@@ -17,10 +20,15 @@ _LEAST = 0.1
 """The bound above the ramp: a tutu, which stands off the hips, follows the thighs a little (worst ratio there)."""
 _LEGS = 0.03
 """Depth below the hip joints that cloth has to reach, as a share of the body's extent (6 cm): a shirt ends above it."""
-_HALF = 1.6
-"""Cone of a skirt (distance off the legs by height below the waist) of which the legs have at most a half."""
+_HALF = 1.2
+"""Cone of a skirt (distance off the legs by height below the waist) of which the legs have at most a half (worst ratio
+of loose garments on three persons)."""
+_LOWER = 0.2
+"""By how many joints of the spine what hangs has to be beside a lower one than it follows, to follow that in full."""
 _RING = 0.02
 """Height of the bins over which distances are averaged, as a share of the body's extent (4 cm)."""
+_AROUND = 6
+"""Edges (8 cm) over which a bound that a thigh raises falls off."""
 _TOUCHES = 0.01
 """Distance within which cloth touches the skin, as a share of the body's extent (2 cm)."""
 _TOP = 0.1
@@ -51,6 +59,44 @@ def hung_from_top(
     return hangs & (height >= (-high - _TOP * (-high - low))[component]), hangs
 
 
+def beside_trunk(
+    vertices: Float[np.ndarray, "N 3"],
+    weights: Float[np.ndarray, "N J"],
+    copied: Float[np.ndarray, "N J"],
+    near: Float[np.ndarray, " N"],
+    trunk: LimbAxis,
+    shoulders: tuple[int, ...],
+) -> Float64[np.ndarray, "N J"]:
+    """Return weights that divide what follows the trunk as the skin at the same height does, where that is lower.
+
+    A cape that touches the shoulders alone has only them to inpaint from, so that all of it would turn with the chest.
+    What hangs beside the waist turns with the waist; what stands off it, as a tutu does, with what carries it.
+
+    Args:
+        vertices: N places.
+        weights: of all J joints.
+        copied: of the nearest skin.
+        near: 1 where the nearest skin tells the height, 0 where the axis of the trunk does, between which it is mixed.
+        trunk: its axis, with pelvis and spine as its first four joints.
+        shoulders: further joints of the trunk: the collars, and shoulders that the part lies on.
+    """
+    low, high = list(trunk.joints[:3]), [trunk.joints[3], *shoulders]
+    at = trunk.weights[cKDTree(trunk.points).query(vertices)[1]]
+    here = np.clip(near * smooth_step(copied[:, [*trunk.joints, *shoulders]].sum(axis=1), 0.5, 0.9), 0.0, 1.0)
+    at = at + here[:, None] * (copied - at)
+    # The share of pelvis and waist in the trunk's skin there, and what is left to chest and shoulders.
+    below = at[:, low].sum(axis=1)
+    share = below / np.maximum(at[:, [*trunk.joints, *shoulders]].sum(axis=1), 1e-9)
+    total, above = weights[:, low + high].sum(axis=1), weights[:, high] + 1e-9 * (np.arange(len(high)) == 0)
+    out = np.array(weights, dtype=np.float64)
+    out[:, low] = (total * share / np.maximum(below, 1e-9))[:, None] * at[:, low]
+    out[:, high] = (total * (1.0 - share) / above.sum(axis=1))[:, None] * above
+    # Places along the spine, of which only lower ones are taken.
+    place = np.array([0.0, 1.0, 2.0, *(3.0 for _ in high)])
+    lower = (weights[:, low + high] - out[:, low + high]) @ place
+    return weights + smooth_step(lower, 0.0, _LOWER)[:, None] * (out - weights)
+
+
 def leg_bound(
     mesh: TriangleMesh,
     component: Int[np.ndarray, " N"],
@@ -67,9 +113,9 @@ def leg_bound(
     hip joints along the legs, and r the mean distance of the cloth at that height by that height (the tangent of half
     the cone's angle; above u = 0.03 E its value there), the bound is
 
-        1 - hung (1 - ramp(u) / (1 + r / 1.6)) ,   ramp from 0.1 at u = -0.05 E to 1 at 0.1 E
+        1 - hung (1 - ramp(u) / (1 + r / 1.2)) ,   ramp from 0.1 at u = -0.05 E to 1 at 0.1 E
 
-    where `hung` is 1 off the skin (from 0.01 E to 0.025 E) where r is above `cone`, no ring goes around one limb alone
+    where `hung` is 1 off the skin (from 0.005 E to 0.015 E) where r is above `cone`, no ring goes around one limb alone
     and, in a component with trouser legs, below the crotch. A shirt ends before there are legs below it; its r is 0.
 
     Args:
@@ -90,9 +136,75 @@ def leg_bound(
         rows = component == k
         wide[rows] = _mean_at_depth(depth[rows], off[rows], (free * known)[rows])
     r = wide / (np.maximum(depth, _LEGS) - _RAMP[0])
-    hung = free * smooth_step(distance / size, 0.01, 0.025) * smooth_step(r, *cone)
+    hung = free * smooth_step(distance / size, 0.005, 0.015) * smooth_step(r, *cone)
     ramp = _LEAST + (1.0 - _LEAST) * smooth_step(depth, *_RAMP)
     return 1.0 - hung * (1.0 - ramp / (1.0 + r / _HALF))
+
+
+def lifted_by_thighs(
+    mesh: TriangleMesh,
+    weights: Float[np.ndarray, "N J"],
+    bound: Float[np.ndarray, " N"],
+    source: TriangleMesh,
+    source_weights: Float[np.ndarray, "V J"],
+    axes: list[LimbAxis],
+) -> Float64[np.ndarray, " N"]:
+    """Return the bound, raised where thighs that rise would come through what it holds back.
+
+    Both legs, and each alone, are turned forwards by 90 degrees about the hip joints, as in a chair and on a stair.
+    Where a bounded vertex is then within the body, its bound is the least of four steps towards its own weight that
+    brings it out, the whole of it where none does; along the surface that falls off over a few edges.
+
+    Args:
+        mesh: the part, N vertices.
+        weights: of all J joints, before they are bounded.
+        bound: of `leg_bound`.
+        source: the body.
+        source_weights: of its vertices.
+        axes: of `limb_axes`.
+    """
+    legs = [list(axis.joints) for axis in axes[:2]]
+    own = np.stack([weights[:, joints].sum(axis=1) for joints in legs], axis=1)
+    total = own.sum(axis=1)
+    held = np.flatnonzero(total > bound + 1e-3)
+    if not len(held):
+        return bound
+    # The turn about the line from hip to hip.
+    side, up = axes[0].points[0] - axes[1].points[0], axes[-1].points[-1] - axes[-1].points[0]
+    side /= np.linalg.norm(side)
+    front = np.cross(side, up)
+    front /= np.linalg.norm(front)
+    up = np.cross(front, side)
+    turn = np.outer(side, side) + np.outer(up, front) - np.outer(front, up)
+
+    def raised(points: np.ndarray, shares: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
+        moved = points.copy()
+        for k in chosen:
+            offset = points - axes[k].points[0]
+            moved += shares[:, k : k + 1] * (offset @ turn.T - offset)
+        return np.ascontiguousarray(moved)
+
+    # Of the body its lower half alone, which is a quarter of the faces.
+    lower = source_weights[:, [*legs[0], *legs[1], *axes[-1].joints[:3]]].sum(axis=1) > 0.5
+    body, used = source.submesh(lower[source.faces].all(axis=1))
+    of_body = np.stack([source_weights[used][:, joints].sum(axis=1) for joints in legs], axis=1)
+    step = np.zeros(mesh.vertex_count)
+    levels = np.linspace(0.0, 1.0, 5)
+    for chosen in ((0, 1), (0,), (1,)):
+        shares = [(bound[held] + t * (total[held] - bound[held])) / total[held] for t in levels]
+        at = np.concatenate([raised(mesh.vertices[held], own[held] * s[:, None], chosen) for s in shares])
+        winding = igl.fast_winding_number(raised(body.vertices, of_body, chosen), body.faces, at)
+        outside = winding.reshape(len(levels), -1) < 0.5
+        least = np.where(outside.any(axis=0), levels[outside.argmax(axis=0)], 1.0)
+        step[held] = np.maximum(step[held], least)
+    # Neighbours follow, the less the farther.
+    edges = mesh.edges
+    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(mesh.vertex_count,) * 2).tocsr()
+    graph = graph + graph.T
+    degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)
+    for _ in range(_AROUND):
+        step = np.maximum(step, graph @ step / degree)
+    return bound + step * np.maximum(total - bound, 0.0)
 
 
 def bounded_legs(

@@ -38,7 +38,7 @@ from smplxpp.transfer.correspond import (
 )
 from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
 from smplxpp.transfer.extend import extend_weights, sample_weights
-from smplxpp.transfer.hanging import bounded_legs, hung_from_top, leg_bound
+from smplxpp.transfer.hanging import beside_trunk, bounded_legs, hung_from_top, leg_bound, lifted_by_thighs
 from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
 from smplxpp.transfer.rigid import rigid_weights
 from smplxpp.transfer.unfollowed import PassedHand, passed_hands, unfollowed_arms
@@ -47,6 +47,9 @@ _PUBLISHED_FAR = 0.4
 """By how much of itself the published method's share grows where anchor weights replace those of the body nearby: the
 free end of a sari has the shoulder alone as an anchor (worst ratio of `benchmarks transfer_garments` and the embedded
 person's skirt)."""
+_BY_HEIGHT = (0.025, 0.06)
+"""Distances off the skin, in shares of the body's extent, between which height along the trunk replaces the nearest
+skin: a string of beads lies on it, a cape stands off it (worst ratio of loose garments on three persons)."""
 _CLOSED = 0.45
 """Share of a component that faces away from the skin from which on it is a closed tube; of an open scarf it is 0.38."""
 _LEAST_SUM = 1e-3
@@ -219,14 +222,14 @@ def _transferred(
     if whole:
         check_placement(source, target, found.distance)
     # Find the rings that go around one limb, and leave out arms that are not in the sleeves.
-    axes, limbs = [], None
+    axes, limbs, unfollowed = [], None, None
     if config.confident is not None and found.distance.max() > config.around[0] * size:
         axes = limb_axes(source, weights, size, config)
         if axes:
             limbs = worn.enclosure or enclosed_by_one(target, axes, joint_count)
             unfollowed = unfollowed_arms(target, axes, limbs, size, config, joint_count)
-            if whole and unfollowed.any():
-                source, weights = restrict_source(source, weights, ~unfollowed)
+            if whole and unfollowed.joints.any():
+                source, weights = restrict_source(source, weights, ~unfollowed.joints)
                 found = closest_points(source, target)
     # Cloth of the trunk that passes a hand, as the corner of a jacket does over one in a pocket, is none of that arm's.
     passing: list[PassedHand] = []
@@ -277,9 +280,11 @@ def _transferred(
         # Mix in the published method's weights. Their share rises from 1 % to 2.5 % of the source's extent off the
         # skin.
         answer = _published(replace(at, confident=matched), source, weights, size, config)
-        share = config.published * smooth_step(found.distance, *(k * size for k in (0.01, 0.025)))
+        off = smooth_step(found.distance, *(k * size for k in (0.01, 0.025)))
+        share = config.published * off
         share *= 1.0 + _PUBLISHED_FAR * smooth_step(found.distance, *(k * size for k in config.far))
-        share = np.minimum(share, 1.0)
+        # On the skin what faces away from it, as the folds of a hijab beside the neck, has no other place to follow.
+        share = np.clip(share, (1.0 - off) * turned_away(found.angle) * ~matched * whole, 1.0)
         share *= 1.0 - far_off
         for passed in passing:
             answer = passed.without_arm(answer)
@@ -291,11 +296,21 @@ def _transferred(
             share[total <= _LEAST_SUM] = 0.0
             answer /= np.maximum(total, _LEAST_SUM)[:, None]
         dense += share[:, None] * (answer - dense)
+    if whole and unfollowed is not None and config.hanging is not None:
+        # Divide what follows the trunk by height. Empty sleeves hang from their armholes.
+        off = smooth_step(found.distance, *(k * size for k in (0.01, 0.025))) * (1.0 - far_off)
+        off[hangs | unfollowed.tubes] = 0.0
+        beside = 1.0 - smooth_step(found.distance, *(k * size for k in _BY_HEIGHT))
+        collars = tuple(config.joint_index(f"{side}_collar", joint_count) for side in ("left", "right"))
+        copied = found.interpolate(source, weights)
+        lower = beside_trunk(target.vertices, dense, copied, beside, axes[-1], collars + unfollowed.shoulders)
+        dense += off[:, None] * (lower - dense)
     if whole and limbs is not None and config.hanging is not None:
         # Leave the pelvis its share of cloth that hangs free before both legs.
         arms = weights[:, [joint for axis in axes[2:4] for joint in axis.joints]].sum(axis=1, keepdims=True)
         off = np.where(found.interpolate(source, arms)[:, 0] > 0.5, np.inf, found.distance)
         bound = leg_bound(target, component, off, axes, limbs, size=size, cone=config.hanging)
+        bound = lifted_by_thighs(target, dense, bound, source, weights, axes)
         dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
     return _Weighted(dense, matched, found.distance, found.angle, policies)
 

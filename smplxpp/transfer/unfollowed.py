@@ -63,29 +63,46 @@ def empty_tubes(mesh: TriangleMesh, axes: list[LimbAxis], size: float) -> Bool[n
     return empty
 
 
+@dataclass(frozen=True, eq=False)
+class Unfollowed:
+    """Arms in no sleeve, which a part does not follow although they are near.
+
+    Attributes:
+        joints: of these arms.
+        tubes: vertices of empty sleeves.
+        shoulders: indices of the shoulders that the part lies on, going around trunk and arm together.
+    """
+
+    joints: Bool[np.ndarray, " J"]
+    tubes: Bool[np.ndarray, " N"]
+    shoulders: tuple[int, ...]
+
+
 def unfollowed_arms(
     mesh: TriangleMesh, axes: list[LimbAxis], found: Enclosure, size: float, config: TransferConfig, joint_count: int
-) -> Bool[np.ndarray, " J"]:
-    """Return the joints (J,) of arms that the part does not follow although they are near: arms in no sleeve.
+) -> Unfollowed:
+    """Find the arms that the part does not follow although they are near: arms in no sleeve.
 
     Where the part has an empty sleeve, these are the whole arms. Where it goes around trunk and arm together, as a
     poncho does, the upper arm carries it, and forearm and hand move under it.
     """
     names = config.joint_names or JOINT_NAMES.get(joint_count, ())
-    out = np.zeros(joint_count, dtype=bool)
+    out, tubes = np.zeros(joint_count, dtype=bool), np.zeros(mesh.vertex_count, dtype=bool)
     # The arms are the third and the fourth axis; fingers belong to their side's arm.
     bare = [(k, side) for k, side in ((2, "left_"), (3, "right_")) if not (found.limb == k).any()]
     if not bare:
-        return out
+        return Unfollowed(out, tubes, ())
+    tubes, covered = empty_tubes(mesh, axes, size), []
     worn = ["hip", "knee", "ankle", "foot", "collar", "eye"]
-    if empty_tubes(mesh, axes, size).any():
+    if tubes.any():
         hidden = [side for _, side in bare]
     else:
-        covered = _covered(mesh, axes[-1], [axes[k] for k, _ in bare])
-        hidden, worn = [side for (_, side), own in zip(bare, covered, strict=True) if own], [*worn, "shoulder"]
+        over = _covered(mesh, axes[-1], [axes[k] for k, _ in bare])
+        hidden, worn = [side for (_, side), own in zip(bare, over, strict=True) if own], [*worn, "shoulder"]
+        covered = [names.index(f"{side}shoulder") for side in hidden]
     for k, name in enumerate(names):
         out[k] = name.startswith(tuple(hidden)) and not any(word in name for word in worn)
-    return out
+    return Unfollowed(out, tubes, tuple(covered))
 
 
 @dataclass(frozen=True, eq=False)
