@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.transfer.anchors import smooth_step
+from smplxpp.transfer.checks import extent
 from smplxpp.transfer.enclosed import Enclosure, LimbAxis
 
 _RAMP = (-0.05, 0.1)
@@ -27,6 +28,8 @@ _LOWER = 0.2
 """By how many joints of the spine what hangs has to be beside a lower one than it follows, to follow that in full."""
 _RING = 0.02
 """Height of the bins over which distances are averaged, as a share of the body's extent (4 cm)."""
+_LIFTED = 0.08
+"""Depth below the hip joints that cloth has to reach for thighs to lift it, as a share of the body's extent (15 cm)."""
 _AROUND = 6
 """Edges (8 cm) over which a bound that a thigh raises falls off."""
 _TOUCHES = 0.01
@@ -145,6 +148,7 @@ def lifted_by_thighs(
     mesh: TriangleMesh,
     weights: Float[np.ndarray, "N J"],
     bound: Float[np.ndarray, " N"],
+    component: Int[np.ndarray, " N"],
     source: TriangleMesh,
     source_weights: Float[np.ndarray, "V J"],
     axes: list[LimbAxis],
@@ -159,6 +163,7 @@ def lifted_by_thighs(
         mesh: the part, N vertices.
         weights: of all J joints, before they are bounded.
         bound: of `leg_bound`.
+        component: of each vertex.
         source: the body.
         source_weights: of its vertices.
         axes: of `limb_axes`.
@@ -166,7 +171,10 @@ def lifted_by_thighs(
     legs = [list(axis.joints) for axis in axes[:2]]
     own = np.stack([weights[:, joints].sum(axis=1) for joints in legs], axis=1)
     total = own.sum(axis=1)
-    held = np.flatnonzero(total > bound + 1e-3)
+    # What ends above the middle of the thighs is no skirt that they lift.
+    deepest = np.full(component.max() + 1, -np.inf)
+    np.maximum.at(deepest, component, _depth(mesh.vertices, axes[:2]))
+    held = np.flatnonzero((total > bound + 1e-3) & (deepest > _LIFTED * extent(source))[component])
     if not len(held):
         return bound
     # The turn about the line from hip to hip.

@@ -283,8 +283,11 @@ def _transferred(
         off = smooth_step(found.distance, *(k * size for k in (0.01, 0.025)))
         share = config.published * off
         share *= 1.0 + _PUBLISHED_FAR * smooth_step(found.distance, *(k * size for k in config.far))
-        # On the skin what faces away from it, as the folds of a hijab beside the neck, has no other place to follow.
-        share = np.clip(share, (1.0 - off) * turned_away(found.angle) * ~matched * whole, 1.0)
+        # On the skin what faces away from it, as the folds of a hijab beside the neck, has no other place to follow;
+        # hair has, whose strands face all ways.
+        if not (allowed is not None and axes and allowed[axes[-1].joints[-1]]):
+            share = np.clip(share, (1.0 - off) * turned_away(found.angle) * ~matched * whole, 1.0)
+        share = np.minimum(share, 1.0)
         share *= 1.0 - far_off
         for passed in passing:
             answer = passed.without_arm(answer)
@@ -310,7 +313,7 @@ def _transferred(
         arms = weights[:, [joint for axis in axes[2:4] for joint in axis.joints]].sum(axis=1, keepdims=True)
         off = np.where(found.interpolate(source, arms)[:, 0] > 0.5, np.inf, found.distance)
         bound = leg_bound(target, component, off, axes, limbs, size=size, cone=config.hanging)
-        bound = lifted_by_thighs(target, dense, bound, source, weights, axes)
+        bound = lifted_by_thighs(target, dense, bound, component, source, weights, axes)
         dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
     return _Weighted(dense, matched, found.distance, found.angle, policies)
 
