@@ -63,8 +63,9 @@ assert all(path.is_dir() for path in SHORTEST)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order files: the longest first, then those of other rooms; `--no-loadscope-reorder` hands them out so."""
     place = {ROOT / name: k for k, name in enumerate(LONGEST)}
-    rest = len(place)
-    items.sort(key=lambda item: place.get(item.path, rest + any(room in item.path.parents for room in SHORTEST)))
+    for path in {item.path for item in items} - place.keys():  # once a file: every process orders thousands of tests
+        place[path] = len(LONGEST) + any(room in path.parents for room in SHORTEST)
+    items.sort(key=lambda item: place[item.path])
 
 
 def pytest_collection_finish() -> None:

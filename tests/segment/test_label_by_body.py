@@ -11,6 +11,7 @@ import pytest
 
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.clean import simplify
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import HAIR, LABELS, LOWER, OUTER, SHOE, SKIN, UPPER
 from smplxpp.core.mesh import TriangleMesh
@@ -32,7 +33,7 @@ def body() -> BodyModel:
 
 @pytest.fixture(scope="module")
 def scanned(body) -> tuple[TriangleMesh, np.ndarray, np.ndarray, BodyParams]:
-    """The fixture's scan, its colours, true labels of its faces, and the parameters of its body."""
+    """The fixture's scan of a quarter of its faces, its colours, true labels of its faces, and its body's parameters."""
     file = read_mesh(PERSON / "scans/scan_000000.ply")
     labels = read_labels(
         PERSON / "scans/scan_000000_labels.npz",
@@ -40,9 +41,11 @@ def scanned(body) -> tuple[TriangleMesh, np.ndarray, np.ndarray, BodyParams]:
         face_count=file.mesh.face_count,
         label_set="capture",
     )
-    corner = labels[file.mesh.faces]
+    coarse = simplify(file.mesh, 20_000)
+    corner = labels[coarse.source_vertex][coarse.mesh.faces]
     truth = np.where(corner[:, 1] == corner[:, 2], corner[:, 1], corner[:, 0])
-    return file.mesh, file.vertex_colors, truth, load_params(PERSON / "params/params.npz", body=body).frame(0)
+    params = load_params(PERSON / "params/params.npz", body=body).frame(0)
+    return coarse.mesh, file.vertex_colors[coarse.source_vertex], truth, params
 
 
 def accuracy(mesh: TriangleMesh, labels: np.ndarray, truth: np.ndarray) -> float:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from scipy.signal import resample_poly
 
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.paths import read_bytes
@@ -57,6 +56,9 @@ class Sound:
         """
         if rate == self.rate or not len(self.samples):
             return Sound(self.samples, rate)
+        # Imported here, because it takes half a second, which a command pays that reads no sound.
+        from scipy.signal import resample_poly
+
         ratio = _rounded(Fraction(rate, self.rate))
         samples = resample_poly(self.samples, ratio.numerator, ratio.denominator)
         # The last samples, which the rounding may add or lose.

@@ -10,6 +10,7 @@ import pytest
 
 from smplxpp.body import load_body, load_params
 from smplxpp.body.named_poses import rare_poses
+from smplxpp.clean import Simplified, simplify
 from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.register.kinematics import BodyState
@@ -38,6 +39,8 @@ QUICK = LocateConfig(
     dress_steps=5,
     finish_steps=5,
 )
+# For what no number of points and starts decides.
+LEAST = replace(QUICK, directions=4, starts=3, coarse_points=200, fine_points=400, dress_steps=3, finish_steps=3)
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +49,14 @@ def body():
 
 
 @pytest.fixture(scope="module")
-def scan() -> TriangleMesh:
-    return read_mesh(PERSON / "scans" / "scan_000000.ply").mesh
+def coarse() -> Simplified:
+    """The fixture's scan of a quarter of its faces, which draws the same points in less time."""
+    return simplify(read_mesh(PERSON / "scans" / "scan_000000.ply").mesh, 20_000)
+
+
+@pytest.fixture(scope="module")
+def scan(coarse) -> TriangleMesh:
+    return coarse.mesh
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +92,12 @@ def test_she_is_found_as_well_after_she_has_turned_and_moved_and_her_faces_point
     assert _error(body, found, truth @ turn.T + move) < 0.015
 
 
-def test_the_same_seed_finds_the_same_body(body, scan, located):
-    again = locate_body(body, scan, config=QUICK)
-    assert np.array_equal(again.params.full_pose, located.params.full_pose)
-    assert np.array_equal(again.params.betas, located.params.betas)
+def test_the_same_seed_finds_the_same_body(body, scan):
+    config = replace(LEAST, starts=1, limbs_tried=1, candidates=1)
+    one, again = (locate_body(body, scan, config=config).params for _ in range(2))
+    assert np.array_equal(again.full_pose, one.full_pose) and np.array_equal(again.betas, one.betas)
+    other = locate_body(body, scan, config=replace(config, seed=1)).params
+    assert not np.array_equal(other.full_pose, one.full_pose)
 
 
 def test_a_heavier_prior_of_poses_turns_joints_less(body, scan, located):
@@ -131,7 +142,7 @@ def bent(body) -> tuple[TriangleMesh, BodyParams]:
 
 def test_a_body_that_no_standing_pose_explains_is_found_among_rare_poses(body, bent):
     mesh, params = bent
-    found = locate_body(body, mesh, config=QUICK)
+    found = locate_body(body, mesh, config=LEAST)
     truth, posed = body.forward(params), body.forward(found.params)
     assert found.candidates[0].pose in dict(rare_poses(body.joint_count))
     assert np.linalg.norm(posed.vertices[0] - truth.vertices[0], axis=1).mean() < 0.025
@@ -153,8 +164,8 @@ def test_a_landmark_that_no_body_has_is_refused(body, scan):
         locate_body(body, scan, landmarks={"third_elbow": np.zeros(3)}, config=QUICK)
 
 
-def test_labels_of_a_labeller_are_asked_for_until_they_stay(body, scan, truth):
-    labels = np.load(PERSON / "scans" / "scan_000000_labels.npz")["label"].astype(int) - 1
+def test_labels_of_a_labeller_are_asked_for_until_they_stay(body, coarse, scan, truth):
+    labels = np.load(PERSON / "scans" / "scan_000000_labels.npz")["label"].astype(int)[coarse.source_vertex] - 1
     asked = []
 
     def labeller(params):
