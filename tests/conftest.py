@@ -110,11 +110,12 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 @pytest.fixture(scope="session")
 def person_run(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
-    """The embedded person's whole build by the command line."""
+    """The embedded person's whole build by the command line, with the smallest texture."""
 
     def build(run: Path) -> None:
         from pipelines.cli import main
 
-        assert main(["build", str(run), "--capture", str(ROOT / "data" / "fixtures" / "person"), "--json"]) == 0
+        capture = str(ROOT / "data" / "fixtures" / "person")
+        assert main(["build", str(run), "--capture", capture, "--texture-size", "1024", "--json"]) == 0
 
     return made_once("person", build)

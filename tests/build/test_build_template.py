@@ -118,7 +118,7 @@ def test_the_capture_comes_back_with_the_parameters_that_were_used(small, tmp_pa
     # The scan's frame is exact, because clothes that a wrong pose drives into the body take most of a build.
     exact, noisy = load_params(PARAMS), load_params(PERSON / "params" / "params_noisy.npz")
     given = replace(exact, body_pose=np.concatenate([exact.body_pose[:1], noisy.body_pose[1:]]))
-    config = BuildConfig(budgets=FEW, samples=2000, label_source="body")
+    config = BuildConfig(budgets=FEW, samples=2000, label_source="body", texture_size=0)
     result = build_template(capture=open_capture(root), params=given, config=config)
     found = result.capture.params(3)
     assert np.array_equal(found.body_pose[0], given.body_pose[3])

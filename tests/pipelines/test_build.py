@@ -250,7 +250,7 @@ def test_the_template_poses_onto_the_scan(person_run):
 
 def test_a_second_call_runs_nothing_and_keeps_the_report(person_run, capsys):
     before = {p: p.stat().st_mtime_ns for p in person_run.rglob("*") if p.is_file() and p.name != ".lock"}
-    assert main(["build", str(person_run), "--capture", str(FIXTURE), "--json"]) == 0
+    assert main(["build", str(person_run), "--capture", str(FIXTURE), "--texture-size", "1024", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["failed"] == 0
     after = {p: p.stat().st_mtime_ns for p in before}
