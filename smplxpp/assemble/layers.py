@@ -29,7 +29,7 @@ class Obstacle:
 
     def __init__(self, name: str, mesh: TriangleMesh, *, solid: bool, max_depth: float) -> None:
         self.name = name
-        self._solid, self._max_depth = solid, max_depth
+        self.solid, self._max_depth = solid, max_depth
         self._field = SignedDistanceField(mesh, solid=solid)
         used = mesh.vertices[np.unique(mesh.faces)]
         self._low, self._high = used.min(axis=0), used.max(axis=0)
@@ -47,7 +47,7 @@ class Obstacle:
         near = self._box_distance(points) <= self._max_depth
         found = self._field.query(points[near])
         distance, gradient = np.full(len(points), np.inf), np.zeros_like(points)
-        if not self._solid:
+        if not self.solid:
             facing = np.einsum("ij,ij->i", found.normal, normals[near]) > 0.5
             meaningful = facing & ~found.on_border & (found.distance > -self._max_depth)
             found.distance[~meaningful] = np.inf
@@ -63,7 +63,7 @@ class Obstacle:
         bound = self._box_distance(points)
         near = bound <= self._max_depth
         bound[near] = self._field.query(points[near]).distance
-        return bound if self._solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
+        return bound if self.solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
 
     def _box_distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance to the bounding box, metres, 0 inside, because far points need no search."""
@@ -81,7 +81,7 @@ class Obstacle:
         It is `wanted`, but outside of a garment at most the distance that the point has already. Parts cut from one
         scan share a seam; a gap there would tear the cloth.
         """
-        if self._solid:
+        if self.solid:
             return np.full(len(points), wanted)
         start = self.distance(points, normals)[0]
         outside = np.clip(np.where(np.isfinite(start), start, 0.0), 0.0, wanted)

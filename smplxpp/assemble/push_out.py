@@ -153,35 +153,60 @@ class _Wall:
     """
 
     def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, clearance: float) -> None:
-        self._obstacle, self._mesh = obstacle, mesh
-        self._centers = face_centers(mesh, mesh.vertices)
-        self._vertex_start, self._center_start = (obstacle.lower_bound(x) for x in (mesh.vertices, self._centers))
-        self._vertex_clearance = obstacle.clearance(mesh.vertices, mesh.vertex_normals, clearance)
+        self._mesh, self._centers = mesh, face_centers(mesh, mesh.vertices)
         # Face centres keep half the clearance, because a chord runs below its arc.
-        self._center_clearance = obstacle.clearance(self._centers, mesh.face_normals, 0.5 * clearance)
+        self._of_vertices = _Distances(obstacle, mesh.vertices, mesh.vertex_normals, clearance)
+        self._of_centers = _Distances(obstacle, self._centers, mesh.face_normals, 0.5 * clearance)
 
     def vertex_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the vertices that are too near after a displacement d (N, 3), and their (n, 3) pushes."""
         normals = (facing or self._mesh).vertex_normals
-        start, clearance = self._vertex_start, self._vertex_clearance
-        return self._push(self._mesh.vertices, d, normals, start, clearance, facing is None)
+        return self._push(self._mesh.vertices, d, normals, self._of_vertices, facing is None)
 
     def center_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the faces whose centres are too near after a displacement d (N, 3), and their (m, 3) pushes."""
         normals, moved = (facing or self._mesh).face_normals, face_centers(self._mesh, d)
-        return self._push(self._centers, moved, normals, self._center_start, self._center_clearance, facing is None)
+        return self._push(self._centers, moved, normals, self._of_centers, facing is None)
 
-    def _push(self, origin, moved, normals, start, clearance, facing_only):
+    def _push(self, origin, moved, normals, distances, facing_only):
         # A signed distance changes by at most the length of the displacement, so that most points need no query.
-        ask = np.flatnonzero(start - np.sqrt(np.einsum("ij,ij->i", moved, moved)) < clearance)
-        distance, gradient = self._obstacle.distance(origin[ask] + moved[ask], normals[ask])
-        missing = clearance[ask] - distance
+        ask = np.flatnonzero(distances.start - np.sqrt(np.einsum("ij,ij->i", moved, moved)) < distances.clearance)
+        distance, gradient = distances.after(ask, origin[ask] + moved[ask], normals[ask])
+        missing = distances.clearance[ask] - distance
         # A point outside may miss 10 um of its clearance. A push must not lead to the far side of a limb: its direction
         # and the point's normal have a cosine above -0.2.
         near = (missing > 1e-5) | (distance < -TOUCHING)
         if facing_only:
             near &= np.einsum("ij,ij->i", gradient, normals[ask]) > -0.2
         return ask[near], missing[near, None] * gradient[near]
+
+
+class _Distances:
+    """Signed distances of the moving points of a layer, asked again only of points that have moved or turned.
+
+    A projection moves few of the points that are near an obstacle, and there are hundreds of projections.
+
+    Attributes:
+        start: lower bounds of the distances at the start, metres.
+        clearance: distances to keep, metres.
+    """
+
+    def __init__(self, obstacle: Obstacle, points: np.ndarray, normals: np.ndarray, clearance: float) -> None:
+        self._obstacle = obstacle
+        self.start, self.clearance = obstacle.lower_bound(points), obstacle.clearance(points, normals, clearance)
+        # Place and normal of each point when it was last asked of, NaN before, which equals nothing.
+        self._asked = np.full((len(points), 6), np.nan)
+        self._distance, self._gradient = np.zeros(len(points)), np.zeros((len(points), 3))
+
+    def after(self, rows: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distances (n,) and gradients (n, 3) of the points of some rows at new places."""
+        # Only a garment asks which way a point faces.
+        now = np.concatenate([points, np.zeros_like(normals) if self._obstacle.solid else normals], axis=1)
+        changed = (self._asked[rows] != now).any(axis=1)
+        new = rows[changed]
+        self._distance[new], self._gradient[new] = self._obstacle.distance(points[changed], normals[changed])
+        self._asked[new] = now[changed]
+        return self._distance[rows], self._gradient[rows]
 
 
 def _project(
