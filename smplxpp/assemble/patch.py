@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
 
 from smplxpp.core import InputError, TriangleMesh, row_lengths
+from smplxpp.core.mesh import cross_rows
 from smplxpp.core.topology import edge_groups, half_edges
 
 MAX_LOOP = 400
@@ -98,7 +99,7 @@ def _least_area(rim: Float[np.ndarray, "L 3"], taken: set[tuple[int, int]]) -> l
             if (i, j) in taken and gap != count - 1:
                 continue
             k = np.arange(i + 1, j)
-            area = 0.5 * row_lengths(np.cross(rim[k] - rim[i], rim[j] - rim[i]))
+            area = 0.5 * row_lengths(cross_rows(rim[k] - rim[i], rim[j] - rim[i]))
             total = cost[i, k] + cost[k, j] + area
             best = int(np.argmin(total))
             cost[i, j], middle[i, j] = total[best], k[best]

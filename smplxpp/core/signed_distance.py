@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
 from smplxpp.core.errors import InputError
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core.mesh import TriangleMesh, cross_rows, normalize_rows
 
 _SOLIDS: dict[bytes, tuple[igl.FastWindingNumberBVH, np.ndarray]] = {}
 """The solids asked of last with their outer faces, because garments, layers and checks ask one after the other of the
@@ -161,8 +161,8 @@ def barycentric_coordinates(
     """Return the barycentric coordinates of points in the planes of triangles with an area; rows sum to 1."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     p = points - triangles[:, 0]
-    normal = np.cross(a, b)
+    normal = cross_rows(a, b)
     squared = np.einsum("ij,ij->i", normal, normal)
-    v = np.einsum("ij,ij->i", np.cross(p, b), normal) / squared
-    w = np.einsum("ij,ij->i", np.cross(a, p), normal) / squared
+    v = np.einsum("ij,ij->i", cross_rows(p, b), normal) / squared
+    w = np.einsum("ij,ij->i", cross_rows(a, p), normal) / squared
     return np.stack([1.0 - v - w, v, w], axis=1)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
 from smplxpp.core import GeometryWarning, InputError, TriangleMesh, normalize_rows, row_lengths
+from smplxpp.core.mesh import cross_rows
 from smplxpp.core.topology import component_labels
 from smplxpp.transfer.config import TransferConfig
 
@@ -234,7 +235,7 @@ def settle_unmatched(
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the angles between unit vectors, radians."""
     # arctan2 keeps its precision at small angles, where arccos of a rounded cosine does not.
-    return np.arctan2(row_lengths(np.cross(a, b)), np.einsum("ij,ij->i", a, b))
+    return np.arctan2(row_lengths(cross_rows(a, b)), np.einsum("ij,ij->i", a, b))
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

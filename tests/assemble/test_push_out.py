@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from smplxpp.assemble import Obstacle, PushConfig, flipped_faces, measure_penetration, push_out, stand_off
 from smplxpp.core import InputError, TriangleMesh
+
+module = sys.modules[push_out.__module__]  # the package has a function of its name
 
 
 def ball(radius: float, subdivisions: int = 4) -> TriangleMesh:
@@ -43,6 +47,28 @@ def test_a_dent_is_pushed_out_to_the_clearance():
     assert np.abs(np.diff(way[moved.edges], axis=1)).max() < 0.5 * way.max()
     # Away from the dent nothing moves.
     assert way[outer.vertices[:, 0] < 0].max() < 1e-6
+
+
+@pytest.mark.parametrize("is_solid", [True, False])
+def test_points_that_stay_are_not_asked_again_and_no_bit_changes(is_solid, monkeypatch):
+    """Hundreds of projections asked of the same distances again and again."""
+    asked = []
+
+    class Counted(Obstacle):
+        def distance(self, points, normals):
+            asked.append(len(points))
+            return super().distance(points, normals)
+
+    def pushed() -> tuple[np.ndarray, int]:
+        asked.clear()
+        obstacle = Counted("inner", ball(0.1), solid=is_solid, max_depth=0.03)
+        return push_out(dented(depth=0.014), [obstacle], PushConfig(clearance=2e-3)), sum(asked)
+
+    few, fewer = pushed()
+    monkeypatch.setattr(module._Distances, "after", lambda self, _, *moved: self._obstacle.distance(*moved))
+    always, all_of_them = pushed()
+    assert np.array_equal(few, always)
+    assert fewer < all_of_them if is_solid else fewer <= all_of_them  # a garment asks where a point faces, too
 
 
 def test_clear_layers_are_left_alone():

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from smplxpp.core import InputError, TriangleMesh, concatenate_meshes
+from smplxpp.core.mesh import cross_rows
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +24,15 @@ def sphere(oracle) -> TriangleMesh:
 def test_areas_and_normals_equal_trimesh(sphere, oracle):
     np.testing.assert_allclose(sphere.face_areas, oracle.area_faces, rtol=1e-12)
     np.testing.assert_allclose(sphere.face_normals, oracle.face_normals, atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2, 7, 1000])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_cross_products_of_rows_are_numpys_bit_for_bit(rows, dtype):
+    a, b = np.random.default_rng(rows).normal(size=(2, rows, 3)).astype(dtype)
+    for other in (b, np.arange(3, dtype=dtype)):
+        found, truth = cross_rows(a, other), np.cross(a, other)
+        assert found.dtype == truth.dtype and np.array_equal(found, truth)
 
 
 def test_vertex_normals_of_a_sphere_are_radial(sphere):
