@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -22,12 +23,25 @@ _VIEWS = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [-0.5, 0.0, 1.0], [0.0, 0.4
 _HALF_EXTENT, _PIXELS = 0.16, 400  # of a view, metres; a pixel is 0.8 mm
 
 
+# Results by template, because five steps of a training ask for the same, which takes a third of a second.
+_INSIDE_OF: WeakKeyDictionary[Template, Bool[np.ndarray, " V"]] = WeakKeyDictionary()
+
+
 def inside_of_mouth(template: Template) -> Bool[np.ndarray, " V"]:
     """Mark the vertices inside the mouth: teeth and tongue by name, and what views from ahead see of the head if its
     jaw hangs down and do not see if it does not.
 
-    A body without joints "head" and "jaw", and one whose jaw uncovers nothing, has none that is not named.
+    A body without joints "head" and "jaw", and one whose jaw uncovers nothing, has none that is not named. The array
+    is read-only.
     """
+    if template not in _INSIDE_OF:
+        inside = _inside_of_mouth(template)
+        inside.flags.writeable = False
+        _INSIDE_OF[template] = inside
+    return _INSIDE_OF[template]
+
+
+def _inside_of_mouth(template: Template) -> Bool[np.ndarray, " V"]:
     mouth_radius = 0.04  # metres about its middle
     body, inside = template.body, np.zeros(template.vertex_count, dtype=bool)
     named = [k for k, name in enumerate(body.part_label_names) if any(word in name for word in _INSIDE)]

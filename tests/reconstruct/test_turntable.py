@@ -62,7 +62,7 @@ def test_a_frame_of_another_pose_is_left_out_and_named(turn, views):
     person = posed_person(BODY, turn.params)
     moved = views[3]
     wrong = replace(moved, opacity=np.roll(moved.opacity, 30, axis=1))
-    found = reconstruct_turntable([*views[:3], wrong, *views[4:]], person, COARSE)
+    found = reconstruct_turntable([*views[:3], wrong, *views[4:]], person, ReconstructConfig(cell=0.03))
     assert list(found.numbers["left_out"]) == ["3"] and "3" not in found.numbers["views"]
     assert any("frame 3 left out" in note for note in found.notes)
 

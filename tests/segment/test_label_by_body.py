@@ -33,7 +33,7 @@ def body() -> BodyModel:
 
 @pytest.fixture(scope="module")
 def scanned(body) -> tuple[TriangleMesh, np.ndarray, np.ndarray, BodyParams]:
-    """The fixture's scan of a quarter of its faces, its colours, true labels of its faces, and its body's parameters."""
+    """The fixture's scan with a quarter of its faces, its colours, true labels of faces, and its body's parameters."""
     file = read_mesh(PERSON / "scans/scan_000000.ply")
     labels = read_labels(
         PERSON / "scans/scan_000000_labels.npz",
