@@ -12,6 +12,7 @@ import re
 import runpy
 import subprocess
 import sys
+import warnings
 from functools import partial
 from pathlib import Path
 from unittest import mock
@@ -43,6 +44,7 @@ FILES = {
 
 SHORT = {"00_main_job": ("--share", "0.005")}
 """Arguments that make an example shorter."""
+FACES = {"hair": 400, "shoe": 400, "upper": 1500, "lower": 1500}
 GAUSSIANS = 6000
 NOTEBOOKS = {"avatar": {"me.avatar", "training"}, "metrics": set(), "template": {"me.glb", "me.npz"}}
 """What each writes beside itself."""
@@ -78,6 +80,14 @@ def _built_before(template: Path, capture: smplxpp.Capture) -> smplxpp.BuildResu
     """The result of a build of a capture whose parameters are exact: a template, and the capture as it is."""
     inspect.signature(build_template).bind(capture=capture)
     return smplxpp.BuildResult(Template.load(template), {}, BuildReport({}, {}), capture)
+
+
+def _small_template(capture: smplxpp.Capture) -> smplxpp.BuildResult:
+    """What the main job builds, of fewer faces; garments that coarse warn."""
+    config = smplxpp.BuildConfig(budgets=FACES, samples=2000)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", smplxpp.core.GeometryWarning)
+        return build_template(capture=capture, config=config)
 
 
 def _in_a_process(name: str, out: Path, *arguments: str) -> str:
