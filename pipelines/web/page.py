@@ -24,9 +24,8 @@ if TYPE_CHECKING:
 def lips_of(face: Face, stance: tuple[dict[str, np.ndarray], dict[str, float]] | None = None) -> bytes:
     """Return tensors in the layout of safetensors: those of `avatar.speech.lips.WEIGHTS`, `face.NAME`, `body.NAME`.
 
-    Of the face: `basis` (6, E) of the articulators, `neutral`, `lowest`, `highest` (E), `jaw` (3) at rest, and
-    `jaw_reach` (2), the radians that an open vowel hangs it and that it hangs at most. Of the body what `stance` holds,
-    tables of `avatar.driving.stance_of`; None for a person who does not gesture.
+    Of the face: `basis` (6, E) of the articulators, `neutral`, `lowest`, `highest` (E), `jaw` (3) at rest, `jaw_reach`
+    (2), radians that an open vowel hangs it and at most; of the body what `stance` holds, of `avatar.driving.stance_of`.
     """
     from avatar.speech.face import JAW_ANGLE
     from avatar.speech.lips import WEIGHTS
@@ -35,7 +34,7 @@ def lips_of(face: Face, stance: tuple[dict[str, np.ndarray], dict[str, float]] |
     own = {name: getattr(face, name) for name in ("basis", "neutral", "lowest", "highest", "jaw")}
     own["jaw_reach"] = np.array([JAW_ANGLE, face.jaw_reach])
     tensors |= {f"face.{name}": value for name, value in own.items()}
-    if stance is not None:
+    if stance:
         tensors |= {f"body.{name}": value for name, value in stance[0].items()}
         about = {**about, "gestures": stance[1]}
     return pack_tensors(tensors, about)
