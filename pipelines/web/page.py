@@ -25,7 +25,7 @@ def lips_of(face: Face, stance: tuple[dict[str, np.ndarray], dict[str, float]] |
     """Return tensors in the layout of safetensors: those of `avatar.speech.lips.WEIGHTS`, `face.NAME`, `body.NAME`.
 
     Of the face: `basis` (6, E) of the articulators, `neutral`, `lowest`, `highest` (E), `jaw` (3) at rest, `jaw_reach`
-    (2), radians that an open vowel hangs it and at most; of the body what `stance` holds, of `avatar.driving.stance_of`.
+    (2), radians that an open vowel hangs it and at most; of the body `stance`, which `avatar.driving.stance_of` makes.
     """
     from avatar.speech.face import JAW_ANGLE
     from avatar.speech.lips import WEIGHTS
