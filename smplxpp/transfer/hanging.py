@@ -24,14 +24,8 @@ _LEGS = 0.03
 _HALF = 1.2
 """Cone of a skirt (distance off the legs by height below the waist) of which the legs have at most a half (worst ratio
 of loose garments on three persons)."""
-_LOWER = 0.2
-"""By how many joints of the spine what hangs has to be beside a lower one than it follows, to follow that in full."""
 _RING = 0.02
 """Height of the bins over which distances are averaged, as a share of the body's extent (4 cm)."""
-_LIFTED = 0.08
-"""Depth below the hip joints that cloth has to reach for thighs to lift it, as a share of the body's extent (15 cm)."""
-_AROUND = 6
-"""Edges (8 cm) over which a bound that a thigh raises falls off."""
 _TOUCHES = 0.01
 """Distance within which cloth touches the skin, as a share of the body's extent (2 cm)."""
 _TOP = 0.1
@@ -94,10 +88,11 @@ def beside_trunk(
     out = np.array(weights, dtype=np.float64)
     out[:, low] = (total * share / np.maximum(below, 1e-9))[:, None] * at[:, low]
     out[:, high] = (total * (1.0 - share) / above.sum(axis=1))[:, None] * above
-    # Places along the spine, of which only lower ones are taken.
+    # Places along the spine, of which only lower ones are taken; those lower by a fifth of a joint in full.
+    lower_joints = 0.2
     place = np.array([0.0, 1.0, 2.0, *(3.0 for _ in high)])
     lower = (weights[:, low + high] - out[:, low + high]) @ place
-    return weights + smooth_step(lower, 0.0, _LOWER)[:, None] * (out - weights)
+    return weights + smooth_step(lower, 0.0, lower_joints)[:, None] * (out - weights)
 
 
 def leg_bound(
@@ -171,10 +166,11 @@ def lifted_by_thighs(
     legs = [list(axis.joints) for axis in axes[:2]]
     own = np.stack([weights[:, joints].sum(axis=1) for joints in legs], axis=1)
     total = own.sum(axis=1)
-    # What ends above the middle of the thighs is no skirt that they lift.
+    # What ends above the middle of the thighs, 15 cm of a person below the hip joints, is no skirt that they lift.
+    lifted_depth = 0.08  # share of the body's extent
     deepest = np.full(component.max() + 1, -np.inf)
     np.maximum.at(deepest, component, _depth(mesh.vertices, axes[:2]))
-    held = np.flatnonzero((total > bound + 1e-3) & (deepest > _LIFTED * extent(source))[component])
+    held = np.flatnonzero((total > bound + 1e-3) & (deepest > lifted_depth * extent(source))[component])
     if not len(held):
         return bound
     # The turn about the line from hip to hip.
@@ -205,12 +201,13 @@ def lifted_by_thighs(
         outside = winding.reshape(len(levels), -1) < 0.5
         least = np.where(outside.any(axis=0), levels[outside.argmax(axis=0)], 1.0)
         step[held] = np.maximum(step[held], least)
-    # Neighbours follow, the less the farther.
+    # Neighbours follow, the less the farther, over edges of 8 cm together.
+    rings = 6
     edges = mesh.edges
     graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(mesh.vertex_count,) * 2).tocsr()
     graph = graph + graph.T
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)
-    for _ in range(_AROUND):
+    for _ in range(rings):
         step = np.maximum(step, graph @ step / degree)
     return bound + step * np.maximum(total - bound, 0.0)
 

@@ -11,9 +11,6 @@ from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 
-_TOGETHER = 500
-"""Rows up to which pieces share a factorisation: one of less takes about the time of the call."""
-
 
 def fit_smoothly(
     mesh: TriangleMesh,
@@ -66,14 +63,15 @@ def fit_smoothly(
 def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
     """Solve a symmetric positive definite system (n, J) piece by piece, each for the joints that occur in it."""
     # Sort the rows by connected component of the matrix, which makes it block diagonal; small pieces are solved
-    # together.
+    # together, up to so few rows that a factorisation takes about the time of its call.
+    shared_rows = 500
     count, piece = sp.csgraph.connected_components(matrix, directed=False)
     order = np.argsort(piece, kind="stable")
     if count > 1:
         matrix, right = matrix[order][:, order], right[order]
     out = np.zeros_like(right)
     ends = np.cumsum(np.bincount(piece))
-    start = np.concatenate([[0], ends[np.append(np.diff(ends // _TOGETHER) > 0, True)]])
+    start = np.concatenate([[0], ends[np.append(np.diff(ends // shared_rows) > 0, True)]])
     no_rows = np.zeros(0, np.int64)
     # Solve each block by a sparse Cholesky factorisation in minimum-degree order.
     for low, high in itertools.pairwise(start):

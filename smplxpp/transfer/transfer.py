@@ -47,9 +47,6 @@ _PUBLISHED_FAR = 0.4
 """By how much of itself the published method's share grows where anchor weights replace those of the body nearby: the
 free end of a sari has the shoulder alone as an anchor (worst ratio of `benchmarks transfer_garments` and the embedded
 person's skirt)."""
-_BY_HEIGHT = (0.025, 0.06)
-"""Distances off the skin, in shares of the body's extent, between which height along the trunk replaces the nearest
-skin: a string of beads lies on it, a cape stands off it (worst ratio of loose garments on three persons)."""
 _CLOSED = 0.45
 """Share of a component that faces away from the skin from which on it is a closed tube; of an open scarf it is 0.38."""
 _LEAST_SUM = 1e-3
@@ -303,7 +300,10 @@ def _transferred(
         # Divide what follows the trunk by height. Empty sleeves hang from their armholes.
         off = smooth_step(found.distance, *(k * size for k in (0.01, 0.025))) * (1.0 - far_off)
         off[hangs | unfollowed.tubes] = 0.0
-        beside = 1.0 - smooth_step(found.distance, *(k * size for k in _BY_HEIGHT))
+        # Between these distances off the skin, shares of the body's extent, height along the trunk replaces the nearest
+        # skin: beads lie on it, a cape stands off it (worst ratio of loose garments on three persons).
+        by_height = (0.025, 0.06)
+        beside = 1.0 - smooth_step(found.distance, *(k * size for k in by_height))
         collars = tuple(config.joint_index(f"{side}_collar", joint_count) for side in ("left", "right"))
         copied = found.interpolate(source, weights)
         lower = beside_trunk(target.vertices, dense, copied, beside, axes[-1], collars + unfollowed.shoulders)
