@@ -59,16 +59,17 @@ def run_example(name: str, out: Path, *arguments: str, template: Path | None = N
         name: of the example.
         out: folder of its result.
         arguments: of its command line.
-        template: what `build_template` gives in the place of the seconds that it takes; its own tests compare it.
+        template: what `build_template` gives in the place of the seconds that it takes; None: a build of few faces.
     """
     if name == BY_COMMAND:
         return _in_a_process(name, out, *arguments)
     printed = io.StringIO()
+    build = _small_template if template is None else partial(_built_before, template)
     with (
         contextlib.chdir(ROOT),
         contextlib.redirect_stdout(printed),
         mock.patch.object(sys, "argv", [f"{name}.py", *arguments, "--out", str(out)]),
-        mock.patch.object(smplxpp, "build_template", partial(_built_before, template)),
+        mock.patch.object(smplxpp, "build_template", build),
         mock.patch.dict(TRAINING_PRESETS, demo=QUICK),
         mock.patch.object(avatar, "TrainConfig", partial(avatar.TrainConfig, gaussians=GAUSSIANS)),
     ):
@@ -239,6 +240,11 @@ def check_fit(text: str, out: Path) -> None:
     psnr, ssim = numbers(r"PSNR (\S+) dB, SSIM (\S+)", text)
     assert psnr > 19.0 and ssim > 0.93
     assert len(read_splat_ply(out / "splats.ply")) == 50_000
+
+
+@pytest.mark.slow
+def test_the_main_job_trains_on_what_it_has_built(tmp_path: Path) -> None:
+    check_main_job(run_example("00_main_job", tmp_path / "out", "--share", "0.02"), tmp_path / "out")
 
 
 def check_main_job(text: str, out: Path) -> None:

@@ -52,6 +52,15 @@ def alone(scan):
     return run
 
 
+@pytest.mark.slow
+def test_the_body_is_found_by_the_default_search_in_the_whole_scan(tmp_path):
+    raw = read_raw_mesh(PERSON / "scans" / "scan_000000.ply")
+    lying = TriangleMesh(100.0 * raw.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0], raw.faces)
+    write_ply(tmp_path / "me.ply", lying, vertex_colors=raw.vertex_colors)
+    Build(run_folder=tmp_path / "run", scan=tmp_path / "me.ply", until_stage=SEGMENT_STAGE, json=True).run()
+    test_the_body_is_found(tmp_path / "run")
+
+
 def test_the_body_is_found(alone):
     true = BODY.forward(load_params(PERSON / "params" / "params.npz").frame(0)).frame(0)
     found = BODY.forward(load_params(alone / "08_capture" / "params.npz")).frame(0)
