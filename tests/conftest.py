@@ -6,6 +6,7 @@ import fcntl
 import gc
 import logging
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,9 @@ import hypothesis
 import pytest
 
 from tests import shape_contracts
+
+# A shell starts what runs in the background with interrupts ignored, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 gc.disable()  # until all is collected: nothing that is imported goes away
 
