@@ -15,7 +15,7 @@ from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotve
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.register.kinematics import BodyState
 from smplxpp.register.landmarks import visible_vertices
-from smplxpp.register.locate import BodyNotFoundError, LocateConfig, locate_body
+from smplxpp.register.locate import BodyNotFoundError, LocateConfig, locate, locate_body
 from smplxpp.register.locate.decision import (
     closed_hands,
     confidence_of,
@@ -108,8 +108,13 @@ def test_a_heavier_prior_of_poses_turns_joints_less(body, scan, located):
     assert np.abs(stiff.params.body_pose).sum() < 0.8 * np.abs(located.params.body_pose).sum()
 
 
-def test_landmarks_overrule_the_surface(body, whole):
-    """Somebody says that she faces backwards: that is believed."""
+@pytest.mark.parametrize("later", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_landmarks_overrule_the_surface(body, whole, monkeypatch, later):
+    """Somebody says that she faces backwards: that is believed. What is searched later moves single limbs."""
+    if not later:
+        monkeypatch.setattr(locate, "look_again", lambda search, best, hints: (best, ()))
+        monkeypatch.setattr(locate, "raise_head", lambda search, best: best)
+        monkeypatch.setattr(locate, "lift_heels", lambda search, best: best)
     back = {"nose": [0.0, 1.45, -0.15], "left_wrist": [-0.5, 0.95, 0.0], "right_wrist": [0.5, 0.95, 0.0]}
     found = locate_body(body, whole, landmarks={k: np.array(v) for k, v in back.items()}, config=QUICK)
     assert abs(abs(found.candidates[0].facing_degrees) - 180.0) < 30.0
