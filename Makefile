@@ -37,8 +37,8 @@ demo: $(STAMP)
 	$(BIN)/smplxpp demo $(RUN)
 
 # One thread a process: two processes of two threads each take twice as long on two cores. A third process fills the time in
-# which tests wait for a browser or a server; a fourth costs more in caches than it fills. Bytecode is kept even where the environment says otherwise, because every
-# process would compile a thousand files.
+# which tests wait for a browser or a server; a fourth costs more in caches than it fills. Bytecode is kept even where the
+# environment says otherwise, because every process would compile a thousand files.
 test: $(STAMP)
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
