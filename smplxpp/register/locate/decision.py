@@ -137,10 +137,10 @@ def findings_of(
     if all(best.misfit.parts[part] < 0.2 for part in legs):
         trust = min(trust, 0.3)
         out.append("neither lower legs nor feet: it may be cut off below")
-    beyond = share_beyond(mesh, posed)
-    if beyond > _BOUNDS.most_beyond:
+    lacking = share_beyond(mesh, posed)
+    if lacking > _BOUNDS.most_beyond:
         trust = min(trust, 0.1)
-        out.append(f"{beyond:.0%} of the body found lies outside of the surface: a part of a person")
+        out.append(f"{lacking:.0%} of the body found lies outside of the surface: a part of a person")
     elsewhere = "" if out else limb_elsewhere(surface, best)
     if elsewhere:
         trust = min(trust, 0.1)
