@@ -331,7 +331,7 @@ class _Training:
                     f"{step} stopped at {done.iteration} of {done.iterations} iterations; the same call continues"
                 )
             if state.is_dir():  # metrics of the step, and of the tracking and pretraining before it
-                shutil.copytree(state, made / "log", ignore=shutil.ignore_patterns("*.safetensors"))
+                shutil.copytree(state, made / "log", ignore=shutil.ignore_patterns("*.safetensors", "*.npz"))
             atomic_write_text(made / _RECORD, json.dumps({"key": key, "settings": jsonable(settings)}, indent=1))
         shutil.rmtree(state, ignore_errors=True)
         return folder

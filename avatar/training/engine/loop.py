@@ -51,6 +51,9 @@ class Task(Protocol):
     def halve_rates(self) -> None:
         """Halve all learning rates from now on."""
 
+    def leave_out(self, iteration: int) -> None:
+        """Count a step that diverged as taken, without a change of what it learns."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConfig:
@@ -226,6 +229,7 @@ class Divergence:
                 raise
             if self.count == 1:
                 self.task.halve_rates()
+            self.task.leave_out(iteration)
             rates = "; learning rates are halved" if self.count == 1 else ""
             log.warning("%s is left out: its loss or a gradient is %s%s", error.subject, error.received, rates)
             return {**self._values, "diverged": self.count}

@@ -284,6 +284,10 @@ class OptimizationTask(ABC, Generic[Batch]):
         """Halve all learning rates from now on."""
         self._rate_share *= 0.5
 
+    def leave_out(self, iteration: int) -> None:
+        """Count a step that diverged as taken: it may be the one that begins or ends the mean of the last steps."""
+        self.mean.after(iteration)
+
     def _backward(self, item: Batch, count: int) -> Mapping[str, Tensor] | None:
         """Backpropagate a micro-batch's share of the loss; return its terms, None if anything is not finite."""
         # Divided by the number of micro-batches, so that the sum of all gradients is that of the mean loss.

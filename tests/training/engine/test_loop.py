@@ -175,6 +175,16 @@ def test_a_step_that_diverges_is_left_out_and_halves_the_rates_once(tmp_path, ca
     assert not same_state(steady.state(), whole.state())
 
 
+@pytest.mark.parametrize("step", [10, 19])
+def test_a_mean_begins_and_ends_with_steps_that_diverge(tmp_path, step):
+    """Of the steps from 10 to 19: 10 is the first that enters the mean, and 19 puts it into the parameters."""
+    optimiser = OptimiserConfig(iterations=20, averaged=0.5)
+    task = Toy(optimiser, poison=(3 * step,))
+    assert run_training(task, config(iterations=20), tmp_path, key="k").finished
+    assert set(task.mean.mean) == set(task.learned)
+    assert all(torch.equal(task.learned[key].detach(), mean) for key, mean in task.mean.mean.items())
+
+
 def test_a_checkpoint_is_of_its_moment_though_the_steps_go_on(tmp_path, monkeypatch):
     slow = threading.Event()
 
