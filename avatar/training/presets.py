@@ -135,7 +135,7 @@ class _Steps:
 
 @dataclass(frozen=True)
 class _Size:
-    """Values in which the presets for two cores differ.
+    """Values in which the presets that track the surface differ.
 
     Attributes:
         gaussians: number of Gaussians.
@@ -154,6 +154,8 @@ class _Size:
         averaged: share of the last steps of bake and compensation over which parameters are averaged.
         penalties: factor of the compensation's penalties of large and far Gaussians.
         surface_normals: see `PhotometricConfig`.
+        perceptual: weight of the perceptual term.
+        poses: in a step of teacher, bake and compensation.
     """
 
     gaussians: int
@@ -172,15 +174,17 @@ class _Size:
     averaged: float = 0.2
     penalties: float = 1.0
     surface_normals: bool = False
+    perceptual: float = 0.0
+    poses: tuple[int, int, int] = (1, 1, 1)
 
 
-def _lean(name: str, size: _Size) -> TrainingPreset:
-    """Make a preset for two cores: the surface is tracked first, networks learn it before they see photographs.
+def _tracked(name: str, size: _Size) -> TrainingPreset:
+    """Make a preset in which the surface is tracked first and networks learn it before they see photographs.
 
     A teacher trained for minutes draws worse pictures than the photographs, so that the bake compares with photographs
-    and takes from the teacher the tracked surface. Several views a step, attributes that learn in every stage, no
-    perceptual term.
+    and takes from the teacher the tracked surface. Several views a step, attributes that learn in every stage.
     """
+    weights = replace(_LEAN_WEIGHTS, perceptual=size.perceptual)
     # A step without rendering costs little, so that it has eight poses.
     pretrain = PretrainConfig(
         iterations=size.pretrain, batch=8, lr=1e-2, lr_final_factor=0.02, warmup=20, betas=(0.9, 0.99)
@@ -197,10 +201,11 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
         teacher=FitTeacherConfig(
             iterations=size.teacher.iterations,
             pretrain=pretrain,
+            poses_per_step=size.poses[0],
             views=3,
             lr=size.teacher.lr,
             attributes=size.teacher.attributes,
-            weights=_LEAN_WEIGHTS,
+            weights=weights,
             surface_normals=size.surface_normals,
             track=TrackConfig(
                 levels=size.track,
@@ -219,17 +224,18 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             attributes=size.bake.attributes,
             regression=True,
             code_lr_factor=5.0,
+            poses_per_step=size.poses[1],
             views=3,
             lr=size.bake.lr,
             null_share=0.2,
             averaged=size.averaged,
-            weights=_LEAN_WEIGHTS,
+            weights=weights,
             surface_normals=size.surface_normals,
         ),
         # Rates of U and C in proportion to that of the mapping networks.
         compensate=CompensateConfig(
             iterations=size.compensate.iterations,
-            poses_per_step=1,
+            poses_per_step=size.poses[2],
             views=3,
             lr=size.compensate.lr,
             position_lr=20.0 * size.compensate.lr,
@@ -243,7 +249,7 @@ def _lean(name: str, size: _Size) -> TrainingPreset:
             init_from_track=True,
             coherence=200.0,
             averaged=size.averaged,
-            weights=_LAST_WEIGHTS,
+            weights=replace(_LAST_WEIGHTS, perceptual=size.perceptual),
             surface_normals=size.surface_normals,
         ),
         blend_shapes=BlendShapeConfig(jaw=True, gated=True),
@@ -282,16 +288,32 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
         compensate=CompensateConfig(),
         blend_shapes=BlendShapeConfig(),
     ),
-    "gpu": TrainingPreset(
-        networks=network_preset("gpu"),
-        fit=PRESETS["paper"],
-        teacher=FitTeacherConfig(iterations=60_000, pretrain=None, lr=1e-3, attributes=0.2, amp=True),
-        bake=BakeConfig(iterations=10_000, null_share=0.1),
-        compensate=CompensateConfig(iterations=15_000, null_share=0.1),
-        blend_shapes=BlendShapeConfig(jaw=True),
+    # What `cpu` does, with the Gaussians, perceptual term and poses a step of `paper`, and the steps of an hour or two
+    # on a GPU. Sizes and rates were not chosen by measurements at this size.
+    "gpu": _tracked(
+        "gpu",
+        _Size(
+            gaussians=270_000,
+            head_share=70 / 270,
+            control_points=2400,
+            track=TrackConfig().levels,
+            body_motion_weight=1.0,
+            tight_reach=0.04,
+            pretrain=2000,
+            field=_Steps(10_000, 3e-3),
+            fit=10_000,
+            rates=LearningRates(),
+            # Ten times the steps of `cpu`, so that attributes need no higher rates than in the fit.
+            teacher=_Steps(4000, 1e-3, 1.0),
+            bake=_Steps(8000, 5e-4, 1.0),
+            compensate=_Steps(20_000, 5e-4, 1.0),
+            penalties=5.0,
+            perceptual=ReconstructionWeights().perceptual,
+            poses=(2, 2, 4),
+        ),
     ),
     "paper-small": _paper_small(),
-    "cpu": _lean(
+    "cpu": _tracked(
         "cpu",
         _Size(
             gaussians=50_000,
@@ -313,7 +335,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             penalties=5.0,
         ),
     ),
-    "demo": _lean(
+    "demo": _tracked(
         "demo",
         _Size(
             # In pictures of 250 pixels a head has 30, too few for a quarter of the Gaussians.

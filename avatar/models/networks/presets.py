@@ -24,16 +24,14 @@ _SMALL = TeacherConfig(centred=True, style_layers=1, noise=False, zero_output=Tr
 
 _TEACHERS = {
     "paper": TeacherConfig(),
-    "gpu": TeacherConfig(
-        in_size=256, out_size=512, channel_base=16384, channel_max=256, style_size=256, zero_output=True
-    ),
+    "gpu": replace(_LEAN, in_size=256, out_size=512, channel_base=8192, channel_max=128, style_size=64),
     "paper-small": replace(_SMALL, in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32),
     "cpu": replace(_LEAN, in_size=128, out_size=256, channel_base=2048, channel_max=64, style_size=32),
     "demo": replace(_LEAN, in_size=64, out_size=128, channel_base=1024, channel_max=32, style_size=16),
 }
 
-# Short trainings have few poses: a vertex depends on nearby joints alone.
-_FIELDS = {name: FieldConfig(local_pose=3) for name in ("cpu", "demo")}
+# Captures have few poses for 63 numbers: a vertex depends on nearby joints alone.
+_FIELDS = {name: FieldConfig(local_pose=3) for name in ("gpu", "cpu", "demo")}
 
 NETWORK_PRESETS = {
     # The field has the paper's sizes in all presets, because it is small.
