@@ -1,6 +1,6 @@
 """Time each part of an answer in a conversation with a synthetic voice, and the offset of sound and poses.
 
-    python -m benchmarks chat --avatar me.avatar [--parts spoken typed long]
+    python -m benchmarks chat --avatar me.avatar [--parts spoken typed long] [--minutes 60]
 
 A Piper voice (extra `[chat]`) says short sentences into a websocket of `smplxpp chat`'s server, as a microphone would:
 in pieces of 64 ms, in real time. Rules answer. The client is no browser: "heard" is when the message with the sound has
@@ -11,8 +11,10 @@ Then the same sentences are typed, by one page and by ten at a time, which all w
 message until the sound of its answer has come, and the memory of the process.
 
 In a long talk a page of headless Chromium types 200 messages, each once the answer to the last begins to be heard:
-seconds until it is, memory of the server and of the page's objects after some and after all of them. Parts that are
-left out keep the figures of their last measurement.
+seconds until it is, memory of the server and of the page's objects after some and after all of them. With `--minutes`
+it types for so long, each message once the last answer was said to its end, and memory is looked at every minute; the
+server is the command's own process then, and two pictures a second are drawn, because a CPU draws them. Parts that
+are left out keep the figures of their last measurement.
 """
 
 from __future__ import annotations
@@ -23,10 +25,13 @@ import gzip
 import json
 import os
 import re
+import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -77,24 +82,31 @@ class ChatBenchmark:
 
     parts: tuple[Literal["spoken", "typed", "long"], ...] = ("spoken", "typed", "long")
     """What is measured."""
+    minutes: float = 0.0
+    """Length of a lasting talk, minutes; 0: none."""
 
     def run(self) -> None:
         """Print and store the figures."""
         import avatar
 
-        command, bundle = Chat(self.avatar), avatar.open_bundle(self.avatar)
-        cast = command.engines(bundle, command.partner())
-        cast.voice.say("Hello.")
         kept = RESULTS / "chat.json"
         figures: dict[str, Any] = json.loads(kept.read_text())["figures"] if kept.exists() else {}
+        bundle = avatar.open_bundle(self.avatar)
+        if self.minutes:
+            figures["a lasting talk"] = {"all": _lasting_talk(self.avatar, self.minutes)}
+        if self.parts:
+            command = Chat(self.avatar)
+            cast = command.engines(bundle, command.partner())
+            cast.voice.say("Hello.")
         if "spoken" in self.parts:
             figures |= _spoken(self.avatar, cast)
         if "typed" in self.parts:
             figures["typed"] = {f"{pages} at a time": _typed(self.avatar, cast, pages) for pages in (1, PAGES)}
         if "long" in self.parts:
             figures["a long talk"] = {"all": _long_talk(self.avatar, cast)}
+        measured = (*self.parts, *(["lasting"] if self.minutes else []))
         today = datetime.date.today().isoformat()
-        figures["dates"] = {**figures.get("dates", {}), **dict.fromkeys(self.parts, today)}
+        figures["dates"] = {**figures.get("dates", {}), **dict.fromkeys(measured, today)}
         figures["gaussians"] = bundle.sizes["N"]
         for name, value in figures.items():
             print(f"{name:38s} {value}")
@@ -169,7 +181,7 @@ def _typed(avatar: Path, cast: ChatParts, pages: int) -> dict[str, Any]:
     for thread in threads:
         thread.join()
     used = time.process_time() - began
-    resident = _resident()
+    resident = _resident(os.getpid())
     server.shutdown()
     assert len(seconds) == pages * len(SENTENCES)
     return {
@@ -186,39 +198,24 @@ def _long_talk(avatar: Path, cast: ChatParts) -> dict[str, Any]:
     """Let a page of Chromium type many messages; return latencies, memory, the page's sizes and its first picture."""
     server = ChatServer(avatar.read_bytes(), cast, name="benchmark")
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    resident, heap, seconds = list[int](), list[float](), list[float]()
-    first = "setInterval(() => { if (window.smplxppPlayer?.player?.pictures) window.first ??= performance.now(); }, 5)"
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Page(Path(folder), size=(320, 400), flags=["--enable-precise-memory-info"]) as page,
-    ):
-        page.send("Page.addScriptToEvaluateOnNewDocument", source=first)
-        page.go(server.address)
-        page.until("window.first && document.querySelector('.times').textContent")
-        page.click(".talk input")
-        page.evaluate("smplxppPlayer.talking.then(({dialogue}) => { window.dialogue = dialogue; })")
+    memory, seconds = list[dict[str, float]](), list[float]()
+    first = "setInterval(() => { if (window.smplxppPlayer?.player?.pictures) window.first ??= performance.now(); }, 5);"
+    with _page_at(server.address, first) as page:
         for k in range(EXCHANGES):
-            began = (
-                f"new Promise(done => {{ const from = performance.now(), end = dialogue.on('answer', () => {{ end();"
-                f" done((performance.now() - from) / 1000); }}); dialogue.type({json.dumps(SENTENCES[k % 8])}); }})"
-            )
-            seconds.append(page.evaluate(began))
+            seconds.append(page.evaluate(_TYPE % json.dumps(SENTENCES[k % len(SENTENCES)])))
             if (k + 1) % SOME == 0:
-                page.send("HeapProfiler.collectGarbage")
-                heap.append(page.evaluate("performance.memory.usedJSHeapSize / 1e6"))
-                resident.append(_resident())
-                print(f"{k + 1} messages: {resident[-1]} MB resident, {heap[-1]:.1f} MB of objects", flush=True)
-        shown, errors = page.evaluate("window.first / 1000"), page.errors
+                memory.append(_memory(page, os.getpid()))
+                print(f"{k + 1} messages: {memory[-1]}", flush=True)
+        shown = page.evaluate("window.first / 1000")
     server.shutdown()
-    assert not errors, errors
     return {
         "messages": EXCHANGES,
         "median": round(float(np.median(seconds)), 3),
         "worst": round(max(seconds), 3),
-        f"resident MB after {SOME}": resident[0],
-        "resident MB": resident[-1],
-        f"MB of the page after {SOME}": round(heap[0], 1),
-        "MB of the page": round(heap[-1], 1),
+        f"resident MB after {SOME}": memory[0]["server"],
+        "resident MB": memory[-1]["server"],
+        f"MB of the page after {SOME}": memory[0]["objects"],
+        "MB of the page": memory[-1]["objects"],
         "seconds to the first picture": round(shown, 2),
         "kB of the player": len(PLAYER.read_bytes()) // 1000,
         "kB of it compressed": len(gzip.compress(PLAYER.read_bytes())) // 1000,
@@ -226,9 +223,81 @@ def _long_talk(avatar: Path, cast: ChatParts) -> dict[str, Any]:
     }
 
 
-def _resident() -> int:
-    """Return the memory of this process, MB."""
-    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+def _lasting_talk(avatar: Path, minutes: float) -> dict[str, Any]:
+    """Let a page of Chromium talk for so long with a server of its own process; return memory of both over time."""
+    command = [sys.executable, "-m", "pipelines.cli", "chat", str(avatar), "--serve", "--no-browser", "--no-token"]
+    calm = "window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 500);"
+    memory, seconds = list[dict[str, float]](), list[float]()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        address = next(found[0] for line in server.stdout if (found := re.search(r"http://\S+", line)))
+        threading.Thread(target=server.stdout.read, daemon=True).start()
+        try:
+            with _page_at(address, calm, (240, 300)) as page:
+                began = time.monotonic()
+                while (passed := time.monotonic() - began) < 60 * minutes:
+                    seconds.append(page.evaluate(_TYPE % json.dumps(SENTENCES[len(seconds) % len(SENTENCES)])))
+                    page.until("answered && !dialogue.stage.speaking")
+                    if passed >= 60 * len(memory):
+                        memory.append({"minute": round(passed / 60, 1), **_memory(page, server.pid)})
+                        print(f"{len(seconds)} messages: {memory[-1]}", flush=True)
+                memory.append({"minute": round(minutes, 1), **_memory(page, server.pid)})
+        finally:
+            server.terminate()
+    # What a talk needs is there after five minutes; growth is the least-squares slope from there on.
+    late = [row for row in memory if row["minute"] >= min(5.0, 0.5 * minutes)]
+    growth = {part: np.polyfit([row["minute"] for row in late], [row[part] for row in late], 1)[0] for part in late[0]}
+    return {
+        "minutes": minutes,
+        "messages": len(seconds),
+        "median": round(float(np.median(seconds)), 3),
+        "worst": round(max(seconds), 3),
+        "early": late[0],
+        "at the end": memory[-1],
+        "most": {part: max(row[part] for row in memory) for part in memory[0]},
+        "growth an hour": {part: round(60 * float(slope), 2) for part, slope in growth.items()},
+        "load of the machine": round(os.getloadavg()[0], 1),
+    }
+
+
+_TYPE = """new Promise(done => {
+  const from = performance.now(), once = (event, act) => { const end = dialogue.on(event, () => { end(); act(); }); };
+  window.answered = false;
+  once("answer", () => done((performance.now() - from) / 1000));
+  once("answered", () => (window.answered = true));
+  dialogue.type(%s);
+})"""
+
+
+@contextmanager
+def _page_at(address: str, script: str, size: tuple[int, int] = (320, 400)) -> Iterator[Page]:
+    """Open a conversation's page with a script before its own; nothing may go wrong in it."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Page(Path(folder), size=size, flags=["--enable-precise-memory-info"]) as page,
+    ):
+        page.send("Page.addScriptToEvaluateOnNewDocument", source=script)
+        page.go(address)
+        page.until("smplxppPlayer.player.pictures && document.querySelector('.times').textContent")
+        page.click(".talk input")
+        page.evaluate("smplxppPlayer.talking.then(({dialogue}) => { window.dialogue = dialogue; })")
+        yield page
+        assert not page.errors, page.errors
+
+
+def _memory(page: Page, server: int) -> dict[str, float]:
+    """Return MB of the server, of the browser's processes and of the page's objects, and how many elements it has."""
+    page.send("HeapProfiler.collectGarbage")
+    objects, elements = page.evaluate(
+        "[performance.memory.usedJSHeapSize / 1e6, document.querySelectorAll('*').length]"
+    )
+    browser = sum(_resident(process) for process in page.processes())
+    return {"server": _resident(server), "browser": browser, "objects": round(objects, 1), "elements": elements}
+
+
+def _resident(process: int) -> int:
+    """Return the memory of a process, MB, without what it shares with others."""
+    found = re.search(r"Pss:\s+(\d+)", Path(f"/proc/{process}/smaps_rollup").read_text())
     assert found is not None
     return int(found[1]) // 1024
 

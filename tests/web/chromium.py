@@ -94,6 +94,19 @@ class Page:
             self._browser.kill()
             self._browser.wait(LIMIT)
 
+    def processes(self) -> list[int]:
+        """Return the browser's processes: its own and those that it started."""
+        parents = {}
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            try:
+                parents[int(stat.parent.name)] = int(stat.read_text().rsplit(")", 1)[1].split()[1])
+            except FileNotFoundError:  # it has ended meanwhile
+                continue
+        found = [self._browser.pid]
+        for process in found:
+            found += [child for child, parent in parents.items() if parent == process]
+        return found
+
     def resize(self, width: int, height: int) -> None:
         """Give the page another size, CSS pixels."""
         self.send(

@@ -34,6 +34,9 @@ export class Dialogue {
   private readonly listeners = new Map<string, Set<(detail: never) => void>>();
   /** The turn whose first picture is waited for, and how many there had been when it began to be heard. */
   private awaited: { turn: number; pictures: number } | null = null;
+  /** The last turn that is known, and the last one that was stopped: sentences of it may still be on their way. */
+  private turn = 0;
+  private stopped = 0;
 
   /** @param address of the websocket. */
   constructor(private readonly player: Animator, address: string) {
@@ -56,8 +59,9 @@ export class Dialogue {
       }
     };
     this.connection.onframes = (data) => {
-      const frames = readFrames(data), known = this.stage.shown;
-      this.stage.take(frames);
+      const frames = readFrames(data), known = this.stage.shown, { line } = frames;
+      if (line) this.turn = Math.max(this.turn, line.turn);
+      this.stage.take(line && line.turn <= this.stopped ? { ...frames, line: null } : frames);
       if (known) return;
       this.stage.pose();
       this.emit("shown", null);
@@ -65,6 +69,7 @@ export class Dialogue {
     this.connection.ontold = (told) => this.hear(told);
     this.connection.onopen = () => {
       this.stage.reset();
+      this.turn = this.stopped = 0;
       this.emit("open", null);
     };
     this.connection.onlost = (final) => {
@@ -93,6 +98,7 @@ export class Dialogue {
 
   /** Ends what the avatar says. */
   stop(): void {
+    this.stopped = this.turn;
     this.stage.hush();
     this.connection.send({ kind: "stop" });
   }
@@ -128,6 +134,7 @@ export class Dialogue {
 
   private hear(told: Told): void {
     if (told.kind === "listening" || told.kind === "stopped") this.stage.hush();
+    if (told.kind === "heard" && typeof told.turn === "number") this.turn = told.turn;
     // What cannot be spoken is shown.
     this.emit((told.kind === "silent" ? "answer" : told.kind) as keyof DialogueEvents, told as never);
   }
