@@ -77,6 +77,15 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Evaluate",
         "a run's models on held-out views and poses: image and surface figures, speed, size, tables, pictures",
     ),
+    # Before `batch`, because the first name that fits is taken.
+    "batch status": ("pipelines.commands.batch", "BatchStatus", "what has become of the subjects of a batch"),
+    "batch stop": ("pipelines.commands.batch", "BatchStop", "end a batch; what stands stays, and the batch can go on"),
+    "batch retry": ("pipelines.commands.batch", "BatchRetry", "run the subjects of a batch again that failed"),
+    "batch": (
+        "pipelines.commands.batch",
+        "RunBatch",
+        "many subjects: check, build, train, evaluate and export each, on this machine, Ray or Slurm",
+    ),
     "ablate": (
         "pipelines.commands.ablate",
         "Ablate",
@@ -224,14 +233,13 @@ def _answer(args: list[str], console: Console) -> int:
         return USER_ERROR
     except MemoryError as error:
         # numpy's own words name the size and the shape that did not fit.
-        words = str(error) or "an array"
-        console.print(
-            Text("error: ", style="red")
-            + Text(
-                f"command {name}: expected memory for {words}, received none. Give it a smaller input or a smaller "
-                "--scale, --size, --max-views or --threads where the command has them; all finished stages are kept"
-            )
+        words = (
+            f"command {name}: expected memory for {str(error) or 'an array'}, received none. Give it a smaller input "
+            "or a smaller --scale, --size, --max-views or --threads where it has them; all finished stages are kept"
         )
+        console.print(Text("error: ", style="red") + Text(words))
+        if "--json" in rest:
+            sys.stdout.write(json.dumps({"error": {"type": "MemoryError", "message": words}}) + "\n")
         return USER_ERROR
     except KeyboardInterrupt:
         console.print("interrupted; every finished stage is kept")

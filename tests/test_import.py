@@ -58,6 +58,7 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"synth"},
         {"captures"},
         {"ablation"},
+        {"batch"},
         {"web"},
         {"viewer"},
         {"chat"},
@@ -70,6 +71,7 @@ NARROW = {
     "avatar.evaluation": {"training", "baselines"},
     "pipelines.synth": {"runs", "stages", "report"},
     "pipelines.captures": {"stages", "synth"},
+    "pipelines.batch": {"stages", "report", "synth", "captures", "ablation"},
     "pipelines.viewer": {"report", "synth", "captures", "ablation"},
     "pipelines.chat": {"runs", "figures", "stages", "report", "synth", "captures", "ablation", "viewer"},
     "pipelines.web": {"runs", "figures", "stages", "report", "synth", "captures", "ablation", "viewer"},
@@ -357,13 +359,14 @@ READS: dict[str, set[str]] = {
     "read_bytes": {"smplxpp/core/files/paths.py", "pipelines/stages/build_config.py"},
     "read_text": {  # the system's, and our own sources
         *("smplxpp/native/__init__.py", "avatar/rendering/memory.py"),
-        *("pipelines/report/builder.py", "pipelines/runs/code.py"),
+        *("pipelines/report/builder.py", "pipelines/runs/code.py", "pipelines/batch/hold.py"),
     },
     "open": {
         *("smplxpp/core/files/array_file.py", "smplxpp/core/files/safe_pickle.py", "smplxpp/core/files/image_file.py"),
         *("smplxpp/core/files/package_file.py", "smplxpp/core/files/atomic.py"),
         *("smplxpp/capture/readers/colmap.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/code.py"),
         *("smplxpp/capture/writers/frame_files.py", "smplxpp/core/params.py", "avatar/formats/ply.py"),  # written
+        *("pipelines/batch/hold.py", "pipelines/batch/process.py"),  # a lock, logs
         *("avatar/training/engine/metrics_log.py", "pipelines/runs/folders.py", "pipelines/commands/terminal.py"),
     },
 }

@@ -94,8 +94,8 @@ class _Line:
     text: str
 
 
-def read_yaml(path: str | Path, *, subject: str = "file", remedy: str = "") -> Any:
-    """Read the content of a YAML file of at most 256 kibibytes as dictionaries, lists, texts, numbers, bools and None.
+def read_yaml(path: str | Path, *, subject: str = "file", remedy: str = "", most_bytes: int = 1 << 18) -> Any:
+    """Read the content of a YAML file, by default of at most 256 KiB, as dictionaries, lists, texts, numbers and None.
 
     Raises:
         InputError: missing, no text, too large, or outside the part of YAML that is read; the message names the line.
@@ -109,7 +109,6 @@ def read_yaml(path: str | Path, *, subject: str = "file", remedy: str = "") -> A
         {'names': ['hat', 'bag']}
     """
     # A file written by hand has some kilobytes.
-    most_bytes = 1 << 18
     text = read_text(path, subject=subject, most=most_bytes, remedy=remedy)
     return _Parser(text, f"{subject} {path}", remedy).document()
 

@@ -1,0 +1,318 @@
+"""`smplxpp batch`: a chain of commands for each of many subjects; its status, its stop, and another attempt."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from pipelines.batch.driver import Progress as State
+from pipelines.batch.driver import begin_batch, drive, retry, take_batch
+from pipelines.batch.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor, gpus_here
+from pipelines.batch.hold import BATCH_HOLD, at_work, request_stop
+from pipelines.batch.jobs import STEPS, Job, JobFile, option_words, read_jobs
+from pipelines.batch.records import Batch, JobRecord, read_batch, records_of
+from pipelines.batch.run_job import Resources
+from pipelines.commands.help import checked_arguments
+from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
+from smplxpp.core.errors import InputError, require_between
+
+_STYLES = {"done": "green", "running": "cyan", "waiting": "dim", "stopped": "yellow", "failed": "red", "refused": "red"}
+
+
+@dataclass(frozen=True)
+class Machines:
+    """Where the commands run."""
+
+    local: OptionalInt = None
+    """Run this many subjects at a time on this machine, which share its cores and GPUs out; the default, with one
+    subject a GPU, or one for four cores."""
+    ray: OptionalText = None
+    """Run on the Ray cluster at this address, or `auto` (extra cluster)."""
+    slurm: bool = False
+    """Run as job arrays of Slurm, by submitit (extra cluster)."""
+    partition: str = ""
+    """With --slurm: the partition; by default Slurm's."""
+    minutes: float = 1440.0
+    """With --slurm: limit of a stay on a machine, for jobs that name none; a training stops before it and goes on."""
+    max_retries: int = 2
+    """Further attempts of a command that the system ended: killed, out of memory, its machine lost. What a command
+    refuses, and checks that fail, are final until `batch retry`."""
+    scratch: OptionalPath = None
+    """Folder on a local disk for captures that are copied from addresses; by default that of temporary files."""
+
+    def executor(self, file: JobFile, batch: Batch) -> Executor:
+        """Return what runs the tasks.
+
+        Raises:
+            InputError: two places at once, or a cluster that does not answer.
+        """
+        if (self.local is not None) + (self.ray is not None) + self.slurm > 1:
+            raise InputError("options local, ray and slurm", expected="one of them", received="several")
+        require_between("option max-retries", self.max_retries, 0, 100)
+        resources = Resources(
+            max_retries=self.max_retries,
+            code_key=batch.code_key,
+            scratch="" if self.scratch is None else str(self.scratch.absolute()),
+            results=file.results,
+            folder=str(file.folder),
+        )
+        if self.ray is not None:
+            return RayExecutor(file.out, resources, address=self.ray)
+        if self.slurm:
+            return SlurmExecutor(file.out, resources, partition=self.partition, minutes=self.minutes)
+        cores, gpus = (
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+            gpus_here(),
+        )
+        workers = self.local or len(gpus) or max(1, cores // 4)
+        require_between("option local", workers, 1, 4096)
+        return LocalExecutor(file.out, resources, workers=workers, gpus=gpus, cores=cores)
+
+
+@dataclass(frozen=True)
+class RunBatch:
+    """Options of `smplxpp batch`. The same command goes on with a batch that was interrupted."""
+
+    jobs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="JOBS.yaml")]
+    """File with the subjects, their captures, and what to do with each (docs/fleet.md)."""
+    machines: Annotated[Machines, tyro.conf.arg(name="")] = field(default_factory=Machines)
+    """Where the commands run."""
+    upgrade: bool = False
+    """Go on with another version of smplxpp than the batch began with: what its code affects is made again, and
+    unfinished trainings begin again."""
+    dry_run: bool = False
+    """Check the job file and print the commands, run nothing."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Run the batch; exit status 1 if a subject failed, 2 if the batch was halted."""
+        file = read_jobs(self.jobs)
+        check_options(file.jobs)
+        if self.dry_run:
+            return self._plan(file)
+        with take_batch(file.out) as held:
+            batch, jobs = begin_batch(file, self.jobs.absolute(), upgrade=self.upgrade)
+            executor = self.machines.executor(file, batch)
+            begin = time.perf_counter()
+            with _shown(enabled=not self.json) as report:
+                state = drive(
+                    file.out,
+                    jobs,
+                    executor,
+                    total=len(file.jobs),
+                    retries=self.machines.max_retries,
+                    report=report,
+                    held=held,
+                )
+            summary = summarise(file.out)
+        if not self.json:
+            print_status(summary, Console(), every=False)
+        halted = {"halted": state.halted, "seconds": round(time.perf_counter() - begin, 3)}
+        failed = bool(summary["states"].get("failed", 0) + summary["states"].get("refused", 0))
+        return {**summary, **halted, "exit_status": 2 if state.halted else int(failed)}
+
+    def _plan(self, file: JobFile) -> dict[str, Any]:
+        """Print what would run."""
+        commands = {
+            job.subject: [" ".join(job.command(step, file.out / job.subject, job.capture)) for step in job.steps]
+            for job in file.jobs
+        }
+        if not self.json:
+            console = Console()
+            for subject, lines in commands.items():
+                console.print(Text(subject, style="bold"))
+                for line in lines:
+                    console.print(f"  smplxpp {line}", soft_wrap=True, highlight=False, markup=False)
+        return {"runs": str(file.out), "commands": commands}
+
+
+@dataclass(frozen=True)
+class BatchStatus:
+    """Options of `smplxpp batch status`."""
+
+    runs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUNS")]
+    """Folder of the batch, `out` of its job file."""
+    all: bool = False
+    """List every subject; by default those that are done or wait are only counted."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Summarise the records."""
+        summary = summarise(self.runs)
+        if not self.json:
+            print_status(summary, Console(), every=self.all)
+        return summary
+
+
+@dataclass(frozen=True)
+class BatchStop:
+    """Options of `smplxpp batch stop`."""
+
+    runs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUNS")]
+    """Folder of the batch."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Ask all that work on the batch to end their commands, which they do within seconds."""
+        batch = read_batch(self.runs)
+        request_stop(self.runs)
+        if not self.json:
+            Console().print(f"asked to stop; `smplxpp batch {batch.job_file}` goes on", soft_wrap=True, highlight=False)
+        return {"runs": str(self.runs), "driver": at_work(self.runs / BATCH_HOLD)}
+
+
+@dataclass(frozen=True)
+class BatchRetry:
+    """Options of `smplxpp batch retry`."""
+
+    runs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUNS")]
+    """Folder of the batch."""
+    failed: bool = False
+    """Run again all that failed or was refused."""
+    subjects: tuple[str, ...] = ()
+    """Run only these of them again."""
+    machines: Annotated[Machines, tyro.conf.arg(name="")] = field(default_factory=Machines)
+    """Where the commands run."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> dict[str, Any]:
+        """Put the failures back, and go on with the batch.
+
+        Raises:
+            InputError: nothing named, or another process drives the batch.
+        """
+        if not self.failed and not self.subjects:
+            raise InputError("batch retry", expected="--failed, or --subjects NAME ...", received="neither")
+        with take_batch(self.runs):
+            retried = retry(self.runs, self.subjects)
+            path = Path(read_batch(self.runs).job_file)
+        return {**RunBatch(path, self.machines, json=self.json).run(), "retried": retried}
+
+
+def check_options(jobs: tuple[Job, ...]) -> None:
+    """Parse the options of every job as their commands will, before anything runs.
+
+    Raises:
+        InputError: an option that a command does not have, or a value that it does not take.
+    """
+    for job in jobs:
+        for step in job.steps:
+            try:
+                _parsed(step, tuple(option_words(job.options.get(step, {}), subject="subject")))
+            except InputError as error:
+                raise InputError(
+                    f"{job.subject}: {step}: {error.subject}",
+                    expected=error.expected,
+                    received=error.received,
+                    remedy=error.remedy,
+                ) from None
+
+
+@cache
+def _parsed(step: str, words: tuple[str, ...]) -> None:
+    """Parse options once for all jobs that have the same."""
+    kind = STEPS[step]
+    name, options = " ".join(kind.words), getattr(import_module(kind.module), kind.options)
+    checked = checked_arguments(name, options, words)
+    # What the runner adds itself; an option of the job that says it again is the user's.
+    places = {"train": ["--capture", "capture"], "convert": ["--out", "out"]}.get(step, [])
+    places = [] if places and places[0] in checked else places
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+            tyro.cli(options, args=["place", *places, *checked], config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit:
+        lines = [line.strip(" │╭╰─╮╯") for line in said.getvalue().splitlines()]
+        raise InputError(
+            "options",
+            expected=f"values that `smplxpp {name}` takes",
+            received=" ".join(filter(None, lines))[:300] or " ".join(words),
+            remedy=f"`smplxpp {name} --help` lists them",
+        ) from None
+
+
+def summarise(runs: Path) -> dict[str, Any]:
+    """Return what has become of a batch as JSON values."""
+    batch = read_batch(runs)
+    records = records_of(runs, batch)
+    return {
+        "runs": str(runs),
+        "name": batch.name,
+        "started": batch.started,
+        "driver": at_work(runs / BATCH_HOLD),
+        "states": dict(Counter(record.state for record in records)),
+        "subjects": [_row(record) for record in records],
+    }
+
+
+def _row(record: JobRecord) -> dict[str, Any]:
+    """Return a subject's row: its state, the step that it is at, the time and the error."""
+    at = next((step for step in record.steps if step.state != "done"), None)
+    error = at.error if at is not None else None
+    return {
+        "subject": record.subject,
+        "state": record.state,
+        "step": "" if at is None else at.step,
+        "minutes": round(sum(step.seconds for step in record.steps) / 60, 2),
+        "attempts": sum(step.attempts for step in record.steps),
+        "error": error,
+        "log": "" if at is None or not at.log else f"{record.subject}/{at.log}",
+    }
+
+
+def print_status(summary: Mapping[str, Any], console: Console, *, every: bool) -> None:
+    """Print the counts, and a line for each subject that failed, stopped or runs."""
+    counts = Text("  ").join(
+        Text(f"{summary['states'][state]} {state}", style=style)
+        for state, style in _STYLES.items()
+        if summary["states"].get(state)
+    )
+    console.print(Text(f"{summary['name']}  ", style="bold") + counts)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    for name in ("subject", "state", "step", "minutes", ""):
+        table.add_column(name, justify="right" if name == "minutes" else "left", overflow="fold")
+    for row in summary["subjects"]:
+        if every or row["state"] in ("failed", "refused", "stopped", "running"):
+            words = str((row["error"] or {}).get("message", ""))
+            state = Text(row["state"], style=_STYLES[row["state"]])
+            table.add_row(row["subject"], state, row["step"], f"{row['minutes']:.1f}", Text(words))
+    if table.row_count:
+        console.print(table)
+
+
+@contextlib.contextmanager
+def _shown(*, enabled: bool) -> Any:
+    """Show a bar with the subjects by state and those at work."""
+    columns = (TextColumn("subjects"), BarColumn(bar_width=20), MofNCompleteColumn(), TimeElapsedColumn())
+    words = TextColumn("{task.fields[words]}", markup=False)
+    with Progress(*columns, words, console=Console(stderr=True), disable=not enabled) as bar:
+        task = bar.add_task("", total=None, words="")
+
+        def report(state: State) -> None:
+            ended = sum(state.states[name] for name in ("done", "failed", "refused", "stopped"))
+            failed = state.states["failed"] + state.states["refused"]
+            at_work = ", ".join(list(state.running)[:4]) + (", ..." if len(state.running) > 4 else "")
+            shown = state.halted or at_work
+            words = f"{failed} failed; {shown}" if failed else shown
+            bar.update(task, total=state.total, completed=ended, words=words)
+
+        yield report
