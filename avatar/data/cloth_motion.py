@@ -13,6 +13,7 @@ from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
 from smplxpp.cloth.driver import LONGEST_STEP
 from smplxpp.cloth.play import SMOOTHING, followed
 from smplxpp.cloth.poses import resampled
+from smplxpp.cloth.quality import ClothQuality, merged
 from smplxpp.core import BodyParams, GeometryWarning, InputError, require_at_least, require_positive
 from smplxpp.template.template import Template
 
@@ -50,6 +51,9 @@ class ClothMotions:
         fps: frames a second of their numbers.
         config: of the simulation; None: the defaults.
 
+    Attributes:
+        quality: what was measured of each garment in the frames that were simulated, without those of the pre-roll.
+
     Raises:
         InputError: no frames a second.
     """
@@ -69,6 +73,7 @@ class ClothMotions:
         self.template, self.garments, self.config = template, tuple(garments), config or ClothMotionConfig()
         self._params, self._frames, self._fps = params, np.array(sorted(frames), dtype=np.int64), fps
         self._shapes: dict[int, ClothShape] = {}
+        self.quality: list[ClothQuality] = []
 
     def simulate(self, run: Sequence[int]) -> None:
         """Simulate consecutive frames, with the frames before them as pre-roll; simulated ones are skipped.
@@ -96,6 +101,8 @@ class ClothMotions:
         last: int | None = None
         wanted = set(run)
         for frame in known:
+            if frame == run[0]:
+                driver.measure_anew()
             # The duration of the first step does not matter, because the simulation starts cold there.
             seconds = 1.0 if last is None else (frame - last) / self._fps
             pose_drawn = self._params(frame)
@@ -103,6 +110,7 @@ class ClothMotions:
             last = frame
             if frame in wanted:
                 self._shapes[frame] = shape
+        self.quality = merged([*self.quality, *driver.quality])
         for note in driver.notes:
             warnings.warn(f"simulated clothes: {note}", GeometryWarning, stacklevel=2)
 

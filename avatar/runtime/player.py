@@ -15,6 +15,7 @@ from avatar.runtime.networks import BlendShapes, DisplacementField
 from avatar.runtime.skeleton import LooseClothes, skeleton_body
 from avatar.runtime.splatting import Splatter, WorldSplats, facing_normals, relit_picture
 from smplxpp.cloth.driver import ClothShape, DriverConfig
+from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import BodyParams, Camera, InputError, TriangleMesh, normalize_rows
 from smplxpp.core.light import Relighting
 from smplxpp.native import thread_count
@@ -122,6 +123,11 @@ class AvatarPlayer:
     def notes(self) -> list[str]:
         """Remarks on the simulation of the loose clothes, a sentence each."""
         return [] if self._clothes is None else self._clothes.notes
+
+    @property
+    def cloth_quality(self) -> list[ClothQuality]:
+        """How well the simulated clothes held in the steps until now; none without clothes."""
+        return [] if self._clothes is None else self._clothes.quality
 
     @property
     def skinned_clothes(self) -> ClothShape | None:

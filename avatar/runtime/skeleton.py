@@ -14,6 +14,7 @@ from smplxpp.body.retarget import PoseRange
 from smplxpp.cloth.driver import ClothDriver, ClothShape, DriverConfig
 from smplxpp.cloth.garment_file import garments_from_arrays
 from smplxpp.cloth.poses import pose_between
+from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import BodyParams, SkinWeights, require_positive
 from smplxpp.template.template import Template
 
@@ -149,6 +150,11 @@ class LooseClothes:
     def notes(self) -> list[str]:
         """Remarks on the simulation, a sentence each."""
         return self._driver.notes
+
+    @property
+    def quality(self) -> list[ClothQuality]:
+        """What was measured of each garment since the player was made."""
+        return self._driver.quality
 
     def step(self, params: BodyParams, seconds: float, path: Sequence[BodyParams] = ()) -> ClothShape:
         """Simulate to a pose, along a path of poses if there is one; see `ClothDriver.step` and `follow`."""

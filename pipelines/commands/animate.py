@@ -25,6 +25,7 @@ from pipelines.runs.layout import GARMENTS, STUDENT
 from smplxpp.cloth import Garment, cut_garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
+from smplxpp.cloth.quality import ClothQuality, all_checks
 from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, require_at_least, require_positive, spread
 from smplxpp.core.camera import Camera
 from smplxpp.raster.shading import ShadeStyle
@@ -84,6 +85,7 @@ class Animate:
     json: bool = False
     """Print what was written as JSON."""
     _notes: tyro.conf.Suppress[list[str]] = field(default_factory=list, init=False)
+    _quality: tyro.conf.Suppress[list[ClothQuality]] = field(default_factory=list, init=False)
 
     def run(self) -> dict:
         """Pose the template frame by frame and write the result, whole or not at all."""
@@ -111,7 +113,7 @@ class Animate:
         simulated = [garment.part for garment in garments]
         if not self.json:
             self._print(len(params), fps, simulated)
-        return {"out": str(self.out), "frames": len(params), "fps": fps, "simulated": simulated, "notes": self._notes}
+        return self._answer(len(params), fps, simulated)
 
     @property
     def _of_student(self) -> bool:
@@ -165,26 +167,27 @@ class Animate:
             numbered_from=begin if self.codes == "trained" else None,
             relighting=self.lighting.relighting(),
         )
-        cameras, frames = student_frames(bundle, motion, shown, film, self._notes)
+        cameras, frames = student_frames(bundle, motion, shown, film, self._notes, self._quality)
         shown_frames = track(
             frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json
         )
         write_film(self.out, shown_frames, fps=fps, size=(cameras[0].width, cameras[0].height))
         if not self.json:
             self._print(len(shown), fps, simulated)
-        return {
-            "out": str(self.out),
-            "frames": len(shown),
-            "fps": fps,
-            "simulated": simulated,
-            "notes": self._notes,
-        }
+        return self._answer(len(shown), fps, simulated)
+
+    def _answer(self, frames: int, fps: float, simulated: list[str]) -> dict:
+        checks = [check.as_dict() for check in all_checks(self._quality, "the film")]
+        about = {"out": str(self.out), "frames": frames, "fps": fps, "simulated": simulated}
+        return {**about, "checks": checks, "notes": self._notes}
 
     def _print(self, frames: int, fps: float, simulated: list[str]) -> None:
         """Print the result to standard output and the notes to standard error."""
         moved = f", simulated: {', '.join(simulated)}" if simulated else ""
         Console().print(f"{self.out}: {frames} frames at {fps:g} a second{moved}", markup=False)
-        for sentence in self._notes:
+        failed = [check for check in all_checks(self._quality, "the film") if check.status == "fail"]
+        said = [f"FAILED {one.name}: {one.value:.2f} {one.unit}, {one.gate}; {one.explanation}" for one in failed]
+        for sentence in (*self._notes, *said):
             Console(stderr=True).print(sentence, markup=False)
 
     def _check_options(self, suffix: str) -> None:
@@ -275,7 +278,7 @@ class Animate:
         if not garments:
             yield from _pose_blocks(template, chosen)
             return
-        surfaces = play(template, garments, whole, fps=fps * self.step, notes=self._notes)
+        surfaces = play(template, garments, whole, fps=fps * self.step, notes=self._notes, quality=self._quality)
         first = len(whole) - 1 - (len(chosen) - 1) * self.step
         for k, vertices in enumerate(surfaces):
             if k >= first and (k - first) % self.step == 0:

@@ -15,6 +15,7 @@ from pipelines.commands.driving import Driving
 from pipelines.commands.options import ClothMode
 from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
 from smplxpp.cloth.play import ways
+from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import BodyParams, Camera, spread
 from smplxpp.core.light import Relighting
 
@@ -58,7 +59,12 @@ def motion_for(bundle: AvatarBundle, path: Path, *, fps: float | None = None) ->
 
 
 def student_frames(
-    bundle: AvatarBundle, motion: BodyParams, shown: range, film: StudentFilm, notes: list[str]
+    bundle: AvatarBundle,
+    motion: BodyParams,
+    shown: range,
+    film: StudentFilm,
+    notes: list[str],
+    quality: list[ClothQuality] | None = None,
 ) -> tuple[list[Camera], Iterator[UInt8[np.ndarray, "H W 3"]]]:
     """Return the cameras of a film and its pictures, drawn as they are asked for.
 
@@ -68,6 +74,7 @@ def student_frames(
         shown: rows of the motion that the film shows.
         film: view, size and light.
         notes: list to which remarks are added.
+        quality: list to which is added, after the last picture, how well simulated clothes held.
     """
     from avatar.runtime import AvatarPlayer
     from avatar.runtime.skeleton import pose_range
@@ -85,7 +92,7 @@ def student_frames(
         motion = limits.clamped(motion) if film.clamp else motion
     player = AvatarPlayer(bundle)
     cameras = _cameras(player, motion.select(list(shown)), film)
-    return cameras, _pictures(player, motion, shown, cameras, film, notes)
+    return cameras, _pictures(player, motion, shown, cameras, film, notes, quality)
 
 
 def _cameras(player: AvatarPlayer, params: BodyParams, film: StudentFilm) -> list[Camera]:
@@ -109,6 +116,7 @@ def _pictures(
     cameras: list[Camera],
     film: StudentFilm,
     notes: list[str],
+    quality: list[ClothQuality] | None,
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     # Step a simulation through every frame of the motion, and draw only the shown ones. Without a simulation, frames
     # that are not shown need no pose.
@@ -128,3 +136,5 @@ def _pictures(
         image, _ = player.draw(picture[k], background=_BACKGROUND, relighting=film.relighting)
         yield (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     notes += player.notes
+    if quality is not None and simulate:
+        quality += player.cloth_quality

@@ -22,6 +22,7 @@ from pipelines.stages.models import ModelStage, Trainer
 from smplxpp.cloth import Garment
 from smplxpp.cloth.calibrate import Calibration
 from smplxpp.cloth.garment_file import load_garments, save_garments
+from smplxpp.cloth.quality import all_checks
 from smplxpp.core.checks import Check
 from smplxpp.template.template import Template
 
@@ -116,13 +117,15 @@ def _numbers_of(one: Calibration, outlines: Outlines | None) -> dict[str, Any]:
         "skinned_mm": 1e3 * one.skinned,
         "simulated_mm": 1e3 * one.simulated,
         "frames": one.frames,
+        "quality": None if one.quality is None else one.quality.as_dict(),
     }
 
 
 def _checks(found: LooseClothes) -> list[Check]:
-    """Return a check of each simulated part's outline against that of skinning."""
+    """Return checks of each simulated part: its outline against that of skinning, and whether its simulation holds."""
     measured = {one.part: found.outlines[one.part] for one in found.garments if one.part in found.outlines}
-    return [
+    simulated = [one.quality for one in found.calibrations if one.part in measured and one.quality is not None]
+    return all_checks(simulated, "training frames") + [
         Check(
             f"{part}: wrong outline with it simulated",
             # 1e-9 keeps a perfect outline under skinning from dividing by zero.

@@ -42,6 +42,7 @@ from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
+from smplxpp.cloth.quality import ClothQuality, all_checks, merged
 from smplxpp.core import Check, InputError, ProgressCallback, ignore_progress, require_known
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.metrics.comparison import MM
@@ -124,7 +125,11 @@ def evaluate(
         if held_out is None:
             return {}
         there = clothes.sequence(capture, device=device)
-        return evaluate_models(loaded, there, held_out, progress=progress).report.models
+        found = evaluate_models(loaded, there, held_out, progress=progress).report.models
+        moved.extend(there.cloth.quality if there.cloth else ())
+        return found
+
+    moved: list[ClothQuality] = []  # what was measured of simulated clothes
 
     def work(folder: Path) -> StageOutput:
         # First pass: all view sets with the poses that the capture gives.
@@ -142,12 +147,11 @@ def evaluate(
                 poses=pose_errors(captures, exact, scene.template),
                 conventions={**report.conventions, "poses": POSE_CONVENTION},
             )
-        return _write(
-            folder,
-            replace(found, report=report),
-            overlap=scene.overlap,
-            pixel=pixel_size(sequence),
-        )
+        written = _write(folder, replace(found, report=report), overlap=scene.overlap, pixel=pixel_size(sequence))
+        # Clothes that tore in the frames that were measured, whatever the figures say.
+        qualities = merged([*(sequence.cloth.quality if sequence.cloth else ()), *moved])
+        written.numbers["clothes"] = [one.as_dict() for one in qualities]
+        return replace(written, checks=[*written.checks, *all_checks(qualities, "held-out poses")])
 
     with own_run_folder(run, (EVALUATE_STAGE, "report")):
         return run_stage(run, stage, work, force=force)

@@ -18,11 +18,14 @@ from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progre
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.resources import peak_memory
 from avatar.training.engine.session import BACK, PRETRAIN, TRACK, Session
+from avatar.training.tracking.track import SIMULATED_FILE
 from pipelines.runs import gates
 from pipelines.runs.layout import KINDS, kind_name
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import CLOTHED, Trainer
+from smplxpp.cloth.quality import all_checks, quality_from
 from smplxpp.core.checks import Check
+from smplxpp.core.files import read_json
 
 TRACK_BACK = f"{TRACK}/{BACK}"
 BEFORE = {TRACK: "track_metrics.jsonl", TRACK_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
@@ -38,6 +41,8 @@ def keep_logs(work: Path, folder: Path) -> None:
         source = work / part / METRICS_FILE
         if source.is_file():
             shutil.copyfile(source, folder / name)
+    if (work / TRACK / SIMULATED_FILE).is_file():
+        shutil.copyfile(work / TRACK / SIMULATED_FILE, folder / SIMULATED_FILE)
 
 
 def write_model(path: Path, model: TeacherAvatar | Student) -> dict[str, Any]:
@@ -114,6 +119,7 @@ def _output(
         "training_cameras": len(sequence.train_cameras),
         "held_out_cameras": held_out,
         "normals": _normals(sequence, folder),
+        "simulated_clothes": read_json(folder / SIMULATED_FILE) if (folder / SIMULATED_FILE).is_file() else [],
         "convention": CONVENTION,
         "seconds_of_tracking": seconds[TRACK] + seconds[TRACK_BACK],
         **_followed(model),
@@ -154,6 +160,8 @@ def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
     # Tracking forwards and back must return to the start; the distance is the drift.
     if "drift_mm" in numbers.get("followed", {}):
         checks.append(gates.DRIFT.check("clothes followed back to the first frame", numbers["followed"]["drift_mm"]))
+    # The simulation that predicted the tracked frames must not tear.
+    checks += all_checks([quality_from(one) for one in numbers["simulated_clothes"]], "prediction")
     # Check each measured kind of views: quality, gain since the start, loss by compression.
     for kind, gate in gates.PSNR.items():
         if kind not in numbers:

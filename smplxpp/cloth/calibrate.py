@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from smplxpp.cloth.driver import ClothDriver, DriverConfig
 from smplxpp.cloth.garment import Garment, GarmentConfig
+from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_at_least, require_between
 from smplxpp.template.template import Template
 
@@ -66,6 +67,7 @@ class Calibration:
         skinned, simulated: mean distance of particles to the followed surface, metres, by skinning alone and with
             these values.
         frames: how many were looked at.
+        quality: of that simulation along the frames; None where none was made.
     """
 
     part: str
@@ -78,6 +80,7 @@ class Calibration:
     skinned: float
     simulated: float
     frames: int
+    quality: ClothQuality | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +157,7 @@ def calibrate(
         for k, body in enumerate(bodies):
             player.step(followed.params.frame(k), 1.0 / followed.fps, posed=body)
             positions.append(player.particles(trial.part))
+        qualities[drag, pin] = player.quality[0]
         return errors(positions)
 
     # The baseline is linear blend skinning, v' = sum_j w_j (R_j v + t_j). Where it explains the surface already, the
@@ -167,6 +171,7 @@ def calibrate(
 
     # Search the grid of all pairs: the error is chaotic in the parameters, so it has no useful gradient.
     pairs = list(product(config.drags, config.pin_depths))
+    qualities: dict[tuple[float, float], ClothQuality] = {}
     table: dict[tuple[float, float], Float[np.ndarray, " L"]] = {}
 
     def best(frames: np.ndarray) -> tuple[float, float]:
@@ -188,12 +193,13 @@ def calibrate(
     drag, pin = best(frames)
     # Keep the garment's own values where the best simulation is not clearly nearer than skinning.
     if table[drag, pin].mean() > config.most_share * skinned.mean():
-        return garment, _found(garment, skinned, table[drag, pin], moves=True)
+        return garment, _found(garment, skinned, table[drag, pin], moves=True, quality=qualities[drag, pin])
     # Estimate the spread by the jackknife over blocks of consecutive frames, since neighbouring frames are correlated.
     left_out = [best(np.setdiff1d(frames, block)) for block in np.array_split(frames, config.blocks)]
     spread = [_jackknife([pair[k] for pair in left_out]) for k in (0, 1)]
     found = with_values(garment, drag=drag, pin_depth=pin)
-    return found, _found(found, skinned, table[drag, pin], moves=True, spread=(spread[0], spread[1]))
+    apart = (spread[0], spread[1])
+    return found, _found(found, skinned, table[drag, pin], moves=True, spread=apart, quality=qualities[drag, pin])
 
 
 def with_values(garment: Garment, *, drag: float, pin_depth: float) -> Garment:
@@ -210,6 +216,7 @@ def _found(
     *,
     moves: bool,
     spread: tuple[float, float] | None = None,
+    quality: ClothQuality | None = None,
 ) -> Calibration:
     return Calibration(
         part=garment.part,
@@ -222,6 +229,7 @@ def _found(
         skinned=float(skinned.mean()),
         simulated=float(simulated.mean()),
         frames=len(skinned),
+        quality=quality,
     )
 
 

@@ -13,6 +13,7 @@ from smplxpp.cloth.embedding import SkinnedRows
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.model import SolverConfig
 from smplxpp.cloth.poses import pose_between, reference_facing_as
+from smplxpp.cloth.quality import ClothQuality
 from smplxpp.cloth.thread import GarmentThread
 from smplxpp.core import BodyParams, InputError, require_at_least, require_choice, require_positive
 from smplxpp.core.errors import one_line
@@ -74,6 +75,7 @@ class ClothDriver:
 
     Attributes:
         notes: remarks on restarts, gaps and failures, a sentence each, in order.
+        quality: what was measured of each garment in the frames since it was made or since `measure_anew`.
 
     Raises:
         InputError: no garment, or one of another template.
@@ -98,7 +100,8 @@ class ClothDriver:
         # The same with the body's shape of the moment, where steps need it.
         self._shaped_rest = self._rest.copy()
         self._skin = self._rows[self._rows < template.body.vertex_count]
-        self._threads = [GarmentThread(g, self._rows, self.config) for g in garments]
+        self._threads = [GarmentThread(g, self._rows, self.config, template.faces) for g in garments]
+        self.quality = [ClothQuality(part=g.part) for g in garments]
         # What places are measured from: near the person, so that float32 knows micrometres wherever that stands.
         self._origin = np.zeros(3)
         self._time = 0.0
@@ -132,6 +135,10 @@ class ClothDriver:
             raise InputError(f"particles of {part}", expected=f"shape {expected}", received=str(particles.shape))
         names = [garment.part for garment in self.garments]
         self._threads[names.index(part)].place((particles - self._origin).astype(np.float32))
+
+    def measure_anew(self) -> None:
+        """Forget what was measured: the frames until now are not used."""
+        self.quality = [ClothQuality(part=one.part) for one in self.quality]
 
     def restart(self) -> None:
         """Forget the state: the next step starts cold."""
@@ -255,7 +262,17 @@ class ClothDriver:
 
     def _shaped(self, posed: PosedBody) -> ClothShape:
         """Take the cloth as it is back to the T-pose."""
-        carried = np.concatenate([thread.carried() for thread in self._threads])
+        each = [thread.carried() for thread in self._threads]
+        carried = np.concatenate(each)
         displacements = self._fine_skinned.unposed(posed, self._rest, carried, origin=self._origin)
         self._shape = ClothShape(self._fine, displacements, self._shape.share)
+        self._measure(each)
         return self._shape
+
+    def _measure(self, drawn: Sequence[Float32[np.ndarray, "N 3"]]) -> None:
+        """Measure the garments as they are, and note the first frame in which one does not hold."""
+        for k, thread in enumerate(self._threads):
+            now, before = thread.measured(self._time, drawn[k]), self.quality[k]
+            self.quality[k] = before.with_(now)
+            if before.holds and not self.quality[k].holds:
+                self.notes.append(f"the cloth tears at {self._time:.2f} s: {now.sentence}")

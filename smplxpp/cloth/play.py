@@ -11,6 +11,7 @@ from jaxtyping import Float
 from smplxpp.cloth.driver import ClothDriver, DriverConfig
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.poses import resampled, smoothed
+from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import BodyParams, require_positive
 from smplxpp.template.template import Template
 
@@ -70,6 +71,7 @@ def play(
     config: DriverConfig | None = None,
     smoothing: float = SMOOTHING,
     notes: list[str] | None = None,
+    quality: list[ClothQuality] | None = None,
 ) -> Iterator[Float[np.ndarray, "V 3"]]:
     """Yield the posed surface of every frame, metres; the clothes start cold before the first one.
 
@@ -79,6 +81,7 @@ def play(
         config: of the driver.
         smoothing: of what the clothes follow (`smplxpp.cloth.play`), seconds.
         notes: list to which the remarks of the driver are added.
+        quality: list whose content becomes what was measured of each garment in the frames until then.
     """
     driver = ClothDriver(template, garments, config)
     weights = template.weights.dense()
@@ -95,4 +98,6 @@ def play(
         blended = (weights @ posed.posed_from_rest[0, :, :3].reshape(-1, 12)).reshape(-1, 3, 4)
         if notes is not None:
             notes += driver.notes[len(notes) :]
+        if quality is not None:
+            quality[:] = driver.quality
         yield np.einsum("vij,vj->vi", blended[:, :, :3], rest) + blended[:, :, 3]

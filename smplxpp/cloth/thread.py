@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int, Int64
 
 from smplxpp.cloth.embedding import CarriedVertices
 from smplxpp.cloth.garment import Garment
+from smplxpp.cloth.quality import BURIED, ClothQuality, EdgeLengths, drawn_edges
 from smplxpp.cloth.solver import ClothSolver, ClothState, move_before_collider
 from smplxpp.core.mesh import row_lengths
 
@@ -26,9 +27,16 @@ class GarmentThread:
     Args:
         garment: what it is.
         rows: (R,) vertices of the template whose places it is given, increasing.
+        faces: of the template, whose edges are measured as they are drawn.
     """
 
-    def __init__(self, garment: Garment, rows: Int64[np.ndarray, " R"], config: DriverConfig) -> None:
+    def __init__(
+        self,
+        garment: Garment,
+        rows: Int64[np.ndarray, " R"],
+        config: DriverConfig,
+        faces: Int[np.ndarray, "F 3"],
+    ) -> None:
         self.garment, self._most_stretch = garment, config.most_stretch
         self._model = garment.model()
         collider = garment.collider
@@ -40,7 +48,9 @@ class GarmentThread:
         self._skin = np.searchsorted(rows, collider.vertices)
         self._pinned = np.flatnonzero(garment.pinned)
         self._share = garment.share()
-        self._most_squared = (self._most_stretch * self._model.lengths + 0.01) ** 2
+        self._edges = EdgeLengths(self._model.edges, self._model.lengths, 0.0)
+        self._drawn = drawn_edges(garment, faces)
+        self._resets = 0
         self._state = ClothState.at_rest(garment.rest.vertices)
         self._places: list[Float32[np.ndarray, "n 3"]] = []
         self._surfaces: list[Float32[np.ndarray, "c 3"]] = []
@@ -81,6 +91,7 @@ class GarmentThread:
         if self._sound():
             return None
         self._state = ClothState.at_rest(own)
+        self._resets += 1
         return "the simulation broke down; the cloth is on the body again and goes on from there"
 
     def place(self, particles: Float32[np.ndarray, "n 3"]) -> None:
@@ -105,13 +116,38 @@ class GarmentThread:
         return self._carried.at(self._state.position, self._surfaces[-1], margin=_FINE_MARGIN)
 
     def buried(self) -> int:
-        """Return how many particles lie inside what the garment touches."""
+        """Return how many particles lie inside what the garment touches, by so much that no contact pushes them out."""
+        # Metres inside what it touches.
+        return int((self._depths() > 0.005).sum())
+
+    def _depths(self) -> Float32[np.ndarray, " L"]:
+        """Return how deep the free particles lie inside what the garment touches, metres; 0 outside."""
         coarse = self.garment.rest.with_vertices(self._state.position)
         normals, loose = coarse.vertex_normals, ~self.garment.pinned
         out = move_before_collider(self._state.position, normals, self._surfaces[-1], self._solver.collider, margin=0.0)
-        # Metres inside what it touches from which a particle counts as buried.
-        buried = 0.005
-        return int((row_lengths(out - self._state.position)[loose] > buried).sum())
+        return row_lengths(out - self._state.position)[loose]
+
+    def measured(self, seconds: float, drawn: Float32[np.ndarray, "N 3"]) -> ClothQuality:
+        """Measure the garment as it is.
+
+        Args:
+            seconds: of the motion, to be said with the figures.
+            drawn: where the carried vertices are, metres.
+        """
+        depths = self._depths()
+        inside = float((depths > BURIED).mean()) if len(depths) else 0.0
+        resets, self._resets = self._resets, 0
+        return ClothQuality(
+            part=self.garment.part,
+            frames=1,
+            longest=self._edges.longest(self._state.position),
+            longest_at=seconds,
+            drawn=self._drawn.longest(drawn),
+            inside=inside,
+            inside_most=inside,
+            deepest=float(depths.max(initial=0.0)),
+            resets=resets,
+        )
 
     def laid_over(
         self, vertices: Int64[np.ndarray, " c"], surface: Float32[np.ndarray, "c 3"]
@@ -131,10 +167,7 @@ class GarmentThread:
         x = self._state.position
         if not (np.isfinite(x).all() and np.isfinite(self._state.velocity).all()):
             return False
-        # Compare squared lengths with the squared limit, which saves a square root for each edge.
-        ends = x[self._model.edges.T]
-        apart = ends[0] - ends[1]
-        return bool((np.einsum("ei,ei->e", apart, apart) <= self._most_squared).all())
+        return self._edges.longest(x) <= self._most_stretch
 
 
 def _four_moments(

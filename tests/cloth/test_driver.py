@@ -131,9 +131,10 @@ def test_a_long_way_is_followed_without_a_jerk():
     """What places are measured from moves along, and the cloth does not notice."""
     walk, still = driver(), driver()
     for k in range(50):
-        shapes = [one.step(standing(at=at), 1 / 30) for one, at in ((walk, (0.2 * k, 0.0, 0.0)), (still, (0, 0, 0)))]
+        way = 0.2 * np.maximum(k - 10, k**2 / 40 if k < 20 else 0)  # 6 m a second after two thirds of one
+        shapes = [one.step(standing(at=at), 1 / 30) for one, at in ((walk, (way, 0.0, 0.0)), (still, (0, 0, 0)))]
     assert walk.notes == []
-    place = walk.particles(PART) - np.float32([0.2 * 49, 0.0, 0.0])
+    place = walk.particles(PART) - np.float32([way, 0.0, 0.0])
     pinned = garment().pinned
     np.testing.assert_allclose(place[pinned], skinned()[pinned], atol=1e-4)
     # At 6 m/s the skirt lies back against the legs.
@@ -210,7 +211,7 @@ def test_a_body_that_starts_in_collision_is_said_and_comes_out():
     count = len(one.notes)
     for _ in range(30):
         shape = one.step(lifted, 1 / 30)
-    assert len(one.notes) == count  # nothing broke
+    assert not any("broke down" in sentence for sentence in one.notes[count:])
     assert np.isfinite(shape.displacements).all()
 
 

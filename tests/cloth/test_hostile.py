@@ -76,7 +76,7 @@ def test_motions_that_shake_wildly_keep_the_cloth_finite(jump):
         shape = one.step(standing(at=at, turned=float(rng.normal()), lifted=float(rng.uniform(0, 1))), 1 / 30)
         assert np.isfinite(shape.displacements).all()
         assert np.linalg.norm(shape.displacements, axis=1).max() < 3.0
-    assert bool(one.notes) == (jump >= 0.5)  # 12 m a second are a leap
+    assert any("restart" in note for note in one.notes) == (jump >= 0.5)  # 12 m a second are a leap
 
 
 def test_frames_of_hostile_numbers_of_a_motion_are_passed_over():

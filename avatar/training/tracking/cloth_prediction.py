@@ -15,6 +15,7 @@ from torch import Tensor
 
 from avatar.data.cloth_motion import ClothMotions
 from smplxpp.cloth import Garment, GarmentConfig, cut_garment
+from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import DEFAULT_FPS, BodyParams, GeometryWarning, InputError
 from smplxpp.template.template import Template
 
@@ -44,11 +45,13 @@ class SimulatedControls:
         displacements: (K, 3) by frame, metres along the axes of the T-pose, 0 off simulated clothes.
         share: in [0, 1], the simulation's share of a control point's displacement.
         part: garment of each control point, from 0 to P - 1; 0: not simulated.
+        quality: what was measured of each garment.
     """
 
     displacements: Mapping[int, Float[Tensor, "K 3"]]
     share: Float[Tensor, " K"]
     part: Int[Tensor, " K"]
+    quality: Sequence[ClothQuality] = ()
 
 
 def simulate_controls(
@@ -95,6 +98,7 @@ def simulate_controls(
         displacements,
         torch.tensor(share[rows], device=controls.device),
         torch.tensor(part[rows], device=controls.device),
+        clothes.quality,
     )
 
 

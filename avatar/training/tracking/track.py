@@ -5,6 +5,7 @@ The loss, its terms and the schedule are described in `avatar.training.tracking`
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,7 +30,10 @@ from avatar.training.tracking.cloth_prediction import ClothPrediction, Observed,
 from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track_uncertainty import expected_errors, structure_tensors, unobserved_weight
 from smplxpp.core import DEFAULT_FPS, InputError
+from smplxpp.core.files.atomic import atomic_write_text
 
+SIMULATED_FILE = "simulated_clothes.json"
+"""File in the session's folder: how well the clothes held whose simulation predicts the frames, part by part."""
 LEVEL_DECAY = 0.1
 """Learning rate at the end of a level, as a fraction of that at its start."""
 
@@ -336,6 +340,10 @@ def follow_surface(
     context = replace(session.context, distributed=None)
     # Forward pass.
     task = TrackTask(sequence, avatar, config, context)
+    simulated = task.prediction.simulated
+    if simulated is not None and (session.distributed or Distributed()).first:
+        quality = [one.as_dict() for one in simulated.quality]
+        atomic_write_text(session.folder / SIMULATED_FILE, json.dumps(quality, indent=1))
     progress = session.run_alone(lambda: task, task.config)
     _share(task, session)
     if not (config.back and progress.finished and len(sequence.train_frames) > 1):

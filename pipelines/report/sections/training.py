@@ -211,6 +211,8 @@ def cloth_section(record: StageRecord) -> Section:
             *_outlines(one["outlines"]),
             _with_spread(one["drag_per_s"], one["drag_spread"]),
             _with_spread(one["pin_depth_mm"], one["pin_spread_mm"]),
+            "-" if not one.get("quality") else f"{one['quality']['longest']:.2f}",
+            "-" if not one.get("quality") else f"{1e3 * one['quality']['deepest']:.0f}",
             str(one["frames"]),
         )
         for part, one in numbers["calibration"].items()
@@ -224,6 +226,8 @@ def cloth_section(record: StageRecord) -> Section:
         "simulation",
         "drag, 1/s",
         "pins, mm",
+        "longest edge, x",
+        "deepest, mm",
         "frames",
     )
     return Section(

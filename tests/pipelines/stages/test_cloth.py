@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from avatar.data.sequence import AvatarSequence
 from avatar.training.loose_clothes import find_garments
 from pipelines.report.sections.training import cloth_section
@@ -35,4 +37,11 @@ def test_the_report_says_what_was_found_and_what_was_not(tmp_path):
     assert rows[PART][0] == "simulated" and "+-" in rows[PART][5]
     assert rows["outer"][0] == "left to the field" and rows["outer"][2:6] == ("-", "-", "-", "-")
     assert "hair: nothing holds it" in section.text
-    assert [check.name for check in section.checks] == [f"{PART}: wrong outline with it simulated"]
+    assert [check.name for check in section.checks] == [
+        *(
+            f"{PART} simulated in training frames: {what}"
+            for what in ("longest edge", "longest drawn edge", "inside the body")
+        ),
+        f"{PART}: wrong outline with it simulated",
+    ]
+    assert float(rows[PART][7]) == pytest.approx(found.calibrations[0].quality.longest, abs=0.006)
