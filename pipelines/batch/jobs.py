@@ -80,7 +80,7 @@ STEPS: Mapping[str, StepKind] = {
 }
 """The steps in the order in which they run."""
 DEFAULT_STEPS = ("check", "build", "train", "evaluate", "export")
-RESERVED = ("batch.json", "index.html", "summary.csv", "stop.json", "cluster")
+RESERVED = ("batch.json", "index.html", "index.json", "summary.csv", "stop.json", "cluster")
 """Names in RUNS that no subject may have."""
 _SUBJECT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 _TOP = ("name", "out", "results", "defaults", "jobs")

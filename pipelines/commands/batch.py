@@ -6,8 +6,7 @@ import contextlib
 import io
 import os
 import time
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -17,7 +16,6 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from rich.text import Text
 
 from pipelines.batch.driver import Progress as State
@@ -25,13 +23,14 @@ from pipelines.batch.driver import begin_batch, drive, retry, take_batch
 from pipelines.batch.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor, gpus_here
 from pipelines.batch.hold import BATCH_HOLD, at_work, request_stop
 from pipelines.batch.jobs import STEPS, Job, JobFile, option_words, read_jobs
-from pipelines.batch.records import Batch, JobRecord, read_batch, records_of
+from pipelines.batch.page import INDEX_FILE, STATE_STYLES, IndexWriter, terminal_table
+from pipelines.batch.records import Batch, read_batch
 from pipelines.batch.run_job import Resources
+from pipelines.batch.table import Row, count_states
 from pipelines.commands.help import checked_arguments
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
+from pipelines.commands.terminal import print_paths
 from smplxpp.core.errors import InputError, require_between
-
-_STYLES = {"done": "green", "running": "cyan", "waiting": "dim", "stopped": "yellow", "failed": "red", "refused": "red"}
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class RunBatch:
     """Options of `smplxpp batch`. The same command goes on with a batch that was interrupted."""
 
     jobs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="JOBS.yaml")]
-    """File with the subjects, their captures, and what to do with each (docs/fleet.md)."""
+    """File with the subjects, their captures, and what to do with each (docs/batch.md)."""
     machines: Annotated[Machines, tyro.conf.arg(name="")] = field(default_factory=Machines)
     """Where the commands run."""
     upgrade: bool = False
@@ -109,8 +108,8 @@ class RunBatch:
         with take_batch(file.out) as held:
             batch, jobs = begin_batch(file, self.jobs.absolute(), upgrade=self.upgrade)
             executor = self.machines.executor(file, batch)
-            begin = time.perf_counter()
-            with _shown(enabled=not self.json) as report:
+            begin, index = time.perf_counter(), IndexWriter(file.out)
+            with _shown(index, enabled=not self.json) as report:
                 state = drive(
                     file.out,
                     jobs,
@@ -120,9 +119,10 @@ class RunBatch:
                     report=report,
                     held=held,
                 )
-            summary = summarise(file.out)
+            rows = index.write()
+        summary = summarise(file.out, rows)
         if not self.json:
-            print_status(summary, Console(), every=False)
+            print_status(summary, rows, Console(), every=False)
         halted = {"halted": state.halted, "seconds": round(time.perf_counter() - begin, 3)}
         failed = bool(summary["states"].get("failed", 0) + summary["states"].get("refused", 0))
         return {**summary, **halted, "exit_status": 2 if state.halted else int(failed)}
@@ -154,10 +154,11 @@ class BatchStatus:
     """Print the summary as JSON."""
 
     def run(self) -> dict[str, Any]:
-        """Summarise the records."""
-        summary = summarise(self.runs)
+        """Summarise the records, and write the page and the table anew."""
+        rows = IndexWriter(self.runs).write()
+        summary = summarise(self.runs, rows)
         if not self.json:
-            print_status(summary, Console(), every=self.all)
+            print_status(summary, rows, Console(), every=self.all)
         return summary
 
 
@@ -250,58 +251,35 @@ def _parsed(step: str, words: tuple[str, ...]) -> None:
         ) from None
 
 
-def summarise(runs: Path) -> dict[str, Any]:
-    """Return what has become of a batch as JSON values."""
+def summarise(runs: Path, rows: Sequence[Row]) -> dict[str, Any]:
+    """Return what has become of a batch as JSON values, the worst subject first."""
     batch = read_batch(runs)
-    records = records_of(runs, batch)
     return {
         "runs": str(runs),
         "name": batch.name,
         "started": batch.started,
         "driver": at_work(runs / BATCH_HOLD),
-        "states": dict(Counter(record.state for record in records)),
-        "subjects": [_row(record) for record in records],
+        "states": {state: count for state, count in count_states(rows).items() if count},
+        "subjects": [{name: value for name, value in vars(row).items() if name != "convention"} for row in rows],
+        "index": str(runs / INDEX_FILE),
     }
 
 
-def _row(record: JobRecord) -> dict[str, Any]:
-    """Return a subject's row: its state, the step that it is at, the time and the error."""
-    at = next((step for step in record.steps if step.state != "done"), None)
-    error = at.error if at is not None else None
-    return {
-        "subject": record.subject,
-        "state": record.state,
-        "step": "" if at is None else at.step,
-        "minutes": round(sum(step.seconds for step in record.steps) / 60, 2),
-        "attempts": sum(step.attempts for step in record.steps),
-        "error": error,
-        "log": "" if at is None or not at.log else f"{record.subject}/{at.log}",
-    }
-
-
-def print_status(summary: Mapping[str, Any], console: Console, *, every: bool) -> None:
-    """Print the counts, and a line for each subject that failed, stopped or runs."""
+def print_status(summary: Mapping[str, Any], rows: Sequence[Row], console: Console, *, every: bool) -> None:
+    """Print the counts, and a line for each subject that failed, stopped, runs, or is done with failed gates."""
     counts = Text("  ").join(
-        Text(f"{summary['states'][state]} {state}", style=style)
-        for state, style in _STYLES.items()
-        if summary["states"].get(state)
+        Text(f"{count} {state}", STATE_STYLES[state]) for state, count in summary["states"].items()
     )
     console.print(Text(f"{summary['name']}  ", style="bold") + counts)
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("subject", "state", "step", "minutes", ""):
-        table.add_column(name, justify="right" if name == "minutes" else "left", overflow="fold")
-    for row in summary["subjects"]:
-        if every or row["state"] in ("failed", "refused", "stopped", "running"):
-            words = str((row["error"] or {}).get("message", ""))
-            state = Text(row["state"], style=_STYLES[row["state"]])
-            table.add_row(row["subject"], state, row["step"], f"{row['minutes']:.1f}", Text(words))
-    if table.row_count:
-        console.print(table)
+    shown = [row for row in rows if every or row.gates_failed or row.state not in ("done", "waiting")]
+    if shown:
+        console.print(terminal_table(shown, most=len(shown) if every else 40))
+    print_paths({"table": Path(summary["index"])}, console)
 
 
 @contextlib.contextmanager
-def _shown(*, enabled: bool) -> Any:
-    """Show a bar with the subjects by state and those at work."""
+def _shown(index: IndexWriter, *, enabled: bool) -> Any:
+    """Show a bar with the subjects by state and those at work, and keep the page up to date."""
     columns = (TextColumn("subjects"), BarColumn(bar_width=20), MofNCompleteColumn(), TimeElapsedColumn())
     words = TextColumn("{task.fields[words]}", markup=False)
     with Progress(*columns, words, console=Console(stderr=True), disable=not enabled) as bar:
@@ -314,5 +292,6 @@ def _shown(*, enabled: bool) -> Any:
             shown = state.halted or at_work
             words = f"{failed} failed; {shown}" if failed else shown
             bar.update(task, total=state.total, completed=ended, words=words)
+            index.update()
 
         yield report
