@@ -21,7 +21,7 @@ from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
-from pipelines.commands.options import OptionalPath
+from pipelines.commands.options import OptionalPath, OptionalText, frame_numbers
 from smplxpp.core import GeometryWarning, InputError, as_mesh, require_at_least
 from smplxpp.core.files.array_file import read_array, read_arrays
 from smplxpp.core.files.atomic import atomic_write_text
@@ -42,6 +42,9 @@ class Metrics:
     """The predicted mesh, or a folder of frames."""
     b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
     """The true mesh, or a folder of frames, matched with those of A by name or else by frame number."""
+    frames: OptionalText = None
+    """Frames of two folders to compare, by the last number of their names: numbers and ranges START:STOP:STEP with
+    commas; by default all."""
     samples: int = 100_000
     """Points taken of each mesh, area-weighted."""
     seed: int = 0
@@ -74,6 +77,11 @@ class Metrics:
             raise InputError("output file", expected=".json or .csv", received=str(self.out))
         require_at_least("option seed", self.seed, 0)
         pairs, skipped = pair_frames(self.a, self.b)
+        wanted = frame_numbers(self.frames)
+        if wanted is not None:
+            numbers = {str(number).zfill(12) for number in wanted}
+            pairs = [pair for pair in pairs if frame_number(pair[1]) in numbers]
+            skipped = [one for one in skipped if frame_number(Path(one["frame"])) in numbers]
         # Compare pair by pair; the progress bar is of use for folders only.
         frames = []
         console = Console(stderr=True)
@@ -135,15 +143,6 @@ class Metrics:
 
     def _report(self, frames: list[dict[str, Any]], skipped: list[dict[str, str]]) -> dict[str, Any]:
         convention = presets()[self.preset]
-        # Statistics over frames: a value that a frame lacks (for instance a label without faces) is left out.
-        rows = [flat_row(frame) for frame in frames]
-        keys = dict.fromkeys(key for row in rows for key in row)
-        known = {key: [row[key] for row in rows if row.get(key) is not None] for key in keys}
-        over_frames = {
-            key: {"mean": float(np.mean(values)), "std": float(np.std(values)), "count": len(values)}
-            for key, values in known.items()
-            if values and key != "frame"
-        }
         return {
             "preset": convention.name,
             "unit": convention.unit,
@@ -154,9 +153,21 @@ class Metrics:
             "threshold_mm": list(self.threshold_mm),
             "visible_only": self.visible_only,
             "frames": frames,
-            "over_frames": over_frames,
+            "over_frames": over_frames(frames),
             "skipped": skipped,
         }
+
+
+def over_frames(frames: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return mean, deviation and count of each number over frames; those that a frame lacks are left out."""
+    rows = [flat_row(frame) for frame in frames]
+    keys = dict.fromkeys(key for row in rows for key in row)
+    known = {key: [row[key] for row in rows if row.get(key) is not None] for key in keys}
+    return {
+        key: {"mean": float(np.mean(values)), "std": float(np.std(values)), "count": len(values)}
+        for key, values in known.items()
+        if values and key != "frame"
+    }
 
 
 def pair_frames(a: Path, b: Path) -> tuple[list[tuple[str, Path, Path]], list[dict[str, str]]]:

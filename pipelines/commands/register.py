@@ -37,6 +37,8 @@ class Register:
     all` wrote."""
     params: OptionalPath = None
     """Body parameters to start from, in the place of the capture's own."""
+    shape: OptionalPath = None
+    """Body parameters whose shape all frames get; by default it is fitted to them. Chunks of a long take share one."""
     keypoints: OptionalPath = None
     """Folder of keypoints, of `smplxpp keypoints detect` or any other detector, in the place of the capture's own."""
     subject: OptionalInt = None
@@ -128,11 +130,11 @@ class Register:
         # Check that options fit together before files are read.
         if self.capture is None and self.scan is None:
             raise InputError("input", expected="--capture, or --scan with --params", received="neither")
-        for name in ("scan", "labels", "landmarks", "body"):
+        for name in ("scan", "labels", "landmarks", "body", "shape"):
             path = getattr(self, name)
             if path is not None and not path.exists():
                 raise InputError(f"option {name}", expected="an existing file", received=str(path))
-        for name in ("keypoints", "masks", "subject"):
+        for name in ("keypoints", "masks", "subject", "shape"):
             if getattr(self, name) is not None and self.capture is None:
                 raise InputError(f"option {name}", expected="a --capture whose cameras they are of", received="none")
         if self.scans is not None and (self.capture is None or self.scan is not None):
@@ -165,6 +167,7 @@ class Register:
             masks=self.masks,
             scans=self.scans,
             subject=self.subject,
+            shape=self.shape,
         )
 
     def _report(self, record: StageRecord) -> Path:

@@ -27,7 +27,7 @@ _T = TypeVar("_T")
 # Fields that are paths, by the record that they stand in.
 _BUILD_PATHS = ("scan", "params", "start", "labels", "cameras", "motion", "body")
 _CHOICE_PATHS = ("keypoints", "masks", "landmarks", "corrections")
-_REGISTER_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks", "scans")
+_REGISTER_PATHS = ("capture", "params", "body", "scan", "labels", "keypoints", "masks", "scans", "shape")
 _RECONSTRUCT_PATHS = ("capture", "masks", "mesh", "body")
 
 

@@ -115,6 +115,8 @@ def observed_digests(observed: Observed, inputs: RegisterInputs, *, landmarks: P
     digests |= {f"scan of frame {frame}": sha256_file(path) for frame, path in _files(observed.scans).items()}
     if inputs.body is not None:
         digests["body"] = sha256_file(inputs.body)
+    if inputs.shape is not None:
+        digests["shape"] = sha256_file(inputs.shape)
     if landmarks is not None:
         digests["landmarks"] = sha256_file(landmarks)
     if isinstance(inputs.labels, Path):

@@ -269,6 +269,7 @@ class RegisterInputs:
         masks: folder of masks that replaces the capture's own.
         scans: folder of a scan a frame that replaces the capture's own.
         subject: place of the person whose keypoints are taken, where several are in view; None: the first.
+        shape: body parameters whose shape all frames have; None: it is fitted.
     """
 
     capture: Path | Capture | None = None
@@ -289,6 +290,7 @@ class RegisterInputs:
     masks: Path | None = None
     scans: Path | None = None
     subject: int | None = None
+    shape: Path | None = None
 
     @property
     def root(self) -> Path | None:

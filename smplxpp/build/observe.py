@@ -160,6 +160,7 @@ def observe(
         fps=capture.fps,
         shape_frames=shape,
         bare=bare,
+        shape=None if inputs.shape is None else load_params(inputs.shape, body=body).frame(0).betas[0],
     )
     maps = tuple(one for one in (masks, labels) if one is not None)
     return Observed(capture, observations, files, (*notes, *more), maps, bool(placed), found)

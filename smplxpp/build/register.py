@@ -92,6 +92,10 @@ def register_observed(
         lost = lost_frames(body, observations, initial, at=at)
         observations = replace(observations, initial=initial)
     if observed.capture is not None and observed.capture.kind == TURNTABLE:
+        if observations.shape is not None:
+            raise InputError(
+                "shape", expected="none: all frames of a turn share one pose and one shape", received="one"
+            )
         # One camera sees no depth: the pose that all frames share gives it. The camera is known, and stands upright.
         turn = TurntableConfig(up_spread=3.0, solver=config)
         fit = register_turntable(body, observations, turn, progress=progress).fit

@@ -96,7 +96,9 @@ class _Registration:
         """Run the schedule and return the result with its residuals and confidence."""
         initial = state = self._start()
         everything = np.arange(len(self.frames))
-        if len(self.frames) <= self.config.window:
+        if self.observed.shape is not None:
+            state, confidence = self._solve_windows(replace(state, betas=self._given_shape(self.observed.shape)))
+        elif len(self.frames) <= self.config.window:
             # A short take is one window, in which shape and poses are solved together.
             state, equations = self._solve(state, _Window(everything, np.ones(len(everything), dtype=bool)), True)
             confidence = joint_confidence(self.kinematics, state, equations, everything)
@@ -176,6 +178,13 @@ class _Registration:
                 remedy="check the calibration with `smplxpp capture check`, or give a fit to start from",
             )
         return state
+
+    def _given_shape(self, shape: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
+        """Return a shape that is given with as many betas as the body has."""
+        given, count = np.atleast_1d(np.asarray(shape, dtype=np.float64)).ravel(), self.body.num_betas
+        if np.abs(given[count:]).max(initial=0.0) > 0 or not np.isfinite(given).all():
+            raise InputError("shape", expected=f"at most {count} finite betas", received=f"{len(given)}")
+        return np.concatenate([given[:count], np.zeros(max(0, count - len(given)))])
 
     # -- solving
 

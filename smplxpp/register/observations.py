@@ -66,6 +66,7 @@ class Observations:
             Held-out frames are not among them and only receive poses.
         fps: frames a second, None if unknown.
         bare: vertices of the body that are known to be bare skin, in addition to those that labels show.
+        shape: betas that all frames have, which are then not fitted: what chunks of one long take share.
     """
 
     frames: tuple[int, ...]
@@ -80,6 +81,7 @@ class Observations:
     shape_frames: tuple[int, ...] | None = None
     fps: float | None = None
     bare: Bool[np.ndarray, " V"] | None = None
+    shape: Float64[np.ndarray, " B"] | None = None
 
     __repr__ = one_line
 

@@ -80,6 +80,22 @@ def test_windows_join(person, cameras):
     assert vertex_error_mm(BODY, pieces.params, whole.params) < 2.0
 
 
+def test_chunks_of_one_shape_join(person, cameras):
+    """Chunks of a take that get its shape need no shape of their own, and meet in the frames that both have."""
+    seen = keypoints(BODY, person, cameras, px=1.0)
+    observed = Observations(tuple(range(FRAMES)), cameras, keypoints=seen, fps=20.0)
+    whole = register(BODY, observed, SMALL)
+    chunks = [
+        register(BODY, replace(observed, frames=frames, shape=whole.params.betas[0]), SMALL).params
+        for frames in ((0, 1, 2, 3, 4), (1, 2, 3, 4, 5))
+    ]
+    assert all((one.betas == whole.params.betas[0]).all() for one in chunks)
+    joined = BodyParams.concatenate([chunks[0].select([0, 1, 2]), chunks[1].select([2, 3, 4])])
+    assert vertex_error_mm(BODY, joined, whole.params) < 2.0
+    with pytest.raises(InputError, match="finite betas"):
+        register(BODY, replace(observed, shape=np.full(BODY.num_betas, np.nan)), SMALL)
+
+
 def test_same_bits_twice(person, cameras):
     observed = Observations((0, 1), cameras, keypoints=keypoints(BODY, person.select([0, 1]), cameras, px=1.0))
     first, second = (register(BODY, observed, SMALL).params for _ in range(2))
