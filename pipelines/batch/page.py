@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from datetime import UTC, datetime
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -120,15 +119,14 @@ def _numbered(row: Row, conventions: Sequence[str]) -> str:
 
 def page_html(content: dict[str, Any]) -> str:
     """Return the page as one HTML text, without network, fonts or other files."""
-    report, batch = resources.files("pipelines.report"), resources.files("pipelines.batch")
     # The style is that of a run's report; the page adds what a long table needs.
-    files = {"report.css": report / "report.css", "index.html.j2": batch / "index.html.j2"}
+    folders = [jinja2.PackageLoader(f"pipelines.{room}", "") for room in ("batch", "report")]
     environment = jinja2.Environment(
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        loader=jinja2.FunctionLoader(lambda name: files[name].read_text(encoding="utf-8")),
+        loader=jinja2.ChoiceLoader(folders),
     )
     # Text of users must not end the script element that carries it.
     data = json.dumps(content, separators=(",", ":"), allow_nan=False)
