@@ -245,7 +245,7 @@ def _filled(
     out, narrow = fill_holes(made, [hole for hole, wide in zip(holes, behind, strict=True) if not wide], config=config)
     # Slits have straight ends across a hem or a cuff, and a thing is as wide as it is: neither can become a sail.
     wide = [*(hole for hole, wide in zip(holes, behind, strict=True) if wide), *cut_slits(*borders, taken=taken)]
-    out, others = fill_holes(out, wide, config=replace(config, width=1.5 * config.width))
+    out, others = fill_holes(out, wide, config=replace(config, width=1.2 * config.width))
     patched = np.arange(out.mesh.vertex_count) >= part.mesh.vertex_count
     return drape_patches(out, patched, fit.at_rest), parted + narrow + others
 

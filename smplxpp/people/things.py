@@ -128,27 +128,76 @@ THINGS: dict[str, tuple[bool, Callable[[], list[np.ndarray]]]] = {
 knuckles."""
 
 
-def _glasses(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
-    """Two discs before the eyes, a bridge, and two temples, in the frame of the head."""
+def _glasses(body: BodyModel, posed: PosedBody, lens: np.ndarray, rim: float) -> list[np.ndarray]:
+    """Two lenses before the eyes, a bridge, and two temples, in the frame of the head.
+
+    Args:
+        body: the model.
+        posed: its first body wears them.
+        lens: points of a lens about the middle of the eye.
+        rim: radius of bridge and temples, metres.
+    """
     eyes, turn = _head(body, posed)
     left, right = eyes
     middle, half = 0.5 * (left + right), 0.5 * float(np.linalg.norm(left - right))
-    lenses = [_tube(0.026, (sign * half, 0.0, 0.030), (sign * half, 0.0, 0.036)) for sign in (1.0, -1.0)]
-    temples = [_tube(0.004, (sign * 0.072, 0.004, 0.034), (sign * 0.078, 0.008, -0.075)) for sign in (1.0, -1.0)]
-    rims = [_tube(0.004, (sign * half, 0.0, 0.033), (sign * 0.072, 0.004, 0.033)) for sign in (1.0, -1.0)]
-    bridge = _tube(0.004, (-0.012, 0.004, 0.035), (0.012, 0.004, 0.035))
+    lenses = [lens + [sign * half, 0.0, 0.033] for sign in (1.0, -1.0)]
+    temples = [_tube(rim, (sign * 0.072, 0.004, 0.034), (sign * 0.078, 0.008, -0.075)) for sign in (1.0, -1.0)]
+    rims = [_tube(rim, (sign * half, 0.0, 0.033), (sign * 0.072, 0.004, 0.033)) for sign in (1.0, -1.0)]
+    bridge = _tube(rim, (-0.012, 0.004, 0.035), (0.012, 0.004, 0.035))
     return [piece @ turn.T + middle for piece in (*lenses, *rims, *temples, bridge)]
 
 
-def _brimmed_hat(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
-    """A crown over the top of the head and a brim 19 cm wide about it, in the frame of the head."""
+def _hat(body: BodyModel, posed: PosedBody, crown: float, brim: float, forward: float) -> list[np.ndarray]:
+    """A crown over the top of the head and a brim about it, in the frame of the head.
+
+    Args:
+        body: the model.
+        posed: its first body wears it.
+        crown: height of the crown, metres; its edge is round where it is below 10 cm.
+        brim: radius of the brim, metres.
+        forward: metres by which the brim lies before the middle of the head, as the peak of a cap.
+    """
     _, turn = _head(body, posed)
     head = posed.vertices[0][body.weights[:, body.joint_names.index("head")] > 0.9] @ turn
     x, z = 0.5 * (head.min(axis=0) + head.max(axis=0))[[0, 2]]
     band = float(head[:, 1].max()) - 0.055  # metres, where the hat sits on the forehead
-    crown = _tube(0.108, (x, band, z), (x, band + 0.11, z))
-    brim = _tube(0.19, (x, band, z), (x, band + 0.012, z))
-    return [piece @ turn.T for piece in (crown, brim)]
+    if crown < 0.1:
+        dome = _ball((0.108, crown, 0.115), (x, band, z))
+        top = dome[dome[:, 1] > band]
+    else:
+        top = _tube(0.108, (x, band, z), (x, band + crown, z))
+    edge = _tube(brim, (x, band, z + forward), (x, band + 0.012, z + forward))
+    return [piece @ turn.T for piece in (top, edge)]
+
+
+def _trunk(body: BodyModel, posed: PosedBody, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the place of a joint of the trunk, the axes right, up and front there, and the trunk's skin in them."""
+    joint = body.joint_names.index(name)
+    turn = posed.posed_from_rest[0][joint][:3, :3]
+    place = posed.joints[0][joint]
+    kept = [k for k, one in enumerate(body.joint_names) if one.startswith(("pelvis", "spine")) or "collar" in one]
+    skin = posed.vertices[0][body.weights[:, kept].sum(axis=1) > 0.6]
+    return place, turn, (skin - place) @ turn
+
+
+def _belt_bag(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
+    """A bag before one hip, 25 mm off the skin for the clothes below."""
+    place, turn, skin = _trunk(body, posed, "pelvis")
+    x = 0.09 * side
+    beside = skin[(np.abs(skin[:, 0] - x) < 0.09) & (np.abs(skin[:, 1] - 0.02) < 0.08)]
+    return [_ball((0.11, 0.08, 0.055), (x, 0.02, float(beside[:, 2].max()) + 0.045)) @ turn.T + place]
+
+
+def _backpack(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
+    """A bag on the back with a strap over either shoulder."""
+    place, turn, skin = _trunk(body, posed, "spine3")
+    back, front = float(skin[:, 2].min()) - 0.015, float(skin[:, 2].max()) + 0.015
+    top = float(skin[np.abs(skin[:, 0]) > 0.08, 1].max()) + 0.02
+    pieces = [_box((0.30, 0.42, 0.15), (0.0, -0.08, back - 0.075))]
+    for x in (-0.1, 0.1):
+        at = [(x, -0.02, back), (x, top, -0.03), (x, -0.02, front), (x, -0.14, 0.5 * (front + back))]
+        pieces += [_tube(0.015, start, end) for start, end in zip(at[:-1], at[1:], strict=True)]
+    return [piece @ turn.T + place for piece in pieces]
 
 
 def _shoulder_bag(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
@@ -184,7 +233,7 @@ def _shoulder_bag(body: BodyModel, posed: PosedBody, side: float) -> list[np.nda
     right = np.cross([0.0, 1.0, 0.0], front)
     right *= side / np.linalg.norm(right)
     level = skin[np.abs(skin[:, 1]) < 0.08]
-    beside = float((level @ right).max()) + 0.025 + 0.045
+    beside = float((level @ right).max()) + 0.01 + 0.045
     frame = np.stack([front / np.linalg.norm(front), [0.0, 1.0, 0.0], right], axis=1)
     return [*pieces, _box((0.28, 0.22, 0.09), (0.0, -0.06, beside)) @ frame.T + hip]
 
@@ -197,9 +246,16 @@ def _head(body: BodyModel, posed: PosedBody) -> tuple[tuple[np.ndarray, np.ndarr
     ]
 
 
+_ROUND, _SQUARE = _tube(0.026, (0.0, 0.0, -0.003), (0.0, 0.0, 0.003)), _box((0.056, 0.042, 0.006), (0.0, 0.0, 0.0))
 WORN: dict[str, Callable[[BodyModel, PosedBody, float], list[np.ndarray]]] = {
-    "glasses": _glasses,
-    "brimmed hat": _brimmed_hat,
+    "glasses": lambda body, posed, side: _glasses(body, posed, _ROUND, 0.004),
+    "sunglasses": lambda body, posed, side: _glasses(body, posed, _SQUARE, 0.006),
+    "goggles": lambda body, posed, side: _glasses(body, posed, _box((0.075, 0.06, 0.03), (0.0, 0.0, 0.01)), 0.008),
+    "brimmed hat": lambda body, posed, side: _hat(body, posed, 0.11, 0.19, 0.0),
+    "top hat": lambda body, posed, side: _hat(body, posed, 0.18, 0.15, 0.0),
+    "cap": lambda body, posed, side: _hat(body, posed, 0.09, 0.09, 0.09),
     "shoulder bag": _shoulder_bag,
+    "belt bag": _belt_bag,
+    "backpack": _backpack,
 }
 """For each kind, the points of its convex pieces on a posed body; 1 or -1 is the left or the right side."""

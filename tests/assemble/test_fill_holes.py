@@ -153,6 +153,27 @@ def test_two_holes_and_the_wide_one_stays(tube):
     assert same is part and (report.holes, report.closed) == (2, 0)
 
 
+def test_a_wide_sleeve_that_was_fused_with_the_side_is_closed_without_a_sail():
+    """A jacket's sleeve stayed open from armpit to wrist, because its patch was half a millimetre too wide."""
+    deep, arm = 0.155, np.linspace(0.0, 0.66, 34)
+    # Down the side, up to the armpit and out along the arm; a wall of faces stands along both edges of the strip.
+    path = np.concatenate([np.stack([0 * arm, -arm[::-1]], 1), np.stack([arm[1:], 0 * arm[1:]], 1)])
+    across = np.linspace(0.0, deep, 8)[1:-1]
+    sides = [np.insert(path, 2, z, axis=1) for z in (0.0, deep)]
+    ends = [np.insert(np.tile(path[k], (6, 1)), 2, across, axis=1) for k in (-1, 0)]
+    rim = np.concatenate([sides[0], ends[0], sides[1][::-1], ends[1][::-1]])
+    count = len(rim)
+    low, high = np.arange(count), np.arange(count) + count
+    faces = [np.stack([low, np.roll(low, -1), high], 1), np.stack([np.roll(low, -1), np.roll(high, -1), high], 1)]
+    vertices = np.concatenate([rim, rim + [-0.02, 0.02, 0.0]])
+    weights = SkinWeights.from_dense(np.ones((2 * count, 1)))
+    colors, index = np.zeros((2 * count, 3), np.uint8), np.arange(2 * count)
+    part = CanonicalPart(TriangleMesh(vertices, np.concatenate(faces)), weights, UPPER.id, colors, index)
+    filled, report = fill_holes(part, [low])
+    assert report.closed == 1 and report.area == pytest.approx(2 * 0.66 * deep, rel=0.05)
+    assert np.abs(filled.mesh.vertices[2 * count :, :2]).min(axis=1).max() < 0.04
+
+
 def test_a_hole_that_cannot_be_closed_stays(tube):
     """Edges of other faces lie across it, both ways."""
     part = without(tube, ((8, 9), (3, 4)))
