@@ -9,7 +9,16 @@ import numpy as np
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.surface_points import SurfacePoints
-from smplxpp.register.locate.persons import Piece, heads, largest_piece, others_carried, people_apart, share_beyond
+from smplxpp.register.locate.persons import (
+    Piece,
+    feet_of,
+    heads,
+    largest_piece,
+    others_carried,
+    people_apart,
+    share_beyond,
+    unlike_person,
+)
 from smplxpp.register.locate.search import Found
 
 
@@ -102,6 +111,12 @@ def findings_of(
         posed: its visible surface.
     """
     out, trust = [], 1.0
+    # What no body explains may be no person at all, or one beside furniture; parts of a person are then no finding.
+    foreign = bool(no_person(best)) or best.misfit.bare > _BOUNDS.good_bare
+    other = unlike_person(mesh, surface) if foreign else ""
+    if other:
+        return (other,), 0.1
+    four_legged = foreign and feet_of(surface) > 2
     # Several people: pieces of their size beside each other, or two heads in the upper half.
     apart = people_apart(mesh)
     if len(apart) > 1:
@@ -114,9 +129,10 @@ def findings_of(
     if len(upper) > 1:
         trust = min(trust, 0.3)
         heights = " and ".join(f"{head[1] - low:.2f}" for head in upper[:3])
-        out.append(
-            f"{len(upper)} heads, {heights} m above the lowest point: two people, or something round that is held"
-        )
+        what = "a four-legged shape as an animal" if four_legged else "something round that is held"
+        out.append(f"{len(upper)} heads, {heights} m above the lowest point: two people, or {what}")
+    elif four_legged and not out:
+        out.append("it stands on more than two feet: a four-legged shape as an animal, or several people")
     # Beside somebody whose hands, face and feet are there; crossed boards have round places, too.
     carried: tuple[tuple[Piece, float], ...] = ()
     if best.misfit.bare < _BOUNDS.good_bare:

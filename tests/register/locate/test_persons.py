@@ -11,10 +11,11 @@ from smplxpp.body.named_poses import standing_poses
 from smplxpp.build.verdict import LEAST_CONFIDENCE
 from smplxpp.core import TriangleMesh, ignore_progress, matrix_from_rotvec
 from smplxpp.core.surface_points import SurfacePoints
+from smplxpp.people.things import _ball, _box, _joined, _tube
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.landmarks import visible_vertices
 from smplxpp.register.locate.decision import confidence_of, findings_of
-from smplxpp.register.locate.persons import convex_share, heads, largest_piece, people_apart
+from smplxpp.register.locate.persons import convex_share, feet_of, heads, largest_piece, people_apart, unlike_person
 from smplxpp.register.locate.search import LocateConfig, Search
 
 BODY = load_body()
@@ -148,3 +149,45 @@ def test_an_arm_in_the_air_beside_one_that_no_body_explains_is_refused(person):
     assert found["raised"][0] < LEAST_CONFIDENCE < found["cut"][0] < found["right"][0]
     assert found["raised"][1].startswith("left arm not where the body has it, and ")
     assert not found["right"][1] and "not where" not in found["cut"][1]
+
+
+LEGS = [_box((0.05, 0.45, 0.05), (x, 0.225, z)) for x in (-0.3, 0.3) for z in (-0.2, 0.2)]
+THINGS = {
+    "furniture as a chair": [*LEGS, _box((0.65, 0.05, 0.5), (0, 0.475, 0)), _box((0.65, 0.6, 0.05), (0, 0.8, -0.2))],
+    "furniture as a table": [*LEGS, _box((0.8, 0.04, 0.6), (0, 0.47, 0))],
+    "furniture as a shelf": [
+        *(_box((0.8, 0.03, 0.35), (0, y, 0)) for y in (0.05, 0.5, 0.95, 1.4, 1.8)),
+        *(_box((0.03, 1.83, 0.35), (x, 0.93, 0)) for x in (-0.41, 0.41)),
+    ],
+    "a lamp, a vase or a column": [
+        _tube(0.2, (0, 0, 0), (0, 0.04, 0)),
+        _tube(0.02, (0, 0.04, 0), (0, 1.4, 0)),
+        _tube(0.2, (0, 1.4, 0), (0, 1.7, 0)),
+    ],
+}
+
+
+def _unlike(mesh: TriangleMesh) -> str:
+    return unlike_person(mesh, SurfacePoints.sample(mesh, 6000, seed=0))
+
+
+@pytest.mark.parametrize("words", THINGS)
+def test_furniture_is_named_and_is_no_part_of_a_person(words):
+    """A chair was "cut off above", and a lamp "hidden by a hood"."""
+    mesh = _joined(THINGS[words])
+    assert _unlike(mesh).endswith(words)
+    confidence, said = _judged(_moved(mesh, 1.0, (0.0, -0.9, 0.0)))
+    assert confidence < LEAST_CONFIDENCE and said.endswith(words)
+
+
+def test_a_four_legged_shape_is_not_called_two_people_alone(person):
+    """A dog has a round head and a round rump in the upper half of its height."""
+    legs = [_tube(0.045, (x, 0.0, z), (x, 0.5, z)) for x in (-0.09, 0.09) for z in (-0.28, 0.28)]
+    body = [_ball((0.14, 0.16, 0.38), (0, 0.55, 0)), _ball((0.09, 0.1, 0.14), (0, 0.75, 0.5))]
+    dog = _joined([*legs, *body, _tube(0.06, (0, 0.6, 0.3), (0, 0.72, 0.47))])
+    confidence, words = _judged(_moved(dog, 1.0, (0.0, -0.4, 0.0)))
+    assert confidence < LEAST_CONFIDENCE and "four-legged shape" in words
+    assert feet_of(SurfacePoints.sample(person, 6000, seed=0)) == 2 and not _unlike(person)
+    # Furniture beside somebody is named, too.
+    chair = _moved(_joined(THINGS["furniture as a chair"]), 1.0, (0.9, -1.1, 0.0))
+    assert _unlike(_together(person, chair)).endswith("alone or beside a person")
