@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -196,7 +197,7 @@ def _backpack(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray
     pieces = [_box((0.30, 0.42, 0.15), (0.0, -0.08, back - 0.075))]
     for x in (-0.1, 0.1):
         at = [(x, -0.02, back), (x, top, -0.03), (x, -0.02, front), (x, -0.14, 0.5 * (front + back))]
-        pieces += [_tube(0.015, start, end) for start, end in zip(at[:-1], at[1:], strict=True)]
+        pieces += [_tube(0.015, start, end) for start, end in pairwise(at)]
     return [piece @ turn.T + place for piece in pieces]
 
 
@@ -229,11 +230,11 @@ def _shoulder_bag(body: BodyModel, posed: PosedBody, side: float) -> list[np.nda
         pieces.append(
             np.stack([p + w * normal + t * thick for p in (start, end) for w in (-0.02, 0.02) for t in (0.0, 1.0)])
         )
-    # The bag hangs upright beside the hip, outside of the widest skin there.
+    # The bag hangs upright beside the hip and touches the widest skin there.
     right = np.cross([0.0, 1.0, 0.0], front)
     right *= side / np.linalg.norm(right)
     level = skin[np.abs(skin[:, 1]) < 0.08]
-    beside = float((level @ right).max()) + 0.01 + 0.045
+    beside = float((level @ right).max()) + 0.045
     frame = np.stack([front / np.linalg.norm(front), [0.0, 1.0, 0.0], right], axis=1)
     return [*pieces, _box((0.28, 0.22, 0.09), (0.0, -0.06, beside)) @ frame.T + hip]
 

@@ -220,7 +220,7 @@ def unlike_person(mesh: TriangleMesh, surface: SurfacePoints) -> str:
     # Those of faces, because vertices of a coarse box have a mean of three.
     points, normals = surface.points, mesh.face_normals[surface.face]
     low, tall = points[:, 1].min(), float(np.ptp(points[:, 1]))
-    # Normals along the vertical, and along the two horizontal directions that most of the others have, within 4 degrees.
+    # Normals along the vertical, and along the two horizontal directions of most of the others, within 4 degrees.
     level = np.abs(normals[:, 1]) > np.cos(np.radians(4.0))
     upright = np.abs(normals[:, 1]) < np.sin(np.radians(4.0))
     turn = np.degrees(np.arctan2(normals[upright, 0], normals[upright, 2])) % 90.0
