@@ -19,8 +19,8 @@ class FillHolesConfig:
     """Options of filling holes with `fill_holes`.
 
     Attributes:
-        width: largest mean width of a patch, metres: twice its area divided by its perimeter. A jacket's side and sleeve
-            that were fused from armpit to wrist have 0.12; a sail between them would have 0.3. 0 fills nothing.
+        width: largest mean width of a patch, metres: twice its area divided by its perimeter. A jacket's side and
+            sleeve that were fused from armpit to wrist have 0.12; a sail between them would have 0.3. 0 fills nothing.
     """
 
     width: float = 0.15
