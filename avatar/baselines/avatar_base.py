@@ -16,7 +16,7 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.deformation_field import FrameCodes, show_null_code
 from avatar.models.networks.teacher import local_offsets
 from avatar.rig.rig import Pose, PosedAvatar, Rig
-from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from smplxpp.core.errors import require_between
 

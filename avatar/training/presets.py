@@ -11,7 +11,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.presets import NetworkPreset, network_preset
 from avatar.models.student import StudentConfig
 from avatar.training.engine.learning_rates import LearningRates
-from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.fit.config import PRESETS, FitConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig

@@ -88,27 +88,28 @@ class Demo:
             perf_counter() - started,
             (out / "report.html").resolve(),
         )
-        Train(run_folder=out, capture=capture, preset="demo").run()
-        Evaluate(run_folder=out, capture=capture).run()
-        film = out / "motion.mp4"
-        Animate(run_folder=out, params=out / REFINED_PARAMS, out=film, height=540).run()
-        page = out / "player.html"
-        Web(source=out, single_file=page, params=out / REFINED_PARAMS, name=NAME, licence=LICENCE).run()
-        where = {"report": out / "report.html", "film": film, "player": page, **self._talk(console)}
+        # The report is written when all of its parts are there, because writing it takes nine seconds.
+        Train(run_folder=out, capture=capture, preset="demo", no_report=True).run()
+        Evaluate(run_folder=out, capture=capture, no_report=True).run()
+        # Film, page and speech play one bundle.
+        avatar, params = out / f"me{BUNDLE_SUFFIX}", out / REFINED_PARAMS
+        export_bundle(out, avatar, name=NAME, licence=LICENCE, params=params, exact=False)
+        film, page = out / "motion.mp4", out / "player.html"
+        Animate(run_folder=avatar, params=params, out=film, height=540).run()
+        Web(source=avatar, single_file=page).run()
+        where = {"report": out / "report.html", "film": film, "player": page, "avatar": avatar}
+        where |= self._talk(avatar, console)
+        rewrite_report(out)
         lines = [f"{name:7} {path.resolve()}" for name, path in where.items()]
         console.print("\n" + "\n".join(lines), highlight=False, soft_wrap=True, markup=False)
         return {"exit_status": built["exit_status"]}
 
-    def _talk(self, console: Console) -> dict[str, Path]:
+    def _talk(self, avatar: Path, console: Console) -> dict[str, Path]:
         """Let the student speak, in the report and in a page; where the extra is not installed, print how to get it."""
-        avatar = self.run_folder / f"me{BUNDLE_SUFFIX}"
-        params = self.run_folder / REFINED_PARAMS
-        export_bundle(self.run_folder, avatar, name=NAME, licence=LICENCE, params=params, exact=False)
         page = self.run_folder / "talking.html"
         try:
             Talk(avatar, self.run_folder / TALKING_FILM, web=page, text=SPEECH, view="front", height=540).run()
         except MissingExtraError as error:
             console.print(f"she does not talk: {error}", markup=False, highlight=False)
-            return {"avatar": avatar}
-        rewrite_report(self.run_folder)
-        return {"avatar": avatar, "talking": page}
+            return {}
+        return {"talking": page}

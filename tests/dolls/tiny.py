@@ -8,7 +8,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.presets import NetworkPreset
 from avatar.models.networks.teacher import TeacherConfig
-from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.fit.config import FitConfig
 from avatar.training.presets import TrainingPreset
 from avatar.training.student.bake import BakeConfig

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.training.engine.optimization_task import OptimiserConfig, OptimizationTask, ParameterGroup
+from avatar.training.engine.adam import OptimiserConfig, ParameterGroup
+from avatar.training.engine.optimization_task import OptimizationTask
 from avatar.training.engine.processes import Distributed
 
 

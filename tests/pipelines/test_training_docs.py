@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from avatar.models.networks.teacher import Teacher
-from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.presets import TRAINING_PRESETS, TrainingPreset
 
 _WORDS = {"mesh": "mesh", "gaussians": "Gaussians"}

@@ -19,9 +19,9 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from avatar.training.engine.adam import OptimiserConfig
 from avatar.training.engine.checkpoints import STATE_FILE
 from avatar.training.engine.loop import LoopConfig, run_training
-from avatar.training.engine.optimization_task import OptimiserConfig
 from tests.dolls.toy import Toy
 
 STEPS = 330

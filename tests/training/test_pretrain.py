@@ -15,8 +15,7 @@ from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
-from avatar.training.engine.optimization_task import OptimizationTask
-from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.optimization_task import OptimizationTask, PretrainConfig
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.student.bake import BakeConfig, bake
 from avatar.training.student.pretrain import PretrainFieldTask, _MapLookup

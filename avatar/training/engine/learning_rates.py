@@ -8,7 +8,7 @@ import numpy as np
 
 from avatar.data.sequence import FrameSequence
 from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
-from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.adam import ParameterGroup
 from smplxpp.core.errors import require_positive
 
 

@@ -1,156 +1,30 @@
-"""Base of all trainings: Adam on micro-batches, schedules, a stop at the first NaN, exact resumption."""
+"""Bases of all trainings: Adam on micro-batches, a stop at the first NaN, exact resumption; pretrainings."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from avatar.gaussians.tensor_file import require_finite, require_like
+from avatar.training.engine.adam import MOMENTS, Adam, MeanOfSteps, OptimiserConfig, ParameterGroup
 from avatar.training.engine.processes import Distributed
-from smplxpp.core import InputError, require_at_least, require_between, require_choice, require_positive
+from smplxpp.core import InputError, require_at_least
 
-EVERY = 10
-"""Steps between two that enter the mean: neighbours differ little, and a mean of every step would cost time."""
-_PREFIX = "mean."
-
-
-class MeanOfSteps:
-    """Running mean of parameters over the last `share` of the steps; it replaces them after the last one.
-
-    Adam's steps have the same length however small a gradient is. Weakly observed parameters therefore wander until the
-    rates are small, and end at a random point. Their mean is near the centre.
-
-    Args:
-        learned: parameters by key, which steps change in place.
-        iterations: T, number of all steps.
-        share: in [0, 1]; 0: no mean.
-    """
-
-    def __init__(self, learned: Mapping[str, Tensor], iterations: int, share: float) -> None:
-        self.learned, self.last = learned, iterations - 1
-        self.first = iterations - round(share * iterations)
-        self.mean: dict[str, Tensor] = {}
-
-    @torch.no_grad()
-    def after(self, iteration: int) -> None:
-        """Update the mean after a step, counted from 0; after the last one copy it into the parameters."""
-        # Running mean of every n-th step: m <- m + (x - m) / k.
-        since = iteration - self.first
-        if since >= 0 and since % EVERY == 0:
-            if not since:
-                self.mean = {key: value.detach().clone() for key, value in self.learned.items()}
-            for key, mean in self.mean.items():
-                # m + (x - m) / k, which needs no sum of k terms and no number of steps in advance.
-                mean.lerp_(self.learned[key], 1.0 / (since // EVERY + 1))
-        if iteration == self.last:
-            for key, mean in self.mean.items():
-                self.learned[key].copy_(mean)
-
-    def state(self) -> dict[str, Tensor]:
-        """Return the current mean by key; empty before the first step that enters it."""
-        return {_PREFIX + key: mean for key, mean in self.mean.items()}
-
-    def restore(self, tensors: Mapping[str, Tensor], *, remedy: str) -> None:
-        """Continue from a `state`, among other tensors.
-
-        Raises:
-            InputError: tensors that are missing, of another shape or type, or not finite; nothing has changed.
-        """
-        if not any(key.startswith(_PREFIX) for key in tensors):
-            self.mean = {}
-            return
-        # Check all tensors before any is taken.
-        wanted = {_PREFIX + key: value for key, value in self.learned.items()}
-        require_like(tensors, wanted, subject="checkpoint", remedy=remedy)
-        require_finite({key: tensors[key] for key in wanted}, subject="checkpoint", remedy=remedy)
-        self.mean = {key: torch.empty_like(value).copy_(tensors[_PREFIX + key]) for key, value in self.learned.items()}
-
-
+CACHE_BYTES = 1 << 30
+"""Bound of the cache of inputs and known displacements, bytes: 1 GiB."""
 Batch = TypeVar("Batch")
 _START_AGAIN = "delete the file of its state, or give --force, to start again"
-MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 class DivergedError(InputError):
     """A loss or gradient is not finite. Parameters and the last checkpoint are as before the step."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OptimiserConfig:
-    """Adam and its learning rates over a training of T steps.
-
-    Attributes:
-        iterations: T.
-        schedule: factor on a group's rate at step t, counted from 0. With f the group's `lr_final_factor`:
-            cosine `f + (1 - f) (1 + cos(pi t / T)) / 2` (Loshchilov and Hutter 2017), exponential `f^(t / T)`,
-            constant 1.
-        warmup: steps over which the rates also rise linearly from `1 / warmup` to 1; 0 for none.
-        betas: decay rates of Adam's moments.
-        eps: of Adam.
-        max_grad_norm: largest norm of all gradients together; larger ones are scaled down to it.
-        averaged: share of the last steps over which the parameters are averaged at the end (`MeanOfSteps`).
-        amp: networks in bfloat16 on CUDA, where the task says so with `OptimizationTask.autocast`. bfloat16 has
-            float32's range, so that no gradient needs scaling. Without effect on the CPU.
-    """
-
-    iterations: int
-    schedule: Literal["cosine", "exponential", "constant"] = "cosine"
-    warmup: int = 0
-    betas: tuple[float, float] = (0.9, 0.999)
-    eps: float = 1e-8
-    max_grad_norm: float = math.inf
-    averaged: float = 0.0
-    amp: bool = False
-
-    def __post_init__(self) -> None:
-        require_choice("optimiser: schedule", self.schedule, ("cosine", "exponential", "constant"))
-        require_at_least("optimiser: iterations", self.iterations, 1)
-        require_at_least("optimiser: warmup", self.warmup, 0)
-        require_positive("optimiser: eps", self.eps)
-        require_between("optimiser: averaged", self.averaged, 0.0, 1.0)
-        require_positive("optimiser: max_grad_norm", self.max_grad_norm, finite=False)
-        if not all(0.0 <= beta < 1.0 for beta in self.betas):
-            raise InputError("optimiser: betas", expected="two numbers in [0, 1)", received=repr(self.betas))
-
-    def lr_factor(self, iteration: int, lr_final_factor: float) -> float:
-        """Return the share of a rate that is left at a step counted from 0."""
-        # Share of the training that is done; the warm-up multiplies whatever the schedule gives.
-        at = iteration / self.iterations
-        rising = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
-        if self.schedule == "cosine":
-            return rising * (lr_final_factor + (1.0 - lr_final_factor) * 0.5 * (1.0 + math.cos(math.pi * at)))
-        return rising * (lr_final_factor**at if self.schedule == "exponential" else 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class ParameterGroup:
-    """Tensors that one learning rate moves.
-
-    Attributes:
-        name: with the tensor's own, `name.own`, its key in checkpoints. Groups may share a name, not a key.
-        parameters: leaves that require a gradient, all of one device.
-        lr: Adam's step at the start.
-        lr_final_factor: share of it left at the end; the schedule says how it gets there.
-    """
-
-    name: str
-    parameters: Mapping[str, Tensor]
-    lr: float
-    lr_final_factor: float = 0.05
-
-    def __post_init__(self) -> None:
-        assert all(value.is_leaf and value.requires_grad for value in self.parameters.values()), self.name
-        require_positive(f"learning rate {self.name}", self.lr)
-        if not 0.0 < self.lr_final_factor <= 1.0:
-            raise InputError(
-                f"final learning rate {self.name}", expected="a share in (0, 1]", received=repr(self.lr_final_factor)
-            )
 
 
 class OptimizationTask(ABC, Generic[Batch]):
@@ -176,12 +50,8 @@ class OptimizationTask(ABC, Generic[Batch]):
         self.learned = dict(keyed)
         assert len(self.learned) == len(keyed) > 0, "parameters need keys of their own"
         self.device = keyed[0][1].device
-        self.optimiser = torch.optim.Adam(
-            [{"params": list(group.parameters.values()), "lr": group.lr} for group in groups],
-            betas=config.betas,
-            eps=config.eps,
-            fused=True,
-        )
+        learned = [{"params": list(group.parameters.values()), "lr": group.lr} for group in groups]
+        self.optimiser = Adam(learned, betas=config.betas, eps=config.eps)
         self.mean = MeanOfSteps(self.learned, config.iterations, config.averaged)
         self._rate_share = 1.0
 
@@ -229,7 +99,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         for group, own in zip(self.optimiser.param_groups, self.groups, strict=True):
             group["lr"] = own.lr * self.lr_factor(iteration, own) * self._rate_share
         # Gradients of the micro-batches, shared among the processes and summed over them.
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad()
         outcomes = self.distributed.share_out(items, lambda item: self._backward(item, len(items)))
         # A loss that is not finite on any process stops all of them, before a parameter has changed.
         finite = []
@@ -330,3 +200,61 @@ def _means(outcomes: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
         for name, value in figures.items():
             columns.setdefault(name, []).append(value)
     return {name: torch.stack(values).mean() if values[1:] else values[0] for name, values in columns.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PretrainConfig:
+    """Choices of a pretraining: batch, steps and learning rate.
+
+    Attributes:
+        iterations: steps of Adam.
+        batch: poses a step.
+        lr: learning rate at the start.
+        lr_final_factor: share of it left at the end.
+        warmup: steps over which it rises linearly, see `OptimiserConfig`.
+        betas: of Adam.
+    """
+
+    iterations: int
+    batch: int = 1
+    lr: float = 5e-4
+    lr_final_factor: float = 0.05
+    warmup: int = 0
+    betas: tuple[float, float] = (0.9, 0.999)
+
+    def __post_init__(self) -> None:
+        for name, least in (("iterations", 1), ("batch", 1), ("warmup", 0)):
+            require_at_least(f"pretraining: {name}", getattr(self, name), least)
+
+    @property
+    def evaluate_every(self) -> int:
+        """Steps between evaluations; there are none before the end."""
+        return self.iterations
+
+    def optimiser(self) -> OptimiserConfig:
+        """Return the configuration of Adam for these steps."""
+        return OptimiserConfig(iterations=self.iterations, warmup=self.warmup, betas=self.betas)
+
+    def shortened(self, share: float) -> PretrainConfig:
+        """Return the configuration with `share` of the steps."""
+        return replace(self, iterations=max(1, round(share * self.iterations)))
+
+
+class PretrainTask(OptimizationTask[tuple[int, ...]]):
+    """A pretraining with one batch a step, in a new random order each epoch."""
+
+    def __init__(self, groups: Sequence[ParameterGroup], config: PretrainConfig, count: int, seed: int) -> None:
+        super().__init__(groups, config.optimiser())
+        self.batch, self.count, self.seed = min(config.batch, count), count, seed
+
+    def micro_batches(self, iteration: int) -> Sequence[tuple[int, ...]]:
+        """Return the numbers of a step's poses, each at most once an epoch; a remainder waits for the next one."""
+        # The permutation follows from seed and epoch alone, so that a resumed training draws the same batches.
+        per_epoch = self.count // self.batch
+        epoch, place = divmod(iteration, per_epoch)
+        order = np.random.default_rng((self.seed, 3, epoch)).permutation(self.count)
+        return [tuple(order[place * self.batch : (place + 1) * self.batch].tolist())]
+
+    def evaluate(self, iteration: int) -> Mapping[str, Any]:
+        """Return no figures, because no view is rendered."""
+        return {"mean": {}}

@@ -9,9 +9,8 @@ from typing import Any
 
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.training.engine.loop import LoopConfig, Progress, run_training
-from avatar.training.engine.optimization_task import OptimizationTask
+from avatar.training.engine.optimization_task import OptimizationTask, PretrainConfig
 from avatar.training.engine.photometric_task import PhotometricConfig, Preview, TaskContext
-from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.processes import Distributed
 
 TRACK, PRETRAIN = "track", "pretrain"

@@ -20,10 +20,10 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rendering.avatar_view import Rendering
 from avatar.rendering.mesh_maps import mesh_maps
 from avatar.rig.rig import Pose, PosedAvatar
+from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
-from avatar.training.engine.pretraining import PretrainConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import PRETRAIN, Session

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,9 +21,9 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track
+from avatar.training.engine.adam import Adam, ParameterGroup
 from avatar.training.engine.learning_rates import pixel_size
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
@@ -107,18 +108,18 @@ def _fit(
     # The weight of a coefficient's error is the norm of its blend shape.
     size = shapes.U.detach()[..., shapes.config.head_shapes :].square().sum((0, 1)).sqrt()
     weight = size / size.max().clamp(min=1e-12)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=weight_decay)
+    learned: dict[str, Any] = {"params": list(network.parameters())}
+    optimiser = Adam([learned], weight_decay=weight_decay, fused=False)
     # Fresh noise on theta in each step: the fit is a smooth function about each pose, not a value at it alone.
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     noise = torch.Generator().manual_seed(0)
-    for _ in range(steps):
+    for step in range(steps):
+        learned["lr"] = rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
         blurred = pose + pose_noise * torch.randn(pose.shape, generator=noise).to(pose)
         found = network(blurred).unflatten(1, targets.shape[1:])
         loss = ((found - targets) * weight).square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        schedule.step()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,8 @@ from avatar.models.networks.sparse_lookups import MapSampler
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar, assign_front_back
 from avatar.rendering.mesh_maps import vertex_normals
-from avatar.training.engine.optimization_task import ParameterGroup
-from avatar.training.engine.pretraining import CACHE_BYTES, PretrainConfig, PretrainTask
+from avatar.training.engine.adam import ParameterGroup
+from avatar.training.engine.optimization_task import CACHE_BYTES, PretrainConfig, PretrainTask
 
 
 class PretrainFieldTask(PretrainTask):

@@ -16,10 +16,10 @@ from avatar.models.networks.teacher import Residuals, TeacherConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track
 from avatar.rig.rig import PosedAvatar
+from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.optimization_task import ParameterGroup
+from avatar.training.engine.optimization_task import CACHE_BYTES, PretrainConfig, PretrainTask
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
-from avatar.training.engine.pretraining import CACHE_BYTES, PretrainConfig, PretrainTask
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.tracking.config import TrackConfig

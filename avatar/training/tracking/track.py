@@ -21,8 +21,8 @@ from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.tensor_file import require_finite, require_like
 from avatar.models.tracked_surface import ControlCage, Track, TrackedAvatar
 from avatar.rendering.mesh_maps import vertex_normals
+from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.optimization_task import ParameterGroup
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import BACK, Session

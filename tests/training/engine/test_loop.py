@@ -18,6 +18,7 @@ import torch
 
 from avatar.training.engine import checkpoints
 from avatar.training.engine import loop as module
+from avatar.training.engine.adam import OptimiserConfig
 from avatar.training.engine.checkpoints import (
     STATE_FILE,
     Checkpoint,
@@ -27,7 +28,7 @@ from avatar.training.engine.checkpoints import (
 )
 from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.metrics_log import append_metrics, read_metrics, truncate_metrics
-from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig
+from avatar.training.engine.optimization_task import DivergedError
 from avatar.training.engine.processes import Distributed
 from smplxpp.core.errors import InputError, MissingExtraError
 from tests.dolls.toy import Toy, same_state

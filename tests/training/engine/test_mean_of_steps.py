@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from avatar.training.engine.adam import EVERY, MeanOfSteps, OptimiserConfig
 from avatar.training.engine.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from avatar.training.engine.optimization_task import EVERY, MeanOfSteps, OptimiserConfig
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy, copied, same_state
 

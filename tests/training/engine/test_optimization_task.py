@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.training.engine.adam import Adam, OptimiserConfig, ParameterGroup
 from avatar.training.engine.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from avatar.training.engine.optimization_task import DivergedError, OptimiserConfig, OptimizationTask, ParameterGroup
+from avatar.training.engine.optimization_task import DivergedError, OptimizationTask
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy, copied, same_state
 
@@ -53,6 +54,33 @@ def test_micro_batches_are_one_step_on_their_mean():
         assert metrics["items"] == [f"batch {3 * k + j}" for j in range(3)]
     for name, value in task.p.items():
         torch.testing.assert_close(value, twin.p[name], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.1])
+@pytest.mark.parametrize("fused", [True, False])
+def test_steps_are_those_of_torchs_classes_bit_for_bit(fused, decay):
+    """Which are not taken, as they import the compiler: a tensor without gradient is left out there, too."""
+    draws = torch.Generator().manual_seed(0)
+    start = [torch.randn(shape, generator=draws) for shape in ((3, 4), (5,), (2,))]
+    own, theirs = ([torch.nn.Parameter(value.clone()) for value in start] for _ in range(2))
+    groups = [{"params": own[:2], "lr": 0.1}, {"params": own[2:], "lr": 0.02}]
+    adam = Adam(groups, betas=(0.8, 0.95), eps=1e-6, weight_decay=decay, fused=fused)
+    made = torch.optim.AdamW if decay else torch.optim.Adam
+    told = [{"params": theirs[:2], "lr": 0.1}, {"params": theirs[2:], "lr": 0.02}]
+    twin = made(told, betas=(0.8, 0.95), eps=1e-6, weight_decay=decay, fused=fused, foreach=False)
+    for k in range(5):
+        for group, other in zip(adam.param_groups, twin.param_groups, strict=True):
+            group["lr"] = other["lr"] = 0.7 * group["lr"]
+        for one, other in zip(own, theirs, strict=True):
+            gradient = None if k == 0 and one.shape == (5,) else torch.randn(one.shape, generator=draws)
+            one.grad, other.grad = gradient, None if gradient is None else gradient.clone()
+        adam.step()
+        twin.step()
+        adam.zero_grad()
+        assert all(value.grad is None for value in own)
+        for one, other in zip(own, theirs, strict=True):
+            assert torch.equal(one, other)
+            assert all(torch.equal(adam.state[one][name], value) for name, value in twin.state[other].items())
 
 
 def test_it_learns():

@@ -12,10 +12,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from avatar.training.engine.adam import OptimiserConfig
 from avatar.training.engine.checkpoints import STATE_FILE
 from avatar.training.engine.loop import METRICS_FILE, LoopConfig, run_training
 from avatar.training.engine.metrics_log import read_metrics
-from avatar.training.engine.optimization_task import OptimiserConfig
 from avatar.training.engine.processes import Distributed, join_processes
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy, same_state

@@ -20,8 +20,8 @@ from unittest import mock
 import torch
 from safetensors.torch import save_file
 
+from avatar.training.engine.adam import OptimiserConfig
 from avatar.training.engine.loop import LoopConfig, run_training
-from avatar.training.engine.optimization_task import OptimiserConfig
 from avatar.training.engine.processes import Distributed, join_processes
 from smplxpp.core.errors import InputError
 from tests.dolls.toy import Toy

@@ -15,7 +15,7 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
-from avatar.training.engine.pretraining import PretrainConfig
+from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.engine.session import Session
 from avatar.training.teacher.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
 from avatar.training.tracking import track as tracking
