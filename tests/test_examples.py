@@ -25,10 +25,9 @@ from PIL import Image
 import avatar
 import smplxpp
 from avatar.formats.ply import read_splat_ply
-from avatar.training.presets import TRAINING_PRESETS
 from smplxpp import Template, build_template
 from smplxpp.build.report import BuildReport
-from tests.pipelines.training_runs import QUICK
+from tests.pipelines.training_runs import quick
 
 ROOT = Path(__file__).resolve().parents[1]
 # What each must write into its folder.
@@ -70,7 +69,7 @@ def run_example(name: str, out: Path, *arguments: str, template: Path | None = N
         contextlib.redirect_stdout(printed),
         mock.patch.object(sys, "argv", [f"{name}.py", *arguments, "--out", str(out)]),
         mock.patch.object(smplxpp, "build_template", build),
-        mock.patch.dict(TRAINING_PRESETS, demo=QUICK),
+        quick(),
         mock.patch.object(avatar, "TrainConfig", partial(avatar.TrainConfig, gaussians=GAUSSIANS)),
     ):
         runpy.run_path(f"examples/{name}.py", run_name="__main__")
@@ -138,7 +137,7 @@ def test_notebook_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
         contextlib.chdir(tmp_path),
         contextlib.redirect_stdout(printed),
         mock.patch.object(smplxpp, "build_template", _small_template),
-        mock.patch.dict(TRAINING_PRESETS, demo=QUICK),
+        quick(),
     ):
         for source in code_of_notebook(name):
             exec(compile(source, name, "exec"), names)

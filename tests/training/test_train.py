@@ -18,7 +18,7 @@ from smplxpp.capture.sources import FrameParams
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 from tests.dolls.dancing import write_dance, write_dance_run
-from tests.pipelines.training_runs import QUICK, train
+from tests.pipelines.training_runs import QUICK, quick, train
 
 COUNTS = {"fit": 2, "teacher": 3, "bake": 3, "compensate": 3}
 CONFIG = avatar.TrainConfig(gaussians=300, iterations=COUNTS, device="cpu")
@@ -41,7 +41,8 @@ def train_in_python(run: Path, capture: Path, out: Path, **config):
     template = Template.load(run / layout.TEMPLATE)
     frame = CONFIG.template_frame if (run / layout.BUILD_FILE).is_file() else None
     options = replace(CONFIG, **{"template_frame": frame, **config})
-    return avatar.train(template, open_capture(capture), out, preset=QUICK, config=options)
+    with quick():
+        return avatar.train(template, open_capture(capture), out, preset=QUICK, config=options)
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +27,7 @@ from smplxpp.register import BodyState
 
 Views = Callable[[int], Sequence[View]]
 """Returns the photographs of a frame at full size."""
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ class Alignment:
         self.variables = Variables.of_body(body.joint_count, body.num_expressions, scene.config)
         # Groups of the depths: one a label.
         self._views, self._cached, self._bytes = views, dict[tuple[int, int], list[View]](), 0
+        self._reading = threading.Lock()
         labels = scene.posed.template.vertex_labels[scene.posed.template.faces[:, 0]]
         self._groups = torch.tensor(labels, dtype=torch.int64)[gaussians.face_index]
         self._jacobian = CentreJacobian(scene.posed, gaussians, self.variables)
@@ -151,14 +155,13 @@ class Alignment:
 
     def losses(self, state: BodyState, on_frame: Callable[[], None] = lambda: None) -> Float64[np.ndarray, " F"]:
         """Return `PhotometricLoss.rigid_loss` of every frame in a state, at the size of the finest level."""
-        halvings, out = self.scene.config.levels[-1].halvings, []
-        for row in range(len(self.frames)):
+        halvings, rigid = self.scene.config.levels[-1].halvings, self._jacobian.rigidity
+
+        def loss(row: int) -> float:
             vertices = self.scene.posed.place(state, row).vertices.detach()
-            views = self._photographs(row, halvings)
-            rigid = self._jacobian.rigidity
-            out.append(self.scene.photometric.rigid_loss(self.gaussians, vertices, rigid, views))
-            on_frame()
-        return np.array(out)
+            return self.scene.photometric.rigid_loss(self.gaussians, vertices, rigid, self._photographs(row, halvings))
+
+        return np.array(list(self._of_frames(loss, on_frame)))
 
     def _begin(self) -> _Carried:
         """Return what a level's first pass starts from."""
@@ -175,13 +178,14 @@ class Alignment:
         if self.scene.cameras is not None:
             self.scene.cameras.clear()
         losses, gradients, curvatures = [], [], []
-        for row in range(len(self.frames)):
-            linear, gradient, curvature = self._linearize(row, level.halvings)
+        for linear, gradient, curvature in self._of_frames(lambda row: self._linearize(row, level.halvings), on_frame):
+            # What frames share is summed in their order.
             appearance.add(linear)
+            if self.scene.cameras is not None:
+                self.scene.cameras.add(linear, self._jacobian.rigidity)
             losses.append(linear.loss)
             gradients.append(gradient)
             curvatures.append(curvature)
-            on_frame()
         found, loss = Normal(np.stack(gradients), np.stack(curvatures)), np.array(losses)
         # Reset frames whose loss grew, with their earlier normal equations, and damp them more.
         bad, damping = loss > worse * before.best, before.damping
@@ -196,6 +200,27 @@ class Alignment:
         if self.learns_appearance:
             self.gaussians = appearance.stepped(self.gaussians, len(self.frames))
         return _Carried(damping, np.where(bad, before.best, loss), self.state, found)
+
+    def _of_frames(self, work: Callable[[int], _T], on_frame: Callable[[], None]) -> Iterator[_T]:
+        """Yield what `work` returns for the row of each frame, in order; as many frames at a time as torch has threads.
+
+        Pictures of a few hundred pixels keep several threads waiting for each other, so that each frame has one thread.
+        """
+        threads, rows = torch.get_num_threads(), range(len(self.frames))
+        if min(threads, len(rows)) == 1:
+            results, pool = map(work, rows), None
+        else:
+            pool = ThreadPoolExecutor(threads, "frame", initializer=torch.set_num_threads, initargs=(1,))
+            results = pool.map(work, rows)
+        try:
+            for result in results:
+                on_frame()
+                yield result
+        finally:
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
+                # A thread sets its own number, and that of threads that start later.
+                torch.set_num_threads(threads)
 
     def _save(self, file: Path, number: int, carried: _Carried) -> None:
         """Write everything that the passes after this number depend on, whole or not at all."""
@@ -243,8 +268,6 @@ class Alignment:
             halvings=halvings,
             each_camera=cameras is not None,
         )
-        if cameras is not None:
-            cameras.add(linear, self._jacobian.rigidity)
         # The chain rule takes the gradient of the vertices to the steps; the Gauss-Newton matrix is J^T M J.
         gradient = self.variables.packed(*posed.gradient(placed, linear.vertex_gradient))
         return linear, gradient, self._jacobian.curvature(placed, linear)
@@ -253,16 +276,16 @@ class Alignment:
         """Return the views of a frame at a level's size, with the current corrections of the cameras."""
         cached_bytes = 1 << 30  # bound of the cached photographs
         key = (row, halvings)
-        if key not in self._cached:
-            # Halved photographs are kept until the bound, then all are dropped: passes read the frames in one order,
-            # so that
-            # dropping the oldest alone would save nothing.
-            views = list(halved(self._views(self.frames[row]), halvings))
-            self._bytes += sum(view.foreground.numel() + view.alpha.numel() for view in views)
-            if self._bytes > cached_bytes:
-                self._cached, self._bytes = {}, 0
-            self._cached[key] = views
-        views = self._cached[key]
+        with self._reading:
+            views = self._cached.get(key, [])
+            if key not in self._cached:
+                # Halved photographs are kept until the bound, then all are dropped: passes read the frames in one
+                # order, so that dropping the oldest alone would save nothing.
+                views = list(halved(self._views(self.frames[row]), halvings))
+                self._bytes += sum(view.foreground.numel() + view.alpha.numel() for view in views)
+                if self._bytes > cached_bytes:
+                    self._cached, self._bytes = {}, 0
+                self._cached[key] = views
         # Corrections change after each pass, so the cache holds views without them.
         corrections = self.scene.cameras
         return views if corrections is None else [corrections.corrected(view) for view in views]

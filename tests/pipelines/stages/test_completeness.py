@@ -11,7 +11,7 @@ import pytest
 from pipelines.runs.artefacts import load_params_of_run, load_scan, load_scan_labels
 from pipelines.runs.layout import TEMPLATE
 from smplxpp.build.completeness import completeness_checks
-from smplxpp.clean import sanitize
+from smplxpp.clean import sanitize, simplify
 from smplxpp.core import LOWER, SKIN, TriangleMesh
 from smplxpp.metrics import CompareConfig, directed_distances
 from smplxpp.template.template import Template
@@ -21,14 +21,13 @@ BODY, REGION, ENDS, SCAN, PATCH, MIRROR = range(6)
 
 @pytest.fixture(scope="module")
 def whole(person_run):
-    """Template, parameters, scan and labels of a finished build."""
+    """Template, parameters, scan and labels of a finished build, the scan with a quarter of its faces."""
     scan, _, _ = load_scan(person_run)
-    return (
-        Template.load(person_run / TEMPLATE),
-        load_params_of_run(person_run),
-        scan,
-        load_scan_labels(person_run, scan.face_count),
-    )
+    of_vertex = np.zeros(scan.vertex_count, dtype=np.int64)
+    of_vertex[scan.faces] = load_scan_labels(person_run, scan.face_count)[:, None]
+    coarse = simplify(scan, 20_000)
+    labels = of_vertex[coarse.source_vertex][coarse.mesh.faces[:, 0]]
+    return Template.load(person_run / TEMPLATE), load_params_of_run(person_run), coarse.mesh, labels
 
 
 def checked(whole, *, labels: np.ndarray | None = None, kept: np.ndarray | None = None, without: str = "none"):

@@ -60,6 +60,23 @@ def test_disturbed_poses_come_back(found, start):
     assert (found.after < found.before).all() and found.kept == ()
 
 
+def test_frames_are_shared_among_threads_and_give_the_bits_of_one(frames):
+    config = replace(QUICK, reference_levels=(), cameras=True)
+    alone, threads, seen = refine_poses(frames, config), torch.get_num_threads(), []
+    torch.set_num_threads(3)
+    try:
+        together = refine_poses(frames, config, progress=lambda step, share: seen.append(share))
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
+    assert seen == sorted(seen) and seen[-1] == 1.0
+    np.testing.assert_array_equal(together.params.full_pose, alone.params.full_pose)
+    np.testing.assert_array_equal(together.after, alone.after)
+    assert torch.equal(together.gaussians.dc, alone.gaussians.dc)
+    for name, pose in alone.cameras.items():
+        np.testing.assert_array_equal(together.cameras[name], pose)
+
+
 @pytest.mark.parametrize("cameras", [False, True])
 def test_a_killed_refinement_goes_on_to_the_same_bits(frames, tmp_path, cameras):
     """In the first pass of the second level, after the passes of the first one."""
