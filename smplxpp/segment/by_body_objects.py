@@ -1,4 +1,4 @@
-"""Find things that a person holds: surface at a hand that no pose of the body and no clothes explain.
+"""Find things that a person holds or wears on a strap: surface that no pose of the body and no clothes explain.
 
 Every face has evidence, in square centimetres of surface, that it belongs to a thing. Evidence grows with the
 distance of faces whose nearest part of the body is a hand, because cloth does not stand off a hand; boards
@@ -10,8 +10,10 @@ minimises
 
 whose second term is low in concave folds and across edges of colour (`edge_weights`), as where a thing lies against
 clothes or an arm. A skirt beside a hand has such evidence, too; it continues smoothly into cloth, so that cutting it
-out is dear. A minimum cut gives O; its pieces are kept where they are large enough, touch the hand, leave its reach,
-and have a border that is short for their area, which a flap of cloth does not have.
+out is dear. Bags have evidence where they stand off trunk and legs and the mirrored place of the other side is empty,
+because clothes hang off both. A minimum cut gives O; its pieces are kept where they are large enough, touch a hand or
+are lacking on the other side, leave the reach of clothes, and have a border that is short for their area, which a flap
+of cloth does not have.
 """
 
 from __future__ import annotations
@@ -45,6 +47,9 @@ _BOARD_REACH = 0.6
 """Metres from a hand within which boards are looked for, the diagonal of a large folder."""
 _HANGS, _LOOKS_OUT = 0.09, 0.5
 """Metres within which a shirt or skirt hangs off trunk and legs, and the cosine between its normal and theirs."""
+# Evidence of surface off trunk and legs that the other side of the person lacks at the mirrored place, by its distance
+# from the body and by how far the scan is from that place, metres.
+_WORN, _LACKED = ((0.015, 0.04, 0.10), (-1.0, 0.0, 0.6)), ((0.03, 0.06), (0.0, 1.0))
 _LENGTH_COST = 2.0  # square centimetres of evidence for one centimetre of a cut through smooth, plain surface
 
 
@@ -99,6 +104,15 @@ def find_objects(
     looks = np.einsum("ij,ij->i", mesh.face_normals, posed.vertex_normals[clothed][at])
     hangs = (region == HAND) & (off < _HANGS) & (looks > _LOOKS_OUT)
     evidence[hangs] = np.minimum(evidence[hangs], 0.0)
+    lacked = np.zeros(mesh.face_count)
+    beside = np.flatnonzero(np.isin(region, (TRUNK, LEG)) & (distance > _WORN[0][0]))
+    if len(beside):
+        away = _from_mirrored(mesh, body, params, posed, beside, np.flatnonzero(clothed)[at[beside]])
+        lacked[beside] = np.interp(away, *_LACKED)
+        worn = (1.0 + np.interp(distance[beside], *_WORN)) * lacked[beside] - 1.0
+        evidence[beside] = np.maximum(evidence[beside], worn)
+        # Cloth looks away from the body: what looks at it may be the back of a thing, and is nearly free.
+        evidence[beside[looks[beside] < -_LOOKS_OUT]] = np.maximum(evidence[beside[looks[beside] < -_LOOKS_OUT]], -0.02)
     if not (mesh.face_areas[evidence > 0].sum() * _CM2 > _LEAST_AREA):
         return FoundObjects.none(mesh.face_count)
     # Boards at an arm or on the chest, from both sides.
@@ -120,8 +134,38 @@ def find_objects(
         (posed.vertices[hand & (own.side == side)], float(mesh.face_areas[left & (charted.side == side)].sum()) * _CM2)
         for side in (1, -1)
     ]
-    where = _Where(distance, to_hand, _sectors(mesh, middle), flat, pairs, length, cost)
+    where = _Where(distance, to_hand, _sectors(mesh, middle), flat, lacked, pairs, length, cost)
     return _accepted(mesh, cut, where, hands)
+
+
+def _from_mirrored(
+    mesh: TriangleMesh,
+    body: BodyModel,
+    params: BodyParams,
+    posed: TriangleMesh,
+    faces: Int64[np.ndarray, " F"],
+    vertex: Int64[np.ndarray, " F"],
+) -> Float64[np.ndarray, " F"]:
+    """Return how far a scan is from where some of its faces would be on the other side of the person, metres.
+
+    The offset of a face from its vertex of the body is mirrored in the frame of the joint that the vertex follows, so
+    that a pose with one leg forward is none of the difference.
+
+    Args:
+        mesh: the scan.
+        body: the model.
+        params: one frame, in the pose of the scan.
+        posed: the body.
+        faces: some faces.
+        vertex: for each of them the vertex of the body.
+    """
+    flip = np.array([-1.0, 1.0, 1.0])
+    other = cKDTree(body.v_template).query(body.v_template[vertex] * flip)[1]
+    joint = np.asarray(body.weights).argmax(axis=1)
+    turn = body.forward(params).posed_from_rest[0][:, :3, :3]
+    offset = np.einsum("nji,nj->ni", turn[joint[vertex]], mesh.face_centers[faces] - posed.vertices[vertex])
+    place = posed.vertices[other] + np.einsum("nij,nj->ni", turn[joint[other]], offset * flip)
+    return cKDTree(mesh.face_centers).query(place)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +177,7 @@ class _Where:
         to_hand: of each face to the nearer hand, metres.
         sector: of each face about the person (`_sectors`).
         flat: share of each face on a board.
+        lacked: how far the other side of the person lacks each face, 0 to 1.
         pairs: the two faces of each edge.
         length: of each edge, centimetres.
         cost: of cutting each edge, square centimetres of evidence.
@@ -142,6 +187,7 @@ class _Where:
     to_hand: Float64[np.ndarray, " M"]
     sector: Int64[np.ndarray, " M"]
     flat: Float64[np.ndarray, " M"]
+    lacked: Float64[np.ndarray, " M"]
     pairs: Int64[np.ndarray, "P 2"]
     length: Float64[np.ndarray, " P"]
     cost: Float64[np.ndarray, " P"]
@@ -204,7 +250,8 @@ def _accepted(
         own = cut & (piece == number)
         areas, to_hand = mesh.face_areas[own] * _CM2, where.to_hand[own]
         area = float(areas.sum())
-        if area < _LEAST_AREA or where.distance[own].max() < _LEAST_REACH or to_hand.min() > _TOUCHES:
+        held = to_hand.min() <= _TOUCHES
+        if area < _LEAST_AREA or where.distance[own].max() < _LEAST_REACH:
             continue
         # Clothes that hang far off the legs go round the person; a thing is on one side of her.
         around = np.bincount(where.sector[own], areas, minlength=_SECTORS) / area
@@ -213,7 +260,7 @@ def _accepted(
         # A hand that what is left of the scan does not show lies elsewhere: then a small piece is the hand itself.
         center = mesh.face_centers[own][to_hand.argmin()]
         nearest = int(np.argmin([np.linalg.norm(h - center, axis=1).min() if len(h) else np.inf for h, _ in hands]))
-        if hands[nearest][1] < _LEFT_OF_HAND and area < _LARGER_THAN_HANDS:
+        if held and hands[nearest][1] < _LEFT_OF_HAND and area < _LARGER_THAN_HANDS:
             continue
         # The cost of its border, relative to a border of the same length through smooth and plain surface.
         border = own[pairs[:, 0]] != own[pairs[:, 1]]
@@ -222,8 +269,16 @@ def _accepted(
         clamped = areas @ where.flat[own] > _CLAMPED * area and to_hand.min() < _CLAMPED_TOUCHES
         if dear > _SMOOTH_BORDER or (length**2 > _LONG_BORDER * area and not (clamped and dear < _CLAMPED_BORDER)):
             continue
+        # What is off the hands is worn, from 150 cm2 on and beginning beside the body, where the other side of the
+        # person lacks two fifths of it, or where it stands 12 cm off her within folds: squared length of the border by
+        # area times its mean cost is 0.1 of backpacks, 1.5 and more of flaps, whose borders are long or smooth.
+        deep = where.distance[own].max() > 0.12 and dear * length**2 < 0.4 * area
+        near = area > 150.0 and where.distance[own].min() < _WORN[0][1]
+        if not held and not (near and (deep or areas @ where.lacked[own] > 0.4 * area)):
+            continue
         faces |= own
-        notes.append(f"a thing of {area:.0f} cm2 at a hand is labelled object")
+        place = "at a hand" if held else "worn off the hands"
+        notes.append(f"a thing of {area:.0f} cm2 {place} is labelled object")
     return FoundObjects(faces | _enclosed(mesh, faces, where), tuple(notes))
 
 

@@ -26,8 +26,8 @@ def rigid_weights(
     """Return skin weights with which every piece of `target` follows one joint of the body, as it is in the scan.
 
     A piece that comes within 3 cm of a hand is held by it and follows its wrist, because fingers that bend would tear
-    it; of two hands, the one that is near to more of it holds it. Every other piece (a bag on the shoulder, a hat)
-    follows the joint with the largest weight in the body nearest to it.
+    it; of two hands, the one that is near to more of it holds it. Every other piece (a hat) follows the joint with the
+    largest weight in the body nearest to it, and one beside thigh and trunk (a bag on a strap) the trunk.
 
     Args:
         source: the posed body.
@@ -62,6 +62,7 @@ def rigid_weights(
     np.add.at(folded.T, owner, own.T)
     limb = folded.argmax(axis=1)
     distance, nearest = cKDTree(source.vertices).query(target.vertices)
+    trunk = [k for k, name in enumerate(names) if name.startswith(("pelvis", "spine"))]
     hands = [k for k, name in enumerate(names) if name.endswith("_wrist") and (limb == k).any()]
     held = np.zeros((len(hands), target.vertex_count), dtype=bool)
     for row, hand in enumerate(hands):
@@ -81,6 +82,11 @@ def rigid_weights(
             # The tenth of it that is nearest to the body, by the sum of the weights there.
             close = own & (distance <= np.quantile(distance[own], 0.1))
             follows[own] = int(folded[nearest[close]].sum(axis=0).argmax())
+            # A bag that hangs beside a hip is carried by the shoulder and does not swing with the thigh, as a holster
+            # does. The trunk is nearest to a sixth of such a bag and more.
+            beside = np.isin(limb[nearest[own]], trunk)
+            if names[follows[own][0]].endswith("_hip") and beside.mean() > 0.15:
+                follows[own] = trunk[int(folded[nearest[own]][beside][:, trunk].sum(axis=0).argmax())]
         policies.append(f"rigid:{names[follows[own][0]]}")
     dense = np.zeros((target.vertex_count, len(names)))
     dense[np.arange(len(follows)), follows] = 1.0

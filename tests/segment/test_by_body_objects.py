@@ -63,6 +63,24 @@ def test_a_case_in_the_hand_is_found_and_nothing_else(open_body, stance, scan):
     assert len(found.notes) == 1 and "cm2 at a hand" in found.notes[0]
 
 
+@pytest.mark.parametrize("kind", ["shoulder bag", "belt bag", "backpack"])
+def test_a_bag_that_no_hand_touches_is_found(open_body, stance, kind):
+    """A bag on a strap was shirt and trousers, which swung with a thigh."""
+    params, posed = stance
+    skin = open_body.mesh(posed.vertices[0])
+    bag = thing_mesh(Thing(kind, "right"), open_body, posed)
+    taken = simulate_scan(concatenate_meshes([skin, bag]), [], _COARSE)
+    mesh, area = taken.mesh, taken.mesh.face_areas
+    truth = (taken.face >= skin.face_count)[mesh.faces].sum(axis=1) >= 2
+    found = find_objects(mesh, open_body, params)
+    assert area[found.faces & truth].sum() > 0.75 * area[truth].sum()
+    assert area[found.faces & ~truth].sum() < 0.05 * area[truth].sum()
+    assert [note.endswith("worn off the hands is labelled object") for note in found.notes] == [True]
+    weights = rigid_weights(skin, open_body.weights, bag, joint_names=open_body.joint_names)
+    carries = open_body.joint_names[weights.dense()[weights.distance.argmax()].argmax()]
+    assert carries == "pelvis" or carries.startswith("spine")
+
+
 def test_the_thing_keeps_its_label_through_the_cut_and_is_no_cloth(open_body, stance, scan):
     mesh, truth = scan
     result = label_by_body(mesh, open_body, stance[0])
@@ -110,7 +128,7 @@ def test_what_a_thing_goes_all_round_is_the_thing_unless_it_is_at_the_hand():
     pairs, _ = face_adjacency(mesh.faces)
     to_hand = np.hypot(x - 0.1, y - 0.12)
     none = np.zeros(mesh.face_count)
-    where = _Where(none, to_hand, none.astype(int), none, pairs, *np.ones((2, len(pairs))))
+    where = _Where(none, to_hand, none.astype(int), none, none, pairs, *np.ones((2, len(pairs))))
     assert (_enclosed(mesh, thing, where) == far).all()
 
 
