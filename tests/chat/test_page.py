@@ -15,7 +15,7 @@ from tests.chat.test_server import NEEDS_NGINX, PROXIED, behind_nginx
 from tests.web.chromium import Page, find_chromium
 from tests.web.ear import LISTEN
 from tests.web.modules import NEEDS_BUILD, node
-from tests.web.test_embed import anybody_can_use
+from tests.web.test_embed import SIZES, anybody_can_use
 
 pytest.importorskip("websockets", reason="extra chat")
 
@@ -70,7 +70,7 @@ def said(page: Page) -> list[str]:
 
 
 @pytest.mark.parametrize("talking", [{"partner": Script((f"Well, {MARKUP}. ", "Yes."))}], indirect=True)
-def test_what_is_typed_is_answered_and_nothing_becomes_markup(talking):
+def test_what_is_typed_is_answered_and_nothing_becomes_markup(talking, tmp_path):
     page, _ = talking
     type_in(page, MARKUP)
     page.until(
@@ -81,6 +81,11 @@ def test_what_is_typed_is_answered_and_nothing_becomes_markup(talking):
     page.until("/picture [0-9.]+ s/.test(document.querySelector('.times').textContent)", "no latency is shown")
     assert page.evaluate("conversation.microphone.on") is False  # Enter is no click on it
     anybody_can_use(page)
+    # Times of answers are never the same, and the avatar moves.
+    page.evaluate("for (const one of ['canvas', '.times', '.rates']) document.querySelector(one).style.opacity = 0")
+    for width, height, _ in SIZES:
+        page.resize(width, height)
+        page.looks_as_kept(f"talk_{width}", tmp_path)
     page.resize(*SIZE)
     assert page.errors == []
 

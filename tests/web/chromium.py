@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from PIL import Image
 
 # Chromium reads commands from descriptor 3 and writes to 4; this puts our pipes there.
 _SHIM = (
@@ -27,6 +29,14 @@ _SWIFTSHADER = (
 )
 LIMIT = 900.0
 _ABOVE = 10
+LOOKS = Path(__file__).parent / "looks"
+# What a person can find in the page: its name, and its place in CSS pixels.
+_SQUARE, _SHADE, _LETTERS, _MOVED = 10, 24, 20, 24  # CSS pixels, of 255, squares, CSS pixels
+_PLACES = """Object.fromEntries([...document.querySelectorAll("h1, button, input, select, [role]")].map(one => {
+    const { x, y, width, height } = one.checkVisibility() ? one.getBoundingClientRect() : {};
+    const name = one.ariaLabel || one.title || one.textContent.slice(0, 24) || one.className;
+    return [`${one.localName} ${name}`, [x, y, width, height].map(Math.round)];
+  }).filter(([, [, , width, height]]) => width && height))"""
 
 
 def find_chromium() -> str | None:
@@ -168,6 +178,34 @@ class Page:
         import base64
 
         path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
+
+    def looks_as_kept(self, name: str, folder: Path) -> None:
+        """Fail where the window does not look as `looks/NAME.png` and `.json` have it; what is seen goes to a folder.
+
+        Letters, and their edges, differ among browsers and among machines' fonts, so that the picture is kept in
+        squares of ten pixels, each their mean, and a square may be as any of its neighbours is kept. Fonts move twenty
+        of them at most; small things, which are no more, are held by their places.
+        """
+        self.evaluate("Promise.all(document.getAnimations().map(one => one.finished)).then(() => 0)")
+        self.screenshot(folder / f"{name}_whole.png")
+        image = np.asarray(Image.open(folder / f"{name}_whole.png").convert("RGB"), float)
+        rows, columns = (side // _SQUARE for side in image.shape[:2])
+        squares = image[: rows * _SQUARE, : columns * _SQUARE].reshape(rows, _SQUARE, columns, _SQUARE, 3)
+        seen, places = np.round(squares.mean(axis=(1, 3))).astype(np.int16), self.evaluate(_PLACES)
+        Image.fromarray(seen.astype(np.uint8)).save(folder / f"{name}.png")
+        (folder / f"{name}.json").write_text(json.dumps(places, indent=1) + "\n")
+        hint = f"if the change is meant, copy {folder}/{name}.png and .json to {LOOKS}"
+        assert (LOOKS / f"{name}.json").exists(), hint
+        kept = np.asarray(Image.open(LOOKS / f"{name}.png").convert("RGB"), np.int16)
+        assert kept.shape == seen.shape, hint
+        for one, other in ((seen, kept), (kept, seen)):
+            near = sliding_window_view(np.pad(other, ((1, 1), (1, 1), (0, 0)), mode="edge"), (3, 3), axis=(0, 1))
+            apart = np.maximum(near.min(axis=(-1, -2)) - one, one - near.max(axis=(-1, -2))).max(axis=-1)
+            assert (apart > _SHADE).sum() <= _LETTERS, f"{(apart > _SHADE).sum()} squares: {hint}"
+        expected = json.loads((LOOKS / f"{name}.json").read_text())
+        assert places.keys() == expected.keys(), hint
+        moved = {key for key, place in places.items() if np.abs(np.subtract(place, expected[key])).max() > _MOVED}
+        assert not moved, f"{moved}: {hint}"
 
     def _wait(self, number: int) -> dict[str, Any]:
         end = time.monotonic() + LIMIT

@@ -17,6 +17,8 @@ export function Avatar({ ref, url, lips, voice, view = "whole", background = nul
   useEffect(() => {
     avatar.current.set({ background, view, ...(parts && { parts }) }).catch((error) => heard.current.onError?.(error));
   }, [background, view, parts]);
-  useImperativeHandle(ref, () => ({ say: (what) => avatar.current.say(what), pose: (params) => avatar.current.pose(params) }), []);
+  useImperativeHandle(ref, () => ({
+    say: (what) => avatar.current.say(what), pose: (params) => avatar.current.pose(params), converse: (server) => avatar.current.converse(server),
+  }), []);
   return <canvas ref={canvas} {...rest} />;
 }
