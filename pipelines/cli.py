@@ -81,6 +81,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "batch status": ("pipelines.commands.batch", "BatchStatus", "what has become of the subjects of a batch"),
     "batch stop": ("pipelines.commands.batch", "BatchStop", "end a batch; what stands stays, and the batch can go on"),
     "batch retry": ("pipelines.commands.batch", "BatchRetry", "run the subjects of a batch again that failed"),
+    "batch frames": (
+        "pipelines.commands.batch_frames",
+        "BatchFrames",
+        "one long take in chunks of frames: reconstructed, registered or measured, and joined",
+    ),
     "batch": (
         "pipelines.commands.batch",
         "RunBatch",

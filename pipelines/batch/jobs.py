@@ -21,13 +21,22 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pipelines.runs.layout import BUILD_STAGES, EVALUATE_STAGE, MODEL_STAGES, REFINE_STAGE, RELIGHT_STAGE
+from pipelines.runs.layout import (
+    BUILD_STAGES,
+    EVALUATE_STAGE,
+    MODEL_STAGES,
+    RECONSTRUCT_STAGE,
+    REFINE_STAGE,
+    REGISTER_STAGE,
+    RELIGHT_STAGE,
+)
 from smplxpp.core.errors import InputError, did_you_mean, require_between, require_choice
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, shown
 from smplxpp.core.files.markup_file import read_yaml
@@ -68,6 +77,21 @@ STEPS: Mapping[str, StepKind] = {
     "check": StepKind(
         ("capture", "check"), "pipelines.commands.capture", "CaptureCheckCommand", files=("check/check.json",)
     ),
+    "reconstruct": StepKind(
+        ("reconstruct",),
+        "pipelines.commands.reconstruct",
+        "ReconstructCommand",
+        stages=(RECONSTRUCT_STAGE,),
+        files=("reconstruct/scans/seams.json",),
+    ),
+    "register": StepKind(
+        ("register",),
+        "pipelines.commands.register",
+        "Register",
+        stages=(REGISTER_STAGE,),
+        files=("register/params.npz",),
+    ),
+    "metrics": StepKind(("metrics",), "pipelines.commands.metrics", "Metrics", files=("metrics.json",)),
     "build": StepKind(("build",), "pipelines.commands.build", "Build", stages=BUILD_STAGES),
     "train": StepKind(
         ("train",), "pipelines.commands.train", "Train", on_gpu=True, stages=(REFINE_STAGE, *MODEL_STAGES)
@@ -79,6 +103,8 @@ STEPS: Mapping[str, StepKind] = {
     "web": StepKind(("web",), "pipelines.commands.web", "Web", files=("player.html",)),
 }
 """The steps in the order in which they run."""
+SPLIT = ("reconstruct", "register", "metrics")
+"""Steps that can be split into chunks of frames: `frames` of a job."""
 DEFAULT_STEPS = ("check", "build", "train", "evaluate", "export")
 RESERVED = ("batch.json", "index.html", "index.json", "summary.csv", "stop.json", "cluster")
 """Names in RUNS that no subject may have."""
@@ -152,10 +178,18 @@ class Job:
         run, given = str(folder / "run"), self.options.get(step, {})
         if "convert" in self.steps and step != "convert":
             capture = str(folder / "capture")
+        if self.frames and step in SPLIT:
+            return self._chunks(step, folder, capture)
         source = [] if "scan" in given else ["--capture", capture]
+        # Parameters that chunks were joined to lie beside the run, whose own registration has all frames.
+        if self.frames and "register" in self.steps and "params" not in given:
+            source += ["--params", str(folder / "register" / "params.npz")]
         places: dict[str, list[str]] = {
             "convert": [capture, "--out", str(folder / "capture")],
             "check": [capture, "--out", str(folder / "check")],
+            "reconstruct": [run, "--capture", capture],
+            "register": [run, "--capture", capture],
+            "metrics": [capture, str(given.get("truth", "")), "--out", str(folder / "metrics.json")],
             "build": [run, *source],
             "train": [run, *source],
             "evaluate": [run, *source],
@@ -166,7 +200,19 @@ class Job:
         words = places[step]
         if step in ("export", "web") and own & {"out", "solid", "single-file"}:
             words = words[:1]
+        given = {name: value for name, value in given.items() if (step, name) != ("metrics", "truth")}
         return [*STEPS[step].words, *words, *option_words(given, subject=self.subject), "--json"]
+
+    def _chunks(self, step: str, folder: Path, capture: str) -> list[str]:
+        """Return the words of the command that runs a step in chunks of frames and joins them."""
+        given = dict(self.options.get(step, {}))
+        truth = ["--truth", str(given.pop("truth"))] if "truth" in given else []
+        if step == "register" and "reconstruct" in self.steps and "scans" not in given:
+            given["scans"] = str(folder / "reconstruct" / "scans")
+        words = ["batch", "frames", step, str(folder / step), "--capture", capture, *truth]
+        words += ["--size", str(self.frames), "--local", str(self.needs.cores or 1)]
+        also = shlex.join(option_words(given, subject=self.subject))
+        return [*words, *(["--also", also] if also else []), "--json"]
 
 
 @dataclass(frozen=True)

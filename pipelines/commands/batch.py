@@ -109,7 +109,7 @@ class RunBatch:
             batch, jobs = begin_batch(file, self.jobs.absolute(), upgrade=self.upgrade)
             executor = self.machines.executor(file, batch)
             begin, index = time.perf_counter(), IndexWriter(file.out)
-            with _shown(index, enabled=not self.json) as report:
+            with shown(index, enabled=not self.json) as report:
                 state = drive(
                     file.out,
                     jobs,
@@ -218,7 +218,8 @@ def check_options(jobs: tuple[Job, ...]) -> None:
     for job in jobs:
         for step in job.steps:
             try:
-                _parsed(step, tuple(option_words(job.options.get(step, {}), subject="subject")))
+                given = {name: value for name, value in job.options.get(step, {}).items() if name != "truth"}
+                _parsed(step, tuple(option_words(given, subject="subject")))
             except InputError as error:
                 raise InputError(
                     f"{job.subject}: {step}: {error.subject}",
@@ -235,7 +236,9 @@ def _parsed(step: str, words: tuple[str, ...]) -> None:
     name, options = " ".join(kind.words), getattr(import_module(kind.module), kind.options)
     checked = checked_arguments(name, options, words)
     # What the runner adds itself; an option of the job that says it again is the user's.
-    places = {"train": ["--capture", "capture"], "convert": ["--out", "out"]}.get(step, [])
+    of_capture = ["--capture", "capture"]
+    more = {"train": of_capture, "reconstruct": of_capture, "convert": ["--out", "out"], "metrics": ["truth"]}
+    places = more.get(step, [])
     places = [] if places and places[0] in checked else places
     said = io.StringIO()
     try:
@@ -278,7 +281,7 @@ def print_status(summary: Mapping[str, Any], rows: Sequence[Row], console: Conso
 
 
 @contextlib.contextmanager
-def _shown(index: IndexWriter, *, enabled: bool) -> Any:
+def shown(index: IndexWriter, *, enabled: bool) -> Any:
     """Show a bar with the subjects by state and those at work, and keep the page up to date."""
     columns = (TextColumn("subjects"), BarColumn(bar_width=20), MofNCompleteColumn(), TimeElapsedColumn())
     words = TextColumn("{task.fields[words]}", markup=False)
@@ -289,8 +292,8 @@ def _shown(index: IndexWriter, *, enabled: bool) -> Any:
             ended = sum(state.states[name] for name in ("done", "failed", "refused", "stopped"))
             failed = state.states["failed"] + state.states["refused"]
             at_work = ", ".join(list(state.running)[:4]) + (", ..." if len(state.running) > 4 else "")
-            shown = state.halted or at_work
-            words = f"{failed} failed; {shown}" if failed else shown
+            now = state.halted or at_work
+            words = f"{failed} failed; {now}" if failed else now
             bar.update(task, total=state.total, completed=ended, words=words)
             index.update()
 
