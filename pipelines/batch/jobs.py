@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -211,8 +210,12 @@ class Job:
             given["scans"] = str(folder / "reconstruct" / "scans")
         words = ["batch", "frames", step, str(folder / step), "--capture", capture, *truth]
         words += ["--size", str(self.frames), "--local", str(self.needs.cores or 1)]
-        also = shlex.join(option_words(given, subject=self.subject))
-        return [*words, *(["--also", also] if also else []), "--json"]
+        also = []
+        for name, value in given.items():
+            for one in value if isinstance(value, list) else [value]:
+                if one is not None and one is not False:
+                    also.append(name if one is True else f"{name}={str(one).replace('{subject}', self.subject)}")
+        return [*words, *(["--also", *also] if also else []), "--json"]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 from rich.text import Text
 
 from pipelines.batch.driver import Progress as State
@@ -24,6 +25,7 @@ from pipelines.batch.executors import Executor, LocalExecutor, RayExecutor, Slur
 from pipelines.batch.hold import BATCH_HOLD, at_work, request_stop
 from pipelines.batch.jobs import STEPS, Job, JobFile, option_words, read_jobs
 from pipelines.batch.page import INDEX_FILE, STATE_STYLES, IndexWriter, terminal_table
+from pipelines.batch.plan import Cost, Site, breaks_first, demands, plan_jobs, read_rates
 from pipelines.batch.records import Batch, read_batch
 from pipelines.batch.run_job import Resources
 from pipelines.batch.table import Row, count_states
@@ -95,7 +97,9 @@ class RunBatch:
     """Go on with another version of smplxpp than the batch began with: what its code affects is made again, and
     unfinished trainings begin again."""
     dry_run: bool = False
-    """Check the job file and print the commands, run nothing."""
+    """Check the job file and print the commands, with hours, gigabytes and what the site lacks; run nothing."""
+    rates: OptionalPath = None
+    """With --dry-run: JSON with rates of this site, and its cores, GPUs and disk under `site` (docs/batch.md)."""
     json: bool = False
     """Print the summary as JSON."""
 
@@ -139,7 +143,12 @@ class RunBatch:
                 console.print(Text(subject, style="bold"))
                 for line in lines:
                     console.print(f"  smplxpp {line}", soft_wrap=True, highlight=False, markup=False)
-        return {"runs": str(file.out), "commands": commands}
+        rates, site = read_rates(self.rates)
+        costs, unknown = plan_jobs(file.jobs, rates, site)
+        if not self.json and costs:
+            print_plan(costs, site, unknown, Console())
+        plan = {step: vars(cost) for step, cost in costs.items()}
+        return {"runs": str(file.out), "commands": commands, "plan": plan, "unknown": unknown}
 
 
 @dataclass(frozen=True)
@@ -278,6 +287,24 @@ def print_status(summary: Mapping[str, Any], rows: Sequence[Row], console: Conso
     if shown:
         console.print(terminal_table(shown, most=len(shown) if every else 40))
     print_paths({"table": Path(summary["index"])}, console)
+
+
+def print_plan(costs: Mapping[str, Cost], site: Site, unknown: Sequence[str], console: Console) -> None:
+    """Print what the steps cost over all subjects, how long the site is busy, and what it lacks."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    table.add_column("all subjects")
+    for name in ("core hours", "GPU hours", "GB read", "GB kept", "files"):
+        table.add_column(name, justify="right")
+    for step, cost in [*costs.items(), ("sum", sum(costs.values(), Cost()))]:
+        numbers = (cost.core_hours, cost.gpu_hours, cost.read_gb, cost.written_gb)
+        table.add_row(step, *(f"{number:,.2f}" for number in numbers), f"{cost.files:,.0f}")
+    console.print(table)
+    hours = ", ".join(f"{name} {hours:,.1f} h" for name, hours in demands(costs.values(), site).items() if hours)
+    console.print(f"busy on {site.cores} cores and {site.gpus} GPUs: {hours}", highlight=False, soft_wrap=True)
+    console.print(f"breaks first: {breaks_first(costs, site)}", highlight=False, soft_wrap=True)
+    if unknown:
+        words = f"{len(unknown)} captures cannot be looked at from here and count as the mean of the others"
+        console.print(words, highlight=False, soft_wrap=True)
 
 
 @contextlib.contextmanager

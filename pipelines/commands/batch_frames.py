@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,8 +58,8 @@ class BatchFrames:
     """Frames: numbers and ranges START:STOP:STEP with commas; by default all that the split names."""
     size: int = 200
     """Most frames of a chunk. Below 100 the overlap of a registration costs more than a fifth."""
-    also: str = ""
-    """Further options of the command, as one text: "--masks DIR --initial none"."""
+    also: tuple[str, ...] = ()
+    """Further options of the command: masks=DIR initial=none, NAME alone for a flag, again for a list."""
     machines: Annotated[Machines, tyro.conf.arg(name="")] = field(default_factory=Machines)
     """Where the chunks run."""
     json: bool = False
@@ -80,7 +79,7 @@ class BatchFrames:
         # A chunk alone would fit a shape of its own, and the body would change at every border.
         if self.step == "register" and "shape" not in given:
             name, needs = f"shape_of_{len(told)}", Needs(cores=1, gpus=0.0)
-            options = {self.step: self._options(given, told)}
+            options: dict[str, dict[str, Any]] = {self.step: self._options(given, told)}
             first = Job(name, self._place, (self.step,), options, needs=needs, accept=(self.step,))
             rows = self._drive(out / "shape", [first])
             given = {**given, "shape": str(out / "shape" / first.subject / "run" / REGISTERED_PARAMS)}
@@ -175,22 +174,25 @@ class BatchFrames:
         return []
 
 
-def options_of(text: str) -> dict[str, Any]:
-    """Return options of a command line by their names, as a job file has them.
+def options_of(words: Sequence[str]) -> dict[str, Any]:
+    """Return options by their names, as a job file has them.
+
+    Raises:
+        InputError: a value without a name.
 
     Example:
-        >>> options_of("--masks mattes --hold-out A B --hull-only")
+        >>> options_of(["masks=mattes", "hold_out=A", "hold_out=B", "hull_only"])
         {'masks': 'mattes', 'hold_out': ['A', 'B'], 'hull_only': True}
     """
     out: dict[str, Any] = {}
-    name = ""
-    for word in shlex.split(text):
-        if word.startswith("--"):
-            name = word[2:].replace("-", "_")
-            out[name] = True
-        elif not name:
-            raise InputError("option also", expected="options that begin with --", received=word)
+    for word in words:
+        name, sign, value = word.partition("=")
+        if not name or name.startswith("-"):
+            raise InputError("option also", expected="NAME=VALUE, or NAME alone for a flag", received=word)
+        name = name.replace("-", "_")
+        before = out.get(name)
+        if before is None:
+            out[name] = value if sign else True
         else:
-            before = out[name]
-            out[name] = word if before is True else [*(before if isinstance(before, list) else [before]), word]
+            out[name] = [*(before if isinstance(before, list) else [before]), value]
     return out

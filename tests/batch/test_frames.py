@@ -18,6 +18,7 @@ from pipelines.batch.frames import (
 from pipelines.batch.jobs import Job
 from pipelines.cli import main
 from pipelines.commands.batch import check_options
+from pipelines.commands.batch_frames import options_of
 from pipelines.commands.metrics import Metrics, over_frames
 from pipelines.runs.artefacts import load_stacked_params
 from smplxpp.body import load_body
@@ -168,12 +169,12 @@ def test_metrics_of_chunks_are_those_of_the_whole(pairs):
 @pytest.mark.slow
 def test_the_command_runs_chunks_and_goes_on(pairs, tmp_path, capsys):
     words = ["batch", "frames", "metrics", str(tmp_path / "out"), "--capture", str(pairs[0]), "--truth", str(pairs[1])]
-    assert main([*words, "--size", "3", "--local", "2", "--also", "--samples 200", "--json"]) == 0
+    assert main([*words, "--size", "3", "--local", "2", "--also", "samples=200", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["chunks"] == 2
     found = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert timeless(found["frames"]) == timeless(Metrics(*pairs, samples=200, json=True).run()["frames"])
     made = (tmp_path / "out/chunks/metrics_000000_000002/metrics.json").stat().st_mtime_ns
-    assert main([*words, "--size", "3", "--local", "2", "--also", "--samples 200", "--json"]) == 0
+    assert main([*words, "--size", "3", "--local", "2", "--also", "samples=200", "--json"]) == 0
     assert (tmp_path / "out/chunks/metrics_000000_000002/metrics.json").stat().st_mtime_ns == made
 
 
@@ -182,8 +183,10 @@ def test_a_chain_of_a_job_with_frames_asks_for_chunks(tmp_path):
     check_options((job,))
     words = job.command("register", tmp_path, "cap")
     assert words[:5] == ["batch", "frames", "register", str(tmp_path / "register"), "--capture"]
-    also = words[words.index("--also") + 1]
-    assert also == f"--initial none --scans {tmp_path / 'reconstruct' / 'scans'}"
+    also = words[words.index("--also") + 1 : -1]
+    assert also == ["initial=none", f"scans={tmp_path / 'reconstruct' / 'scans'}"]
+    with pytest.raises(InputError, match="flag"):
+        options_of(["--initial", "none"])
     assert job.command("build", tmp_path, "cap")[-3:-1] == ["--params", str(tmp_path / "register" / "params.npz")]
     whole = Job("anna", "cap", ("register", "build"))
     assert whole.command("register", tmp_path, "cap")[:2] == ["register", str(tmp_path / "run")]

@@ -1,0 +1,346 @@
+"""What a batch will cost: hours of cores and GPUs, gigabytes and files of each step, and where a site breaks first.
+
+    cost(step) = factor(step) x (fixed + rate x amount),   hours = max over resources of demand / supply
+
+Amounts are images, megapixels and frames of a capture; rates are those of `Rates`, measured on single machines. A file
+of the user's own rates replaces them, and the records of subjects that are done give factors for the rest (`learned`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from pipelines.batch.jobs import Job, is_address
+from smplxpp.capture import open_capture
+from smplxpp.core import spread
+from smplxpp.core.errors import InputError, require_known
+from smplxpp.core.files.json_file import as_number, as_object, read_json
+
+HOUR = 3600.0
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What decides the cost of a subject.
+
+    Attributes:
+        frames: of the capture.
+        cameras: of the capture.
+        megapixels: of an image that is trained on.
+        source_mb: of an image as it was recorded, with its mask, MB.
+        held_out_cameras: cameras that are measured.
+        held_out_frames: frames that are measured.
+    """
+
+    frames: int
+    cameras: int
+    megapixels: float
+    source_mb: float
+    held_out_cameras: int = 2
+    held_out_frames: int = 0
+
+    @property
+    def images(self) -> int:
+        """Return the number of images."""
+        return self.frames * self.cameras
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Rates of the steps: seconds of one core, hours of one GPU, bytes.
+
+    Attributes:
+        convert_s_mp: decoding, undistortion and writing, a megapixel written of photographs four times as large
+            (capture_loader.json: 2.2 images of 3 megapixels a second).
+        convert_mb_mp: least and most of a JPEG of quality 95 and its mask, MB a megapixel: a person on black, a room.
+        check_s_mp: `capture check`, a megapixel of at most `check_images` images.
+        check_images: images that a check opens by default.
+        start_s: a command's imports and first files.
+        build_s: a template (real.json: 0.5 to 1.5 minutes; less where parameters are given).
+        register_s: registration by keypoints, masks, labels and scans, a frame and camera (registration_*.json).
+        reconstruct_s_mp: surface of a frame, a megapixel of all its cameras (reconstruction_*.json: 6 to 11).
+        train_core_hours: training on a CPU by preset (training_*.json, hardware.md).
+        train_gpu_hours: training on one H200 by preset (gpu*.json); `gpu` and `paper` are their iterations over steps
+            that were timed of `paper` and of an earlier `gpu`; neither was run to its end.
+        train_images: images that a training reads, by preset: steps times cameras; each is decoded when it is read.
+        evaluate_s_mp: rendering and comparison, a megapixel of a measured image and model, on a core.
+        evaluate_gpu_s: the same on a GPU, an image and model.
+        models: models that are measured.
+        export_s: bundle and page.
+        run_mb: MB of a run without its surfaces: template, models, pictures, reports.
+        scan_mb: of a reconstructed surface.
+        factors: by step, what measured costs of a site are of those foretold.
+    """
+
+    convert_s_mp: float = 0.154
+    convert_mb_mp: tuple[float, float] = (0.12, 0.35)
+    check_s_mp: float = 0.03
+    check_images: int = 2000
+    start_s: float = 3.0
+    build_s: float = 30.0
+    register_s: float = 0.12
+    reconstruct_s_mp: float = 8.0
+    train_core_hours: Mapping[str, float] = field(
+        default_factory=lambda: {"demo": 0.12, "cpu": 1.0, "paper-small": 0.35}
+    )
+    train_gpu_hours: Mapping[str, float] = field(
+        default_factory=lambda: {"demo": 0.03, "cpu": 0.07, "paper-small": 0.1, "gpu": 4.0, "paper": 94.0}
+    )
+    train_images: Mapping[str, float] = field(
+        default_factory=lambda: {"demo": 2e3, "cpu": 1e4, "paper-small": 1e4, "gpu": 1.5e5, "paper": 1e6}
+    )
+    evaluate_s_mp: float = 1.5
+    evaluate_gpu_s: float = 0.1
+    models: int = 3
+    export_s: float = 6.0
+    run_mb: float = 150.0
+    scan_mb: float = 8.0
+    factors: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step needs.
+
+    Attributes:
+        core_hours: of one core.
+        gpu_hours: of one GPU.
+        read_gb: read from the shared disk.
+        written_gb: written there, and kept.
+        files: opened or made there.
+        made: files made there, and kept.
+    """
+
+    core_hours: float = 0.0
+    gpu_hours: float = 0.0
+    read_gb: float = 0.0
+    written_gb: float = 0.0
+    files: float = 0.0
+    made: float = 0.0
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(Cost)))
+
+    def times(self, share: float) -> Cost:
+        """Return so many times the cost."""
+        return Cost(*(getattr(self, one.name) * share for one in fields(Cost)))
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a cluster has for the batch.
+
+    Attributes:
+        cores: that run at the same time.
+        gpus: likewise.
+        disk_tb: free on the shared disk.
+        disk_mb_s: read or written by all machines together.
+        files_s: opened or made by all machines together; a metadata server of NFS does some thousands.
+        files: inodes that are free.
+    """
+
+    cores: int = 2
+    gpus: int = 0
+    disk_tb: float = 1.0
+    disk_mb_s: float = 500.0
+    files_s: float = 2000.0
+    files: float = 1e9
+
+
+def cost_of(step: str, facts: Facts, rates: Rates, *, preset: str = "cpu", gpu: bool = False) -> Cost:
+    """Return what a step costs for a subject, at the most bytes that an image may have.
+
+    Args:
+        step: convert, check, reconstruct (every frame), register, build, train, evaluate, export, web.
+        facts: of the subject.
+        rates: of the site.
+        preset: of the training.
+        gpu: whether training and evaluation have one.
+
+    Raises:
+        InputError: a preset without a rate on this kind of machine.
+
+    Example:
+        >>> cost = cost_of("convert", Facts(6000, 48, 3.0, 2.0), Rates())
+        >>> round(cost.core_hours), round(cost.written_gb)
+        (37, 302)
+    """
+    image_mb = facts.megapixels * rates.convert_mb_mp[1]
+    seconds, gpu_hours, read, written, files, made = rates.start_s, 0.0, 0.0, 0.0, 10.0, 10.0
+    if step == "convert":
+        seconds += rates.convert_s_mp * facts.megapixels * facts.images
+        # An image and its mask are two files here and there.
+        read, written = facts.source_mb * facts.images, image_mb * facts.images
+        files, made = 4.0 * facts.images, 2.0 * facts.images
+    elif step == "check":
+        opened = min(facts.images, rates.check_images)
+        seconds += rates.check_s_mp * facts.megapixels * opened
+        read, files = image_mb * opened, 2.0 * opened
+    elif step == "reconstruct":
+        seconds += rates.reconstruct_s_mp * facts.megapixels * facts.images
+        read, written = image_mb * facts.images, rates.scan_mb * facts.frames
+        files, made = 2.0 * facts.images, 2.0 * facts.frames
+    elif step == "register":
+        seconds += rates.register_s * facts.images
+        files = 2.0 * facts.images
+    elif step == "build":
+        seconds, written, made = seconds + rates.build_s, 0.5 * rates.run_mb, 100.0
+    elif step == "train":
+        rate = rates.train_gpu_hours if gpu else rates.train_core_hours
+        if preset not in rate:
+            where = "a GPU" if gpu else "cores"
+            raise InputError(
+                f"preset {preset}", expected=f"one with a rate on {where}: {', '.join(rate)}", received=preset
+            )
+        # A GPU's training keeps a core busy with reading.
+        gpu_hours, hours = (rate[preset], rate[preset]) if gpu else (0.0, rate[preset])
+        seconds += HOUR * hours
+        looks = rates.train_images.get(preset, 0.0)
+        read, written, files = image_mb * looks, 0.5 * rates.run_mb, 2.0 * looks
+    elif step == "evaluate":
+        looks = _measured(facts)
+        work = rates.models * looks
+        gpu_hours = rates.evaluate_gpu_s * work / HOUR if gpu else 0.0
+        seconds += HOUR * gpu_hours if gpu else rates.evaluate_s_mp * facts.megapixels * work
+        read, files = image_mb * looks, 2.0 * looks
+    else:
+        seconds += rates.export_s
+    cost = Cost(seconds / HOUR, gpu_hours, 1e-3 * read, 1e-3 * written, files, made)
+    factor = rates.factors.get(step, 1.0)
+    return replace(cost, core_hours=factor * cost.core_hours, gpu_hours=factor * cost.gpu_hours)
+
+
+def facts_of(place: str | Path, *, protocol: str | None = None) -> Facts | None:
+    """Return what a capture's files say about its cost; None where it is elsewhere, or cannot be opened.
+
+    Args:
+        place: its folder, or an address.
+        protocol: of the capture.
+    """
+    if is_address(str(place)) or not Path(place).is_dir():
+        return None
+    try:
+        capture = open_capture(Path(place), protocol=protocol)
+    except InputError:  # the batch itself says what is wrong with it
+        return None
+    cameras, splits = list(capture.cameras.values()), capture.splits
+    # A few views stand for all.
+    frames = spread(list(capture.frames), 4)
+    views = [(name, frame) for name in capture.cameras for frame in frames][:64]
+    files = [capture.file(*view, kind) for view in views for kind in ("image", "mask")]
+    sizes = [file.stat().st_size for file in files if file is not None]
+    return Facts(
+        frames=len(capture.frames),
+        cameras=len(cameras),
+        megapixels=sum(camera.width * camera.height for camera in cameras) / max(len(cameras), 1) / 1e6,
+        source_mb=1e-6 * sum(sizes) / max(len(views), 1),
+        held_out_cameras=len(splits.novel_view_cameras),
+        held_out_frames=len(splits.novel_pose_frames),
+    )
+
+
+def plan_jobs(jobs: Sequence[Job], rates: Rates, site: Site) -> tuple[dict[str, Cost], list[str]]:
+    """Return what each step costs over all jobs, and the subjects whose captures cannot be looked at from here.
+
+    Args:
+        jobs: of a batch.
+        rates: of the site.
+        site: whether it has GPUs decides what trains.
+    """
+    costs: dict[str, Cost] = {}
+    unknown = []
+    for job in jobs:
+        train = job.options.get("train", {})
+        facts = facts_of(job.capture, protocol=train.get("protocol")) if job.capture else Facts(1, 0, 0.0, 0.0, 0)
+        if facts is None:
+            unknown.append(job.subject)
+            continue
+        device = train.get("device", "auto")
+        gpu = device == "cuda" or (device == "auto" and site.gpus > 0 and job.needs.gpus > 0)
+        for step in job.steps:
+            cost = cost_of(step, facts, rates, preset=str(train.get("preset", "cpu")), gpu=gpu)
+            costs[step] = costs.get(step, Cost()) + cost
+    # Captures that nobody can look at from here are taken to be like the others.
+    seen = len(jobs) - len(unknown)
+    if unknown and seen:
+        costs = {step: cost.times((seen + len(unknown)) / seen) for step, cost in costs.items()}
+    return costs, unknown
+
+
+def _measured(facts: Facts) -> float:
+    """Return how many images an evaluation measures with its defaults, see `ProtocolConfig`."""
+    trained = facts.frames - facts.held_out_frames
+    held_out = facts.held_out_cameras * facts.frames
+    return held_out + 2.0 * facts.held_out_frames + 2.0 * trained / 4.0
+
+
+def demands(costs: Iterable[Cost], site: Site) -> dict[str, float]:
+    """Return the hours that each resource of a site is busy with costs; the largest is the least that they take."""
+    whole = sum(costs, Cost())
+    return {
+        "cores": whole.core_hours / max(site.cores, 1),
+        "GPUs": whole.gpu_hours / site.gpus if site.gpus else (float("inf") if whole.gpu_hours else 0.0),
+        "bytes of the disk": (whole.read_gb + whole.written_gb) * 1e3 / site.disk_mb_s / HOUR,
+        "files of the disk": whole.files / site.files_s / HOUR,
+    }
+
+
+def breaks_first(costs: Mapping[str, Cost], site: Site) -> str:
+    """Return in a line what a site lacks, or what keeps a batch longest."""
+    whole = sum(costs.values(), Cost())
+    if whole.gpu_hours and not site.gpus:
+        return "there is no GPU"
+    if whole.written_gb > 1e3 * site.disk_tb:
+        return f"the disk: {whole.written_gb / 1e3:,.1f} TB are written, {site.disk_tb:,.1f} TB are free"
+    if whole.made > site.files:
+        return f"the disk's inodes: {whole.made:,.0f} files are made, {site.files:,.0f} are free"
+    busy = demands(costs.values(), site)
+    what = max(busy, key=lambda name: busy[name])
+    of = {"cores": "core_hours", "GPUs": "gpu_hours", "files of the disk": "files"}.get(what, "read_gb")
+    step = max(costs, key=lambda name: getattr(costs[name], of))
+    return f"{what}: busy for {busy[what]:,.1f} hours, most of all with {step}"
+
+
+def read_rates(path: Path | None) -> tuple[Rates, Site]:
+    """Read a JSON file with entries of `Rates` and, under "site", of `Site`; the defaults for None.
+
+    Raises:
+        InputError: a name that is none of theirs, or a value of another kind.
+    """
+    if path is None:
+        return Rates(), Site()
+    content = as_object(read_json(path, subject="rates"), subject=f"rates {path}")
+    site = as_object(content.pop("site", {}), subject=f"rates {path}: site")
+    for given, cls in ((content, Rates), (site, Site)):
+        require_known(f"rates {path}", given, [one.name for one in fields(cls)])
+    for name, value in {**content, **site}.items():
+        values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else [value]
+        for one in values:
+            as_number(one, subject=f"rates {path}: {name}", least=0.0)
+    if "convert_mb_mp" in content:
+        low, high = content["convert_mb_mp"]
+        content["convert_mb_mp"] = (low, high)
+    # Presets that a file does not name keep their rate.
+    for name in ("train_core_hours", "train_gpu_hours", "train_images"):
+        if name in content:
+            content[name] = {**getattr(Rates(), name), **content[name]}
+    return Rates(**content), Site(**site)
+
+
+def learned(rates: Rates, spent: Mapping[str, Iterable[tuple[float, float]]]) -> Rates:
+    """Return rates with the factors that finished steps show.
+
+    Args:
+        rates: that foretold.
+        spent: by step, foretold and measured core-hours of each subject.
+    """
+    ratios: dict[str, Any] = {}
+    for step, pairs in spent.items():
+        found = [measured / foretold for foretold, measured in pairs if foretold > 0 and measured > 0]
+        if found:
+            ratios[step] = rates.factors.get(step, 1.0) * median(found)
+    return replace(rates, factors={**rates.factors, **ratios})
