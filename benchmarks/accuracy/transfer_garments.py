@@ -38,6 +38,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.accuracy.driving import Method, nearest_point
+from benchmarks.support.people import worn_template
 from benchmarks.support.results import store_results
 from smplxpp.body import BodyModel, load_body
 from smplxpp.body.named_poses import stress_poses, worn_poses
@@ -45,7 +46,7 @@ from smplxpp.cloth import ClothDriver, cut_garment
 from smplxpp.cloth.driver import DriverConfig
 from smplxpp.cloth.poses import pose_between
 from smplxpp.core import GeometryWarning, TriangleMesh
-from smplxpp.people.garments.wardrobe import POSES, SHAPES, Case, cases, worn_template
+from smplxpp.people.garments.wardrobe import POSES, SHAPES, Case, cases
 from smplxpp.skinning import UnposeConfig, skin, unpose
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.checks import extent

@@ -15,18 +15,29 @@ from jaxtyping import Bool
 
 from benchmarks.support.results import ROOT
 from pipelines.figures.sheets import caption, contact_sheet, encode_png, row
-from smplxpp.body import load_body, load_params
-from smplxpp.core import LABELS, InputError, TriangleMesh, display_colors
+from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.core import (
+    LABEL_BY_NAME,
+    LABELS,
+    BodyParams,
+    InputError,
+    SkinWeights,
+    TriangleMesh,
+    display_colors,
+)
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people import PersonScan, people, variant
 from smplxpp.people.bodies import FINGERS
 from smplxpp.people.garments.mannequin import shares
+from smplxpp.people.garments.wardrobe import Case
 from smplxpp.people.person_scan import face_majority
 from smplxpp.raster import render_shaded
 from smplxpp.raster.viewpoints import body_cameras
 from smplxpp.segment import read_labels
+from smplxpp.skinning import unpose
+from smplxpp.template import Template
 
 _CAPTURES = ROOT.parent / "shared" / "captures"
 FOLDERS = {
@@ -65,6 +76,31 @@ def captured(name: str) -> PersonScan:
         colors=read.vertex_colors,
         face_labels=face_majority(labels, read.mesh.faces),
         seen=_seen(folder, read.mesh),
+    )
+
+
+def worn_template(body: BodyModel, case: Case) -> Template:
+    """Return the person of a case in its garment: a template of two parts by the authored weights.
+
+    In the pose of the scan it has the scan's shape, folds and noise included. The part has the garment's label as its
+    name.
+    """
+    rest = unpose(case.mesh.vertices, case.weights, body.forward(case.params).posed_from_rest[0]).vertices
+    bare = BodyParams.rest(betas=case.params.betas[0], expressions=body.num_expressions)
+    count = body.vertex_count
+    part = np.repeat([0, 1], [count, len(rest)])
+    return Template(
+        body=body,
+        vertices=np.concatenate([body.forward(bare).vertices[0], rest]),
+        faces=np.concatenate([body.faces, case.mesh.faces + count]),
+        vertex_labels=np.where(part == 0, 0, LABEL_BY_NAME[case.garment.label].id),
+        vertex_part=part,
+        part_names=("body", case.garment.label),
+        vertex_colors=np.full((len(part), 3), 128),
+        weights=SkinWeights.from_dense(np.concatenate([body.weights, case.weights])),
+        betas=case.params.betas[0],
+        body_index=np.where(part == 0, np.arange(len(part)), 0),
+        scan_index=np.full(len(part), -1),
     )
 
 

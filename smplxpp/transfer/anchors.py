@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32
+from scipy.sparse import csr_matrix
 
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.transfer.inpaint import fit_smoothly
+from smplxpp.transfer.inpaint import Operators, fit_smoothly
 
 LEAST_ADMISSIBILITY = 1e-6
 """Floor of every admissibility: where nothing admissible is near, all points of the body count alike."""
@@ -19,6 +20,7 @@ def anchor_weights(
     *,
     length: float,
     laplacian: str,
+    whole: Operators | None = None,
 ) -> Float64[np.ndarray, "N J"]:
     """Inpaint the weights of confident vertices along the surface: these keep theirs, the others follow from them.
 
@@ -26,7 +28,7 @@ def anchor_weights(
         mesh: every vertex referenced.
         copied: weights of the closest points; components without a confident vertex keep them.
         confident: vertices that keep their weights.
-        length, laplacian: see `fit_smoothly`.
+        length, laplacian, whole: see `fit_smoothly`.
 
     Returns:
         (N, J), none negative, rows summing to 1.
@@ -34,7 +36,8 @@ def anchor_weights(
     known = copied.any(axis=0)
     out = np.zeros_like(copied, dtype=np.float64)
     width = np.where(confident, 0.0, np.inf)
-    out[:, known] = np.clip(fit_smoothly(mesh, copied[:, known], width, length=length, laplacian=laplacian), 0.0, 1.0)
+    fitted = fit_smoothly(mesh, copied[:, known], width, length=length, laplacian=laplacian, whole=whole)
+    out[:, known] = np.clip(fitted, 0.0, 1.0)
     return out / out.sum(axis=1, keepdims=True)
 
 
@@ -43,8 +46,8 @@ def neighbouring_joints(weights: Float[np.ndarray, "V J"], *, least: float = 0.1
 
     So the weights show the skeleton's neighbourhoods, whatever its tree is.
     """
-    strong = (weights > least).astype(np.float64)
-    return (strong.T @ strong > 0) | np.eye(weights.shape[1], dtype=bool)
+    strong = csr_matrix(weights > least, dtype=np.float64)
+    return (strong.T @ strong).toarray().astype(bool) | np.eye(weights.shape[1], dtype=bool)
 
 
 def joint_admissibility(
@@ -66,7 +69,8 @@ def point_admissibility(
     admissible: Float[np.ndarray, "N J"], weights: Float[np.ndarray, "S J"]
 ) -> Float64[np.ndarray, "N S"]:
     """Return how much each point of the body, by its weights, may count for each vertex."""
-    out = admissible @ weights.T
+    used = np.flatnonzero(admissible.any(axis=0) & weights.any(axis=0))
+    out = admissible[:, used] @ weights[:, used].T
     return np.maximum(out, LEAST_ADMISSIBILITY, out=out)
 
 

@@ -125,11 +125,15 @@ def _axes_remedy(source: TriangleMesh, points: np.ndarray, better: float) -> str
     hips all round, would be nearer to a body that it cuts from head to foot.
     """
     sample = points[:: max(1, len(points) // 500)]
+    turned = [np.ascontiguousarray(sample[:, axes] * sign) for _, axes, sign in _AXES]
+    squared = igl.point_mesh_squared_distance(np.concatenate(turned), source.vertices, source.faces)[0]
+    nearer = np.sqrt(np.median(squared.reshape(len(_AXES), -1), axis=1)) < better
+    if not nearer.any():
+        return ""
     inside = _share_inside(source, sample) + 0.15
-    for name, axes, sign in _AXES:
-        turned = np.ascontiguousarray(sample[:, axes] * sign)
-        squared, _, _ = igl.point_mesh_squared_distance(turned, source.vertices, source.faces)
-        if np.sqrt(np.median(squared)) < better and _share_inside(source, turned) <= inside:
+    for k in np.flatnonzero(nearer):
+        if _share_inside(source, turned[k]) <= inside:
+            name = _AXES[k][0]
             return f"the axes differ: the target seems to have {name}; both need +Y up"
     return ""
 

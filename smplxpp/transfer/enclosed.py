@@ -281,7 +281,7 @@ def _axis(
     # Skin that follows the limb, without what hangs on its last joint, such as fingers and toes.
     own = weights[:, list(joints)].sum(axis=1) > 0.5
     skin, rows = source.vertices[own], weights[own]
-    nearest = ((skin[:, None] - points) ** 2).sum(axis=2).argmin(axis=1)
+    nearest = cKDTree(points).query(skin)[1]
     kernel = np.exp(-0.5 * ((np.arange(len(points))[:, None] - nearest) * (at[1] - at[0]) / (_KERNEL * size)) ** 2)
     # Far from any skin the kernel vanishes; the least share there is that of the nearest.
     kernel += 1e-12

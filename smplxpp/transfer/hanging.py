@@ -96,10 +96,9 @@ def beside_trunk(
 
 
 def leg_bound(
-    mesh: TriangleMesh,
+    depth: Float[np.ndarray, " N"],
     component: Int[np.ndarray, " N"],
     distance: Float[np.ndarray, " N"],
-    axes: list[LimbAxis],
     limbs: Enclosure,
     *,
     size: float,
@@ -117,19 +116,18 @@ def leg_bound(
     and, in a component with trouser legs, below the crotch. A shirt ends before there are legs below it; its r is 0.
 
     Args:
-        mesh: the part, N vertices.
+        depth: of N vertices, by `depth_below_hips`.
         component: of each vertex.
         distance: to the skin, metres; infinite where that is an arm's.
-        axes: of `limb_axes`.
         limbs: of `enclosed_by_one`.
         size: E, the body's extent, metres.
         cone: r up to which there is no bound, and from which on it is full.
     """
-    depth = _depth(mesh.vertices, axes[:2]) / size
+    depth = depth / size
     free = (1.0 - limbs.share) * _below_crotch(component, depth, limbs)
     known = np.isfinite(distance)
     off = np.where(known, distance, 0.0) / size
-    wide = np.zeros(mesh.vertex_count)
+    wide = np.zeros(len(depth))
     for k in np.unique(component):
         rows = component == k
         wide[rows] = _mean_at_depth(depth[rows], off[rows], (free * known)[rows])
@@ -143,6 +141,7 @@ def lifted_by_thighs(
     mesh: TriangleMesh,
     weights: Float[np.ndarray, "N J"],
     bound: Float[np.ndarray, " N"],
+    depth: Float[np.ndarray, " N"],
     component: Int[np.ndarray, " N"],
     source: TriangleMesh,
     source_weights: Float[np.ndarray, "V J"],
@@ -158,6 +157,7 @@ def lifted_by_thighs(
         mesh: the part, N vertices.
         weights: of all J joints, before they are bounded.
         bound: of `leg_bound`.
+        depth: of the vertices, by `depth_below_hips`.
         component: of each vertex.
         source: the body.
         source_weights: of its vertices.
@@ -169,7 +169,7 @@ def lifted_by_thighs(
     # What ends above the middle of the thighs, 15 cm of a person below the hip joints, is no skirt that they lift.
     lifted_depth = 0.08  # share of the body's extent
     deepest = np.full(component.max() + 1, -np.inf)
-    np.maximum.at(deepest, component, _depth(mesh.vertices, axes[:2]))
+    np.maximum.at(deepest, component, depth)
     held = np.flatnonzero((total > bound + 1e-3) & (deepest > lifted_depth * extent(source))[component])
     if not len(held):
         return bound
@@ -194,13 +194,20 @@ def lifted_by_thighs(
     of_body = np.stack([source_weights[used][:, joints].sum(axis=1) for joints in legs], axis=1)
     step = np.zeros(mesh.vertex_count)
     levels = np.linspace(0.0, 1.0, 5)
-    for chosen in ((0, 1), (0,), (1,)):
-        shares = [(bound[held] + t * (total[held] - bound[held])) / total[held] for t in levels]
-        at = np.concatenate([raised(mesh.vertices[held], own[held] * s[:, None], chosen) for s in shares])
+
+    def outside(chosen: tuple[int, ...], rows: np.ndarray, levels: np.ndarray) -> np.ndarray:
+        shares = [(bound[rows] + t * (total[rows] - bound[rows])) / total[rows] for t in levels]
+        at = np.concatenate([raised(mesh.vertices[rows], own[rows] * s[:, None], chosen) for s in shares])
         winding = igl.fast_winding_number(raised(body.vertices, of_body, chosen), body.faces, at)
-        outside = winding.reshape(len(levels), -1) < 0.5
-        least = np.where(outside.any(axis=0), levels[outside.argmax(axis=0)], 1.0)
-        step[held] = np.maximum(step[held], least)
+        return winding.reshape(len(levels), -1) < 0.5
+
+    for chosen in ((0, 1), (0,), (1,)):
+        # Most are out as they are: further levels are tried for the others alone.
+        within = held[~outside(chosen, held, levels[:1])[0]]
+        if len(within):
+            out = outside(chosen, within, levels[1:])
+            least = np.where(out.any(axis=0), levels[1:][out.argmax(axis=0)], 1.0)
+            step[within] = np.maximum(step[within], least)
     # Neighbours follow, the less the farther, over edges of 8 cm together.
     rings = 6
     edges = mesh.edges
@@ -225,13 +232,11 @@ def bounded_legs(
     return out
 
 
-def _depth(vertices: np.ndarray, legs: list[LimbAxis]) -> Float64[np.ndarray, " N"]:
+def depth_below_hips(vertices: Float[np.ndarray, "N 3"], legs: list[LimbAxis]) -> Float64[np.ndarray, " N"]:
     """Return the height of vertices below the hip joints, along the nearest leg, metres; negative above them."""
     depth, nearest = np.zeros(len(vertices)), np.full(len(vertices), np.inf)
     for axis in legs:
-        squared = ((vertices[:, None] - axis.points) ** 2).sum(axis=2)
-        index = squared.argmin(axis=1)
-        own = squared[np.arange(len(vertices)), index]
+        own, index = cKDTree(axis.points).query(vertices)
         along = np.einsum("ij,ij->i", vertices - axis.points[index], axis.tangents[index])
         # Between the axis' ends its nearest point says the height, outside them the continued line.
         outside = (index == 0) | (index == len(axis.points) - 1)

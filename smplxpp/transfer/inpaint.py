@@ -11,6 +11,11 @@ from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 
+_SMALLEST_ANGLE = float(np.radians(0.1))
+"""Radians, below which cotangents of a face exceed those of others a hundredfold."""
+Operators = tuple[sp.csc_matrix, Float64[np.ndarray, " N"]]
+"""The cotangent matrix (N, N) of a mesh and its vertices' masses (N,)."""
+
 
 def fit_smoothly(
     mesh: TriangleMesh,
@@ -19,6 +24,7 @@ def fit_smoothly(
     *,
     length: float,
     laplacian: str = "auto",
+    whole: Operators | None = None,
 ) -> Float64[np.ndarray, "N J"]:
     """Smooth `values` over the surface, each over a neighbourhood of its own width.
 
@@ -35,6 +41,7 @@ def fit_smoothly(
         nothing.
         length: l.
         laplacian: see `laplacian_and_mass`.
+        whole: `shared_operators` of the mesh, where several fits have it in common.
 
     Returns:
         (N, J); may leave [0, 1] a little (the energy is biharmonic).
@@ -42,12 +49,15 @@ def fit_smoothly(
     fixed = width <= 0.5 * float(np.median(edge_lengths(mesh)))
     if fixed.all():
         return values
-    # A free row's equation reaches two rings; faces further away do not matter.
-    touched = np.zeros(mesh.vertex_count, dtype=bool)
-    touched[mesh.faces[(~fixed)[mesh.faces].any(axis=1)]] = True
-    near, used = mesh.submesh(touched[mesh.faces].any(axis=1))
+    if whole is None:
+        # A free row's equation reaches two rings; faces further away do not matter.
+        touched = np.zeros(mesh.vertex_count, dtype=bool)
+        touched[mesh.faces[(~fixed)[mesh.faces].any(axis=1)]] = True
+        near, used = mesh.submesh(touched[mesh.faces].any(axis=1))
+        stiffness, mass = laplacian_and_mass(near, kind=laplacian)
+    else:
+        (stiffness, mass), used = whole, np.arange(mesh.vertex_count)
     # Set up the normal equations of the free rows, divided by l^2; fixed rows go to the right-hand side.
-    stiffness, mass = laplacian_and_mass(near, kind=laplacian)
     free = ~fixed[used]
     data = np.zeros(len(used))
     data[free] = mass[free] / width[used[free]] ** 4
@@ -58,6 +68,17 @@ def fit_smoothly(
     out = np.array(values, dtype=np.float64)
     out[used[free]] = _solve_pieces(matrix, right)
     return out
+
+
+def shared_operators(mesh: TriangleMesh, laplacian: str) -> Operators | None:
+    """Return the Laplacian and masses that every part of a mesh has in common with it.
+
+    None where a face is so thin that it changes those of its neighbours: each part is then better off on its own.
+    """
+    lengths = edge_lengths(mesh)
+    if laplacian == "intrinsic" or _smallest_angle(lengths) < _SMALLEST_ANGLE or (mollify(lengths) != lengths).any():
+        return None
+    return laplacian_and_mass(mesh, kind="cotangent")
 
 
 def _solve_pieces(matrix: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
@@ -119,7 +140,7 @@ def mollify(lengths: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
     return lengths + max(0.0, float(shortfall.max(initial=0.0)))
 
 
-def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> tuple[sp.csc_matrix, Float64[np.ndarray, " N"]]:
+def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> Operators:
     """Return the cotangent matrix C (N, N), negative semi-definite, and Voronoi masses (N,), all positive.
 
     Args:
@@ -131,7 +152,7 @@ def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> tuple[sp.cs
     """
     lengths = edge_lengths(mesh)
     if kind == "auto":
-        kind = "intrinsic" if _smallest_angle(lengths) < np.radians(0.1) else "cotangent"
+        kind = "intrinsic" if _smallest_angle(lengths) < _SMALLEST_ANGLE else "cotangent"
     lengths, faces = mollify(lengths), mesh.faces
     if kind == "intrinsic" and igl.is_edge_manifold(faces)[0]:
         lengths, faces = igl.intrinsic_delaunay_triangulation(lengths, faces)[:2]

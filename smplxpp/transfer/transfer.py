@@ -38,8 +38,15 @@ from smplxpp.transfer.correspond import (
 )
 from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
 from smplxpp.transfer.extend import extend_weights, sample_weights
-from smplxpp.transfer.hanging import beside_trunk, bounded_legs, hung_from_top, leg_bound, lifted_by_thighs
-from smplxpp.transfer.inpaint import average_neighbours, fit_smoothly
+from smplxpp.transfer.hanging import (
+    beside_trunk,
+    bounded_legs,
+    depth_below_hips,
+    hung_from_top,
+    leg_bound,
+    lifted_by_thighs,
+)
+from smplxpp.transfer.inpaint import Operators, average_neighbours, fit_smoothly, shared_operators
 from smplxpp.transfer.rigid import rigid_weights
 from smplxpp.transfer.unfollowed import PassedHand, passed_hands, unfollowed_arms
 
@@ -255,7 +262,9 @@ def _transferred(
         tops, hangs = hung_from_top(target.vertices, component, found.distance, axes[-1], size)
         confident |= tops
     # Compute each vertex's own value, then smooth the values over the surface.
-    at = _Matches(target, normals, found, component, confident, hangs)
+    surface, used = target.submesh(np.ones(target.face_count, dtype=bool))
+    shared = shared_operators(surface, config.laplacian) if config.published else None
+    at = _Matches(_Surface(surface, used, shared), target, normals, found, component, confident, hangs)
     values = _values(source, weights, at, allowed, size, config)
     for passed in passing:
         values = passed.without_arm(values)
@@ -272,7 +281,7 @@ def _transferred(
     closed = (away > _CLOSED)[component] & ~hangs & (config.confident is not None)
     angles = np.where(closed, 0.0, found.angle)
     closer = replace(found, distance=found.distance * (1.0 - 0.7 * far_off), angle=angles)
-    dense[:, occurring] = _smooth(target, closer, values[:, occurring], matched, settled, size, config)
+    dense[:, occurring] = _smooth(at, closer, values[:, occurring], matched, settled, size, config)
     if config.published:
         # Mix in the published method's weights. Their share rises from 1 % to 2.5 % of the source's extent off the
         # skin.
@@ -312,10 +321,20 @@ def _transferred(
         # Leave the pelvis its share of cloth that hangs free before both legs.
         arms = weights[:, [joint for axis in axes[2:4] for joint in axis.joints]].sum(axis=1, keepdims=True)
         off = np.where(found.interpolate(source, arms)[:, 0] > 0.5, np.inf, found.distance)
-        bound = leg_bound(target, component, off, axes, limbs, size=size, cone=config.hanging)
-        bound = lifted_by_thighs(target, dense, bound, component, source, weights, axes)
+        depth = depth_below_hips(target.vertices, axes[:2])
+        bound = leg_bound(depth, component, off, limbs, size=size, cone=config.hanging)
+        bound = lifted_by_thighs(target, dense, bound, depth, component, source, weights, axes)
         dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
     return _Weighted(dense, matched, found.distance, found.angle, policies)
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """The mesh of the target's vertices that have a face, which these are, and the operators on it that fits share."""
+
+    mesh: TriangleMesh
+    used: np.ndarray
+    whole: Operators | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,6 +342,7 @@ class _Matches:
     """Hold the target and its matches to the source.
 
     Attributes:
+        surface: of the target.
         target: N vertices.
         normals: outward.
         found: closest points of the source.
@@ -331,6 +351,7 @@ class _Matches:
         hangs: vertices that touch nothing and follow the confident ones alone.
     """
 
+    surface: _Surface
     target: TriangleMesh
     normals: np.ndarray
     found: Correspondence
@@ -400,14 +421,16 @@ def _published(
 def _anchor_weights(at: _Matches, copied: np.ndarray, length: float, config: TransferConfig) -> np.ndarray:
     """Return the anchor weights (N, J); vertices without a face and components without one keep `copied`."""
     kept = at.confident | components_without(at.component, at.confident)
-    mesh, used = at.target.submesh(np.ones(at.target.face_count, dtype=bool))
+    on = at.surface
     out = copied.copy()
-    out[used] = anchor_weights(mesh, copied[used], kept[used], length=length, laplacian=config.laplacian)
+    out[on.used] = anchor_weights(
+        on.mesh, copied[on.used], kept[on.used], length=length, laplacian=config.laplacian, whole=on.whole
+    )
     return out
 
 
 def _smooth(
-    target: TriangleMesh,
+    at: _Matches,
     found: Correspondence,
     values: np.ndarray,
     matched: np.ndarray,
@@ -424,12 +447,14 @@ def _smooth(
         distance = np.hypot(found.distance, config.turned * size * turned_away(found.angle))
         width = np.where(settled, 0.0, config.smoothing * widening * distance)
     # Fit, clip what the biharmonic energy overshoots, and normalise.
-    mesh, used = target.submesh(np.ones(target.face_count, dtype=bool))
+    on, used = at.surface, at.surface.used
     length = config.length_scale * size
-    fitted = fit_smoothly(mesh, values[used], width[used], length=length, laplacian=config.laplacian)
+    fitted = fit_smoothly(
+        on.mesh, values[used], width[used], length=length, laplacian=config.laplacian, whole=on.whole
+    )
     out = values.copy()
     out[used] = np.clip(fitted, 0.0, 1.0)
     out /= out.sum(axis=1, keepdims=True)
     if config.averaging_steps:
-        out = average_neighbours(target, out, ~matched & ~settled, steps=config.averaging_steps)
+        out = average_neighbours(at.target, out, ~matched & ~settled, steps=config.averaging_steps)
     return out

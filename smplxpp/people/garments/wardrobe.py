@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from smplxpp.body import BodyModel
 from smplxpp.clean.simplify import simplify
-from smplxpp.core import LABEL_BY_NAME, BodyParams, SkinWeights, TriangleMesh
+from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.people.garments.cut import Garment
 from smplxpp.people.garments.draped import draped_garments, hooded_cape
 from smplxpp.people.garments.fitted import bottoms, fitted_garments, tops, worn_things
@@ -19,8 +19,7 @@ from smplxpp.people.garments.hair import beads, beards, hairstyles, tied_and_sho
 from smplxpp.people.garments.loose import layered_garments, loose_garments, peplum_blouse
 from smplxpp.people.garments.mannequin import ARMS_DOWN, HAND_JOINTS, Mannequin, lowered, shares
 from smplxpp.people.textures import smooth_noise
-from smplxpp.skinning import UnposeConfig, skin, unpose
-from smplxpp.template import Template
+from smplxpp.skinning import skin
 
 SHAPES = ("mean", "heavy and tall", "slight")
 POSES = ("T", "A", "hands")
@@ -118,32 +117,6 @@ def scan(mannequin: Mannequin, garment: Garment, shape: str, pose: str, *, seed:
         cloth.vertices[index],
         mannequin.body.mesh(posed.vertices[0]),
         params,
-    )
-
-
-def worn_template(body: BodyModel, case: Case) -> Template:
-    """Return the person of a case in its garment: a template of two parts by the authored weights.
-
-    In the pose of the scan it has the scan's shape, folds and noise included. The part has the garment's label as its
-    name.
-    """
-    reference, tolerant = body.forward(case.params).posed_from_rest[0], UnposeConfig(warn_below=0.0, fail_below=-np.inf)
-    rest = unpose(case.mesh.vertices, case.weights, reference, config=tolerant).vertices
-    bare = BodyParams.rest(betas=case.params.betas[0], expressions=body.num_expressions)
-    count = body.vertex_count
-    part = np.repeat([0, 1], [count, len(rest)])
-    return Template(
-        body=body,
-        vertices=np.concatenate([body.forward(bare).vertices[0], rest]),
-        faces=np.concatenate([body.faces, case.mesh.faces + count]),
-        vertex_labels=np.where(part == 0, 0, LABEL_BY_NAME[case.garment.label].id),
-        vertex_part=part,
-        part_names=("body", case.garment.label),
-        vertex_colors=np.full((len(part), 3), 128),
-        weights=SkinWeights.from_dense(np.concatenate([body.weights, case.weights])),
-        betas=case.params.betas[0],
-        body_index=np.where(part == 0, np.arange(len(part)), 0),
-        scan_index=np.full(len(part), -1),
     )
 
 
