@@ -182,12 +182,13 @@ def _without_bridges(
     """
     source = np.arange(part.vertex_count)
     opened = np.unique(part.border_edges)
-    # Cloth that passes a hand hangs on the sleeve where the scan has fused them, and would follow it.
-    apart = webs_to_hands(fit.mesh, body.weights, part, ruled.settings) & ~ruled.stiff(part, source)
-    # Trouser legs that touch are parted, too. Which leg the cloth goes around is found before that opens its rings.
     axes = limb_axes(fit.mesh, body.weights, extent(fit.mesh), ruled.settings)
-    if axes and ruled.settings.confident is not None and config.rounds:
-        limbs = enclosed_by_one(part, axes, body.joint_count)
+    known = axes and ruled.settings.confident is not None and config.rounds
+    limbs = enclosed_by_one(part, axes, body.joint_count) if known else None
+    # Cloth that passes a hand hangs on the sleeve where the scan has fused them, and would follow it.
+    apart = webs_to_hands(fit.mesh, body.weights, part, ruled.settings, limbs=limbs) & ~ruled.stiff(part, source)
+    # Trouser legs that touch are parted, too. Which leg the cloth goes around is found before that opens its rings.
+    if limbs is not None:
         joined = limbs.joining_legs(part.faces) & ~ruled.stiff(part, source)
         if joined.any():
             ruled, apart = replace(ruled, limbs=limbs), apart | joined

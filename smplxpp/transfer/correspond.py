@@ -109,7 +109,7 @@ def prefer_facing(
     # Search positions and scaled normals together: one nearest neighbour in six dimensions.
     x, n = points[rows], normals[rows]
     tree = cKDTree(np.hstack([source.face_centers, length * source.face_normals]))
-    face = tree.query(np.hstack([x - 0.5 * length * n, length * n]), workers=-1)[1]
+    face = tree.query(np.hstack([x - 0.5 * length * n, length * n]))[1]
     # Find the point of that face nearest to the vertex, and the angle there.
     corners = source.faces[face]
     barycentric = _barycentric(x, *(source.vertices[corners[:, k]] for k in range(3)))

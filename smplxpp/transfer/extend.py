@@ -94,7 +94,7 @@ def extend_weights(
     near = np.pi / (half - 1.0) * (1.0 - fraction) * _agreement(np.cos(found.angle))
     # Sum it over the 32 nearest samples; the kernel's rest is a few percent.
     count = min(32, len(samples.points))
-    distance, index = cKDTree(samples.points).query(points, k=np.arange(1, count + 1), workers=-1)
+    distance, index = cKDTree(samples.points).query(points, k=np.arange(1, count + 1))
     cosine = sum(normals[:, None, k] * samples.normals[index, k] for k in range(3))
     # d^(p-2) (r^2 + rho^2)^(-p/2) as a ratio of like magnitudes, whatever the unit.
     scale = d2 + rho2

@@ -66,13 +66,17 @@ def rings_around(
     """
     # The faces that each plane cuts, of all planes at once: one graph is quicker than many.
     side = heights(axis, mesh)
-    count = np.add.reduce([(side > 0)[:, mesh.faces[:, corner]] for corner in range(3)], dtype=np.int8)
-    cut = (count > 0) & (count < 3)
-    plane, face = np.nonzero(cut & (cut.sum(axis=1) > 2)[:, None])
+    over = side > 0
+    # Planes that leave all vertices on one side cut nothing.
+    reached = np.flatnonzero(over.any(axis=1) & ~over.all(axis=1))
+    first, second, third = (over[reached][:, mesh.faces[:, corner]] for corner in range(3))
+    cut = (first != second) | (first != third)
+    plane, face = np.nonzero(cut & (np.count_nonzero(cut, axis=1) > 2)[:, None])
     if not len(plane):
         return []
+    plane = reached[plane]
     faces = mesh.faces[face]
-    above = side[plane[:, None], faces] > 0
+    above = over[plane[:, None], faces]
     # The two edges of each face that cross the plane: those at the corner that is alone on its side.
     odd = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     rows = np.arange(len(plane))

@@ -265,7 +265,8 @@ def _transferred(
     surface, used = target.submesh(np.ones(target.face_count, dtype=bool))
     shared = shared_operators(surface, config.laplacian) if config.published else None
     at = _Matches(_Surface(surface, used, shared), target, normals, found, component, confident, hangs)
-    values = _values(source, weights, at, allowed, size, config)
+    copied = found.interpolate(source, weights)
+    values = _values(source, weights, at, copied, allowed, size, config)
     for passed in passing:
         values = passed.without_arm(values)
     far_off = np.zeros(len(values))
@@ -285,7 +286,10 @@ def _transferred(
     if config.published:
         # Mix in the published method's weights. Their share rises from 1 % to 2.5 % of the source's extent off the
         # skin.
-        answer = _published(replace(at, confident=matched), source, weights, size, config)
+        answer = np.zeros_like(dense)
+        followed = np.flatnonzero(copied.any(axis=0))
+        length = config.published_length * size
+        answer[:, followed] = _anchor_weights(replace(at, confident=matched), copied[:, followed], length, config)
         off = smooth_step(found.distance, *(k * size for k in (0.01, 0.025)))
         share = config.published * off
         share *= 1.0 + _PUBLISHED_FAR * smooth_step(found.distance, *(k * size for k in config.far))
@@ -314,13 +318,12 @@ def _transferred(
         by_height = (0.025, 0.06)
         beside = 1.0 - smooth_step(found.distance, *(k * size for k in by_height))
         collars = tuple(config.joint_index(f"{side}_collar", joint_count) for side in ("left", "right"))
-        copied = found.interpolate(source, weights)
         lower = beside_trunk(target.vertices, dense, copied, beside, axes[-1], collars + unfollowed.shoulders)
         dense += off[:, None] * (lower - dense)
     if whole and limbs is not None and config.hanging is not None:
         # Leave the pelvis its share of cloth that hangs free before both legs.
-        arms = weights[:, [joint for axis in axes[2:4] for joint in axis.joints]].sum(axis=1, keepdims=True)
-        off = np.where(found.interpolate(source, arms)[:, 0] > 0.5, np.inf, found.distance)
+        arms = [joint for axis in axes[2:4] for joint in axis.joints]
+        off = np.where(copied[:, arms].sum(axis=1) > 0.5, np.inf, found.distance)
         depth = depth_below_hips(target.vertices, axes[:2])
         bound = leg_bound(depth, component, off, limbs, size=size, cone=config.hanging)
         bound = lifted_by_thighs(target, dense, bound, depth, component, source, weights, axes)
@@ -364,14 +367,14 @@ def _values(
     source: TriangleMesh,
     weights: np.ndarray,
     at: _Matches,
+    copied: np.ndarray,
     allowed: np.ndarray | None,
     size: float,
     config: TransferConfig,
 ) -> np.ndarray:
     """Return the weights (N, J) that each vertex takes from the body nearby, blended with its anchor weights."""
     joint_count, used = weights.shape[1], np.flatnonzero(weights.any(axis=0))
-    weights = weights[:, used]
-    copied = at.found.interpolate(source, weights)
+    weights, copied = weights[:, used], copied[:, used]
     anchors = admissible = None
     # Compute anchor weights and the admissible joints; components without a confident vertex have the label's alone.
     alone = components_without(at.component, at.confident)
@@ -406,18 +409,6 @@ def _values(
     return out
 
 
-def _published(
-    at: _Matches, source: TriangleMesh, weights: np.ndarray, size: float, config: TransferConfig
-) -> np.ndarray:
-    """Return the published method's weights (N, J), where `at.confident` are all matched vertices."""
-    used = np.flatnonzero(weights.any(axis=0))
-    out = np.zeros((at.target.vertex_count, weights.shape[1]))
-    out[:, used] = _anchor_weights(
-        at, at.found.interpolate(source, weights[:, used]), config.published_length * size, config
-    )
-    return out
-
-
 def _anchor_weights(at: _Matches, copied: np.ndarray, length: float, config: TransferConfig) -> np.ndarray:
     """Return the anchor weights (N, J); vertices without a face and components without one keep `copied`."""
     kept = at.confident | components_without(at.component, at.confident)
@@ -449,9 +440,7 @@ def _smooth(
     # Fit, clip what the biharmonic energy overshoots, and normalise.
     on, used = at.surface, at.surface.used
     length = config.length_scale * size
-    fitted = fit_smoothly(
-        on.mesh, values[used], width[used], length=length, laplacian=config.laplacian, whole=on.whole
-    )
+    fitted = fit_smoothly(on.mesh, values[used], width[used], length=length, laplacian=config.laplacian, whole=on.whole)
     out = values.copy()
     out[used] = np.clip(fitted, 0.0, 1.0)
     out /= out.sum(axis=1, keepdims=True)

@@ -174,7 +174,12 @@ def passed_hands(
 
 
 def webs_to_hands(
-    source: TriangleMesh, weights: Float64[np.ndarray, "V J"], target: TriangleMesh, config: TransferConfig
+    source: TriangleMesh,
+    weights: Float64[np.ndarray, "V J"],
+    target: TriangleMesh,
+    config: TransferConfig,
+    *,
+    limbs: Enclosure | None = None,
 ) -> Bool[np.ndarray, " M"]:
     """Return the faces of a part that join cloth that passes a hand with the sleeve, as scans fuse them.
 
@@ -183,17 +188,19 @@ def webs_to_hands(
         weights: of its vertices.
         target: the part, in the body's pose.
         config: settings, with the names of the joints.
+        limbs: that the part goes around, where the caller has them.
     """
     web = np.zeros(target.face_count, dtype=bool)
     copied = closest_points(source, target).interpolate(source, weights)
     # Rings are looked for only where cloth passes a hand at all.
     if not passed_hands(target, copied, None, config):
         return web
-    axes = limb_axes(source, weights, extent(source), config)
-    if not axes:
-        return web
-    found = enclosed_by_one(target, axes, weights.shape[1])
-    for passed in passed_hands(target, copied, found, config):
+    if limbs is None:
+        axes = limb_axes(source, weights, extent(source), config)
+        if not axes:
+            return web
+        limbs = enclosed_by_one(target, axes, weights.shape[1])
+    for passed in passed_hands(target, copied, limbs, config):
         on_arm = (copied[:, passed.arm].sum(axis=1) > 0.5) & ~passed.vertices
         web |= passed.vertices[target.faces].any(axis=1) & on_arm[target.faces].any(axis=1)
     return web
