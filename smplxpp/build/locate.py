@@ -17,12 +17,13 @@ from smplxpp.build.scan import ScanFile
 from smplxpp.build.scan_keypoints import Landmarks, facing, keypoints_of_scan
 from smplxpp.build.verdict import LEAST_CONFIDENCE
 from smplxpp.clean import smooth_if_rough
-from smplxpp.core import BACKGROUND, BodyParams, Check, InputError, StageOutput, TriangleMesh
+from smplxpp.core import BACKGROUND, SKIN, BodyParams, Check, InputError, StageOutput, TriangleMesh
 from smplxpp.core.files.json_file import jsonable
 from smplxpp.detect import load_detector
 from smplxpp.register import ScanObservation, bare_of_scan, read_landmarks
 from smplxpp.register.locate import BodyNotFoundError, LocatedBody, locate_body
 from smplxpp.segment import UNSURE, label_by_body
+from smplxpp.segment.by_body_confidence import TAKEN_AS_BARE
 
 _CERTAIN = 0.4
 """Certainty from which a detector's point proposes the pose of a limb: less is seen by few views, or only by some."""
@@ -195,4 +196,8 @@ def certain_labels(
     """Return labels of a scan's faces by its colours and a body in it; -1 where they do not tell."""
     # A wrong label pulls the fit, a missing one only slows it.
     labelled = label_by_body(mesh, body, params, colors=colors)
-    return np.where(labelled.confidence >= UNSURE, labelled.face_labels, BACKGROUND)
+    known = labelled.confidence >= UNSURE
+    if TAKEN_AS_BARE in labelled.notes:
+        # Skin or tight clothes: either lies where the body is.
+        known |= (labelled.face_labels == SKIN.id) & (labelled.confidence >= 0.76 * UNSURE)
+    return np.where(known, labelled.face_labels, BACKGROUND)

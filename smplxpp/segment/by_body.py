@@ -250,6 +250,8 @@ def weigh_evidence(
         layers = replace(layers, bib=False)
     elif lab is not None:
         waist = None
+    if waist is not None:
+        outfit = replace(outfit, waist_step=np.inf)
     if lab is None:
         upper = chart.height > outfit.upper_start
         upper = upper if waist is None else np.where(waist.faces, waist.upper, upper)

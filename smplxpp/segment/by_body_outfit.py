@@ -79,6 +79,8 @@ class Outfit:
         margins: by border, the additional cost of the best outline whose border is more than 6 cm away, nats.
         column: P(label) in the column's rings, over all outlines.
         sleeve: P(sleeve) in the arm's rings.
+        waist_step: nats by which the surface steps at the border of lower and upper garment; inf where colours, or
+            folds, show it.
     """
 
     shoe_top: float
@@ -89,6 +91,7 @@ class Outfit:
     margins: dict[str, float]
     column: Float64[np.ndarray, "R L"]
     sleeve: Float64[np.ndarray, " Q"]
+    waist_step: float = np.inf
 
     @property
     def has_lower(self) -> bool:

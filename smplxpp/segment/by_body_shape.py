@@ -129,7 +129,12 @@ def outfit_by_shape(seen: ShapeEvidence) -> Outfit:
     near = float(np.clip(near if dressed else near + 1.0 - worn, _NONE, 1.0 - _NONE))
     margins["cuff"] = NAT * float(np.log(near) - np.log1p(-near))
     sleeve_share = worn * (1.0 - np.cumsum(sleeved)[:-1])
-    return Outfit(shoe_top, lower_start, lower_end, upper_start, float(reach[best]), margins, shares, sleeve_share)
+    # A hem may lie up to two rings beside the border.
+    waist, hems = int((states < _UPPER).sum()), seen.column_hems
+    steps = np.maximum(hems.outwards, hems.inwards)[max(0, waist - 2) : waist + 3]
+    return Outfit(
+        *borders, float(reach[best]), margins, shares, sleeve_share, waist_step=float(steps.max(initial=-np.inf))
+    )
 
 
 _BORDER_NAMES = ("shoe_top", "lower_start", "lower_end", "upper_start")

@@ -11,6 +11,7 @@ import pytest
 
 from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body, load_params
+from smplxpp.build.locate import certain_labels
 from smplxpp.clean import simplify
 from smplxpp.core.errors import InputError
 from smplxpp.core.labels import HAIR, LABELS, LOWER, OUTER, SHOE, SKIN, UPPER
@@ -165,7 +166,7 @@ def test_calves_that_no_shape_of_the_body_has_are_no_trousers(body, calves):
 
 
 def test_who_wears_nothing_wears_no_shirt(body):
-    """Without colours the bare body was labelled shirt, shoes and hair, then skin in doubt; three of four are right."""
+    """Without colours the bare body was labelled shirt, shoes and hair; as leggings look the same, it is not sure."""
     params = BodyParams.rest()
     mesh = body.mesh(body.forward(params).vertices[0])
     result = label_by_body(mesh, body, params)
@@ -174,7 +175,8 @@ def test_who_wears_nothing_wears_no_shirt(body):
     area = mesh.face_areas[below]
     assert area @ (labels[below] == SKIN.id) > 0.99 * area.sum()
     trunk = np.abs(mesh.face_centers[:, 1] - body.forward(params).joints[0, body.joint_names.index("spine1"), 1]) < 0.05
-    assert UNSURE < np.median(result.confidence[trunk]) <= result.confidence[trunk].max() <= 0.75
+    assert 0.76 * UNSURE < np.median(result.confidence[trunk]) <= result.confidence[trunk].max() < UNSURE
+    assert (certain_labels(mesh, body, None, params)[trunk] == SKIN.id).mean() > 0.99  # the fit may lean on it
     assert any("no hem" in note for note in result.notes)
 
 
