@@ -87,10 +87,6 @@ SIMULATED = (
     "wide trousers, hem 24 cm",
     "cape",
 )
-_FRAME = 1.0 / 30.0
-"""Seconds of a frame of the simulation."""
-_SETTLE, _MOVE, _HOLD = 60, 30, 36
-"""Frames in which cloth settles in the scan's pose, moves on to the next pose, and comes to rest there."""
 _ANY_DETERMINANT = UnposeConfig(warn_below=-np.inf, fail_below=-np.inf)  # baselines may fold a vertex: measure it
 
 Scores = dict[str, dict[str, float]]
@@ -140,14 +136,15 @@ class Trial:
         driver = ClothDriver(template, [garment], DriverConfig(ramp=0.0, hold=0.0))
         worn = worn_poses(scanned)
         path = [scanned, *(worn.frame(k) for k in range(len(worn)))]
-        # Settle, then go from pose to pose, each of which is held until the cloth has come to rest.
+        # Settle, then go from pose to pose, each of which is held until the cloth has come to rest; frames of 1/30 s.
+        frame, settle, move, hold = 1.0 / 30.0, 60, 30, 36
         shapes = []
         for before, after in pairwise([scanned, *path]):
-            for k in range(1, _MOVE + 1):
-                t = k / _MOVE
-                driver.step(pose_between(before, after, t * t * (3.0 - 2.0 * t)), _FRAME)
-            for _ in range(_HOLD if after is not scanned else _SETTLE):
-                shape = driver.step(after, _FRAME)
+            for k in range(1, move + 1):
+                t = k / move
+                driver.step(pose_between(before, after, t * t * (3.0 - 2.0 * t)), frame)
+            for _ in range(hold if after is not scanned else settle):
+                shape = driver.step(after, frame)
             rest = template.vertices.copy()
             rest[shape.vertices] += shape.displacements
             shapes.append(skin(rest[count:], case.weights, template.posed_from_rest(after)[0]))

@@ -20,9 +20,6 @@ _LEAST_OFF = 0.006
 _BESIDE, _LEAST_BESIDE = 0.08, 0.03
 """Metres off the body, and square metres there on one side, from which clothes are reported as a bag. Of 9 real people
 without one a jacket at a hand in its pocket has most, 0.023, and a tenth of that on the other side."""
-_STEP_SEEN, _ABOUT_WAIST = 1.0, 0.12
-"""Nats of a step below which it is none, and metres up and down from such a border for which labels are not sure: of 21
-in 46 people's scans 17 are wrong there (a fifth of the area and more), of steps above 3 nats a third."""
 _BORDERS = {
     "shoe_top": "where shoes or socks end",
     "lower_start": "where the lower garment's hem is",
@@ -70,10 +67,12 @@ def confidence_bound(
     # people are bare; 0.57 is the least share of right area that leaving one out gives, and it is not sure.
     if not colored and outfit.unclothed:
         most[(labels == SKIN.id) & np.isin(chart.region, (TRUNK, ARM, LEG))] *= 0.57
-    # About a waist at which nothing steps 0.6 of the area is right, between 0.57 and 0.63 with any person left out.
-    if outfit.has_lower and outfit.waist_step < _STEP_SEEN:
+    # A waist at which nothing steps is a guess: of 21 in scans of 46 people a fifth of the area within 12 cm and more is
+    # wrong at 17, where the step is above 3 nats at a third. There 0.6 of the area is right.
+    step_seen, about = 1.0, 0.12
+    if outfit.has_lower and outfit.waist_step < step_seen:
         beside = np.isin(labels, (UPPER.id, LOWER.id)) & np.isin(chart.region, (TRUNK, LEG))
-        most[beside & (np.abs(chart.height - outfit.upper_start) < _ABOUT_WAIST)] *= 0.59
+        most[beside & (np.abs(chart.height - outfit.upper_start) < about)] *= 0.59
     return most
 
 

@@ -11,8 +11,6 @@ from jaxtyping import Bool, Float, Float64
 
 from smplxpp.core.mesh import TriangleMesh, row_lengths
 
-_SMALLEST_ANGLE = float(np.radians(0.1))
-"""Radians, below which cotangents of a face exceed those of others a hundredfold."""
 Operators = tuple[sp.csc_matrix, Float64[np.ndarray, " N"]]
 """The cotangent matrix (N, N) of a mesh and its vertices' masses (N,)."""
 
@@ -76,7 +74,7 @@ def shared_operators(mesh: TriangleMesh, laplacian: str) -> Operators | None:
     None where a face is so thin that it changes those of its neighbours: each part is then better off on its own.
     """
     lengths = edge_lengths(mesh)
-    if laplacian == "intrinsic" or _smallest_angle(lengths) < _SMALLEST_ANGLE or (mollify(lengths) != lengths).any():
+    if laplacian == "intrinsic" or _has_slivers(lengths) or (mollify(lengths) != lengths).any():
         return None
     return laplacian_and_mass(mesh, kind="cotangent")
 
@@ -152,7 +150,7 @@ def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> Operators:
     """
     lengths = edge_lengths(mesh)
     if kind == "auto":
-        kind = "intrinsic" if _smallest_angle(lengths) < _SMALLEST_ANGLE else "cotangent"
+        kind = "intrinsic" if _has_slivers(lengths) else "cotangent"
     lengths, faces = mollify(lengths), mesh.faces
     if kind == "intrinsic" and igl.is_edge_manifold(faces)[0]:
         lengths, faces = igl.intrinsic_delaunay_triangulation(lengths, faces)[:2]
@@ -161,9 +159,9 @@ def laplacian_and_mass(mesh: TriangleMesh, *, kind: str = "auto") -> Operators:
     return sp.csc_matrix(cotangent), mass
 
 
-def _smallest_angle(lengths: np.ndarray) -> float:
-    """Return the smallest angle of all faces in radians; 0 where a face has no area."""
+def _has_slivers(lengths: np.ndarray) -> bool:
+    """Return whether some angle of a face is below 0.1 degrees, as where it has no area."""
     a, b, c = np.sort(lengths, axis=1).T  # the smallest angle lies opposite to a
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.where(b * c > 0, (b * b + c * c - a * a) / (2 * b * c), 1.0)
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)).min(initial=np.pi / 3))
+    return bool(np.arccos(np.clip(cosine, -1.0, 1.0)).min(initial=np.pi / 3) < np.radians(0.1))
