@@ -67,8 +67,8 @@ def confidence_bound(
     # people are bare; 0.57 is the least share of right area that leaving one out gives, and it is not sure.
     if not colored and outfit.unclothed:
         most[(labels == SKIN.id) & np.isin(chart.region, (TRUNK, ARM, LEG))] *= 0.57
-    # A waist at which nothing steps is a guess: of 21 in scans of 46 people a fifth of the area within 12 cm and more is
-    # wrong at 17, where the step is above 3 nats at a third. There 0.6 of the area is right.
+    # A waist at which nothing steps is a guess: at 17 of 21 in scans of 46 people a fifth of the area within 12 cm or
+    # more is wrong, at a third of those with a step above 3 nats. 0.6 of the area is right there.
     step_seen, about = 1.0, 0.12
     if outfit.has_lower and outfit.waist_step < step_seen:
         beside = np.isin(labels, (UPPER.id, LOWER.id)) & np.isin(chart.region, (TRUNK, LEG))
