@@ -20,6 +20,7 @@ from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, motion_tensors,
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.garment_file import garments_to_arrays
 from smplxpp.core import BodyParams, require_positive
+from smplxpp.raster import hiding_parts
 from smplxpp.template.template import Template
 
 
@@ -99,7 +100,7 @@ def write_bundle(
     pieces: dict[str, tuple[Tensors, Mapping[str, Any]]] = {
         "skeleton": (_skeleton(template), {}),
         "surface": (_surface(template, cut, config), {}),
-        "gaussians": (_gaussians(bound.tensors, per_face, config), {}),
+        "gaussians": (_gaussians(bound.tensors, per_face, config) | _covered(template, bound.face_index.numpy()), {}),
     }
     # Optional pieces follow the parts that the student was trained with.
     if student.field is not None and student.codes is not None:
@@ -221,6 +222,12 @@ def _gaussians(tensors: Mapping[str, Tensor], per_face: Int64[np.ndarray, " F"],
     return (
         counts | halves(plain) | signed("quats", quats, np.float32(1.0)) | signed("sh", own["sh"], _largest(own["sh"]))
     )
+
+
+def _covered(template: Template, face: Int64[np.ndarray, " N"]) -> Tensors:
+    """Return which part hides each Gaussian of the skin: players lay these on the skin where that part is taken off."""
+    parts = hiding_parts(template.mesh, template.vertex_part[template.faces[:, 0]].astype(np.int64))[face]
+    return {"covered": parts.astype(np.uint8 if parts.max(initial=0) < 256 else np.uint32)} if parts.any() else {}
 
 
 def _largest(sh: Float[np.ndarray, "N K 3"]) -> Float[np.ndarray, "K 3"]:

@@ -4,6 +4,7 @@ from smplxpp.raster.shading import ShadeStyle, render_shaded
 from smplxpp.raster.viewpoints import VIEWS, body_cameras, fit_cameras, render_overlay, render_within, turntable_cameras
 from smplxpp.raster.zbuffer import (
     MeshMaps,
+    hiding_parts,
     outer_visible_faces,
     outer_visible_points,
     outside_views,
@@ -18,6 +19,7 @@ __all__ = [
     "ShadeStyle",
     "body_cameras",
     "fit_cameras",
+    "hiding_parts",
     "outer_visible_faces",
     "outer_visible_points",
     "outside_views",

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.runtime import AvatarPlayer
 from tests.dolls.dancing import dance
-from tests.runtime.bundles import EXACT, KINDS, student, write
+from tests.runtime.bundles import EXACT, KINDS, student, write, write_dressed
 from tests.web.modules import NEEDS_BUILD, node
 
 pytestmark = NEEDS_BUILD
@@ -94,3 +94,29 @@ def test_a_browser_without_vectors_is_told_so():
     WebAssembly.Module = class { constructor() { throw new WebAssembly.CompileError("no SIMD"); } };
     let result = ""; try { new m.Native(); } catch (error) { result = error.message; }"""
     assert "no WebAssembly with SIMD" in node(script)
+
+
+def test_skin_whose_clothes_are_off_lies_on_its_triangles_and_is_opaque(tmp_path):
+    """Trained under clothes, skin fills gaps between their Gaussians: bare, it had ragged edges and holes."""
+    write_dressed(tmp_path)
+    script = """
+    const avatar = await read(given), deformer = new m.Deformer(avatar), { covered, part, face } = avatar.gaussians;
+    const centers = (hidden) => {
+      deformer.pose(m.poseAt(avatar.motion, 0), null, hidden);
+      deformer.order([0, 0, 1, 5], 0.01, [], false);
+      return [...deformer.recordsFor([0, 0, 2], avatar.gaussians.count)];
+    };
+    const result = { covered: [...covered], part: [...part], first: centers([]), bare: centers([1]), again: centers([]),
+      vertices: [...deformer.vertices], faces: Array.from(face, (f) => [...avatar.mesh.faces.subarray(3 * f, 3 * f + 3)]),
+      barycentric: [...avatar.gaussians.barycentric] };"""
+    got = node(script, given=str(tmp_path / "me.avatar"))
+    covered, part = np.array(got["covered"]), np.array(got["part"])
+    assert 10 < (covered == 1).sum() < (part == 0).sum() and (part[covered > 0] == 0).all()
+    first, bare = (np.array(got[name]).reshape(-1, 14) for name in ("first", "bare"))
+    assert got["first"] == got["again"]
+    np.testing.assert_array_equal(bare[covered == 0], first[covered == 0])
+    assert (bare[covered == 1, 3] == 1.0).all() and (first[covered == 1, 3] < 1.0).all()
+    corners = np.array(got["vertices"]).reshape(-1, 3)[np.array(got["faces"])]
+    share = np.array(got["barycentric"]).reshape(-1, 2)
+    places = np.einsum("nk,nkc->nc", np.c_[share, 1.0 - share.sum(axis=1)], corners)
+    np.testing.assert_allclose(bare[covered == 1, :3], places[covered == 1], atol=1e-5)

@@ -137,6 +137,8 @@ export interface Gaussians {
   harmonics: Float32Array;
   harmonicCount: number;
   part: Uint8Array;
+  /** (N,) the part that hides each, 0 for one that shows; null: not told. */
+  covered: Int32Array | null;
 }
 
 /** Poses in turn. */

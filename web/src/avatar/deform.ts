@@ -11,6 +11,8 @@ import { RegressionEvaluator } from "./regression.ts";
  * the normal that the eye sees, where it was asked for (folded by `web/splats.cpp`). */
 export const RECORD = 14;
 const BODY_JOINTS = 21;
+/** Standard deviation of skin that is laid bare: in its triangle's mean edge, and in the mean distance of Gaussians, which many triangles lack. */
+const BARE_EDGES = 0.5, BARE_SPACING = 0.6;
 /** What a pose takes time for, as `avatar.runtime.player` counts it. */
 export const PARTS = ["pose", "field", "blend", "world"] as const;
 
@@ -46,6 +48,9 @@ export class Deformer {
   private readonly blend: BlendAdder | null;
   private readonly surface: Block<Uint8Array>;
   private readonly bound: Block<Uint8Array>;
+  private readonly placed: Record<"offset" | "scales" | "quats" | "opacity", Block<Float32Array>>;
+  /** Gaussians of skin whose clothes are off, and the parts that are. */
+  private bare: { rows: number[]; parts: string } = { rows: [], parts: "" };
   private readonly world: Record<"means" | "quats" | "scales" | "colors" | "rotations", Block<Float32Array>>;
   private readonly splats: Block<Uint8Array>;
   private readonly sorting: {
@@ -81,9 +86,10 @@ export class Deformer {
       this.skinning.joints, this.skinning.weights, field && native.keep(field.neighbours), field && native.keep(field.weights),
     ]);
     const faces = native.keep(mesh.faces), dc = native.keep(g.color);
+    this.placed = { offset: native.keep(g.offset), scales: native.keep(g.scales), quats: native.keep(g.quats), opacity: native.keep(g.opacity) };
+    const own = this.placed;
     this.bound = native.struct([F, N, V], [
-      faces, native.keep(g.first), native.keep(g.barycentric), native.keep(g.offset), native.keep(g.scales), native.keep(g.quats), dc,
-      [g.thickness],
+      faces, native.keep(g.first), native.keep(g.barycentric), own.offset, own.scales, own.quats, dc, [g.thickness],
     ]);
     this.world = {
       means: native.floats(3 * N), quats: native.floats(4 * N), scales: native.floats(3 * N), colors: native.floats(3 * N),
@@ -91,7 +97,7 @@ export class Deformer {
     };
     const { means, quats, scales, colors, rotations } = this.world;
     this.splats = native.struct([N, g.harmonicCount], [
-      means, quats, scales, native.keep(g.opacity), colors, native.keep(g.harmonics), native.keep(g.face), rotations,
+      means, quats, scales, own.opacity, colors, native.keep(g.harmonics), native.keep(g.face), rotations,
     ]);
     this.sorting = {
       row: native.floats(4), part: native.keep(g.part), hidden: native.room(Uint8Array, 256), order: native.room(Uint32Array, N),
@@ -130,8 +136,12 @@ export class Deformer {
     if (shapes.correctives && features) this.shape(shapes.correctives, features);
   }
 
-  /** Moves everything to a pose; clothes that are simulated are where they are said to be. */
-  pose(pose: Pose, cloth: Displaced | null = null): void {
+  /**
+   * Moves everything to a pose; clothes that are simulated are where they are said to be.
+   *
+   * @param hidden parts that are taken off: the skin under them lies bare.
+   */
+  pose(pose: Pose, cloth: Displaced | null = null, hidden: Iterable<number> = []): void {
     const { native, field, blend, transforms, rest, posed, world } = this;
     const theta = Float32Array.from(pose.rotations.subarray(3, 3 + 3 * BODY_JOINTS));
     const times = [this.clock()];
@@ -141,6 +151,8 @@ export class Deformer {
     field?.evaluate(theta);
     lap();
     blend?.pose(pose, theta, cloth && cloth.keep);
+    this.undress(hidden);
+    for (const row of blend ? this.bare.rows : []) blend!.added.view.fill(0, 6 * row, 6 * row + 3);
     lap();
     native.run("runtime_surface", this.surface, rest, field && field.moved, cloth && cloth.displacements, cloth && cloth.share,
       transforms, posed, native.slices);
@@ -190,6 +202,32 @@ export class Deformer {
     });
     native.run("web_normals", BigInt(V), BigInt(F), this.posed, own.faces, own.first, own.barycentric, own.corners, own.normals);
     return own.normals;
+  }
+
+  /** Lays skin whose clothes are off flat on its triangles: trained under clothes, it fills the gaps between their Gaussians. */
+  private undress(hidden: Iterable<number>): void {
+    const { placed: { offset, scales, quats, opacity }, avatar: { mesh, gaussians: g } } = this, { covered } = g, off = new Set(hidden);
+    const parts = [...off].sort().join();
+    if (!covered || parts === this.bare.parts) return;
+    const rows = Array.from(covered.keys()).filter((i) => covered[i] && off.has(covered[i]));
+    this.bare = { rows, parts };
+    for (const [block, values] of [[offset, g.offset], [scales, g.scales], [quats, g.quats], [opacity, g.opacity]] as const) block.view.set(values);
+    const side = (a: number, b: number) => Math.hypot(...[0, 1, 2].map((k) => mesh.vertices[3 * a + k] - mesh.vertices[3 * b + k]));
+    const sides = ([a, b, c]: Int32Array) => [side(a, b), side(b, c), side(c, a)];
+    // Heron's formula gives the area, over all triangles that carry Gaussians, of which each has a share.
+    let area = 0;
+    for (let f = 0; rows.length && f < mesh.faces.length; f += 3) {
+      const [a, b, c] = sides(mesh.faces.subarray(f, f + 3)), half = (a + b + c) / 2;
+      area += Math.sqrt(Math.max(0, half * (half - a) * (half - b) * (half - c)));
+    }
+    const spacing = Math.sqrt(area / g.count);
+    for (const i of rows) {
+      const face = 3 * g.face[i], [a, b, c] = sides(mesh.faces.subarray(face, face + 3));
+      offset.view.fill(0, 3 * i, 3 * i + 3);
+      quats.view.set([1, 0, 0, 0], 4 * i);
+      scales.view.fill(Math.max(BARE_EDGES, (BARE_SPACING * spacing * 3) / Math.max(a + b + c, 1e-6)), 2 * i, 2 * i + 2);
+      opacity.view[i] = 1;
+    }
   }
 
   private shape({ rows, basis, size }: Basis, coefficients: Block<Float32Array>): void {

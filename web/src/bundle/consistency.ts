@@ -70,6 +70,9 @@ export function checkConsistency(about: About, t: Tensors): void {
   const usable = (row: Float32Array) => Math.hypot(...row) > LEAST_LENGTH && Math.hypot(...row) < MOST_LENGTH;
   require(everyRow(t.floats("gaussians.quats"), 4, usable), "gaussians.quats", `lengths from ${LEAST_LENGTH} to ${MOST_LENGTH}`);
   require(t.floats("gaussians.opacities").every((value) => value >= 0 && value <= 1), "gaussians.opacities", "values in [0, 1]");
+  const covered = t.has("gaussians.covered") ? t.ints("gaussians.covered") : Int32Array.of();
+  const most = Math.max(1, about.partNames.length);
+  require(covered.every((part) => part >= 0 && part < most), "gaussians.covered", `parts in [0, ${about.partNames.length})`);
   // The surface: the skin first, because expressions and correctives index it alone.
   const weights = t.floats("surface.joint_weights"), parts = t.ints("surface.parts");
   const summed = (row: Float32Array) => Math.abs(sum(row) - 1) < SUM_TOLERANCE;

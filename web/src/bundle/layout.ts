@@ -30,7 +30,7 @@ export const PIECES: Record<string, Record<string, string>> = {
   },
   gaussians: {
     per_face: "i F", barycentric: "f N 2", offset: "f N 3", log_scales: "f N 2", quats: "f N 4", opacities: "f N",
-    dc: "f N 3", sh: "f N K 3",
+    dc: "f N 3", sh: "f N K 3", covered: "i? N",
   },
   field: {
     points: "f C 3", neighbours: "i V n <C", weights: "f V n", cloth: "i c <C", sets: "i S 21", member: "i C <S",

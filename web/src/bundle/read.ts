@@ -182,6 +182,7 @@ function gaussians(t: Tensors, faces: Int32Array, parts: Int32Array): Gaussians 
     color: t.floats("gaussians.dc"),
     harmonics: t.floats("gaussians.sh"),
     harmonicCount: K,
+    covered: t.has("gaussians.covered") ? t.ints("gaussians.covered") : null,
   };
 }
 

@@ -97,7 +97,7 @@ function posed(request: Extract<Request, { kind: "frame" }>, deformer: Deformer)
   const simulated = request.seconds === null ? null : clothes;
   const cloth = simulated && simulated.follow(request.pose, request.seconds!);
   const moved = performance.now();
-  deformer.pose(request.pose, cloth);
+  deformer.pose(request.pose, cloth, request.hidden);
   const posed = performance.now();
   // Where the page sorts, this only leaves out what is hidden or behind the camera.
   const { count, depths } = deformer.order(camera.view.slice(8, 12), NEAR, request.hidden, request.sorted);
