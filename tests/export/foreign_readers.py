@@ -2,8 +2,8 @@
 
     python tests/export/foreign_readers.py READER FILE
 
-READER is assimp (assimp_py), ufbx, bpy, usd (usd-core) or trimesh. Exit 3: it is not installed. `load_three.mjs` does
-the same with the loaders of three.js.
+READER is assimp (assimp_py), ufbx, bpy, usd (usd-core) or trimesh, or a validator, which tells its remarks: usd-rules
+or vrm-schema (jsonschema). Exit 3: it is not installed. `load_three.mjs` reads with the loaders of three.js.
 """
 
 from __future__ import annotations
@@ -159,12 +159,53 @@ def by_trimesh(path: Path) -> dict:
     )
 
 
+def by_usd_rules(path: Path) -> dict:
+    """Hold USD against OpenUSD's rules, with which `usdchecker` works: its validators, before 26 ComplianceChecker."""
+    from pxr import Sdr, Tf, Usd, UsdUtils
+
+    if hasattr(UsdUtils, "ComplianceChecker"):
+        try:  # the first question fails where PyPI's wheels lack the definitions of UsdPreviewSurface
+            Sdr.Registry().GetShaderNodeByIdentifier("UsdPreviewSurface")
+        except Tf.ErrorException as error:
+            sys.stderr.write(f"{error}\n")
+        checker = UsdUtils.ComplianceChecker(arkit=True)
+        checker.CheckCompliance(str(path))
+        found = [*checker.GetErrors(), *checker.GetFailedChecks(), *checker.GetWarnings()]
+        return {"remarks": [one for one in found if "invalid shader node" not in one]}
+    from pxr import UsdValidation
+
+    rules = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    found = UsdValidation.ValidationContext(rules).Validate(Usd.Stage.Open(str(path)))
+    return {"remarks": [one.GetErrorAsString() for one in found]}
+
+
+def by_vrm_schema(path: Path) -> dict:
+    """Hold VRMC_vrm against its JSON schemas, from github.com/vrm-c/vrm-specification in the folder $VRM_SCHEMAS."""
+    from jsonschema import Draft202012Validator
+    from referencing import Registry, Resource
+    from referencing.jsonschema import DRAFT202012
+
+    if "VRM_SCHEMAS" not in os.environ:
+        raise ModuleNotFoundError("$VRM_SCHEMAS names no folder")
+    # glTF's own, which the extension's refer to, are Khronos's validator's to check.
+    of_gltf = {"glTFProperty": {"type": "object"}, "glTFid": {"type": "integer", "minimum": 0}, "textureInfo": {}}
+    schemas = {f"{name}.schema.json": schema for name, schema in of_gltf.items()}
+    schemas |= {p.name: json.loads(p.read_text()) for p in Path(os.environ["VRM_SCHEMAS"]).rglob("VRMC_vrm*.json")}
+    resources = [(name, Resource.from_contents(one, DRAFT202012)) for name, one in schemas.items()]
+    data = path.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    whole = Draft202012Validator(schemas["VRMC_vrm.schema.json"], registry=Registry().with_resources(resources))
+    return {"remarks": [one.message for one in whole.iter_errors(document["extensions"]["VRMC_vrm"])]}
+
+
 READERS: dict[str, Callable[[Path], dict]] = {
     "assimp": by_assimp,
     "ufbx": by_ufbx,
     "bpy": by_bpy,
     "usd": by_usd,
     "trimesh": by_trimesh,
+    "usd-rules": by_usd_rules,
+    "vrm-schema": by_vrm_schema,
 }
 
 if __name__ == "__main__":

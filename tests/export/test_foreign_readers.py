@@ -24,6 +24,7 @@ from smplxpp.export.vrm import in_vrm_pose
 from smplxpp.template.template import Template
 from smplxpp.template.texture import Texture, encode_texture
 from tests.export.templates import open_body_template, with_part
+from tests.export.test_glb_validator import validate
 
 HERE = Path(__file__).parent
 PYTHONS = [sys.executable, *filter(None, os.environ.get("FOREIGN_PYTHONS", "").split(os.pathsep))]
@@ -35,6 +36,7 @@ READERS = {
     "usd": (".usdc", ".usdz"),
     "trimesh": (".glb", ".vrm", ".obj"),
 }
+VALIDATORS = {"khronos": (".glb", ".vrm"), "vrm-schema": (".vrm",), "usd-rules": (".usdc", ".usdz")}
 pytestmark = pytest.mark.slow
 
 
@@ -100,3 +102,14 @@ def test_everything_arrives(reader, suffix, dressed, files):
         assert found["bones"] in (55, None)
         # VRM has presets beside ARKit's; Blender drops the tongue's from USD, which moves nothing outside of the mouth.
         assert found["morphs"] in {".vrm": (65, None), ".usdc": (51, 52), ".usdz": (51, 52)}.get(suffix, (52, None))
+
+
+@pytest.mark.parametrize(("name", "suffix"), [(name, suffix) for name, of in VALIDATORS.items() for suffix in of])
+def test_validators_have_no_remark(name, suffix, files):
+    if name != "khronos":
+        assert read(name, files[suffix])["remarks"] == []
+        return
+    issues = validate(files[suffix])["issues"]
+    # It knows no extension of VRM's, and says so.
+    assert {issue["code"] for issue in issues["messages"]} <= {"UNSUPPORTED_EXTENSION"}
+    assert not issues["numErrors"] and not issues["numWarnings"]
