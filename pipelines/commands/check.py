@@ -69,12 +69,12 @@ class CheckMesh:
             atomic_write_text(self.out / "check.json", json_format.dumps(report, indent=1) + "\n")
             write_ply(self.out / "faults.ply", found.mesh, vertex_colors=found.colors())
         if not self.json:
-            _print(report, Console())
+            _print(report, Console(), self.out)
         return {**report, "exit_status": int(self.strict and report["verdict"] == "fail")}
 
 
-def _print(report: dict[str, Any], console: Console) -> None:
-    """Print the faults, and of parts without any one line."""
+def _print(report: dict[str, Any], console: Console, out: Path | None) -> None:
+    """Print the faults, borders, which clothes have, and the verdict."""
     styles = {"pass": "green", "warn": "yellow", "fail": "red"}
     size = f"{report['vertices']:,} vertices, {report['faces']:,} faces"
     table = Table(title=f"{report['path']}: {size}", title_justify="left")
@@ -91,5 +91,11 @@ def _print(report: dict[str, Any], console: Console) -> None:
         console.print(table)
     if "not_posed" in report.get("rig", {}):
         console.print(f"no stress poses: {report['rig']['not_posed']}", style="yellow", markup=False)
-    verdict = report["verdict"]
-    console.print(f"[{styles[verdict]}]{verdict}[/]: {passed} of {len(report['checks'])} checks pass; {size}")
+    for name, of in report.get("quality", {}).items():
+        if of["border_loops"] or of["nonmanifold_vertices"]:
+            said = f"{name}: {of['components']} pieces, {of['border_loops']} borders"
+            said += f", the longest {max(of['border_lengths_mm']):,.0f} mm" if of["border_loops"] else ""
+            touching = f", surfaces touch at {of['nonmanifold_vertices']} vertices"
+            console.print(said + touching * bool(of["nonmanifold_vertices"]), markup=False, highlight=False)
+    verdict, where = report["verdict"], f"; faults in colour: {out / 'faults.ply'}" if out else ""
+    console.print(f"[{styles[verdict]}]{verdict}[/]: {passed} of {len(report['checks'])} checks pass; {size}{where}")

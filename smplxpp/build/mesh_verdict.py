@@ -58,6 +58,7 @@ _RIG = {_OFF: (0.01, 0.1), "a joint twice at a vertex": (0.0, np.inf)}
 # Colours of regions, the later over the earlier where both are; grey is fine.
 _GREY = (190, 190, 190)
 _PALETTE = {
+    "at a border": (150, 200, 255),
     "off the scan": (80, 120, 255),
     "a joint twice at a vertex": (200, 200, 120),
     "weights off a sum of 1": (180, 255, 180),
@@ -188,6 +189,8 @@ class MeshVerdict:
         if self.rig is not None or len(self.parts) > 1:
             pieces = component_labels(part.edges, part.vertex_count)[part.faces[:, 0]]
         self.numbers.setdefault("quality", {})[name] = mesh_quality(part).as_dict()
+        borders = np.isin(part.faces, np.unique(part.border_edges)).sum(axis=1) > 1
+        self.regions.setdefault("at a border", np.zeros(self.mesh.face_count, dtype=bool))[chosen[borders]] = True
         for fault, faces in faulty_faces(part, pieces=pieces).items():
             gate = _SHARES.get(fault)
             value, unit = (100 * float(faces.mean()), "%") if gate else (int(faces.sum()), "")

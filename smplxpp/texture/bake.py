@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from smplxpp.core import SKIN, TriangleMesh, normalize_rows, row_lengths
 from smplxpp.core.mesh_files.raw_mesh import FacePictures
+from smplxpp.core.signed_distance import barycentric_coordinates
 from smplxpp.template.template import BODY_PART, Template
 from smplxpp.template.texture import Texture, corner_tangents, encode_texture
 from smplxpp.texture.atlas import Atlas, Texels, can_unwrap, texels_of, unwrap
@@ -23,6 +24,8 @@ from smplxpp.texture.photographs import Painter
 _FAR = 0.015
 # Rounds in which the colours that were carried under clothes become smooth, a vertex's with those of its neighbours.
 _ROUNDS = 40
+# Texels along an edge of the scan from which a search serves four of them.
+_FINE = 4
 # Texels a side of the squares within which empty texels take colours: 32 mm of the surface at 2048.
 _SQUARE = 32
 
@@ -130,6 +133,10 @@ class _Bake:
             labels = template.vertex_labels[template.vertex_part == index]
             self.surfaces.append(scan.labelled(int(np.bincount(labels).argmax()) if len(labels) else SKIN.id))
         self.corner_normals = posed.vertex_normals[posed.faces]
+        # Metres a texel of a picture of one texel: the root of area by flat area.
+        flat = TriangleMesh(np.pad(atlas.uv, ((0, 0), (0, 1))), atlas.face_uv)
+        self.spread = float(np.sqrt(posed.face_areas.sum() / max(flat.face_areas.sum(), 1e-12)))
+        self.texel = np.inf
         self.reached = self._reached()
         self.texels = np.zeros(len(template.part_names), np.int64)
         self.seen = np.zeros(len(template.part_names), np.int64)
@@ -139,6 +146,7 @@ class _Bake:
     ) -> tuple[UInt8[np.ndarray, "S S 3"], UInt8[np.ndarray, "S S 3"] | None]:
         """Paint one picture: its colours, and its normals where they are asked for."""
         faces = (self.atlas.picture == picture)[self.part_of_face]
+        self.texel = self.spread / size
         color = np.zeros((size, size, 3), np.uint8)
         known = np.zeros((size, size), dtype=bool)
         relief = np.full((size, size, 3), (128, 128, 255), np.uint8) if normals else None
@@ -181,7 +189,7 @@ class _Bake:
         if surface is None or not shown.any():
             return np.zeros(len(shown), dtype=bool), np.zeros(0, np.int64), np.zeros((0, 3))
         tried = texels.select(shown)
-        distance, face, barycentric, rim = surface.nearest(tried.interpolate(self.posed.triangles))
+        distance, face, barycentric, rim = self._nearest(tried, surface)
         near = distance <= np.where(rim, beyond_rim, _FAR)
         if self.template.part_names[part] == BODY_PART:
             # The body closes where the scan's skin has two sides, as between fingers: only what faces alike is meant.
@@ -189,6 +197,34 @@ class _Bake:
             near &= facing > 0
         shown[shown] = near
         return shown, face[near], barycentric[near]
+
+    def _nearest(
+        self, texels: Texels, surface: LabelledSurface
+    ) -> tuple[Float64[np.ndarray, " T"], np.ndarray, Float64[np.ndarray, "T 3"], Bool[np.ndarray, " T"]]:
+        """Find the points of a surface nearest to texels, as `LabelledSurface.nearest`.
+
+        Where texels are fine against the scan's faces, a search for one of four finds the face, onto whose plane the
+        other three are projected: they may miss a neighbouring face by half a texel, in half the time.
+        """
+        points = texels.interpolate(self.posed.triangles)
+        if self.texel * _FINE > surface.edge:
+            return surface.nearest(points)
+        # The first texel of each square of two by two is searched for, and those of squares whose first is elsewhere.
+        top, left = (texels.row // 2).min(), (texels.column // 2).min()
+        square = texels.row // 2 - top, texels.column // 2 - left
+        first = np.flatnonzero((texels.row % 2 == 0) & (texels.column % 2 == 0))
+        of_square = np.full((square[0].max() + 1, square[1].max() + 1), -1)
+        of_square[square[0][first], square[1][first]] = np.arange(len(first))
+        found = of_square[square]
+        alone = np.flatnonzero(found < 0)
+        found[alone] = len(first) + np.arange(len(alone))
+        searched = np.concatenate([first, alone])
+        _, face, _, rim = (part[found] for part in surface.nearest(points[searched]))
+        triangles = self.scan.mesh.triangles[face]
+        barycentric = np.clip(barycentric_coordinates(points, triangles), 0.0, None)
+        barycentric /= barycentric.sum(axis=1, keepdims=True)
+        away = points - np.einsum("tk,tkd->td", barycentric, triangles)
+        return row_lengths(away), face, barycentric, rim
 
     def _reached(self) -> Bool[np.ndarray, " F"]:
         """Tell which faces the scan may show: not those between fixed vertices, nor those far from their label."""

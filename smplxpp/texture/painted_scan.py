@@ -81,6 +81,12 @@ class LabelledSurface:
         return tree
 
     @cached_property
+    def edge(self) -> float:
+        """Length of a typical edge, metres."""
+        corners = self.mesh.triangles[self.faces]
+        return float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
+
+    @cached_property
     def _rim(self) -> Bool[np.ndarray, "m 3"]:
         """Whether the edge opposite each corner ends these faces: another label or a hole lies beyond it."""
         corners = self.mesh.faces[self.faces]

@@ -53,6 +53,20 @@ def test_planted_faults_of_a_mesh_are_named_and_coloured(tmp_path, capsys):
     assert ((colors != 190).any(axis=1) == marked).all()
 
 
+def test_borders_are_counted_in_words_and_coloured(tmp_path, capsys):
+    """A verdict said nothing of holes, which `check.json` alone had."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    open_ball = TriangleMesh(ball.vertices, ball.faces[ball.triangles_center[:, 1] < 0.4])
+    write_ply(tmp_path / "open.ply", open_ball)
+    assert CheckMesh(tmp_path / "open.ply", out=tmp_path / "out").run()["verdict"] == "pass"
+    said = " ".join(capsys.readouterr().out.split())
+    border = np.linalg.norm(np.diff(open_ball.vertices[open_ball.border_edges], axis=1), axis=2).sum() * 1e3
+    assert f"mesh: 1 pieces, 1 borders, the longest {border:,.0f} mm" in said
+    assert "faults.ply" in said and "touch" not in said
+    marked = (read_mesh(tmp_path / "out" / "faults.ply").vertex_colors != 190).any(axis=1)
+    assert set(np.unique(open_ball.border_edges)) <= set(np.flatnonzero(marked)) and marked.mean() < 0.2
+
+
 def test_a_whole_mesh_passes_and_its_weights_and_scan_are_checked(tmp_path, capsys):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     mesh = TriangleMesh(ball.vertices, ball.faces)
