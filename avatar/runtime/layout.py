@@ -240,8 +240,8 @@ def check_consistency(
     usable = bool(((lengths > 1e-3) & (lengths < 1e3)).all())
     require(usable, "gaussians.quats", "lengths from 0.001 to 1000", "others")
     covered = tensors.get("gaussians.covered", np.zeros(1, np.int32))
-    known = bool(((covered >= 0) & (covered < max(1, len(about.part_names)))).all())
-    require(known, "gaussians.covered", f"parts in [0, {len(about.part_names)})", "others")
+    within = bool(((covered >= 0) & (covered < max(1, len(about.part_names)))).all())
+    require(within, "gaussians.covered", f"parts in [0, {len(about.part_names)})", "others")
     # Weights are stored in 16 bits, and may miss a sum of 1 by rounding.
     opacity, weights = tensors["gaussians.opacities"], tensors["surface.joint_weights"]
     require(bool((opacity >= 0).all() and (opacity <= 1).all()), "gaussians.opacities", "values in [0, 1]", "others")

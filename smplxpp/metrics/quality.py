@@ -240,7 +240,7 @@ def doubtful_pair(a: MeshLike, b: MeshLike) -> str:
     Example:
         >>> square = ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
         >>> doubtful_pair(square, (1000 * np.array(square[0]), square[1]))
-        'the second mesh is 1e+03 times as large as the first: their units differ by 1000'
+        'the second mesh is 1,000 times as large as the first: their units differ by 1000'
     """
     one, other = as_mesh(a, subject="first mesh"), as_mesh(b, subject="second mesh")
     boxes = [
@@ -250,7 +250,7 @@ def doubtful_pair(a: MeshLike, b: MeshLike) -> str:
     for factor in (10, 100, 1000):
         if factor / 1.5 <= max(ratio, 1.0 / max(ratio, np.finfo(float).tiny)) <= 1.5 * factor:
             large, small, times = ("second", "first", ratio) if ratio > 1 else ("first", "second", 1.0 / ratio)
-            return f"the {large} mesh is {times:.3g} times as large as the {small}: their units differ by {factor}"
+            return f"the {large} mesh is {times:,.4g} times as large as the {small}: their units differ by {factor}"
     # Overlap along each axis, as a share of the shorter of both extents; a flat box overlaps where it lies within.
     shared = np.minimum(boxes[0][1], boxes[1][1]) - np.maximum(boxes[0][0], boxes[1][0])
     shortest = np.minimum(*(box[1] - box[0] for box in boxes))

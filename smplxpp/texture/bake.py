@@ -24,8 +24,6 @@ from smplxpp.texture.photographs import Painter
 _FAR = 0.015
 # Rounds in which the colours that were carried under clothes become smooth, a vertex's with those of its neighbours.
 _ROUNDS = 40
-# Texels along an edge of the scan from which a search serves four of them.
-_FINE = 4
 # Texels a side of the squares within which empty texels take colours: 32 mm of the surface at 2048.
 _SQUARE = 32
 
@@ -206,8 +204,9 @@ class _Bake:
         Where texels are fine against the scan's faces, a search for one of four finds the face, onto whose plane the
         other three are projected: they may miss a neighbouring face by half a texel, in half the time.
         """
+        fine = 4  # texels along an edge of the scan
         points = texels.interpolate(self.posed.triangles)
-        if self.texel * _FINE > surface.edge:
+        if self.texel * fine > surface.edge:
             return surface.nearest(points)
         # The first texel of each square of two by two is searched for, and those of squares whose first is elsewhere.
         top, left = (texels.row // 2).min(), (texels.column // 2).min()

@@ -77,6 +77,14 @@ def test_units_and_tolerances() -> None:
         hausdorff(ball, (ball.vertices, np.zeros((0, 3), int)))
 
 
+def test_meshes_in_other_units_get_one_pass() -> None:
+    """Metres against millimetres, of which a warning tells, kept the command busy for ten minutes."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    found = hausdorff((1e3 * ball.vertices, ball.faces), (ball.vertices, ball.faces))
+    assert found.a_to_b.evaluations == found.b_to_a.evaluations == len(ball.vertices)
+    assert found.lower_mm <= 499.5e3 * (1 + 1e-9) <= found.upper_mm
+
+
 def test_normals_whose_winding_is_mixed_are_compared_without_their_sign() -> None:
     """A ball with every third face turned: the mean angle says 60 degrees, the consistency that nothing is off."""
     ball = trimesh.creation.icosphere(subdivisions=3)
