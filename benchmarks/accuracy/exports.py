@@ -253,8 +253,8 @@ class TextureBenchmark:
     """Store the figures."""
 
     def run(self) -> None:
-        """Print and store a row a run and size."""
-        rows = {f"{run.name}, {size}": self._row(run, size) for run in self.runs for size in self.sizes}
+        """Print and store a row a run, by size."""
+        rows = {run.name: {str(size): self._row(run, size) for size in self.sizes} for run in self.runs}
         print(json.dumps(rows, indent=1))
         if self.store:
             names = " ".join(run.name for run in self.runs)
