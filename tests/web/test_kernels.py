@@ -107,7 +107,8 @@ def test_skin_whose_clothes_are_off_lies_on_its_triangles_and_is_opaque(tmp_path
       return [...deformer.recordsFor([0, 0, 2], avatar.gaussians.count)];
     };
     const result = { covered: [...covered], part: [...part], first: centers([]), bare: centers([1]), again: centers([]),
-      vertices: [...deformer.vertices], faces: Array.from(face, (f) => [...avatar.mesh.faces.subarray(3 * f, 3 * f + 3)]),
+      vertices: [...deformer.vertices],
+      faces: Array.from(face, (f) => [...avatar.mesh.faces.subarray(3 * f, 3 * f + 3)]),
       barycentric: [...avatar.gaussians.barycentric] };"""
     got = node(script, given=str(tmp_path / "me.avatar"))
     covered, part = np.array(got["covered"]), np.array(got["part"])
