@@ -127,3 +127,18 @@ def person_run(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Pa
         assert main(["build", str(run), "--capture", capture, "--texture-size", "1024", "--json"]) == 0
 
     return made_once("person", build)
+
+
+@pytest.fixture(scope="session")
+def danced(made_once: Callable[[str, Callable[[Path], object]], Path]) -> tuple[Path, Path]:
+    """The capture of the doll that dances, and a run of `smplxpp train` on it with tiny networks."""
+
+    def make(folder: Path) -> None:
+        from tests.dolls.dancing import write_dance, write_dance_run
+        from tests.pipelines.training_runs import train
+
+        capture, run = write_dance(folder / "dance"), write_dance_run(folder / "run")
+        assert train(run, capture) == 0
+
+    folder = made_once("danced", make)
+    return folder / "dance", folder / "run"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from unittest import mock
 
@@ -19,9 +19,9 @@ from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, NOT_FOUND_PICTUR
 from pipelines.runs.stage import require_stage
 from smplxpp.body import load_body, load_params
 from smplxpp.build import locate
-from smplxpp.clean import simplify
+from smplxpp.clean import Simplified, simplify
 from smplxpp.core import BACKGROUND, SKIN, TriangleMesh
-from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
+from smplxpp.core.mesh_files.mesh_io import RawMesh, read_mesh, read_raw_mesh, write_ply
 from smplxpp.register.locate import BodyNotFoundError, Candidate, LocateConfig, LocatedBody
 from smplxpp.segment import read_labels
 
@@ -32,11 +32,17 @@ FACES = 20_000
 FEW = LocateConfig(directions=6, starts=6, limbs_tried=2, candidates=2, dress_steps=5, finish_steps=5)
 
 
+@cache
+def whole_and_coarse() -> tuple[RawMesh, Simplified]:
+    """The fixture's scan, and with fewer faces."""
+    raw = read_raw_mesh(PERSON / "scans" / "scan_000000.ply")
+    return raw, simplify(TriangleMesh(raw.vertices, raw.faces), FACES)
+
+
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory):
     """The fixture's scan of fewer faces, in centimetres, lying on its back as files with z up do."""
-    raw = read_raw_mesh(PERSON / "scans" / "scan_000000.ply")
-    coarse = simplify(TriangleMesh(raw.vertices, raw.faces), FACES)
+    raw, coarse = whole_and_coarse()
     x, y, z = coarse.mesh.vertices.T
     path = tmp_path_factory.mktemp("scan") / "me.ply"
     lying = TriangleMesh(100.0 * np.stack([x, -z, y], axis=1), coarse.mesh.faces)
@@ -74,14 +80,13 @@ def test_the_body_is_found(alone):
 
 
 def test_labels_are_told(alone):
-    raw = read_raw_mesh(PERSON / "scans" / "scan_000000.ply")
+    raw, coarse = whole_and_coarse()
     true = read_labels(
         PERSON / "scans" / "scan_000000_labels.npz",
         vertex_count=len(raw.vertices),
         face_count=len(raw.faces),
         label_set="capture",
     )
-    coarse = simplify(TriangleMesh(raw.vertices, raw.faces), FACES)
     with np.load(alone / SEGMENT_STAGE / "labels.npz") as labels, np.load(alone / "08_capture" / "scan.npz") as kept:
         told, source = labels["face_labels"], kept["scan/source_face"]
     corners = true[coarse.source_vertex][coarse.mesh.faces[source]]

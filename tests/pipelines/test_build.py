@@ -16,9 +16,11 @@ import pytest
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.commands.inspect import summarise_run
+from pipelines.report import Section
+from pipelines.report.sections import build as sections
 from pipelines.runs.artefacts import load_scan, load_source_faces
 from pipelines.runs.layout import TEMPLATE_STAGES
-from pipelines.runs.stage import StageRecord
+from pipelines.runs.stage import StageRecord, read_manifest
 from pipelines.stages.build import build
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
 from smplxpp.assemble import FillHolesConfig
@@ -235,6 +237,27 @@ def test_the_report_stands_alone(person_run):
     assert not re.findall(r"url\(\s*['\"]?(?!data:|#)", text)
     assert "@import" not in text
     assert "<script src" not in text
+
+
+def test_the_template_is_drawn_once_for_the_reports_of_a_process_until_a_stage_changes(person_run, monkeypatch):
+    """The demo drew the same pictures for five seconds at each of its reports."""
+    drawn = []
+    for name in ("scan", "parts", "weights", "template", "fidelity", "poses"):
+        monkeypatch.setattr(
+            sections, f"{name}_section", lambda *given, name=name: (drawn.append(name), Section(title=name))[1]
+        )
+    monkeypatch.setattr(sections, "write_report", lambda path, report: report)
+    monkeypatch.setattr(sections, "_LAST", {})
+    inputs, config = load_build(person_run)
+    records = {name: StageRecord(person_run / name, read_manifest(person_run / name), True) for name in TEMPLATE_STAGES}
+    shown = [sections.write_build_report(person_run, inputs, config, records).sections for _ in range(2)]
+    assert len(drawn) == 6 and shown[0] == shown[1]
+    sections.rewrite_report(person_run)
+    assert len(drawn) == 6
+    kept = records["30_clean"]
+    changed = {**records, "30_clean": replace(kept, manifest={**kept.manifest, "seconds": 1.0})}
+    sections.write_build_report(person_run, inputs, config, changed)
+    assert len(drawn) == 12
 
 
 def test_the_template_poses_onto_the_scan(person_run):

@@ -23,7 +23,7 @@ from pipelines.stages import train as train_stage
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.errors import InputError
 from tests.cloth.persons import person
-from tests.dolls.dancing import HELD_OUT, template, write_dance, write_dance_run
+from tests.dolls.dancing import HELD_OUT, template, write_dance_run
 from tests.dolls.skirted import write_skirted
 from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
 
@@ -36,15 +36,13 @@ MODELS = {
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_dance(tmp_path_factory.mktemp("captures") / "dance")
+def capture(danced):
+    return danced[0]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, capture):
-    run = write_dance_run(tmp_path_factory.mktemp("runs") / "dance")
-    assert train(run, capture) == 0
-    return run
+def trained(danced):
+    return danced[1]
 
 
 @pytest.fixture

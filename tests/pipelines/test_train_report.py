@@ -19,17 +19,13 @@ from pipelines.report.sections.training import (
 )
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core import GeometryWarning, spread
-from tests.dolls.dancing import write_dance, write_dance_run
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
-from tests.pipelines.training_runs import STAGES, train
+from tests.pipelines.training_runs import STAGES
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    base = tmp_path_factory.mktemp("report")
-    run, capture = write_dance_run(base / "run"), write_dance(base / "capture")
-    assert train(run, capture) == 0
-    return run
+def run(danced):
+    return danced[1]
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.core import SKIN, UPPER, BodyParams, InputError, TriangleMesh, rotvec_from_matrix
-from smplxpp.register import Observations, RegisterConfig, ScanObservation, register
+from smplxpp.register import BodyFit, Observations, RegisterConfig, ScanObservation, register
 from tests.register.people import disturbed, keypoints, masks, moving, ring, vertex_error_mm
 
 BODY = load_body()
@@ -27,9 +27,28 @@ def cameras():
     return ring(6)
 
 
-def test_exact_keypoints_give_the_pose(person, cameras):
-    observed = Observations(tuple(range(FRAMES)), cameras, keypoints=keypoints(BODY, person, cameras), fps=20.0)
-    fit = register(BODY, observed, SMALL)
+@pytest.fixture(scope="module")
+def exact(person, cameras) -> Observations:
+    return Observations(tuple(range(FRAMES)), cameras, keypoints=keypoints(BODY, person, cameras), fps=20.0)
+
+
+@pytest.fixture(scope="module")
+def of_exact(exact) -> BodyFit:
+    return register(BODY, exact, SMALL)
+
+
+@pytest.fixture(scope="module")
+def noisy(person, cameras) -> Observations:
+    return Observations(tuple(range(FRAMES)), cameras, keypoints=keypoints(BODY, person, cameras, px=2.0), fps=20.0)
+
+
+@pytest.fixture(scope="module")
+def of_noisy(noisy) -> BodyParams:
+    return register(BODY, noisy, SMALL).params
+
+
+def test_exact_keypoints_give_the_pose(person, of_exact):
+    fit = of_exact
     true, found = BODY.forward(person).joints, BODY.forward(fit.params).joints
     assert 1e3 * np.linalg.norm(true - found, axis=2).mean() < 4.0
     assert (fit.params.betas == fit.params.betas[0]).all()  # one shape
@@ -37,18 +56,11 @@ def test_exact_keypoints_give_the_pose(person, cameras):
     assert not fit.initial_residuals and not fit.notes
 
 
-def test_noisy_keypoints_and_masks(person, cameras):
-    seen = keypoints(BODY, person, cameras, px=2.0)
+def test_noisy_keypoints_and_masks(person, cameras, noisy, of_noisy):
     mask = masks(BODY, person, cameras)
     start = disturbed(person, degrees=2.0, metres=0.01, betas=0.3)
-    frames = tuple(range(FRAMES))
-    alone = register(BODY, Observations(frames, cameras, keypoints=seen, fps=20.0), SMALL)
-    both = register(
-        BODY,
-        Observations(frames, cameras, keypoints=seen, mask=lambda c, f: mask[c, f], initial=start, fps=20.0),
-        SMALL,
-    )
-    assert vertex_error_mm(BODY, both.params, person) < vertex_error_mm(BODY, alone.params, person) < 15.0
+    both = register(BODY, replace(noisy, mask=lambda c, f: mask[c, f], initial=start), SMALL)
+    assert vertex_error_mm(BODY, both.params, person) < vertex_error_mm(BODY, of_noisy, person) < 15.0
     assert np.nanmean(both.residuals["silhouette_px"]) < np.nanmean(both.initial_residuals["silhouette_px"])
     assert both.confidence.shape == (FRAMES, BODY.joint_count)
     assert (both.confidence[:, :22] > 0.5).all()
@@ -60,24 +72,17 @@ def degrees_away(fitted, true):
     return np.degrees(np.linalg.norm(rotvec_from_matrix(a.transpose(0, 1, 3, 2) @ b), axis=2)).mean()
 
 
-def test_a_fit_beside_keypoints_tells_the_turns_that_they_do_not(person, cameras):
-    seen = keypoints(BODY, person, cameras, px=2.0)
-    near, far = (disturbed(person, degrees=d, metres=0.01, betas=0.3) for d in (1.0, 15.0))
-    frames = tuple(range(FRAMES))
-    alone, helped, misled = (
-        register(BODY, Observations(frames, cameras, keypoints=seen, initial=start, fps=20.0), SMALL).params
-        for start in (None, near, far)
-    )
-    assert degrees_away(helped, person) < 0.7 * degrees_away(alone, person)
-    assert vertex_error_mm(BODY, misled, person) < 1.5 * vertex_error_mm(BODY, alone, person)
+def test_a_fit_beside_keypoints_tells_the_turns_that_they_do_not(person, noisy, of_noisy):
+    starts = (disturbed(person, degrees=d, metres=0.01, betas=0.3) for d in (1.0, 15.0))
+    helped, misled = (register(BODY, replace(noisy, initial=start), SMALL).params for start in starts)
+    assert degrees_away(helped, person) < 0.7 * degrees_away(of_noisy, person)
+    assert vertex_error_mm(BODY, misled, person) < 1.5 * vertex_error_mm(BODY, of_noisy, person)
 
 
-def test_windows_join(person, cameras):
+def test_windows_join(exact, of_exact):
     """A take longer than the window is solved piece by piece and comes to the same."""
-    observed = Observations(tuple(range(FRAMES)), cameras, keypoints=keypoints(BODY, person, cameras), fps=20.0)
-    whole = register(BODY, observed, SMALL)
-    pieces = register(BODY, observed, RegisterConfig(window=2, shape_frames=4))
-    assert vertex_error_mm(BODY, pieces.params, whole.params) < 2.0
+    pieces = register(BODY, exact, RegisterConfig(window=2, shape_frames=4))
+    assert vertex_error_mm(BODY, pieces.params, of_exact.params) < 2.0
 
 
 def test_chunks_of_one_shape_join(person, cameras):

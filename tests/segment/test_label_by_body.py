@@ -19,7 +19,7 @@ from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.segment import UNSURE, label_by_body, read_labels, segment_scan
+from smplxpp.segment import UNSURE, SegmentedScan, label_by_body, read_labels, segment_scan
 from smplxpp.segment.by_body_outfit import NAT, RUNS, OutfitConfig, find_outfit, label_shares
 from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 
@@ -49,6 +49,13 @@ def scanned(body) -> tuple[TriangleMesh, np.ndarray, np.ndarray, BodyParams]:
     return coarse.mesh, file.vertex_colors[coarse.source_vertex], truth, params
 
 
+@pytest.fixture(scope="module")
+def labelled(body, scanned) -> SegmentedScan:
+    """That scan's labels."""
+    mesh, colors, _, params = scanned
+    return label_by_body(mesh, body, params, colors=colors)
+
+
 def accuracy(mesh: TriangleMesh, labels: np.ndarray, truth: np.ndarray) -> float:
     return float(mesh.face_areas @ (labels == truth) / mesh.face_areas.sum())
 
@@ -66,16 +73,15 @@ def test_a_clothed_scan_is_labelled_though_the_body_is_a_little_wrong(body, scan
     assert np.array_equal(again.face_labels, result.face_labels)
 
 
-def test_the_direction_she_faces_does_not_matter(body, scanned):
+def test_the_direction_she_faces_does_not_matter(body, scanned, labelled):
     mesh, colors, _, params = scanned
-    before = label_by_body(mesh, body, params, colors=colors)
     angle = np.radians(110.0)
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     root = body.forward(params).joints[0, 0]
     vertices = (mesh.vertices - root) @ turn.T + root
     turned = replace(params, global_orient=rotvec_from_matrix(turn @ matrix_from_rotvec(params.global_orient)))
     after = label_by_body(mesh.with_vertices(vertices), body, turned, colors=colors)
-    assert accuracy(mesh, after.face_labels, before.face_labels) > 0.999
+    assert accuracy(mesh, after.face_labels, labelled.face_labels) > 0.999
 
 
 def test_without_colours_it_says_so(body, scanned):
@@ -88,10 +94,11 @@ def test_without_colours_it_says_so(body, scanned):
 def painted(body: BodyModel, paint: dict[str, tuple]) -> tuple[TriangleMesh, np.ndarray, BodyParams]:
     """A naked body whose regions are painted: what colours alone say."""
     params = BodyParams.rest()
-    mesh = body.mesh(body.forward(params).vertices[0])
+    posed = body.forward(params)
+    mesh = body.mesh(posed.vertices[0])
     colors = np.tile(np.array(_SKIN_RGB, dtype=np.uint8), (mesh.vertex_count, 1))
     x, y, _ = mesh.vertices.T
-    joint = {name: body.forward(params).joints[0, k] for k, name in enumerate(body.joint_names)}
+    joint = dict(zip(body.joint_names, posed.joints[0], strict=True))
     where = {
         "hair": y > joint["head"][1] + 0.16,
         "shirt": (y > joint["pelvis"][1] + 0.05) & (y < joint["neck"][1] - 0.03) & (np.abs(x) < joint["left_elbow"][0]),
@@ -228,7 +235,7 @@ def test_an_open_jacket_is_told_from_a_closed_one_by_its_lips(body, half):
 def test_a_front_in_the_colour_of_the_trousers_is_a_waistcoat_where_it_ends_over_them(body, hem):
     """A black waistcoat over a white shirt was labelled trousers, as a bib is that goes on above the waist."""
     mesh, colors, params = painted(body, {"shirt": (240, 240, 240), "trousers": _GREY, "hair": _GREY})
-    joint = {name: body.forward(params).joints[0, k] for k, name in enumerate(body.joint_names)}
+    joint = dict(zip(body.joint_names, body.forward(params).joints[0], strict=True))
     x, y, z = mesh.vertices.T
     trunk = (y > joint["pelvis"][1]) & (y < joint["neck"][1] - 0.06) & (np.abs(x) < joint["left_shoulder"][0])
     front = trunk & (z > joint["spine2"][2])
@@ -385,12 +392,12 @@ def test_a_head_alone_is_labelled_and_nothing_at_all_is_refused(body, scanned):
         label_by_body(empty, body, params)
 
 
-def test_votes_of_few_views_are_completed_by_the_body(body, scanned):
-    mesh, colors, truth, params = scanned
+def test_votes_of_few_views_are_completed_by_the_body(scanned, labelled):
+    mesh, colors, truth, _ = scanned
     votes = np.zeros((mesh.face_count, len(LABELS)))
     front = mesh.face_normals[:, 2] > 0.3
     votes[np.flatnonzero(front), truth[front]] = 3.0
-    prior = label_by_body(mesh, body, params, colors=colors)
+    prior = labelled
     alone = segment_scan(mesh, votes=votes)
     both = segment_scan(mesh, votes=votes, colors=colors, prior=prior)
     assert accuracy(mesh, both.face_labels, truth) > max(accuracy(mesh, alone.face_labels, truth), 0.98)

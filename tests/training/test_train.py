@@ -17,24 +17,21 @@ from smplxpp.capture import open_capture
 from smplxpp.capture.sources import FrameParams
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
-from tests.dolls.dancing import write_dance, write_dance_run
-from tests.pipelines.training_runs import QUICK, quick, train
+from tests.pipelines.training_runs import QUICK, quick
 
 COUNTS = {"fit": 2, "teacher": 3, "bake": 3, "compensate": 3}
 CONFIG = avatar.TrainConfig(gaussians=300, iterations=COUNTS, device="cpu")
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return write_dance(tmp_path_factory.mktemp("captures") / "dance")
+def capture(danced) -> Path:
+    return danced[0]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, capture) -> Path:
+def run(danced) -> Path:
     """The folder of the command."""
-    run = write_dance_run(tmp_path_factory.mktemp("runs") / "dance")
-    assert train(run, capture) == 0
-    return run
+    return danced[1]
 
 
 def train_in_python(run: Path, capture: Path, out: Path, **config):

@@ -109,7 +109,7 @@ def _fit(
     size = shapes.U.detach()[..., shapes.config.head_shapes :].square().sum((0, 1)).sqrt()
     weight = size / size.max().clamp(min=1e-12)
     learned: dict[str, Any] = {"params": list(network.parameters())}
-    optimiser = Adam([learned], weight_decay=weight_decay, fused=False)
+    optimiser = Adam([learned], weight_decay=weight_decay)
     # Fresh noise on theta in each step: the fit is a smooth function about each pose, not a value at it alone.
     noise = torch.Generator().manual_seed(0)
     for step in range(steps):
