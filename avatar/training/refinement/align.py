@@ -207,9 +207,9 @@ class Alignment:
         Pictures of a few hundred pixels keep several threads waiting for each other, so that each frame has one thread.
         """
         threads, rows = torch.get_num_threads(), range(len(self.frames))
-        if min(threads, len(rows)) == 1:
-            results, pool = map(work, rows), None
-        else:
+        results: Iterator[_T] = map(work, rows)
+        pool = None
+        if min(threads, len(rows)) > 1:
             pool = ThreadPoolExecutor(threads, "frame", initializer=torch.set_num_threads, initargs=(1,))
             results = pool.map(work, rows)
         try:
