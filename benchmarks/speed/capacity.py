@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -69,7 +70,7 @@ def main() -> int:
         name, figures = "capacity", foretell(args.subjects, facts, rates, site, args.steps, args.preset)
     print(json.dumps(figures, indent=1))
     if args.store:
-        store_results(name, "python -m benchmarks capacity", figures)
+        store_results(name, f"python -m benchmarks capacity {' '.join(sys.argv[1:])}".replace(" --store", ""), figures)
     return 0
 
 

@@ -18,7 +18,7 @@ from pipelines.batch.jobs import Job, is_address
 from smplxpp.capture import open_capture
 from smplxpp.core import spread
 from smplxpp.core.errors import InputError, require_known
-from smplxpp.core.files.json_file import as_number, as_object, read_json
+from smplxpp.core.files.json_file import as_list, as_number, as_object, read_json
 
 HOUR = 3600.0
 
@@ -57,7 +57,7 @@ class Rates:
         convert_s_mp: decoding, undistortion and writing, a megapixel written of photographs four times as large
             (capture_loader.json: 2.2 images of 3 megapixels a second).
         convert_mb_mp: least and most of a JPEG of quality 95 and its mask, MB a megapixel: a person on black, a room.
-        check_s_mp: `capture check`, a megapixel of at most `check_images` images.
+        check_s: `capture check`, an image and a megapixel of it, of at most `check_images` images.
         check_images: images that a check opens by default.
         start_s: a command's imports and first files.
         build_s: a template (real.json: 0.5 to 1.5 minutes; less where parameters are given).
@@ -78,9 +78,9 @@ class Rates:
 
     convert_s_mp: float = 0.154
     convert_mb_mp: tuple[float, float] = (0.12, 0.35)
-    check_s_mp: float = 0.03
+    check_s: tuple[float, float] = (0.014, 0.014)
     check_images: int = 2000
-    start_s: float = 3.0
+    start_s: float = 2.0
     build_s: float = 30.0
     register_s: float = 0.12
     reconstruct_s_mp: float = 8.0
@@ -96,7 +96,7 @@ class Rates:
     evaluate_s_mp: float = 1.5
     evaluate_gpu_s: float = 0.1
     models: int = 3
-    export_s: float = 6.0
+    export_s: float = 0.5
     run_mb: float = 150.0
     scan_mb: float = 8.0
     factors: Mapping[str, float] = field(default_factory=dict)
@@ -178,7 +178,7 @@ def cost_of(step: str, facts: Facts, rates: Rates, *, preset: str = "cpu", gpu: 
         files, made = 4.0 * facts.images, 2.0 * facts.images
     elif step == "check":
         opened = min(facts.images, rates.check_images)
-        seconds += rates.check_s_mp * facts.megapixels * opened
+        seconds += (rates.check_s[0] + rates.check_s[1] * facts.megapixels) * opened
         read, files = image_mb * opened, 2.0 * opened
     elif step == "reconstruct":
         seconds += rates.reconstruct_s_mp * facts.megapixels * facts.images
@@ -321,9 +321,9 @@ def read_rates(path: Path | None) -> tuple[Rates, Site]:
         values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else [value]
         for one in values:
             as_number(one, subject=f"rates {path}: {name}", least=0.0)
-    if "convert_mb_mp" in content:
-        low, high = content["convert_mb_mp"]
-        content["convert_mb_mp"] = (low, high)
+    for name in {"convert_mb_mp", "check_s"} & content.keys():
+        first, second = as_list(content[name], subject=f"rates {path}: {name}")
+        content[name] = (first, second)
     # Presets that a file does not name keep their rate.
     for name in ("train_core_hours", "train_gpu_hours", "train_images"):
         if name in content:
