@@ -246,8 +246,8 @@ def _parsed(step: str, words: tuple[str, ...]) -> None:
     checked = checked_arguments(name, options, words)
     # What the runner adds itself; an option of the job that says it again is the user's.
     of_capture = ["--capture", "capture"]
-    more = {"train": of_capture, "reconstruct": of_capture, "convert": ["--out", "out"], "metrics": ["truth"]}
-    places = more.get(step, [])
+    more = dict.fromkeys(("train", "evaluate", "reconstruct"), of_capture)
+    places = {**more, "convert": ["--out", "out"], "metrics": ["truth"]}.get(step, [])
     places = [] if places and places[0] in checked else places
     said = io.StringIO()
     try:
