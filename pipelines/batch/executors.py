@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -147,9 +148,13 @@ class RayExecutor:
         ray = _ray()
         self.runs, self.resources, self._ray = runs, resources, ray
         try:
+            # Ray itself tries for minutes to reach an address at which nothing listens.
+            host, _, port = address.partition("://")[2 if "://" in address else 0].rpartition(":")
+            if host and port.isdigit():
+                socket.create_connection((host, int(port)), timeout=20).close()
             if not ray.is_initialized():
                 ray.init(address=address, log_to_driver=False, logging_level="warning")
-        except (RuntimeError, ConnectionError, ValueError) as error:
+        except (RuntimeError, OSError, ValueError) as error:
             raise InputError(
                 f"Ray at {address}",
                 expected=f"a cluster of Ray {ray.__version__} and Python {sys.version.split()[0]}, as are here",

@@ -1,0 +1,194 @@
+"""The same chains on Ray and through Slurm's arrays, and after kills: nothing is lost, nothing runs twice to its end."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipelines.batch.driver import begin_batch, drive, take_batch
+from pipelines.batch.executors import RayExecutor, SlurmExecutor
+from pipelines.batch.hold import JOB_HOLD, read_holder
+from pipelines.batch.jobs import read_jobs
+from pipelines.batch.records import read_batch, read_job, records_of
+from pipelines.batch.run_job import Resources
+from smplxpp import InputError
+
+STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in.py")))
+STEPS = ("check", "build", "export")
+DRIVER = """
+import sys
+from pathlib import Path
+from pipelines.batch import driver
+from pipelines.batch.executors import LocalExecutor
+from pipelines.batch.jobs import read_jobs
+from pipelines.batch.run_job import Resources
+driver.current_key = lambda: "a" * 64
+file = read_jobs(Path(sys.argv[1]))
+with driver.take_batch(file.out) as held:
+    _, jobs = driver.begin_batch(file, Path(sys.argv[1]))
+    resources = Resources(program=tuple(sys.argv[2:]), folder=str(file.folder), max_retries=20)
+    driver.drive(file.out, jobs, LocalExecutor(file.out, resources, workers=2, gpus=[], cores=2), held=held)
+"""
+
+
+@pytest.fixture(autouse=True)
+def one_key(monkeypatch):
+    monkeypatch.setattr("pipelines.batch.driver.current_key", lambda: "a" * 64)
+
+
+def job_file(folder: Path, count: int, seconds: float) -> Path:
+    (folder / "capture").mkdir()
+    lines = [f"  - {{subject: s{k:02}, capture: capture}}" for k in range(count)]
+    wait = f"{{seconds: {seconds}}}"
+    defaults = f"defaults: {{steps: [check, build, export], check: {wait}, build: {wait}, export: {wait}}}"
+    path = folder / "jobs.yaml"
+    path.write_text("\n".join(["out: runs", defaults, "jobs:", *lines]))
+    return path
+
+
+def all_ran_once(runs: Path) -> None:
+    """Every subject is done, and each of its steps came to its end once."""
+    records = records_of(runs, read_batch(runs))
+    assert {record.state for record in records} == {"done"}, [
+        (record.subject, [(step.step, step.state, step.error) for step in record.steps])
+        for record in records
+        if record.state != "done"
+    ]
+    for record in records:
+        assert (runs / record.subject / "ends.txt").read_text().split() == list(STEPS)
+
+
+def run(path: Path, executor) -> object:
+    file = read_jobs(path)
+    with take_batch(file.out) as held:
+        _, jobs = begin_batch(file, path)
+        return drive(file.out, jobs, executor, held=held)
+
+
+@pytest.mark.slow
+def test_a_driver_that_is_killed_leaves_no_command_behind_and_a_second_goes_on(tmp_path):
+    path = job_file(tmp_path, 6, 0.4)
+    command = [sys.executable, "-c", DRIVER, str(path), *STAND_IN]
+    chance = random.Random(0)
+    for _ in range(3):
+        driver = subprocess.Popen(command)
+        until = time.monotonic() + 900
+        seen = chance.randrange(1, 6)
+        while len(list(tmp_path.glob("runs/*/*.tries"))) < seen and driver.poll() is None and time.monotonic() < until:
+            time.sleep(0.05)
+        time.sleep(chance.random())
+        driver.send_signal(signal.SIGKILL)
+        driver.wait()
+    assert subprocess.run(command, timeout=900, check=False).returncode == 0
+    all_ran_once(tmp_path / "runs")
+
+
+@pytest.mark.slow
+def test_ten_random_kills_of_commands_cost_ten_attempts(tmp_path):
+    path = job_file(tmp_path, 6, 0.5)
+    driver = subprocess.Popen([sys.executable, "-c", DRIVER, str(path), *STAND_IN])
+    chance, killed, until = random.Random(1), 0, time.monotonic() + 1800
+    while killed < 10 and driver.poll() is None and time.monotonic() < until:
+        time.sleep(0.1 + 0.3 * chance.random())
+        found = [read_job(tmp_path / "runs", folder.name) for folder in tmp_path.glob("runs/s*")]
+        working = [s.pid for record in found if record for s in record.steps if s.state == "running" and s.pid]
+        if working:
+            try:
+                os.killpg(chance.choice(working), signal.SIGKILL)
+                killed += 1
+            except ProcessLookupError:
+                continue
+    assert driver.wait(timeout=900) == 0
+    all_ran_once(tmp_path / "runs")
+    records = records_of(tmp_path / "runs", read_batch(tmp_path / "runs"))
+    # A kill may come between the command's end and the record of it, and then costs nothing.
+    assert 18 + 5 <= sum(step.attempts for record in records for step in record.steps) <= 18 + killed
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_that_loses_a_node_loses_nothing(tmp_path):
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    path = job_file(tmp_path, 8, 0.5)
+    with _quiet():
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+        node = cluster.add_node(num_cpus=2)
+        try:
+            resources = Resources(program=STAND_IN, folder=str(tmp_path), max_retries=3)
+            executor = RayExecutor(tmp_path / "runs", resources, address=cluster.address)
+            lost = []
+
+            def report(progress) -> None:
+                # In the middle: some are done, and others run.
+                if not lost and progress.states["done"] >= 2:
+                    lost.append(True)
+                    cluster.remove_node(node, allow_graceful=False)
+
+            file = read_jobs(path)
+            with take_batch(file.out) as held:
+                _, jobs = begin_batch(file, path)
+                drive(file.out, jobs, executor, report=report, held=held)
+            assert lost
+        finally:
+            ray.shutdown()
+            cluster.shutdown()
+    all_ran_once(tmp_path / "runs")
+
+
+def test_ray_that_does_not_answer_is_told(tmp_path):
+    pytest.importorskip("ray")
+    with pytest.raises(InputError, match="ray start --head"):
+        RayExecutor(tmp_path, Resources(), address="127.0.0.1:1")
+
+
+def test_extras_that_are_not_installed_are_told(tmp_path, monkeypatch):
+    for name in ("ray", "submitit"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=r"a batch on Ray needs ray.*extra cluster"):
+        RayExecutor(tmp_path, Resources(), address="auto")
+    with pytest.raises(ImportError, match=r"a batch on Slurm needs submitit.*extra cluster"):
+        SlurmExecutor(tmp_path, Resources())
+
+
+@pytest.mark.slow
+def test_slurm_arrays_run_the_same_chains_by_submitits_own_stand_in(tmp_path):
+    pytest.importorskip("submitit")
+    path = job_file(tmp_path, 3, 0.0)
+    resources = Resources(program=STAND_IN, folder=str(tmp_path))
+    with _quiet():
+        progress = run(path, SlurmExecutor(tmp_path / "runs", resources, cluster="local"))
+    assert progress.states["done"] == 3
+    all_ran_once(tmp_path / "runs")
+
+
+def test_what_slurm_takes_back_goes_on_in_the_next_array(tmp_path):
+    submitit = pytest.importorskip("submitit")
+    from pipelines.batch.executors import RequeuedJob
+
+    path = job_file(tmp_path, 1, 0.0)
+    job, resources = read_jobs(path).jobs[0], Resources(program=STAND_IN, folder=str(tmp_path))
+    again = RequeuedJob().checkpoint(job, tmp_path / "runs/s00", resources)
+    assert isinstance(again, submitit.helpers.DelayedSubmission)
+    assert again.function(*again.args)["state"] == "done" and not read_holder(tmp_path / f"runs/s00/{JOB_HOLD}")
+
+
+class _quiet:
+    """Warnings of packages that are not ours are no errors here."""
+
+    def __enter__(self):
+        import warnings
+
+        self.caught = warnings.catch_warnings()
+        self.caught.__enter__()
+        warnings.simplefilter("ignore")
+
+    def __exit__(self, *error):
+        self.caught.__exit__(*error)
