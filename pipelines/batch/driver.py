@@ -117,6 +117,8 @@ def drive(
     pending = deque(Task.of(job, parts_of(job, splits=executor.splits)) for job in jobs)
     progress = Progress(total or len(jobs), Counter(done=(total or len(jobs)) - len(jobs), waiting=len(jobs)))
     tries: Counter[tuple[str, tuple[str, ...]]] = Counter()
+    for job in jobs:
+        executor.check(job)
     try:
         while pending or progress.running:
             if not progress.halted:

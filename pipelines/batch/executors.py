@@ -47,6 +47,10 @@ class Executor(Protocol):
     splits: bool
     """Whether a chain is cut where it begins or ends to need a GPU."""
 
+    def check(self, job: Job) -> None:
+        """Raise `InputError` where a job asks for more than there is."""
+        ...
+
     def room(self, task: Task) -> bool:
         """Return whether a task can begin, or be queued, now."""
         ...
@@ -81,6 +85,11 @@ class LocalExecutor:
         self._free = dict.fromkeys(gpus, 1.0)
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="batch")
         self._running: dict[Future[dict[str, Any]], tuple[Task, dict[str, float]]] = {}
+
+    def check(self, job: Job) -> None:
+        """Refuse a job that asks for more GPUs than there are; where there are none, it trains on cores."""
+        if self._free and job.needs.gpus > len(self._free):
+            raise _too_many_gpus(job, f"at most {len(self._free)}, which this machine has")
 
     def room(self, task: Task) -> bool:
         """Return whether a worker and the task's GPUs are free."""
@@ -121,12 +130,6 @@ class LocalExecutor:
         wanted = task.job.needs.gpus
         if not task.on_gpu or not self._free:
             return {}
-        if wanted > len(self._free):
-            raise InputError(
-                f"{task.job.subject}: resources: gpus",
-                expected=f"at most {len(self._free)}, which this machine has",
-                received=f"{wanted:g}",
-            )
         share, tiny = min(wanted, 1.0), 1e-6
         free = [gpu for gpu, left in self._free.items() if left > share - tiny]
         count = max(1, int(wanted))
@@ -162,6 +165,12 @@ class RayExecutor:
                 remedy="start it with `ray start --head`, or install its version of Ray here",
             ) from None
         self._running: dict[Any, Task] = {}
+
+    def check(self, job: Job) -> None:
+        """Refuse a job that asks for GPUs of a cluster without any, for which it would wait for ever."""
+        trains = any(STEPS[step].on_gpu for step in job.steps)
+        if trains and job.needs.gpus and not self._ray.cluster_resources().get("GPU"):
+            raise _too_many_gpus(job, "0 on a cluster without GPUs")
 
     def room(self, task: Task) -> bool:
         """Return True: Ray queues what does not fit."""
@@ -223,6 +232,9 @@ class SlurmExecutor:
         self._submitit = _submitit()
         self._waiting: list[Task] = []
         self._running: list[tuple[Task, Any]] = []
+
+    def check(self, job: Job) -> None:
+        """Leave it to Slurm, which knows its partitions."""
 
     def room(self, task: Task) -> bool:
         """Return True: Slurm queues what does not fit."""
@@ -300,6 +312,15 @@ def gpus_here() -> list[str]:
         return []
     count = sum(line.startswith("GPU ") for line in done.stdout.splitlines())
     return [str(number) for number in range(count)]
+
+
+def _too_many_gpus(job: Job, expected: str) -> InputError:
+    return InputError(
+        f"{job.subject}: resources: gpus",
+        expected=expected,
+        received=f"{job.needs.gpus:g}",
+        remedy="`resources: {gpus: 0}` in the job file trains on cores",
+    )
 
 
 def _ray() -> Any:

@@ -115,7 +115,8 @@ class Hold:
         """Renew the file until the end, or until it bears another's mark."""
         while not self._ended.wait(self.beat):
             with suppress(OSError):  # a server that does not answer: its next answer counts
-                if read_holder(self.path).get("mark") != self._mark:
+                # A file that cannot be read for a moment bears nobody's mark.
+                if read_holder(self.path).get("mark", self._mark) != self._mark:
                     self.lost = True
                     return
                 os.utime(self.path)

@@ -98,7 +98,7 @@ STEPS: Mapping[str, StepKind] = {
     "evaluate": StepKind(
         ("evaluate",), "pipelines.commands.evaluate", "Evaluate", on_gpu=True, stages=(EVALUATE_STAGE, RELIGHT_STAGE)
     ),
-    "export": StepKind(("export",), "pipelines.commands.export", "Export", files=("{subject}.avatar",)),
+    "export": StepKind(("export",), "pipelines.commands.export", "Export", files=("{subject}.avatar", "{subject}.glb")),
     "web": StepKind(("web",), "pipelines.commands.web", "Web", files=("player.html",)),
 }
 """The steps in the order in which they run."""
@@ -192,7 +192,8 @@ class Job:
             "build": [run, *source],
             "train": [run, *source],
             "evaluate": [run, *source],
-            "export": [run, "--out", str(folder / f"{self.subject}.avatar")],
+            # A student for our players; without a training the rigged template.
+            "export": [run, "--out", str(folder / f"{self.subject}.{'avatar' if 'train' in self.steps else 'glb'}")],
             "web": [run, "--single-file", str(folder / "player.html")],
         }
         own = {name.replace("_", "-") for name in given}

@@ -1,4 +1,4 @@
-"""The same chains on Ray and through Slurm's arrays, and after kills: nothing is lost, nothing runs twice to its end."""
+"""The same chains on Ray and through Slurm, and after kills: nothing is lost, nothing runs twice to its end."""
 
 from __future__ import annotations
 
