@@ -80,14 +80,11 @@ def _print(report: dict[str, Any], console: Console, out: Path | None) -> None:
     table = Table(title=f"{report['path']}: {size}", title_justify="left")
     for column in ("part", "finding", "value", "limit", ""):
         table.add_column(column, justify="right" if column == "value" else "left", overflow="fold")
-    passed = 0
-    for row in report["checks"]:
-        if row["status"] == "pass":
-            passed += 1
-            continue
+    faults = [row for row in report["checks"] if row["status"] != "pass"]
+    for row in faults:
         value = f"{row['value']:.4g} {row['unit']}".strip()
         table.add_row(row["part"], row["name"], value, row["gate"], row["status"], style=styles[row["status"]])
-    if table.row_count:
+    if faults:
         console.print(table)
     if "not_posed" in report.get("rig", {}):
         console.print(f"no stress poses: {report['rig']['not_posed']}", style="yellow", markup=False)
@@ -95,7 +92,8 @@ def _print(report: dict[str, Any], console: Console, out: Path | None) -> None:
         if of["border_loops"] or of["nonmanifold_vertices"]:
             said = f"{name}: {of['components']} pieces, {of['border_loops']} borders"
             said += f", the longest {max(of['border_lengths_mm']):,.0f} mm" if of["border_loops"] else ""
-            touching = f", surfaces touch at {of['nonmanifold_vertices']} vertices"
-            console.print(said + touching * bool(of["nonmanifold_vertices"]), markup=False, highlight=False)
+            said += f", touching at {n} vertices" if (n := of["nonmanifold_vertices"]) else ""
+            console.print(said, markup=False, highlight=False)
     verdict, where = report["verdict"], f"; faults in colour: {out / 'faults.ply'}" if out else ""
-    console.print(f"[{styles[verdict]}]{verdict}[/]: {passed} of {len(report['checks'])} checks pass; {size}{where}")
+    passed = f"{len(report['checks']) - len(faults)} of {len(report['checks'])} checks pass"
+    console.print(f"[{styles[verdict]}]{verdict}[/]: {passed}; {size}{where}")

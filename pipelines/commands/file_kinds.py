@@ -111,12 +111,10 @@ def _mesh_facts(path: Path) -> list[str]:
 
     file = read_mesh(path)
     size = " x ".join(f"{side:.4g}" for side in np.ptp(file.mesh.vertices, axis=0))
-    colors = "coloured" if file.vertex_colors is not None else "no colours"
-    rig = f", {len(file.rig.names)} joints" if file.rig is not None else ""
-    return [
-        f"{file.mesh.vertex_count:,} vertices, {file.mesh.face_count:,} faces, {colors}{rig}",
-        f"{size} along x, y and z, in the units of the file",
-    ]
+    facts = "coloured" if file.vertex_colors is not None else "no colours"
+    facts += f", {len(file.rig.names)} joints" if file.rig is not None else ""
+    counts = f"{file.mesh.vertex_count:,} vertices, {file.mesh.face_count:,} faces"
+    return [f"{counts}, {facts}", f"{size} along x, y and z, in the units of the file"]
 
 
 def _params_facts(path: Path) -> list[str]:

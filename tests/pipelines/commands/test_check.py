@@ -62,7 +62,7 @@ def test_borders_are_counted_in_words_and_coloured(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     border = np.linalg.norm(np.diff(open_ball.vertices[open_ball.border_edges], axis=1), axis=2).sum() * 1e3
     assert f"mesh: 1 pieces, 1 borders, the longest {border:,.0f} mm" in said
-    assert "faults.ply" in said and "touch" not in said
+    assert "faults.ply" in said and "touching" not in said
     marked = (read_mesh(tmp_path / "out" / "faults.ply").vertex_colors != 190).any(axis=1)
     assert set(np.unique(open_ball.border_edges)) <= set(np.flatnonzero(marked)) and marked.mean() < 0.2
 
