@@ -97,7 +97,7 @@ class _Registration:
         initial = state = self._start()
         everything = np.arange(len(self.frames))
         if self.observed.shape is not None:
-            state, confidence = self._solve_windows(replace(state, betas=self._given_shape(self.observed.shape)))
+            state, confidence = self._solve_windows(self._with_shape(state, self.observed.shape))
         elif len(self.frames) <= self.config.window:
             # A short take is one window, in which shape and poses are solved together.
             state, equations = self._solve(state, _Window(everything, np.ones(len(everything), dtype=bool)), True)
@@ -179,12 +179,20 @@ class _Registration:
             )
         return state
 
-    def _given_shape(self, shape: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
-        """Return a shape that is given with as many betas as the body has."""
+    def _with_shape(self, state: BodyState, shape: Float64[np.ndarray, " B"]) -> BodyState:
+        """Return poses that named points give, with a shape that is given.
+
+        The poses are found with a free shape first, because bones of another length than the start's may fold an elbow
+        the wrong way, from where surfaces do not lead back.
+        """
         given, count = np.atleast_1d(np.asarray(shape, dtype=np.float64)).ravel(), self.body.num_betas
         if np.abs(given[count:]).max(initial=0.0) > 0 or not np.isfinite(given).all():
             raise InputError("shape", expected=f"at most {count} finite betas", received=f"{len(given)}")
-        return np.concatenate([given[:count], np.zeros(max(0, count - len(given)))])
+        terms = self._terms(state, np.arange(len(self.frames)))
+        if terms.points():
+            scales = np.geomspace(40.0, 1.0, self.config.joint_steps)
+            state, _ = self._step("joints", state, terms, self.config.joint_steps, True, scales)
+        return replace(state, betas=np.concatenate([given[:count], np.zeros(max(0, count - len(given)))]))
 
     # -- solving
 
