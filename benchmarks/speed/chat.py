@@ -11,10 +11,10 @@ Then the same sentences are typed, by one page and by ten at a time, which all w
 message until the sound of its answer has come, and the memory of the process.
 
 In a long talk a page of headless Chromium types 200 messages, each once the answer to the last begins to be heard:
-seconds until it is, memory of the server and of the page's objects after some and after all of them. With `--minutes`
-it types for so long, each message once the last answer was said to its end, and memory is looked at every minute; the
-server is the command's own process then, and two pictures a second are drawn, because a CPU draws them. Parts that
-are left out keep the figures of their last measurement.
+seconds until it is, memory of the server's process, of the browser and of the page's objects after some and after all
+of them. With `--minutes` it types for so long, each message once the last answer was said to its end; memory is looked
+at every minute from the fifth on, and two pictures a second are drawn, because a CPU draws them. Parts that are left
+out keep the figures of their last measurement.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ SILENCE = 2.0
 """Seconds between two sentences at least."""
 PAGES = 10
 """Pages that type at a time: more than a small machine has cores, by far."""
-EXCHANGES, SOME = 200, 40
-"""Messages of a long talk, and those after which everything that is kept for good should be there."""
+EXCHANGES, SOME, EARLY = 200, 40, 5.0
+"""Messages of a long talk, and those, or the minutes, after which everything that is kept for good should be there."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,11 @@ class ChatBenchmark:
 
         kept = RESULTS / "chat.json"
         figures: dict[str, Any] = json.loads(kept.read_text())["figures"] if kept.exists() else {}
+        figures.setdefault("a long talk", {})
         bundle = avatar.open_bundle(self.avatar)
         if self.minutes:
-            figures["a lasting talk"] = {"all": _lasting_talk(self.avatar, self.minutes)}
-        if self.parts:
+            figures["a long talk"] |= {"to the end": _long_talk(self.avatar, self.minutes)}
+        if {"spoken", "typed"} & set(self.parts):
             command = Chat(self.avatar)
             cast = command.engines(bundle, command.partner())
             cast.voice.say("Hello.")
@@ -103,7 +104,7 @@ class ChatBenchmark:
         if "typed" in self.parts:
             figures["typed"] = {f"{pages} at a time": _typed(self.avatar, cast, pages) for pages in (1, PAGES)}
         if "long" in self.parts:
-            figures["a long talk"] = {"all": _long_talk(self.avatar, cast)}
+            figures["a long talk"] |= {"interrupted": _long_talk(self.avatar)}
         measured = (*self.parts, *(["lasting"] if self.minutes else []))
         today = datetime.date.today().isoformat()
         figures["dates"] = {**figures.get("dates", {}), **dict.fromkeys(measured, today)}
@@ -194,68 +195,49 @@ def _typed(avatar: Path, cast: ChatParts, pages: int) -> dict[str, Any]:
     }
 
 
-def _long_talk(avatar: Path, cast: ChatParts) -> dict[str, Any]:
-    """Let a page of Chromium type many messages; return latencies, memory, the page's sizes and its first picture."""
-    server = ChatServer(avatar.read_bytes(), cast, name="benchmark")
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    memory, seconds = list[dict[str, float]](), list[float]()
-    first = "setInterval(() => { if (window.smplxppPlayer?.player?.pictures) window.first ??= performance.now(); }, 5);"
-    with _page_at(server.address, first) as page:
-        for k in range(EXCHANGES):
-            seconds.append(page.evaluate(_TYPE % json.dumps(SENTENCES[k % len(SENTENCES)])))
-            if (k + 1) % SOME == 0:
-                memory.append(_memory(page, os.getpid()))
-                print(f"{k + 1} messages: {memory[-1]}", flush=True)
-        shown = page.evaluate("window.first / 1000")
-    server.shutdown()
-    return {
-        "messages": EXCHANGES,
-        "median": round(float(np.median(seconds)), 3),
-        "worst": round(max(seconds), 3),
-        f"resident MB after {SOME}": memory[0]["server"],
-        "resident MB": memory[-1]["server"],
-        f"MB of the page after {SOME}": memory[0]["objects"],
-        "MB of the page": memory[-1]["objects"],
-        "seconds to the first picture": round(shown, 2),
-        "kB of the player": len(PLAYER.read_bytes()) // 1000,
-        "kB of it compressed": len(gzip.compress(PLAYER.read_bytes())) // 1000,
-        "load of the machine": round(os.getloadavg()[0], 1),
-    }
+def _long_talk(avatar: Path, minutes: float = 0.0) -> dict[str, Any]:
+    """Let a page of Chromium type to a server of its own process; return latencies, memory and the page's sizes.
 
-
-def _lasting_talk(avatar: Path, minutes: float) -> dict[str, Any]:
-    """Let a page of Chromium talk for so long with a server of its own process; return memory of both over time."""
+    Args:
+        avatar: the bundle. minutes: how long; 0: as many messages as are asked for, each interrupting the last answer.
+    """
     command = [sys.executable, "-m", "pipelines.cli", "chat", str(avatar), "--serve", "--no-browser", "--no-token"]
-    calm = "window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 500);"
-    memory, seconds = list[dict[str, float]](), list[float]()
+    script = (
+        "setInterval(() => { if (window.smplxppPlayer?.player?.pictures) window.first ??= performance.now(); }, 5);"
+    )
+    script += "window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 500);" * (minutes > 0)
+    memory, seconds, early = list[dict[str, float]](), list[float](), min(EARLY, minutes / 2)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         address = next(found[0] for line in server.stdout if (found := re.search(r"http://\S+", line)))
         threading.Thread(target=server.stdout.read, daemon=True).start()
         try:
-            with _page_at(address, calm, (240, 300)) as page:
-                began = time.monotonic()
-                while (passed := time.monotonic() - began) < 60 * minutes:
+            with _page_at(address, script, (240, 300) if minutes else (320, 400)) as page:
+                began, passed = time.monotonic(), 0.0
+                while passed < minutes if minutes else len(seconds) < EXCHANGES:
                     seconds.append(page.evaluate(_TYPE % json.dumps(SENTENCES[len(seconds) % len(SENTENCES)])))
-                    page.until("answered && !dialogue.stage.speaking")
-                    if passed >= 60 * len(memory):
-                        memory.append({"minute": round(passed / 60, 1), **_memory(page, server.pid)})
+                    if minutes:
+                        page.until("answered && !dialogue.stage.speaking")
+                    passed = (time.monotonic() - began) / 60
+                    if passed >= early + len(memory) if minutes else len(seconds) % SOME == 0:
+                        memory.append({"minute": round(passed, 1), **_memory(page, server.pid)})
                         print(f"{len(seconds)} messages: {memory[-1]}", flush=True)
-                memory.append({"minute": round(minutes, 1), **_memory(page, server.pid)})
+                shown = page.evaluate("window.first / 1000")
         finally:
             server.terminate()
-    # What a talk needs is there after five minutes; growth is the least-squares slope from there on.
-    late = [row for row in memory if row["minute"] >= min(5.0, 0.5 * minutes)]
-    growth = {part: np.polyfit([row["minute"] for row in late], [row[part] for row in late], 1)[0] for part in late[0]}
+    # A browser frees memory when it likes: the least of a while is what is really held.
+    while_, parts = max(1, len(memory) // 6), ("server", "browser", "objects")
     return {
-        "minutes": minutes,
         "messages": len(seconds),
+        "minutes": round(passed, 1),
         "median": round(float(np.median(seconds)), 3),
         "worst": round(max(seconds), 3),
-        "early": late[0],
-        "at the end": memory[-1],
-        "most": {part: max(row[part] for row in memory) for part in memory[0]},
-        "growth an hour": {part: round(60 * float(slope), 2) for part, slope in growth.items()},
+        "MB at first": {part: min(row[part] for row in memory[:while_]) for part in parts},
+        "MB at last": {part: min(row[part] for row in memory[-while_:]) for part in parts},
+        "MB at most": {part: max(row[part] for row in memory) for part in parts},
+        "seconds to the first picture": round(shown, 2),
+        "kB of the player": len(PLAYER.read_bytes()) // 1000,
+        "kB of it compressed": len(gzip.compress(PLAYER.read_bytes())) // 1000,
         "load of the machine": round(os.getloadavg()[0], 1),
     }
 
@@ -286,13 +268,11 @@ def _page_at(address: str, script: str, size: tuple[int, int] = (320, 400)) -> I
 
 
 def _memory(page: Page, server: int) -> dict[str, float]:
-    """Return MB of the server, of the browser's processes and of the page's objects, and how many elements it has."""
+    """Return MB of the server, of the browser's processes and of the page's objects."""
     page.send("HeapProfiler.collectGarbage")
-    objects, elements = page.evaluate(
-        "[performance.memory.usedJSHeapSize / 1e6, document.querySelectorAll('*').length]"
-    )
+    objects = page.evaluate("performance.memory.usedJSHeapSize / 1e6")
     browser = sum(_resident(process) for process in page.processes())
-    return {"server": _resident(server), "browser": browser, "objects": round(objects, 1), "elements": elements}
+    return {"server": _resident(server), "browser": browser, "objects": round(objects, 1)}
 
 
 def _resident(process: int) -> int:

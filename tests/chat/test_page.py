@@ -224,10 +224,11 @@ def test_an_avatar_in_a_page_of_the_same_site_talks_with_the_server(talking):
         "import('./player.js').then(async ({createAvatar}) => { const canvas = document.createElement('canvas');"
         " canvas.style.cssText = 'width: 100px; height: 100px'; document.body.append(canvas); window.told = [];"
         " window.guest = createAvatar(canvas, {url: 'me.avatar'}); window.dialogue = await guest.converse('./');"
+        " window.early = [dialogue.connection.open, dialogue.type('hello')];"
         " for (const event of ['hello', 'heard', 'answer']) dialogue.on(event, it => told.push([event, it])); })"
     )
-    page.until("dialogue.stage.shown && told.length", "the server shows nobody")
-    assert page.evaluate("dialogue.type('hello')") is True
+    page.until("window.dialogue?.stage.shown && told.length", "the server shows nobody")
+    assert page.evaluate("early") == [False, True]  # what is said at once is said when somebody is there
     page.until("told.some(([event, {text}]) => event === 'answer' && /How are you/.test(text))")
     assert page.evaluate("told.map(([event]) => event).join().startsWith('hello,heard,answer')")
     assert page.evaluate("guest.player.performer !== null && (dialogue.close(), guest.player.performer === null)")

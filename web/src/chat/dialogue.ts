@@ -37,6 +37,8 @@ export class Dialogue {
   /** The last turn that is known, and the last one that was stopped: sentences of it may still be on their way. */
   private turn = 0;
   private stopped = 0;
+  /** What was typed before the first connection; null after it. */
+  private early: string[] | null = [];
 
   /** @param address of the websocket. */
   constructor(private readonly player: Animator, address: string) {
@@ -70,6 +72,8 @@ export class Dialogue {
     this.connection.onopen = () => {
       this.stage.reset();
       this.turn = this.stopped = 0;
+      for (const text of this.early ?? []) this.connection.send({ kind: "say", text });
+      this.early = null;
       this.emit("open", null);
     };
     this.connection.onlost = (final) => {
@@ -89,10 +93,17 @@ export class Dialogue {
     return () => void listeners.delete(listener);
   }
 
-  /** Says something to the avatar; what that says ends. To be called by a click or a key. @returns whether somebody is there. */
+  /**
+   * Says something to the avatar; what that says ends. To be called by a click or a key. Before the first connection it waits
+   * for that. @returns whether somebody is there, or may come.
+   */
   type(text: string): boolean {
     this.stage.unlock();
     this.stop();
+    if (this.early) {
+      this.early = [text];
+      return true;
+    }
     return this.connection.send({ kind: "say", text });
   }
 
