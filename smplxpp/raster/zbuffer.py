@@ -175,7 +175,8 @@ def hiding_parts(
     """Return for each face of part 0 the part that hides it from outside; 0 for one that shows, and for other parts.
 
     A face is hidden if other parts lie before its centre in more than 0.7 of the views that part 0 alone would show it
-    in; of these parts it is the most frequent.
+    in; of these parts it is the most frequent. Views are at most 30 degrees from level (+Y up), because from below a
+    skirt hides nothing.
 
     Example:
         >>> outer = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]])
@@ -190,7 +191,9 @@ def hiding_parts(
     before = np.zeros((len(own), int(part.max(initial=0)) + 1))
     centers = mesh.face_centers[own]
     skin = TriangleMesh(mesh.vertices, mesh.faces[own])
-    for camera in outside_views(mesh, views=views, resolution=resolution) if len(own) else []:
+    level = np.abs(view_directions(views)[:, 1]) <= 0.5
+    cameras = outside_views(mesh, views=views, resolution=resolution) if len(own) else []
+    for camera in (one for one, chosen in zip(cameras, level, strict=False) if chosen):
         # The centres that part 0 alone shows, and the part of the nearest face at their pixels.
         x, y, z = camera.screen_from_world(centers).T[:3]
         at = np.floor(y).astype(int), np.floor(x).astype(int)
