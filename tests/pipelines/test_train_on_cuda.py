@@ -72,6 +72,8 @@ def smiling() -> Template:
     return replace(made, body=replace(made.body, exprdirs=0.002 * some))
 
 
+# A skirt that few steps have tracked hangs on edges at the limit of what holds.
+@pytest.mark.filterwarnings("ignore:simulated clothes:smplxpp.core.errors.GeometryWarning")
 def test_every_stage_with_loose_clothes_and_their_evaluation(tmp_path, monkeypatch):
     run, capture = tmp_path / "run", write_skirted(tmp_path / "skirted")
     for path in (TEMPLATE, PARAMS):
