@@ -1,18 +1,19 @@
 """Measure bodies found in bare scans against the truth, and the labels that follow from them.
 
-    python -m benchmarks scan_alone [--people 12] [--who NAME ...] [--seed 0] [--variants "as it is" "3 mm noise"]
+    python -m benchmarks scan_alone [--people 12] [--who NAME ...] [--seed 0] [--things KIND ...]
+        [--variants "as it is" "3 mm noise"]
 
 Scans are the fixture's, the captures' that are there, and procedural people (`synth.people`); each is read as a
-file without parameters, labels, units and axis would be, and gone through as `smplxpp build --scan` does. The truth is
-looked at in measuring alone. Wrong facing: the pelvis' front more than 90 degrees off. Labels are those of
-`label_by_body`, on faces that the scanner saw.
+file without parameters, labels, units and axis would be, and gone through as `smplxpp build --scan` does. With --things
+two of the people hold or wear them (`smplxpp.people.things`). The truth is looked at in measuring alone. Wrong facing:
+the pelvis' front more than 90 degrees off. Labels are those of `label_by_body`, on faces that the scanner saw.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -23,13 +24,18 @@ from benchmarks.support.results import store_results
 from smplxpp.body import BodyModel, load_body
 from smplxpp.build.locate import certain_labels
 from smplxpp.clean import convert_points, find_scan_frame
-from smplxpp.core import BodyParams, InputError
-from smplxpp.people import VARIANTS, PersonScan, people, person, variant
+from smplxpp.core import OBJECT, BodyParams, InputError
+from smplxpp.people import CAST, VARIANTS, PersonScan, people, person, variant
+from smplxpp.people.making import make_person
+from smplxpp.people.scan_simulation import ScanConfig
+from smplxpp.people.things import THINGS, WORN, Thing
 from smplxpp.register.locate import locate_body
 from smplxpp.segment import label_by_body
 
 BODY_JOINTS = 22
 COMMAND = "python -m benchmarks scan_alone"
+_BEARERS = ("woman T-shirt jeans bob, A", "heavy man T-shirt shorts bald, T")
+_SCAN = ScanConfig(cell=0.008, views=26, resolution=512, faces=25000)
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,8 @@ class ScanAlone:
     """These of them by name (`smplxpp.people.cast`), in place of the first ones."""
     outsiders: bool = False
     """The people whose surface the body model cannot reach, in place of the first ones of the cast."""
+    things: tuple[str, ...] = ()
+    """Kinds of things that two people of the cast hold or wear, or "all", in place of the first ones."""
     seed: int = 0
     """Seed of the procedural people."""
     captured: bool = True
@@ -70,6 +78,13 @@ class ScanAlone:
 
     def _scans(self) -> Iterator[PersonScan]:
         names = tuple(VARIANTS) if "all" in self.variants else self.variants
+        if self.things:
+            for kind in (*THINGS, *WORN) if "all" in self.things else self.things:
+                for who, side in zip(_BEARERS, ("left", "right"), strict=True):
+                    thing = Thing(kind, side, (90, 50, 20))
+                    made = make_person(who, CAST[who], load_body(), seed=self.seed, scan=_SCAN, thing=thing)
+                    yield from (variant(replace(made, name=f"{who}: {kind}"), one) for one in names)
+            return
         if self.captured:
             for name in captured_names():
                 yield from (variant(captured(name), one) for one in names)
@@ -107,6 +122,10 @@ def measured(scan: PersonScan, body: BodyModel, *, labels: bool) -> dict[str, fl
     if labels:
         labelled = label_by_body(mesh, body, found.params, colors=scan.colors)
         row["labels_right"] = float((labelled.face_labels == scan.face_labels)[scan.seen].mean())
+        true, own = (labels == OBJECT.id for labels in (scan.face_labels, labelled.face_labels))
+        if true.any():
+            # Intersection over union of the thing's area.
+            row["thing_iou"] = float(mesh.face_areas[true & own].sum() / mesh.face_areas[true | own].sum())
     return row
 
 
@@ -138,6 +157,7 @@ def line(row: dict[str, float | str | bool | list[str]]) -> str:
     shown += f"facing {row['facing_degrees']:.0f} degrees off, "
     shown += f"{'' if row['frame_found'] else 'WRONG UNITS OR AXIS, '}confidence {row['confidence']:.2f}, "
     shown += f"labels {row['labels_right']:.1%}, " if "labels_right" in row else ""
+    shown += f"thing {row['thing_iou']:.2f}, " if "thing_iou" in row else ""
     return f"{row['scan']}: {shown}{row['cpu_seconds']:.0f} s" + "".join(f"; {p}" for p in row["problems"])
 
 

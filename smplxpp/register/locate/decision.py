@@ -113,9 +113,9 @@ def findings_of(
     out, trust = [], 1.0
     # What no body explains may be no person at all, or one beside furniture; parts of a person are then no finding.
     foreign = bool(no_person(best)) or best.misfit.bare > _BOUNDS.good_bare
-    other = unlike_person(mesh, surface) if foreign else ""
-    if other:
-        return (other,), 0.1
+    shape = unlike_person(mesh, surface) if foreign else ""
+    if shape:
+        return (shape,), 0.1
     four_legged = foreign and feet_of(surface) > 2
     # Several people: pieces of their size beside each other, or two heads in the upper half.
     apart = people_apart(mesh)
