@@ -62,15 +62,15 @@ def main() -> int:
             spent = {step: [(row["foretold_s"], row["measured_s"]) for row in rows] for step, rows in figures.items()}
             own = learned(rates, spent)
             atomic_write_text(args.rates_out, json.dumps({**asdict(own), "site": asdict(site)}, indent=1) + "\n")
-        name, figures = "capacity_check", {"steps": figures, "of the sums": of_sums(figures)}
+        name, found = "capacity_check", {"steps": figures, "of the sums": of_sums(figures)}
     else:
         cameras, frames = args.held_out
         megapixels = args.size[0] * args.size[1] / 1e6
         facts = Facts(args.frames, args.cameras, megapixels, args.source_mb, cameras, frames)
-        name, figures = "capacity", foretell(args.subjects, facts, rates, site, args.steps, args.preset)
-    print(json.dumps(figures, indent=1))
+        name, found = "capacity", foretell(args.subjects, facts, rates, site, args.steps, args.preset)
+    print(json.dumps(found, indent=1))
     if args.store:
-        store_results(name, f"python -m benchmarks capacity {' '.join(sys.argv[1:])}".replace(" --store", ""), figures)
+        store_results(name, f"python -m benchmarks capacity {' '.join(sys.argv[1:])}".replace(" --store", ""), found)
     return 0
 
 

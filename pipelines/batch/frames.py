@@ -39,7 +39,6 @@ from smplxpp.metrics import point_to_surface
 
 OVERLAP = 10
 """Frames that a chunk of a registration has beside its own on each side: as many as the windows of one registration."""
-_MOST_INSIDE = 400  # frames inside of chunks that are compared with the borders: the 99th percentile has four above it
 JUMP = Gate("x", 1.5, 3.0, higher_is_better=False)
 """Largest jump at a border, as a share of the 99th percentile of the jumps inside of chunks. A motion's own jumps reach
 1 to 1.4 there; a chunk with 10 mm more of one thing reaches 3 and more."""
@@ -168,7 +167,8 @@ def _motion_jumps(
     """
     order, at_border = sorted(rows), {frame for border in borders for frame in border}
     beside = {frame: (before, after) for before, frame, after in zip(order, order[1:], order[2:], strict=False)}
-    others = spread([frame for frame in beside if frame not in at_border], _MOST_INSIDE)
+    most = 400  # frames inside of chunks that are compared: the 99th percentile has four above it
+    others = spread([frame for frame in beside if frame not in at_border], most)
     known: dict[int, Float64[np.ndarray, "J 3"]] = {}
 
     def jump(frame: int) -> float | None:

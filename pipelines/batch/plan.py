@@ -20,8 +20,6 @@ from smplxpp.core import spread
 from smplxpp.core.errors import InputError, require_known
 from smplxpp.core.files.json_file import as_list, as_number, as_object, read_json
 
-HOUR = 3600.0
-
 
 @dataclass(frozen=True)
 class Facts:
@@ -198,18 +196,18 @@ def cost_of(step: str, facts: Facts, rates: Rates, *, preset: str = "cpu", gpu: 
             )
         # A GPU's training keeps a core busy with reading.
         gpu_hours, hours = (rate[preset], rate[preset]) if gpu else (0.0, rate[preset])
-        seconds += HOUR * hours
+        seconds += 3600.0 * hours
         looks = rates.train_images.get(preset, 0.0)
         read, written, files = image_mb * looks, 0.5 * rates.run_mb, 2.0 * looks
     elif step == "evaluate":
         looks = _measured(facts)
         work = rates.models * looks
-        gpu_hours = rates.evaluate_gpu_s * work / HOUR if gpu else 0.0
-        seconds += HOUR * gpu_hours if gpu else rates.evaluate_s_mp * facts.megapixels * work
+        gpu_hours = rates.evaluate_gpu_s * work / 3600.0 if gpu else 0.0
+        seconds += 3600.0 * gpu_hours if gpu else rates.evaluate_s_mp * facts.megapixels * work
         read, files = image_mb * looks, 2.0 * looks
     else:
         seconds += rates.export_s
-    cost = Cost(seconds / HOUR, gpu_hours, 1e-3 * read, 1e-3 * written, files, made)
+    cost = Cost(seconds / 3600.0, gpu_hours, 1e-3 * read, 1e-3 * written, files, made)
     factor = rates.factors.get(step, 1.0)
     return replace(cost, core_hours=factor * cost.core_hours, gpu_hours=factor * cost.gpu_hours)
 
@@ -284,8 +282,8 @@ def demands(costs: Iterable[Cost], site: Site) -> dict[str, float]:
     return {
         "cores": whole.core_hours / max(site.cores, 1),
         "GPUs": whole.gpu_hours / site.gpus if site.gpus else (float("inf") if whole.gpu_hours else 0.0),
-        "bytes of the disk": (whole.read_gb + whole.written_gb) * 1e3 / site.disk_mb_s / HOUR,
-        "files of the disk": whole.files / site.files_s / HOUR,
+        "bytes of the disk": (whole.read_gb + whole.written_gb) * 1e3 / site.disk_mb_s / 3600.0,
+        "files of the disk": whole.files / site.files_s / 3600.0,
     }
 
 
