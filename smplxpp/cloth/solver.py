@@ -59,8 +59,12 @@ class _Model(ctypes.Structure):
 
 class _Forces(ctypes.Structure):
     _fields_ = [
-        (name, ctypes.c_double)
-        for name in ("gravity", "drag", "normal_drag", "inner_friction", "friction", "own_margin", "most_speed")
+        *(
+            (name, ctypes.c_double)
+            for name in ("gravity", "drag", "normal_drag", "inner_friction", "friction", "own_margin", "most_speed")
+        ),
+        ("most_stretch", ctypes.c_double),
+        ("report", ctypes.c_void_p),
     ]
 
 
@@ -85,11 +89,17 @@ class ClothSolver:
             *(len(collider.margin), len(collider.faces)),
             *(address(array, dtype) for array, dtype in arrays),
         )
+        self._report = np.zeros(2, dtype=np.int64)
         self._forces = _Forces(
             GRAVITY,
             *(fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction),
-            *(config.own_margin, config.most_speed),
+            *(config.own_margin, config.most_speed, config.most_stretch, address(self._report, "int64")),
         )
+
+    @property
+    def released(self) -> int:
+        """Return how many contacts were let go until now because cloth between them could not keep its length."""
+        return int(self._report[0])
 
     def advance(
         self,
@@ -122,7 +132,8 @@ class ClothSolver:
             (ctypes.c_void_p * 4)(*(address(array).value for array in places)),
             (ctypes.c_void_p * 4)(*(address(array).value for array in skin)),
         )
-        # Whole substeps of at most the configured length; the small term keeps round-off from adding one.
+        # Whole substeps of at most the configured length; the small term keeps round-off from adding one. The kernel
+        # takes shorter ones where skin or cloth would move by more than the cloth's thickness in one.
         native_library().smplxpp_cloth_advance(
             *(ctypes.byref(self._native), ctypes.byref(self._forces), ctypes.byref(moments)),
             ctypes.c_float(seconds),

@@ -50,7 +50,7 @@ class GarmentThread:
         self._share = garment.share()
         self._edges = EdgeLengths(self._model.edges, self._model.lengths, 0.0)
         self._drawn = drawn_edges(garment, faces)
-        self._resets = 0
+        self._resets = self._released = 0
         self._state = ClothState.at_rest(garment.rest.vertices)
         self._places: list[Float32[np.ndarray, "n 3"]] = []
         self._surfaces: list[Float32[np.ndarray, "c 3"]] = []
@@ -137,6 +137,7 @@ class GarmentThread:
         depths = self._depths()
         inside = float((depths > BURIED).mean()) if len(depths) else 0.0
         resets, self._resets = self._resets, 0
+        released, self._released = self._solver.released - self._released, self._solver.released
         return ClothQuality(
             part=self.garment.part,
             frames=1,
@@ -147,6 +148,7 @@ class GarmentThread:
             inside_most=inside,
             deepest=float(depths.max(initial=0.0)),
             resets=resets,
+            released=released,
         )
 
     def laid_over(

@@ -42,7 +42,8 @@ def test_vertices_are_carried_as_numpy_carries_them():
     assert np.abs(found - scattered(coarse)).max() > 0.01
 
 
-def test_what_is_carried_is_pushed_out_as_points_are():
+def test_what_is_carried_is_pushed_out_as_points_are_and_deep_vertices_by_less():
+    """All at once, and none beside them, they would be spikes."""
     coarse = bent(hanging())
     body = ball(radius=0.1)
     body = body.with_vertices(body.vertices + coarse.vertices.mean(axis=0) - [0.0, 0.0, 0.085])
@@ -52,7 +53,10 @@ def test_what_is_carried_is_pushed_out_as_points_are():
     found = carried.at(coarse.vertices.astype(np.float32), skin, margin=0.002)
     points, normals = embedding.carried_with_normals(coarse)
     expected = move_before_collider(points.astype(np.float32), normals, skin, solid, margin=0.002)
-    np.testing.assert_allclose(found, expected, atol=5e-6)
+    depth = np.linalg.norm(expected - points, axis=1) - 0.002
+    share = np.clip(2.0 - depth / 0.015, 0.0, 1.0)[:, None]
+    assert ((share > 0.1) & (share < 0.9)).sum() > 10 and (depth > 0.03).any()
+    np.testing.assert_allclose(found, points + share * (expected - points), atol=2e-5)
     pushed = np.linalg.norm(found - points, axis=1) > 1e-4
     assert 0.02 < pushed.mean() < 0.98
 

@@ -309,7 +309,8 @@ def test_no_particle_is_farther_from_its_attachment_than_its_tether():
         x = scene.run(1 / 30).position
         away = np.linalg.norm(x - x[model.anchor], axis=1)
         loose = model.anchor >= 0
-        np.testing.assert_array_less(away[loose], model.tether[loose] * (1 + 1e-5))
+        # The bound on edges comes after the tethers and may give up three hundredths of them.
+        np.testing.assert_array_less(away[loose], model.tether[loose] * 1.03)
         most = max(most, (away[loose] / model.tether[loose]).max())
     assert loose.sum() == 30 and most > 0.999  # they were asked for
 
@@ -397,3 +398,74 @@ def test_places_and_states_of_other_sizes_are_refused():
     ):
         with pytest.raises(InputError, match=r"moments|particles"):
             solver.advance(state, 0.01, places, skin)
+
+
+def longest(scene: Scene) -> float:
+    """The longest edge over its length at rest."""
+    ends = scene.state.position[scene.solver.model.edges].astype(float)
+    return float((np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / scene.solver.model.lengths).max())
+
+
+def test_no_edge_is_longer_than_the_bound_however_its_attachments_are_shaken():
+    """Soft cloth whose upper edge is thrown about at 4 m/s was drawn to three times its length."""
+    mesh = hanging(9, 21, 0.03)
+    places = lambda t: mesh.vertices + [0.25 * np.sin(16 * t), 0.1 * np.sin(23 * t), 0.25 * np.cos(14 * t)]  # noqa: E731
+    loose, held_in = (
+        hung(mesh, replace(PLAIN, stretch_stiffness=20.0, slack=5.0), places=places, config=config)
+        for config in (SolverConfig(most_stretch=99.0), SolverConfig(most_stretch=1.2))
+    )
+    found = {id(scene): max(longest(scene.run(1 / 30) and scene) for _ in range(20)) for scene in (loose, held_in)}
+    assert found[id(loose)] > 1.6
+    assert found[id(held_in)] < 1.2 * (1 + 1e-4)
+    assert held_in.solver.released == 0
+
+
+def test_attachments_that_the_body_draws_apart_slide_before_cloth_is_torn():
+    """A strip held at both ends, which go apart to twice its length."""
+    mesh = lying(5, 15, 0.03)
+    ends = (mesh.vertices[:, 2] < mesh.vertices[:, 2].min() + 1e-6) | (
+        mesh.vertices[:, 2] > mesh.vertices[:, 2].max() - 1e-6
+    )
+    model = build_model(mesh, ends * 1.0, PLAIN)
+    scene = Scene(model, mesh.vertices, places=lambda t: mesh.vertices * [1.0, 1.0, 1.0 + t])
+    for _ in range(30):
+        scene.run(1 / 30)
+        assert longest(scene) < 1.25
+    span = np.ptp(scene.state.position[:, 2]) / np.ptp(mesh.vertices[:, 2])
+    assert 1.1 < span < 1.25  # of 2: the rest is slid
+    assert np.isfinite(scene.state.velocity).all()
+
+
+def test_a_piece_caught_between_two_bodies_is_let_go_and_not_stretched():
+    """A hem caught at shin and shoe was drawn to 5.7 times its length."""
+    mesh = hanging(7, 15, 0.03)
+    left, right = ball(0.05), ball(0.05)
+    middle = mesh.vertices.mean(axis=0)
+    both = TriangleMesh(
+        np.concatenate([left.vertices, right.vertices]), np.concatenate([left.faces, right.faces + left.vertex_count])
+    )
+
+    def skin(t: float) -> np.ndarray:
+        # Two balls before and behind the lower half, which close on it and go down by twice its length.
+        apart, down = max(0.047, 0.08 - 0.2 * t), [0.0, -0.9 * max(0.0, t - 0.2), 0.0]
+        at = middle + [0.0, -0.1, 0.0] + np.array(down)
+        return np.concatenate([left.vertices + at + [0, 0, apart], right.vertices + at - [0, 0, apart]])
+
+    scene = hung(mesh, replace(PLAIN, friction=2.0), touches=collider(both), skin=skin)
+    for _ in range(36):
+        scene.run(1 / 30)
+        assert longest(scene) < 1.25
+
+
+def test_a_fast_body_does_not_pass_through_cloth():
+    """At 6 m/s it moves by three thicknesses of the cloth in a substep of 2 ms."""
+    mesh = hanging(13, 13, 0.02)
+    core = ball(0.06)
+    middle = mesh.vertices.mean(axis=0)
+    scene = hung(
+        mesh, touches=collider(core, margin=0.004), skin=lambda t: core.vertices + middle + [0, 0, -0.2 + 6.0 * t]
+    )
+    scene.run(2 / 30)
+    inside = np.linalg.norm(scene.state.position - (middle + [0, 0, 0.2]), axis=1) < 0.058
+    assert not inside.any()
+    assert scene.state.position[:, 2].max() > 0.1  # it was taken along

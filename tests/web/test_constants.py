@@ -67,6 +67,7 @@ REPEATED = {
         "CONTACTS_EVERY": SOLVER.contacts_every,
         "MOST_SPEED": SOLVER.most_speed,
         "MOST_STRETCH": DRIVER.most_stretch,
+        "LONGEST_EDGE": SOLVER.most_stretch,
     },
     "src/lips/features.ts": {
         "RATE": audio_features.RATE,

@@ -37,11 +37,14 @@ struct Skinned {
     const float* weight;   // (V, influences)
 };
 
+constexpr float kDrawnOut = 0.015f;  // metres inside from which drawn cloth is not brought out wholly
+
 Vec3 unit(Vec3 a) { return a * (1.0f / std::max(smplxpp::length(a), 1e-12f)); }
 
-// To `margin` metres before the surface, along its smooth normal, where a place lies behind that and not too deep.
+// To `margin` metres before the surface, along its smooth normal, where a place lies behind that and not too deep; `whole`
+// metres deep and more by less and less, to nothing at twice that: neighbours of which one alone came out would be a spike.
 Vec3 pushed_out(Vec3 p, Vec3 cloth_normal, Surface& surface, const int32_t* faces, const Vec3* skin, float margin,
-                const float* deepest) {
+                const float* deepest, float whole) {
     const int32_t near = surface.nearest(p, cloth_normal);
     if (near < 0 || surface.clear(p, near)) return p;
     const Contact contact = surface.find_from(near, p, cloth_normal);
@@ -58,7 +61,8 @@ Vec3 pushed_out(Vec3 p, Vec3 cloth_normal, Surface& surface, const int32_t* face
     if (l < 1e-6f) return p;
     normal = normal * (1.0f / l);
     const float height = dot(p - foot, normal);
-    return height < margin && height > -most ? p + normal * (margin - height) : p;
+    if (!(height < margin && height > -most)) return p;
+    return p + normal * ((margin - height) * std::clamp(2.0f + height / whole, 0.0f, 1.0f));
 }
 
 // The transform of a vertex: its joints' (J, 3, 4), blended.
@@ -101,7 +105,7 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_carry(const Carried* in, const float* x, co
             const Vec3 up = unit(normal[size_t(q[0])] * w[0] + normal[size_t(q[1])] * w[1] + normal[size_t(q[2])] * w[2]);
             const Vec3 there = place[q[0]] * w[0] + place[q[1]] * w[1] + place[q[2]] * w[2] + tangent[size_t(2 * t)] * by[0] +
                                tangent[size_t(2 * t + 1)] * by[1] + up * by[2];
-            ((Vec3*)points)[v] = pushed_out(there, up, surface, in->collider_face, (const Vec3*)skin, margin, in->deepest);
+            ((Vec3*)points)[v] = pushed_out(there, up, surface, in->collider_face, (const Vec3*)skin, margin, in->deepest, kDrawnOut);
         }
     });
 }
@@ -117,7 +121,7 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_push_out(int64_t n, float* points, const fl
         surface.look(skin);
         for (int64_t i = 0; i < n; ++i) {
             Vec3& p = ((Vec3*)points)[i];
-            p = pushed_out(p, ((const Vec3*)normals)[i], surface, faces, skin, margin, deepest);
+            p = pushed_out(p, ((const Vec3*)normals)[i], surface, faces, skin, margin, deepest, INFINITY);
         }
     });
 }

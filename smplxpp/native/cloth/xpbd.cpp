@@ -1,5 +1,7 @@
 // Extended position-based dynamics of cloth (Macklin et al. 2016) with small steps (Macklin et al. 2019): one correction a
-// substep of edges, hinges, springs, tethers and contacts, in the order of their arrays (Gauss-Seidel), on one thread.
+// substep of edges, hinges, springs, tethers and contacts, in the order of their arrays (Gauss-Seidel), on one thread; then
+// strain limiting as a hard bound (Provot 1995; Thomaszewski et al. 2009; Wang et al. 2010), at the end of the span until no
+// edge is longer than it may be: first together with the contacts, then without those that cannot be kept as well.
 //
 // Small cloth in float: about 800 particles a garment, a thousand substeps a second. Nothing here depends on the time of
 // day, on threads or, being built without contraction, on the CPU: the same bits everywhere.
@@ -49,6 +51,8 @@ struct Model {
 
 struct Forces {
     double gravity, drag, normal_drag, inner_friction, friction, own_margin, most_speed;
+    double most_stretch;  // of an edge, over its length at rest
+    int64_t* report;      // 2: contacts that were let go, particles that follow their places and were moved from these
 };
 
 // Four moments of the places and of the collider: the last one, this one's start and end, the next one.
@@ -74,6 +78,7 @@ public:
           surface_(m.collider_vertices, m.collider_face, m.collider_faces), contact_(n_, Contact{-1, {0, 0, 0}}) {}
 
     void advance(const Moments& moments, float seconds, int32_t substeps, int32_t contacts_every) {
+        substeps = std::max(substeps, std::min(kShorter * substeps, needed(moments, seconds)));
         const float h = seconds / float(substeps);
         prepare(h);
         std::transform(position_, position_ + n_, x_.begin(), widened);
@@ -95,14 +100,50 @@ public:
             hold();
             if (f_.own_margin > 0) part();
             touch();
+            for (int32_t k = 0; k < kSweeps && !limit(k % 2 == 1, kShared, 1.0f); ++k) {}
             finish(h);
         }
+        bound();
         std::transform(x_.begin(), x_.end(), position_, narrowed);
         std::transform(v_.begin(), v_.end(), velocity_, narrowed);
     }
 
 private:
+    static constexpr int32_t kShorter = 3;                       // times as many substeps at most as were asked for
+    static constexpr int32_t kSweeps = 6;                        // over edges that are too long, a substep
+    static constexpr int32_t kLed = 8, kFree = 16, kSlide = 48;  // sweeps of the bound after which the deeper end is moved, ...
+    static constexpr int32_t kBound = 200;                       // ... contacts are let go, what follows its place slides; all
+    static constexpr float kGives = 0.5f;                        // inverse mass that it has then, where others have 1
+    static constexpr float kOver = 1.8f;                         // times the correction from the sweeps without contacts on
+    static constexpr float kLetGo = 3e-3f;                       // metres within the margin from which a contact was let go
+    static constexpr float kOut = 4e-3f;                         // metres a substep at which deep cloth comes out
+
     float w(int64_t i) const { return m_.inverse_mass[i]; }
+
+    // Substeps in which neither skin nor cloth moves by more than the cloth's thickness, against the mean motion of the places:
+    // a person who runs takes all along. What is not finite asks for none.
+    int32_t needed(const Moments& moments, float seconds) const {
+        float thickness = 0;
+        for (int64_t i = 0; i < m_.collider_vertices; ++i) thickness = std::max(thickness, m_.margin[i]);
+        if (!(thickness > 0) || n_ == 0) return 0;
+        const auto way = [](const float* from, const float* to, size_t i) {
+            return Vec3{to[3 * i] - from[3 * i], to[3 * i + 1] - from[3 * i + 1], to[3 * i + 2] - from[3 * i + 2]};
+        };
+        Vec3 mean = {0, 0, 0};
+        for (size_t i = 0; i < n_; ++i) mean = mean + way(moments.place[1], moments.place[2], i);
+        mean = mean * (1.0f / float(n_));
+        float most = 0;
+        for (size_t i = 0; i < n_; ++i) {
+            const Vec3 d = velocity_[i] * seconds - mean;
+            most = std::max(most, dot(d, d));
+        }
+        for (size_t i = 0; i < skin_.size(); ++i) {
+            const Vec3 d = way(moments.collider[1], moments.collider[2], i) - mean;
+            most = std::max(most, dot(d, d));
+        }
+        const float substeps = std::ceil(std::sqrt(most) / thickness);
+        return substeps < 1e6f ? int32_t(substeps) : 0;
+    }
 
     // Gravity and air, then on by the velocity.
     void move(float h) {
@@ -129,7 +170,8 @@ private:
             const float masses = w(i) + w(j);
             const auto stiff = [&](const float* soft) { return std::max(masses + soft[k] * over, 1e-20f); };
             const float drags = masses == 0 || share <= 0 ? 0.0f : share / masses;
-            edges_[size_t(k)] = {i, j, w(i), w(j), m_.length[k], stiff(m_.stretch), stiff(m_.compress), drags};
+            const float most = float(f_.most_stretch) * m_.length[k];
+            edges_[size_t(k)] = {i, j, w(i), w(j), m_.length[k], stiff(m_.stretch), stiff(m_.compress), drags, most, most * most};
         }
         hinges_.resize(size_t(m_.hinges));
         for (int64_t k = 0; k < m_.hinges; ++k) {
@@ -171,6 +213,56 @@ private:
         }
     }
 
+    // One sweep over the edges that are too long, from what holds the cloth downwards or back; says whether there was none.
+    // The ends share the correction by their inverse masses, of which one that follows its place has `pins` of the other end's.
+    // Where it is led, the end that hangs deeper takes nine tenths: a taut sheet then needs few sweeps (Mueller et al. 2012).
+    // What slides counts all particles alike. `over` times the correction: rings shrink by little a sweep, and an edge that
+    // comes out too short is no harm.
+    enum Sharing { kShared, kLedDown, kSliding };
+    bool limit(bool back, Sharing sharing, float over) {
+        bool within = true;
+        const size_t count = edges_.size();
+        for (size_t k = 0; k < count; ++k) {
+            const Edge& e = edges_[back ? count - 1 - k : k];
+            const Vec4 d = x_[size_t(e.i)] - x_[size_t(e.j)];
+            const float squared = dot(d, d);
+            if (squared <= e.most_squared) continue;
+            within = false;
+            float a = e.mass_i, b = e.mass_j;
+            if (sharing == kSliding) {
+                a = a > 0 ? 1.0f : kGives, b = b > 0 ? 1.0f : kGives;
+            } else if (sharing == kLedDown && a > 0 && b > 0) {
+                const bool deeper = m_.tether[e.i] > m_.tether[e.j];
+                a = deeper ? 0.9f : 0.1f, b = 1.0f - a;
+            }
+            const float l = std::sqrt(squared);
+            const Vec4 step = d * (over * (l - e.most) / (l * (a + b)));
+            x_[size_t(e.i)] -= step * a;
+            x_[size_t(e.j)] += step * b;
+        }
+        return within;
+    }
+
+    // The hard bound at the end of a span. Limits of lengths are convex, so that sweeps over them converge. What the body pushes
+    // and what two of its limbs pinch may leave no place within all of them: contacts give way, then what follows its place
+    // slides along the body, which alone has a solution always. Velocities are not those of these corrections.
+    void bound() {
+        int32_t sweeps = 0;
+        for (; sweeps < kBound; ++sweeps) {
+            const Sharing sharing = sweeps >= kSlide ? kSliding : sweeps >= kLed && sweeps < kFree ? kLedDown : kShared;
+            if (limit(sweeps % 2 == 1, sharing, sweeps >= kFree ? kOver : 1.0f)) break;
+            if (sweeps < kFree) push();
+        }
+        if (sweeps <= kFree || !f_.report) return;
+        for (size_t i = 0; i < n_; ++i) {
+            Place at;
+            if (w(int64_t(i)) == 0)
+                f_.report[1] += length(x_[i] - widened(place_[i])) > 1e-3f;
+            else if (place_on(i, at) && at.margin - dot(narrowed(x_[i]) - at.point, at.normal) > kLetGo)
+                ++f_.report[0];
+        }
+    }
+
     void pull(float h) {
         const float over = 1.0f / (h * h);
         for (size_t i = 0; i < n_; ++i) {
@@ -196,34 +288,58 @@ private:
             contact_[i] = w(int64_t(i)) == 0 ? Contact{-1, {0, 0, 0}} : surface_.find(narrowed(x_[i]), narrowed(normal_[i]));
     }
 
-    // Out of the collider along its smooth normal; Coulomb's friction against its own motion.
+    // The place of the collider that a particle touches, now and before the substep.
+    struct Place {
+        Vec3 point, was, normal;
+        float margin, deepest;
+    };
+    bool place_on(size_t i, Place& at) const {
+        if (contact_[i].face < 0 || w(int64_t(i)) == 0) return false;
+        const int32_t* q = m_.collider_face + 3 * int64_t(contact_[i].face);
+        const float* b = contact_[i].weight;
+        at = {{0, 0, 0}, {0, 0, 0}, {0, 0, 0}, 0, 0};
+        for (int j = 0; j < 3; ++j) {
+            at.point = at.point + skin_[size_t(q[j])] * b[j];
+            at.was = at.was + skin_before_[size_t(q[j])] * b[j];
+            at.normal = at.normal + surface_.normal(q[j]) * b[j];
+            at.margin += m_.margin[q[j]] * b[j];
+            at.deepest += m_.deepest[q[j]] * b[j];
+        }
+        const float l = length(at.normal);
+        if (l < 1e-6f) return false;
+        at.normal = at.normal * (1.0f / l);
+        return true;
+    }
+
+    // Out of the collider along its smooth normal; Coulomb's friction against its own motion. What lies deep comes out no faster
+    // than `kOut` and the collider: at once it would fly.
     void touch() {
         const float friction = float(f_.friction);
+        Place at;
         for (size_t i = 0; i < n_; ++i) {
-            if (contact_[i].face < 0 || w(int64_t(i)) == 0) continue;
-            const int32_t* q = m_.collider_face + 3 * int64_t(contact_[i].face);
-            const float* b = contact_[i].weight;
-            Vec3 p = {0, 0, 0}, was = {0, 0, 0}, n = {0, 0, 0};
-            float margin = 0, deepest = 0;
-            for (int j = 0; j < 3; ++j) {
-                p = p + skin_[size_t(q[j])] * b[j];
-                was = was + skin_before_[size_t(q[j])] * b[j];
-                n = n + surface_.normal(q[j]) * b[j];
-                margin += m_.margin[q[j]] * b[j];
-                deepest += m_.deepest[q[j]] * b[j];
-            }
-            const float l = length(n);
-            if (l < 1e-6f) continue;
-            n = n * (1.0f / l);
+            if (!place_on(i, at)) continue;
             Vec3 x = narrowed(x_[i]);
-            const float height = dot(x - p, n), depth = margin - height;
-            if (depth <= 0 || height < -deepest) continue;
-            x = x + n * depth;
-            Vec3 slip = (x - narrowed(before_[i])) - (p - was);
-            slip = slip - n * dot(slip, n);
+            const float height = dot(x - at.point, at.normal);
+            if (at.margin - height <= 0 || height < -at.deepest) continue;
+            const float depth = std::min(at.margin - height, kOut + std::max(0.0f, dot(at.point - at.was, at.normal)) +
+                std::max(0.0f, dot(narrowed(before_[i]) - x, at.normal)));
+            x = x + at.normal * depth;
+            Vec3 slip = (x - narrowed(before_[i])) - (at.point - at.was);
+            slip = slip - at.normal * dot(slip, at.normal);
             const float way = length(slip);
             if (way > 1e-9f) x = x - slip * std::min(1.0f, friction * depth / way);
             x_[i] = widened(x);
+        }
+    }
+
+    // The same without friction, between sweeps of the bound.
+    void push() {
+        Place at;
+        for (size_t i = 0; i < n_; ++i) {
+            if (!place_on(i, at)) continue;
+            const float height = dot(narrowed(x_[i]) - at.point, at.normal);
+            if (at.margin - height > 0 && height > -at.deepest)
+                x_[i] = x_[i] + widened(at.normal * std::min(kOut, at.margin - height));
         }
     }
 
@@ -285,6 +401,7 @@ private:
         float mass_i, mass_j;  // inverse masses
         float length, stretched, compressed;  // at rest; what resists it where it is longer, where it is shorter
         float drags;           // of the ends' difference of velocities over their masses
+        float most, most_squared;  // metres that it may be long
     };
     struct Hinge {
         int32_t corner[4];

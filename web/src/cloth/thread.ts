@@ -5,6 +5,8 @@ import { CarriedVertices } from "./carried.ts";
 import { pinned, shareOf, type Garment } from "./garment.ts";
 import { buildModel } from "./model.ts";
 
+/** Longest edge over its length at rest, which the solver keeps. */
+const LONGEST_EDGE = 1.2;
 /** Seconds of a substep at most, substeps between two searches for contacts, metres a second at most. */
 const SUBSTEP = 1 / 500, CONTACTS_EVERY = 8, MOST_SPEED = 8, GRAVITY = 9.81;
 /** Metres that what is carried keeps from the skin. */
@@ -86,7 +88,7 @@ export class GarmentThread {
       null, native.keep(model.anchor), native.keep(model.tether), colliderFaces, native.keep(collider.margin), deepest,
     ]);
     this.forces = native.keep(Float64Array.of(
-      GRAVITY, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, 0, MOST_SPEED));
+      GRAVITY, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, 0, MOST_SPEED, LONGEST_EDGE, 0));
     [this.places, this.surfaces] = [new Moments(native, n), new Moments(native, c)];
     this.moments = native.struct([], [...this.places.blocks, ...this.surfaces.blocks]);
   }
