@@ -13,7 +13,7 @@ from shutil import rmtree
 
 from pipelines.batch.executors import Executor, Outcome, Task
 from pipelines.batch.hold import BATCH_HOLD, JOB_HOLD, Hold, at_work, request_stop, stop_requested, withdraw_stop
-from pipelines.batch.jobs import STEPS, Job, JobFile
+from pipelines.batch.jobs import Job, JobFile
 from pipelines.batch.records import (
     BATCH_FILE,
     FINAL,
@@ -28,6 +28,7 @@ from pipelines.batch.records import (
     save_job,
     stands,
 )
+from pipelines.batch.steps import STEPS
 from pipelines.runs.layout import ALL_STAGES
 from smplxpp import __version__
 from smplxpp.core.errors import InputError
@@ -184,7 +185,7 @@ def retry(runs: Path, subjects: Sequence[str] = ()) -> list[str]:
 
 
 def _prepare(runs: Path, job: Job, *, stale: bool) -> bool:
-    """Put a subject's record into the state from which it goes on; whether anything of it does not stand."""
+    """Put a subject's record into the state from which it continues; whether anything of it does not stand."""
     folder = runs / job.subject
     record = read_job(runs, job.subject)
     if record is None:
@@ -227,14 +228,14 @@ def _settle(
     tries: Counter[tuple[str, tuple[str, ...]]],
     retries: int,
 ) -> Task | None:
-    """Take note of a task's end; return the task that goes on with its chain, or None."""
+    """Take note of a task's end; return the task that continues with its chain, or None."""
     subject, key = task.job.subject, (task.job.subject, task.steps)
     if isinstance(outcome, BaseException):
         return _lost(runs, task, outcome, progress, tries, retries)
     meaning, state = outcome["meaning"], outcome["state"]
     if meaning == "done" and state == "waiting" and task.rest:
         return Task.of(task.job, task.rest)
-    # A training at its limit goes on as often as it takes; a subject that another process holds is asked for again.
+    # A training at its limit continues as often as it takes; a subject that another process holds is asked for again.
     if meaning == "again":
         return task
     if meaning == "busy":

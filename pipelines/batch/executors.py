@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from pipelines.batch.jobs import STEPS, Job
+from pipelines.batch.jobs import Job
 from pipelines.batch.run_job import Resources, run_job
+from pipelines.batch.steps import STEPS
 from smplxpp.core.errors import InputError, MissingExtraError
 
 Outcome = dict[str, Any] | BaseException
@@ -212,7 +213,7 @@ class RayExecutor:
 
 
 class SlurmExecutor:
-    """Job arrays of Slurm by submitit; a task that Slurm ends or preempts goes on in the next array.
+    """Job arrays of Slurm by submitit; a task that Slurm ends or preempts continues in the next array.
 
     Args:
         runs: RUNS.
@@ -297,7 +298,7 @@ class RequeuedJob:
         return run_job(job, folder, resources)
 
     def checkpoint(self, *arguments: Any) -> Any:
-        """Return the call that goes on: what stands is on the disk."""
+        """Return the call that continues: what stands is on the disk."""
         return _submitit().helpers.DelayedSubmission(self, *arguments)
 
 

@@ -1,6 +1,6 @@
 """Hold a batch or a subject for one process at a time across machines, and ask those that work on a batch to stop.
 
-Two means, because no file system of a cluster is sure to have the first:
+Two means, because no file system of a cluster is certain to have the first:
 
 | file system | lock of the system (`flock`) | heartbeat |
 |---|---|---|
@@ -92,7 +92,7 @@ class Hold:
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
-        # An empty file tells a process on another machine at once that nobody holds it.
+        # An empty file tells a process on another machine at once that no process holds it.
         if not self.lost:
             with suppress(OSError):
                 self._write("")
@@ -115,7 +115,7 @@ class Hold:
         """Renew the file until the end, or until it bears another's mark."""
         while not self._ended.wait(self.beat):
             with suppress(OSError):  # a server that does not answer: its next answer counts
-                # A file that cannot be read for a moment bears nobody's mark.
+                # A file that cannot be read for a moment bears no mark.
                 if read_holder(self.path).get("mark", self._mark) != self._mark:
                     self.lost = True
                     return
@@ -123,7 +123,7 @@ class Hold:
 
 
 def read_holder(path: Path) -> dict[str, Any]:
-    """Return host, pid, since and mark of who holds a file; empty where nobody does, or nobody can be told."""
+    """Return host, pid, since and mark of who holds a file; empty where no process does, or none can be told."""
     try:
         text = path.read_text(encoding="utf-8")
         return as_object(parse_json(text, subject="lock"), subject="lock") if text else {}
@@ -151,7 +151,7 @@ def process_runs(pid: int) -> bool:
 
 
 def at_work(path: Path, *, stale: float = 120.0) -> dict[str, Any]:
-    """Return who holds a file now, as far as a reader can tell; empty where nobody does."""
+    """Return who holds a file now, as far as a reader can tell; empty where no process does."""
     holder = read_holder(path)
     if not holder:
         return {}

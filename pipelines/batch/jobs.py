@@ -27,116 +27,18 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pipelines.runs.layout import (
-    BUILD_STAGES,
-    EVALUATE_STAGE,
-    MODEL_STAGES,
-    RECONSTRUCT_STAGE,
-    REFINE_STAGE,
-    REGISTER_STAGE,
-    RELIGHT_STAGE,
-)
-from smplxpp.core.errors import InputError, did_you_mean, require_between, require_choice
+from pipelines.batch.steps import SPLIT, STEPS, Needs
+from smplxpp.core.errors import InputError, did_you_mean, require_choice
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, shown
 from smplxpp.core.files.markup_file import read_yaml
 from smplxpp.core.files.paths import absolute
 
-
-@dataclass(frozen=True)
-class StepKind:
-    """A command as a step of a chain.
-
-    Attributes:
-        words: of the command.
-        module: that runs it, whose code is part of the batch's key.
-        options: class of its options there.
-        judged: whether exit status 1, checks that failed, ends the chain.
-        on_gpu: whether it computes on a GPU where the job has one.
-        stages: stages of the run whose manifests prove that it stands.
-        files: files of the subject's folder that prove it; `{capture}` is the converted capture's folder.
-    """
-
-    words: tuple[str, ...]
-    module: str
-    options: str
-    judged: bool = True
-    on_gpu: bool = False
-    stages: tuple[str, ...] = ()
-    files: tuple[str, ...] = ()
-
-
-STEPS: Mapping[str, StepKind] = {
-    "convert": StepKind(
-        ("capture", "convert"),
-        "pipelines.commands.capture",
-        "CaptureConvertCommand",
-        judged=False,  # status 1 says that something was left out
-        files=("capture/conversion.json", "capture/capture.json"),
-    ),
-    "check": StepKind(
-        ("capture", "check"), "pipelines.commands.capture", "CaptureCheckCommand", files=("check/check.json",)
-    ),
-    "reconstruct": StepKind(
-        ("reconstruct",),
-        "pipelines.commands.reconstruct",
-        "ReconstructCommand",
-        stages=(RECONSTRUCT_STAGE,),
-        files=("reconstruct/scans/seams.json",),
-    ),
-    "register": StepKind(
-        ("register",),
-        "pipelines.commands.register",
-        "Register",
-        stages=(REGISTER_STAGE,),
-        files=("register/params.npz",),
-    ),
-    "metrics": StepKind(("metrics",), "pipelines.commands.metrics", "Metrics", files=("metrics.json",)),
-    "build": StepKind(("build",), "pipelines.commands.build", "Build", stages=BUILD_STAGES),
-    "train": StepKind(
-        ("train",), "pipelines.commands.train", "Train", on_gpu=True, stages=(REFINE_STAGE, *MODEL_STAGES)
-    ),
-    "evaluate": StepKind(
-        ("evaluate",), "pipelines.commands.evaluate", "Evaluate", on_gpu=True, stages=(EVALUATE_STAGE, RELIGHT_STAGE)
-    ),
-    "export": StepKind(("export",), "pipelines.commands.export", "Export", files=("{subject}.avatar", "{subject}.glb")),
-    "web": StepKind(("web",), "pipelines.commands.web", "Web", files=("player.html",)),
-}
-"""The steps in the order in which they run."""
-SPLIT = ("reconstruct", "register", "metrics")
-"""Steps that can be split into chunks of frames: `frames` of a job."""
 DEFAULT_STEPS = ("check", "build", "train", "evaluate", "export")
 RESERVED = ("batch.json", "index.html", "index.json", "summary.csv", "stop.json", "cluster")
 """Names in RUNS that no subject may have."""
 _SUBJECT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 _TOP = ("name", "out", "results", "defaults", "jobs")
 _OPTIONS = ("steps", "frames", "accept", "resources", *STEPS)
-
-
-@dataclass(frozen=True)
-class Needs:
-    """What a job takes of a machine.
-
-    Attributes:
-        cores: threads of a command; 0: an equal share of the machine.
-        gpus: GPUs of a training: a fraction where several trainings share one, several for one training by torchrun.
-        minutes: limit of one stay on a cluster, after which a training goes on in the next one; 0: none.
-        gigabytes: memory to ask of a cluster; 0: what it gives by default.
-    """
-
-    cores: int = 0
-    gpus: float = 1.0
-    minutes: float = 0.0
-    gigabytes: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_between("resources: cores", self.cores, 0, 4096)
-        require_between("resources: gpus", self.gpus, 0.0, 64.0)
-        if self.gpus > 1 and self.gpus != int(self.gpus):
-            raise InputError(
-                "resources: gpus", expected="a fraction of one, or a whole number", received=f"{self.gpus:g}"
-            )
-        require_between("resources: minutes", self.minutes, 0.0, 1e6)
-        require_between("resources: gigabytes", self.gigabytes, 0.0, 1e5)
 
 
 @dataclass(frozen=True)
@@ -159,7 +61,7 @@ class Job:
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     frames: int = 0
     accept: tuple[str, ...] = ()
-    needs: Needs = Needs()
+    needs: Needs = field(default_factory=Needs)
 
     @property
     def remote(self) -> bool:

@@ -22,7 +22,7 @@ from smplxpp.core.files.paths import read_bytes
 
 Meaning = Literal["done", "refused", "failed", "system", "disk", "busy", "again", "stopped", "code"]
 """What an end means. `system`: another attempt may help; `disk`: it is full; `busy`: another process is in the run
-folder; `again`: a limit of time stopped the command, which goes on when it is given once more; `code`: the installed
+folder; `again`: a limit of time stopped the command, which continues when it is given once more; `code`: the installed
 code is not that of the batch."""
 PATIENCE = ("SIGINT", "SIGTERM", "SIGKILL")
 """How a command is asked to end, from the kindest: on the first it says what it keeps."""
@@ -132,7 +132,7 @@ def meaning_of(ended: Ended, *, log: Path, answer: Path, judged: bool) -> tuple[
         words = f"ended by {name}"
         words += ": probably out of memory, the system's log tells" if name == "SIGKILL" else ""
         return "system", {"message": words, "last": last}
-    # An error that the command has worded. A full disk is nobody's fault, and a run in use is free later.
+    # An error that the command has worded. A full disk is no fault of the input, and a run in use is free later.
     if error is not None:
         message = str(error.get("message", ""))
         if _names_a_full_disk(message):
@@ -238,9 +238,9 @@ def _last_lines(log: Path, *, most: int = 2000) -> str:
             lines = [line.strip(" │╭╰─╮╯") for line in file.read().decode(errors="replace").splitlines()]
     except OSError:
         return ""
-    said = [line for line in lines if line]
-    found = [line for line in said if re.match(r"[\w.]*(Error|Exception|Interrupt)\b", line)]
-    return (found[-1:] or said[-1:] or [""])[0][:most]
+    full = [line for line in lines if line]
+    found = [line for line in full if re.match(r"[\w.]*(Error|Exception|Interrupt)\b", line)]
+    return (found[-1:] or full[-1:] or [""])[0][:most]
 
 
 def _failed_checks(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -254,7 +254,7 @@ def _failed_checks(content: Mapping[str, Any]) -> dict[str, Any]:
         "message": f"{len(failed)} checks failed: {shown}",
         "expected": "checks that pass",
         "received": shown,
-        "remedy": advice[0] if advice else "see its report; `accept` in the job file goes on all the same",
+        "remedy": advice[0] if advice else "see its report; `accept` in the job file continues all the same",
         "checks": words,
     }
 

@@ -5,7 +5,7 @@ has one writer at a time (`pipelines.batch.hold`) and is replaced whole, so that
 
 | state | of a step or a job |
 |---|---|
-| waiting | has not begun, or was interrupted and goes on where it stood |
+| waiting | has not begun, or was interrupted and continues where it stood |
 | running | a process works on it |
 | done | came to its end, and its checks passed or are accepted |
 | failed | its checks failed, or the system's failures used up its attempts |
@@ -27,7 +27,8 @@ from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
-from pipelines.batch.jobs import STEPS, Job, JobFile
+from pipelines.batch.jobs import Job, JobFile
+from pipelines.batch.steps import STEPS
 from pipelines.runs.code import PACKAGES, TRAINING, code_of, sha256_file, versions
 from pipelines.runs.manifest import require_plain_fields
 from smplxpp import __version__
@@ -66,7 +67,7 @@ class StepRecord:
         log: file of its standard error, below RUNS/SUBJECT.
         answer: file of its JSON answer, there too.
         asked: the command as the job asks for it, without places that differ from machine to machine.
-        proofs: SHA-256 of the files by which a later start tells that it stands, by their paths there.
+        proofs: SHA-256 of the files that prove to a later start that it stands, by their paths there.
     """
 
     step: str
@@ -154,7 +155,7 @@ class Batch:
 
     @staticmethod
     def of(file: JobFile, path: Path, *, key: str, started: str | None = None) -> Batch:
-        """Return the record of a batch that begins, or goes on."""
+        """Return the record of a batch that begins, or continues."""
         jobs = tuple({"subject": job.subject, "capture": job.capture, "steps": list(job.steps)} for job in file.jobs)
         return Batch(file.name, str(__version__), key, started or now(), str(path), jobs)
 
@@ -236,7 +237,7 @@ def records_of(runs: Path, batch: Batch) -> list[JobRecord]:
 
 
 def proofs_of(folder: Path, job: Job, step: str) -> dict[str, str]:
-    """Return the SHA-256 of the files by which a step stands, by their paths in the subject's folder.
+    """Return the SHA-256 of the files that prove that a step stands, by their paths in the subject's folder.
 
     A stage's manifest has the digests of its files, so that the manifests stand for all that a command made.
     """

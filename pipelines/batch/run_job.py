@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.batch.hold import JOB_HOLD, Hold, stop_requested
-from pipelines.batch.jobs import STEPS, Job
+from pipelines.batch.jobs import Job
 from pipelines.batch.process import Ended, Meaning, end_orphan, meaning_of, own_program, run_process
 from pipelines.batch.records import (
     LOGS,
@@ -32,6 +32,7 @@ from pipelines.batch.records import (
     save_job,
     stands,
 )
+from pipelines.batch.steps import STEPS
 from pipelines.batch.stores import Store
 from pipelines.runs.folders import keep_out_of_capture
 from smplxpp.core.errors import InputError, MissingExtraError
@@ -57,8 +58,8 @@ class Resources:
         threads: OMP_NUM_THREADS of its commands; 0: as the environment says.
         gpus: CUDA_VISIBLE_DEVICES of its commands; None: as the environment says, as Ray and Slurm set it.
         steps: steps of this call; empty: all.
-        minutes: of this call, after which a training stops and goes on in the next; 0: no limit.
-        max_retries: attempts of a step beyond the first that the system's failures may cost.
+        minutes: of this call, after which a training stops and continues in the next; 0: no limit.
+        max_retries: attempts of a step after the first that the system's failures may cost.
         code_key: that of the batch, which the installed code has to have; empty: any.
         scratch: folder on a local disk for what is copied from addresses.
         results: address that a finished subject's folder is copied to; empty: none.
@@ -172,7 +173,7 @@ class _Chain:
         self._save()
         if self.record.state == "done" and self.resources.results:
             meaning = self._send()
-        # What was fetched to scratch goes when nobody will ask for it: a retry may come for what failed.
+        # What was fetched to scratch goes when no step will read it: a retry may come for what failed.
         if self.record.state == "done":
             self.store.clear()
         return meaning

@@ -23,11 +23,12 @@ from pipelines.batch.driver import Progress as State
 from pipelines.batch.driver import begin_batch, drive, retry, take_batch
 from pipelines.batch.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor, gpus_here
 from pipelines.batch.hold import BATCH_HOLD, at_work, request_stop
-from pipelines.batch.jobs import STEPS, Job, JobFile, option_words, read_jobs
+from pipelines.batch.jobs import Job, JobFile, option_words, read_jobs
 from pipelines.batch.page import INDEX_FILE, STATE_STYLES, IndexWriter, terminal_table
 from pipelines.batch.plan import Cost, Site, breaks_first, demands, plan_jobs, read_rates
 from pipelines.batch.records import Batch, read_batch
 from pipelines.batch.run_job import Resources
+from pipelines.batch.steps import STEPS
 from pipelines.batch.table import Row, count_states
 from pipelines.commands.help import checked_arguments
 from pipelines.commands.options import OptionalInt, OptionalPath, OptionalText
@@ -49,7 +50,7 @@ class Machines:
     partition: str = ""
     """With --slurm: the partition; by default Slurm's."""
     minutes: float = 1440.0
-    """With --slurm: limit of a stay on a machine, for jobs that name none; a training stops before it and goes on."""
+    """With --slurm: limit of a stay on a machine, for jobs that name none; a training stops before it and continues."""
     max_retries: int = 2
     """Further attempts of a command that the system ended: killed, out of memory, its machine lost. What a command
     refuses, and checks that fail, are final until `batch retry`."""
@@ -87,7 +88,7 @@ class Machines:
 
 @dataclass(frozen=True)
 class RunBatch:
-    """Options of `smplxpp batch`. The same command goes on with a batch that was interrupted."""
+    """Options of `smplxpp batch`. The same command continues with a batch that was interrupted."""
 
     jobs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="JOBS.yaml")]
     """File with the subjects, their captures, and what to do with each (docs/batch.md)."""
@@ -185,7 +186,9 @@ class BatchStop:
         batch = read_batch(self.runs)
         request_stop(self.runs)
         if not self.json:
-            Console().print(f"asked to stop; `smplxpp batch {batch.job_file}` goes on", soft_wrap=True, highlight=False)
+            Console().print(
+                f"asked to stop; `smplxpp batch {batch.job_file}` continues", soft_wrap=True, highlight=False
+            )
         return {"runs": str(self.runs), "driver": at_work(self.runs / BATCH_HOLD)}
 
 
@@ -249,12 +252,12 @@ def _parsed(step: str, words: tuple[str, ...]) -> None:
     more = dict.fromkeys(("train", "evaluate", "reconstruct"), of_capture)
     places = {**more, "convert": ["--out", "out"], "metrics": ["truth"]}.get(step, [])
     places = [] if places and places[0] in checked else places
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed):
             tyro.cli(options, args=["place", *places, *checked], config=(tyro.conf.FlagCreatePairsOff,))
     except SystemExit:
-        lines = [line.strip(" │╭╰─╮╯") for line in said.getvalue().splitlines()]
+        lines = [line.strip(" │╭╰─╮╯") for line in printed.getvalue().splitlines()]
         raise InputError(
             "options",
             expected=f"values that `smplxpp {name}` takes",

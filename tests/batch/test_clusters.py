@@ -9,9 +9,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from pipelines.batch import executors
 from pipelines.batch.driver import begin_batch, drive, take_batch
 from pipelines.batch.executors import RayExecutor, SlurmExecutor
 from pipelines.batch.hold import JOB_HOLD, read_holder
@@ -156,6 +158,20 @@ def test_extras_that_are_not_installed_are_told(tmp_path, monkeypatch):
         RayExecutor(tmp_path, Resources(), address="auto")
     with pytest.raises(ImportError, match=r"a batch on Slurm needs submitit.*extra cluster"):
         SlurmExecutor(tmp_path, Resources())
+
+
+def test_a_ray_of_another_version_is_told(tmp_path, monkeypatch):
+    """A cluster's own words, in the place of Ray, which the test environment lacks."""
+    words = "Version mismatch: The cluster was started with: Ray: 2.9.0 Python: 3.10.4"
+
+    def init(**options):
+        raise RuntimeError(words)
+
+    ray = SimpleNamespace(__version__="2.60.0", is_initialized=lambda: False, init=init)
+    monkeypatch.setattr(executors, "_ray", lambda: ray)
+    with pytest.raises(InputError, match="Ray 2.60.0 and Python") as caught:
+        RayExecutor(tmp_path, Resources(), address="auto")
+    assert caught.value.received == words and "install its version" in caught.value.remedy
 
 
 @pytest.mark.slow
