@@ -169,7 +169,7 @@ def test_a_ray_of_another_version_is_told(tmp_path, monkeypatch):
 
     ray = SimpleNamespace(__version__="2.60.0", is_initialized=lambda: False, init=init)
     monkeypatch.setattr(executors, "_ray", lambda: ray)
-    with pytest.raises(InputError, match="Ray 2.60.0 and Python") as caught:
+    with pytest.raises(InputError, match=r"Ray 2\.60\.0 and Python") as caught:
         RayExecutor(tmp_path, Resources(), address="auto")
     assert caught.value.received == words and "install its version" in caught.value.remedy
 
