@@ -110,7 +110,7 @@ def frames_option(frames: Sequence[int]) -> str:
 
 
 def shape_frames(frames: Sequence[int], most: int) -> tuple[int, ...]:
-    """Return at most so many frames, spread evenly over a take, whose registration gives the shape of all chunks."""
+    """Return at most `most` frames, spread evenly over a take, whose registration gives the shape of all chunks."""
     return tuple(spread(list(frames), most))
 
 

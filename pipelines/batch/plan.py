@@ -124,7 +124,7 @@ class Cost:
         return Cost(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(Cost)))
 
     def times(self, share: float) -> Cost:
-        """Return so many times the cost."""
+        """Return the cost times a number."""
         return Cost(*(getattr(self, one.name) * share for one in fields(Cost)))
 
 
@@ -262,7 +262,7 @@ def plan_jobs(jobs: Sequence[Job], rates: Rates, site: Site) -> tuple[dict[str, 
         for step in job.steps:
             cost = cost_of(step, facts, rates, preset=str(train.get("preset", "cpu")), gpu=gpu)
             costs[step] = costs.get(step, Cost()) + cost
-    # Captures that nobody can look at from here are taken to be like the others.
+    # Captures at an address are taken to be like the others.
     seen = len(jobs) - len(unknown)
     if unknown and seen:
         costs = {step: cost.times((seen + len(unknown)) / seen) for step, cost in costs.items()}

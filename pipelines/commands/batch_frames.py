@@ -43,7 +43,7 @@ from smplxpp.register import RegisterConfig
 
 @dataclass(frozen=True)
 class BatchFrames:
-    """Options of `smplxpp batch frames`. The same command goes on with one that was interrupted."""
+    """Options of `smplxpp batch frames`. The same command continues one that was interrupted."""
 
     step: Annotated[Literal["reconstruct", "register", "metrics"], tyro.conf.Positional]
     """Command that computes a chunk. All frames of a registration share the shape of frames all over the take."""
