@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -135,8 +136,8 @@ def page_html(content: dict[str, Any]) -> str:
     return environment.get_template("index.html.j2").render(title=content["title"], data=data, files=SUMMARY_FILE)
 
 
-def terminal_table(rows: Sequence[Row], *, most: int = 40) -> Table:
-    """Return the first rows as a table for a terminal; a reason stands below its subject.
+def terminal_table(rows: Sequence[Row], *, most: int = 40) -> Group:
+    """Return the first rows as a table for a terminal; reasons stand below it, as wide as the terminal.
 
     Args:
         rows: the rows, worst first.
@@ -149,13 +150,9 @@ def terminal_table(rows: Sequence[Row], *, most: int = 40) -> Table:
     for name in ("min", "GPU h", "gates", "poses dB", "views dB", "P2S mm", "MB"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows[:most]:
-        # Untrusted words are text, never markup.
-        subject = Text(row.subject)
-        if row.reason:
-            subject.append(f"\n{row.reason}", style="dim")
         p2s = row.poses_p2s if row.poses_p2s is not None else row.views_p2s
         table.add_row(
-            subject,
+            Text(row.subject),
             Text(row.state, style=STATE_STYLES[row.state]),
             f"{row.step} {row.done}/{row.steps}".strip(),
             f"{row.minutes:.1f}",
@@ -168,7 +165,8 @@ def terminal_table(rows: Sequence[Row], *, most: int = 40) -> Table:
         )
     if len(rows) > most:
         table.caption = f"{len(rows) - most} more in {INDEX_FILE} and {SUMMARY_FILE}"
-    return table
+    # Untrusted words are text, never markup.
+    return Group(table, *(Text(f"{row.subject}: {row.reason}", style="dim") for row in rows[:most] if row.reason))
 
 
 def _cell(value: float | None, digits: int) -> str:
