@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -81,8 +82,9 @@ MOTIONS: Mapping[str, tuple[_Key, ...]] = {
     "squat": ((0.0, {}, (0, 0, 0)), (0.5, _SQUAT, (0, -0.55, 0)), (0.9, _SQUAT, (0, -0.55, 0)), (1.5, {}, (0, 0, 0))),
     "twist": tuple((0.3 * k, {"pelvis": (0, 75.0 * (-1) ** k * (k > 0), 0)}, (0, 0, 0)) for k in range(6)),
     "dance": (
-        *((0.0, {}, (0, 0, 0)), (0.35, {**_SPLIT, "pelvis": (0, 120.0, 0)}, (0, 0, 0.2))),
-        *((0.8, {**_STRIDE, **_both("shoulder", z=40.0), "pelvis": (0, 240.0, 0)}, (0.3, 0, 0.2))),
+        (0.0, {}, (0, 0, 0)),
+        (0.35, {**_SPLIT, "pelvis": (0, 120.0, 0)}, (0, 0, 0.2)),
+        (0.8, {**_STRIDE, **_both("shoulder", z=40.0), "pelvis": (0, 240.0, 0)}, (0.3, 0, 0.2)),
         (1.15, {**_BACK, "pelvis": (0, 340.0, 0), "spine2": (0, 30.0, 0)}, (0.3, 0, 0)),
         (1.5, {"pelvis": (0, 380.0, 0)}, (0, 0, 0)),
     ),
@@ -130,7 +132,7 @@ def wardrobe(mannequin: Mannequin) -> dict[str, Garment]:
     waist = j["spine1"][1] + 0.04
     calf = 0.45 * j["left_knee"][1] + 0.55 * j["left_ankle"][1]
 
-    def skirt(name: str, top: float, hem: float, label: str = "lower", **cut: object) -> Garment:
+    def skirt(name: str, top: float, hem: float, label: str = "lower", **cut: Any) -> Garment:
         return Garment(name, label, partial(hung, mannequin, top, hem, **cut), loose=True)
 
     more = (
@@ -154,7 +156,7 @@ def dressed(mannequin: Mannequin, garment: Garment) -> Template:
         vertex_labels=np.repeat([0, label], [count, more]),
         vertex_part=np.repeat([0, 1], [count, more]),
         part_names=("body", garment.label),
-        vertex_colors=np.repeat(np.uint8([[205, 165, 140], [70, 95, 160]]), [count, more], axis=0),
+        vertex_colors=np.repeat(np.array([[205, 165, 140], [70, 95, 160]], dtype=np.uint8), [count, more], axis=0),
         weights=SkinWeights.from_dense(np.concatenate([body.weights, cloth.weights])),
         betas=mannequin.params.betas[0],
         body_index=np.concatenate([np.arange(count), np.zeros(more, int)]),

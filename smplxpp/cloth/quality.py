@@ -20,9 +20,10 @@ LONGEST_EDGE = Gate("x", 1.25, 1.25, higher_is_better=False)
 
 Woven cloth tears or is cut on the bias beyond a quarter; the eye sees a taut string from there on.
 """
-SPIKE = Gate("x", 2.0, 2.0, higher_is_better=False)
+SPIKE = Gate("x", 2.0, 10.0, higher_is_better=False)
 """Longest edge of the drawn surface over its length at rest. It bends about the simulated one at a distance, so that
-its outer side is longer in every fold: garments that hold reach 1.8, slivers in a tear 3 and more."""
+its outer side is longer in every fold: most garments reach 1.8, lips of a folded hem, which hang on another side of the
+cloth, 3 to 6, and pieces beside the simulated one 10 and more."""
 INSIDE = Gate("% of particles", 5.0, 20.0, higher_is_better=False)
 """Mean share of particles more than `BURIED` inside of what they touch: a limb shows through a larger patch."""
 BURIED = 2e-3
@@ -59,8 +60,8 @@ class ClothQuality:
 
     @property
     def holds(self) -> bool:
-        """Return whether no edge was too long, no sliver drawn into a spike, and nothing broke down."""
-        return self.longest <= LONGEST_EDGE.fail and self.drawn <= SPIKE.fail and not self.resets
+        """Return whether no edge was too long and nothing broke down."""
+        return self.longest <= LONGEST_EDGE.fail and not self.resets
 
     def with_(self, other: ClothQuality) -> ClothQuality:
         """Return the figures of both spans of frames together.
