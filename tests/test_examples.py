@@ -13,6 +13,7 @@ import runpy
 import subprocess
 import sys
 import warnings
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from unittest import mock
@@ -25,6 +26,7 @@ from PIL import Image
 import avatar
 import smplxpp
 from avatar.formats.ply import read_splat_ply
+from avatar.training.engine.checkpoints import STATE_FILE
 from smplxpp import Template, build_template
 from smplxpp.build.report import BuildReport
 from tests.pipelines.training_runs import quick
@@ -70,10 +72,19 @@ def run_example(name: str, out: Path, *arguments: str, template: Path | None = N
         mock.patch.object(sys, "argv", [f"{name}.py", *arguments, "--out", str(out)]),
         mock.patch.object(smplxpp, "build_template", build),
         quick(),
+        rough_clothes(),
         mock.patch.object(avatar, "TrainConfig", partial(avatar.TrainConfig, gaussians=GAUSSIANS)),
     ):
         runpy.run_path(f"examples/{name}.py", run_name="__main__")
     return printed.getvalue()
+
+
+@contextlib.contextmanager
+def rough_clothes() -> Iterator[None]:
+    """Within the block clothes that a two hundredth of the steps has tracked may stretch as they are simulated."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "simulated clothes", smplxpp.core.GeometryWarning)
+        yield
 
 
 def _built_before(template: Path, capture: smplxpp.Capture) -> smplxpp.BuildResult:
@@ -138,6 +149,7 @@ def test_notebook_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
         contextlib.redirect_stdout(printed),
         mock.patch.object(smplxpp, "build_template", _small_template),
         quick(),
+        rough_clothes(),
     ):
         for source in code_of_notebook(name):
             exec(compile(source, name, "exec"), names)
@@ -181,7 +193,8 @@ def test_example_runs_and_writes_only_its_files(name: str, tmp_path: Path, built
         template = built[1] / "smplxpp.npz"
         given = ("--template", str(template)) if name == "05_fit" else SHORT.get(name, ())
         text = run_example(name, out, *given, template=template)
-    assert {path.name for path in out.iterdir()} == FILES[name]
+    # A fit on a busy machine leaves the checkpoint of its half minute.
+    assert {path.name for path in out.iterdir()} - {STATE_FILE} == FILES[name]
     check = {
         "00": check_main_job,
         "01": check_build,
