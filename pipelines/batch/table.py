@@ -173,15 +173,19 @@ def _of_record(record: JobRecord) -> dict[str, Any]:
         "peak_mb": max((step.peak_mb for step in steps), default=0.0) or None,
         "host": "" if last is None else last.host,
         "log": f"{record.subject}/{last.log}" if last is not None and last.log else "",
-        "reason": "" if record.state in ("done", "running", "waiting") else _reason(record),
+        "reason": "" if record.state in ("done", "running") else _reason(record),
     }
 
 
 def _reason(record: JobRecord) -> str:
     """Return in a line why a subject stopped: expected, received and remedy of its step's error, or its status."""
-    step = next((one for one in record.steps if one.state in ("failed", "refused", "stopped")), None)
+    stopped = [one for one in record.steps if one.state in ("failed", "refused", "stopped")]
+    # A full disk or other code leaves a step waiting, with the reason.
+    step = next(
+        (one for one in [*stopped, *record.steps] if one in stopped or (one.state == "waiting" and one.error)), None
+    )
     if step is None:
-        return record.note
+        return "" if record.state == "waiting" else record.note
     error = step.error or {}
     parts = [f"{name} {error[name]}" for name in ("expected", "received") if error.get(name)]
     if not parts:

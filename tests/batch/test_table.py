@@ -49,6 +49,12 @@ def test_the_worst_come_first_with_their_reasons(tmp_path):
     assert "cannot be read" in broken.reason
     refused = next(row for row in rows if row.state == "refused")
     assert refused.reason == "scan: expected one whole person, received two heads <b>& a dog</b>. Give --params"
+    # A disk that was full leaves its subject waiting, and says why.
+    record = json.loads((runs / "subject_0004" / "job.json").read_text())
+    record["steps"][0]["error"] = {"message": "no space left on device"}
+    (runs / "subject_0004" / "job.json").write_text(json.dumps(record))
+    waiting = [row for row in BatchTable(runs).rows() if row.state == "waiting"]
+    assert {row.reason for row in waiting} == {"", "no space left on device"}
     done = [row for row in rows if row.state == "done"]
     assert [row.poses_psnr for row in done] == sorted(row.poses_psnr for row in done)
     # Failed gates go before bad pictures, and a harder protocol before an exact one.
