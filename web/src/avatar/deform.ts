@@ -12,7 +12,7 @@ import { RegressionEvaluator } from "./regression.ts";
 export const RECORD = 14;
 const BODY_JOINTS = 21;
 /** Standard deviation of skin that is laid bare: in its triangle's mean edge, and in the mean distance of Gaussians, which many triangles lack. */
-const BARE_EDGES = 0.5, BARE_SPACING = 0.6;
+const BARE_EDGES = 0.5, BARE_SPACING = 1.35;
 /** What a pose takes time for, as `avatar.runtime.player` counts it. */
 export const PARTS = ["pose", "field", "blend", "world"] as const;
 
