@@ -32,7 +32,7 @@ from pipelines.batch.steps import STEPS
 from pipelines.runs.code import PACKAGES, TRAINING, code_of, sha256_file, versions
 from pipelines.runs.manifest import require_plain_fields
 from smplxpp import __version__
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, require_choice
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_list, as_object, as_text, read_json
 from smplxpp.core.files.paths import regular_file
@@ -192,7 +192,10 @@ def read_batch(runs: Path) -> Batch:
     texts = {name: as_text(value, subject=f"batch {path}: {name}") for name, value in known.items()}
     jobs = [as_object(job, subject=f"batch {path}: job") for job in as_list(content.pop("jobs", None), subject="jobs")]
     for job in jobs:
-        as_text(job.get("subject"), subject=f"batch {path}: subject")
+        for name in ("subject", "capture"):
+            as_text(job.get(name), subject=f"batch {path}: {name}")
+        for step in as_list(job.get("steps"), subject=f"batch {path}: steps"):
+            require_choice(f"batch {path}: steps", as_text(step, subject=f"batch {path}: step"), tuple(STEPS))
     return Batch(
         texts["name"], texts["version"], texts["code_key"], texts["started"], texts["job_file"], tuple(jobs), content
     )
@@ -231,8 +234,8 @@ def records_of(runs: Path, batch: Batch) -> list[JobRecord]:
     out = []
     for job in batch.jobs:
         found = read_job(runs, job["subject"])
-        steps = [StepRecord(step) for step in job.get("steps", [])]
-        out.append(found or JobRecord(job["subject"], job.get("capture", ""), steps))
+        steps = [StepRecord(step) for step in job["steps"]]
+        out.append(found or JobRecord(job["subject"], job["capture"], steps))
     return out
 
 

@@ -16,6 +16,8 @@ from avatar.models.model_file import load_avatar, save_avatar
 from avatar.rig.rig import Rig
 from avatar.training.engine.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.training.engine.metrics_log import read_metrics
+from pipelines.batch.jobs import read_jobs
+from pipelines.batch.records import Batch, JobRecord, read_batch, records_of, save_batch, save_job
 from pipelines.commands.inspect import summarise_run
 from pipelines.report import Report, write_report
 from pipelines.report.builder import readable
@@ -144,6 +146,28 @@ def _model_door(kind: str, *, compact: bool = False) -> Door:
     )
 
 
+def _write_batch(folder: Path) -> None:
+    """A job file, the record of its batch and that of one subject."""
+    path, entries = folder / "jobs.yaml", "train: {preset: gpu, loose_parts: [upper]}, resources: {gpus: 0.5}"
+    path.write_text(
+        f"out: runs\ndefaults: {{steps: [build, train]}}\njobs:\n  - {{subject: a, capture: c, {entries}}}\n"
+    )
+    file = read_jobs(path)
+    save_batch(file.out, Batch.of(file, path, key="a" * 64))
+    record = JobRecord.of(file.jobs[0])
+    record.steps[0].error = {"message": "scan: expected a person", "checks": ["P2S"]}
+    save_job(file.out, record)
+
+
+def _open_batch(folder: Path) -> None:
+    """What a start, `batch status` and the page read."""
+    file = read_jobs(folder / "jobs.yaml")
+    for record in records_of(folder / "runs", read_batch(folder / "runs")):
+        record.settle()
+    for job in file.jobs:
+        _ = [job.command(step, folder, job.capture) for step in job.steps]
+
+
 def run_doors() -> list[Door]:
     """Doors that `avatar` and `pipelines` have."""
     lines = [{"iteration": k, "loss": 1.0 / (k + 1), "psnr": 20.0 + k} for k in range(6)]
@@ -188,6 +212,7 @@ def run_doors() -> list[Door]:
             unit_cube_of,
         ),
         Door("run", _write_run, _open_run, ("**/*.json",), refuses=False),
+        Door("batch", _write_batch, _open_batch, ("**/*.json", "*.yaml")),
         Door(
             "splats",
             lambda folder: write_splat_ply(folder / "s.ply", random_splats()),
