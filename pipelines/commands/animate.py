@@ -186,8 +186,8 @@ class Animate:
         moved = f", simulated: {', '.join(simulated)}" if simulated else ""
         Console().print(f"{self.out}: {frames} frames at {fps:g} a second{moved}", markup=False)
         failed = [check for check in all_checks(self._quality, "the film") if check.status == "fail"]
-        said = [f"FAILED {one.name}: {one.value:.2f} {one.unit}, {one.gate}; {one.explanation}" for one in failed]
-        for sentence in (*self._notes, *said):
+        failures = [f"FAILED {one.name}: {one.value:.2f} {one.unit}, {one.gate}; {one.explanation}" for one in failed]
+        for sentence in (*self._notes, *failures):
             Console(stderr=True).print(sentence, markup=False)
 
     def _check_options(self, suffix: str) -> None:

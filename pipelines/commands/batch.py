@@ -164,7 +164,7 @@ class BatchStatus:
     """Print the summary as JSON."""
 
     def run(self) -> dict[str, Any]:
-        """Summarise the records, and write the page and the table anew."""
+        """Summarise the records, and write the page and the table again."""
         rows = IndexWriter(self.runs).write()
         summary = summarise(self.runs, rows)
         if not self.json:

@@ -90,10 +90,10 @@ def _print(report: dict[str, Any], console: Console, out: Path | None) -> None:
         console.print(f"no stress poses: {report['rig']['not_posed']}", style="yellow", markup=False)
     for name, of in report.get("quality", {}).items():
         if of["border_loops"] or of["nonmanifold_vertices"]:
-            said = f"{name}: {of['components']} pieces, {of['border_loops']} borders"
-            said += f", the longest {max(of['border_lengths_mm']):,.0f} mm" if of["border_loops"] else ""
-            said += f", touching at {n} vertices" if (n := of["nonmanifold_vertices"]) else ""
-            console.print(said, markup=False, highlight=False)
+            line = f"{name}: {of['components']} pieces, {of['border_loops']} borders"
+            line += f", the longest {max(of['border_lengths_mm']):,.0f} mm" if of["border_loops"] else ""
+            line += f", touching at {n} vertices" if (n := of["nonmanifold_vertices"]) else ""
+            console.print(line, markup=False, highlight=False)
     verdict, where = report["verdict"], f"; faults in colour: {out / 'faults.ply'}" if out else ""
     passed = f"{len(report['checks']) - len(faults)} of {len(report['checks'])} checks pass"
     console.print(f"[{styles[verdict]}]{verdict}[/]: {passed}; {size}{where}")

@@ -219,7 +219,7 @@ def flat_row(frame: dict[str, Any]) -> dict[str, Any]:
             row[f"{prefix}fscore@{scores['threshold_mm']:g}mm"] = scores["fscore"]
         # Normals are read for both directions together.
         for key in ("normal_angle_deg", "normal_consistency"):
-            values = [(result[way] or {}).get(key) for way in ("pred_to_gt", "gt_to_pred")]
+            values = [(result[side] or {}).get(key) for side in ("pred_to_gt", "gt_to_pred")]
             known = [value for value in values if value is not None]
             row[prefix + key] = float(np.mean(known)) if len(known) == 2 else None
         for direction in ("pred_to_gt", "gt_to_pred"):

@@ -144,7 +144,7 @@ def _subject(subject: str | Path | MeshLike | Template, unit: str) -> MeshVerdic
     mesh = as_mesh(file.mesh, unit=unit)
     parts = {"mesh": np.ones(mesh.face_count, dtype=bool)}
     if file.face_part is not None and len(np.unique(file.face_part)) > 1:
-        # Meshes of one name are told apart by their numbers.
+        # Meshes of one name are distinguished by their numbers.
         names = [
             name if file.part_names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(file.part_names)
         ]

@@ -18,16 +18,14 @@ if TYPE_CHECKING:
 LONGEST_EDGE = Gate("x", 1.25, 1.25, higher_is_better=False)
 """Longest edge of the simulated mesh over its length at rest, in any frame that is used.
 
-Woven cloth tears or is cut on the bias beyond a quarter; the eye sees a taut string from there on.
+Woven cloth tears or is cut on the bias above a quarter; the eye sees a taut string from there on.
 """
 SPIKE = Gate("x", 2.0, 10.0, higher_is_better=False)
 """Longest edge of the drawn surface over its length at rest. It bends about the simulated one at a distance, so that
 its outer side is longer in every fold: most garments reach 1.8, lips of a folded hem, which hang on another side of the
 cloth, 3 to 6, and pieces beside the simulated one 10 and more."""
 INSIDE = Gate("% of particles", 5.0, 20.0, higher_is_better=False)
-"""Mean share of particles more than `BURIED` inside of what they touch: a limb shows through a larger patch."""
-BURIED = 2e-3
-"""Metres inside from which a particle counts: the distance that drawn cloth keeps from the skin."""
+"""Mean share of particles more than 2 mm inside of what they touch: a limb shows through a larger patch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +38,7 @@ class ClothQuality:
         longest: longest edge of the simulated mesh over its length at rest, in the worst frame.
         longest_at: seconds of that frame.
         drawn: the same of the drawn surface.
-        inside: mean share of the free particles that are more than `BURIED` inside of what they touch.
+        inside: mean share of the free particles that are more than 2 mm inside of what they touch.
         inside_most: that share in the worst frame.
         deepest: depth of the deepest one in any frame, metres.
         resets: how often the simulation broke down and began again on the body.

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int, Int64
 
 from smplxpp.cloth.embedding import CarriedVertices
 from smplxpp.cloth.garment import Garment
-from smplxpp.cloth.quality import BURIED, ClothQuality, EdgeLengths, drawn_edges
+from smplxpp.cloth.quality import ClothQuality, EdgeLengths, drawn_edges
 from smplxpp.cloth.solver import ClothSolver, ClothState, move_before_collider
 from smplxpp.core.mesh import row_lengths
 
@@ -92,7 +92,7 @@ class GarmentThread:
             return None
         self._state = ClothState.at_rest(own)
         self._resets += 1
-        return "the simulation broke down; the cloth is on the body again and goes on from there"
+        return "the simulation broke down; the cloth was laid on the body again and continues from there"
 
     def place(self, particles: Float32[np.ndarray, "n 3"]) -> None:
         """Put the particles elsewhere, metres from the driver's origin; their velocities stay."""
@@ -131,11 +131,12 @@ class GarmentThread:
         """Measure the garment as it is.
 
         Args:
-            seconds: of the motion, to be said with the figures.
+            seconds: of the motion, printed with the figures.
             drawn: where the carried vertices are, metres.
         """
         depths = self._depths()
-        inside = float((depths > BURIED).mean()) if len(depths) else 0.0
+        buried = 2e-3  # metres, the distance that drawn cloth keeps from the skin
+        inside = float((depths > buried).mean()) if len(depths) else 0.0
         resets, self._resets = self._resets, 0
         released, self._released = self._solver.released - self._released, self._solver.released
         return ClothQuality(

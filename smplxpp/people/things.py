@@ -156,7 +156,7 @@ def _hat(body: BodyModel, posed: PosedBody, crown: float, brim: float, forward: 
         posed: its first body wears it.
         crown: height of the crown, metres; its edge is round where it is below 10 cm.
         brim: radius of the brim, metres.
-        forward: metres by which the brim lies before the middle of the head, as the peak of a cap.
+        forward: distance in metres of the brim before the middle of the head, as the peak of a cap.
     """
     _, turn = _head(body, posed)
     head = posed.vertices[0][body.weights[:, body.joint_names.index("head")] > 0.9] @ turn

@@ -45,11 +45,10 @@ _ON_HEAD = ((0.0, 1.0), (-0.5, -0.5))
 _BOARD, _BOARD_ON_CHEST = 0.3, ((0.02, 0.04), (0.0, 1.0))
 _BOARD_REACH = 0.6
 """Metres from a hand within which boards are looked for, the diagonal of a large folder."""
-_HANGS, _LOOKS_OUT = 0.09, 0.5
-"""Metres within which a shirt or skirt hangs off trunk and legs, and the cosine between its normal and theirs."""
-# Evidence of surface off trunk and legs that the other side of the person lacks at the mirrored place, by its distance
-# from the body and by how far the scan is from that place, metres.
-_WORN, _LACKED = ((0.015, 0.04, 0.10), (-1.0, 0.0, 0.6)), ((0.03, 0.06), (0.0, 1.0))
+_LOOKS_OUT = 0.5
+"""Cosine between the normals of a shirt or skirt and of the trunk and legs that it hangs off."""
+# Evidence of surface off trunk and legs that the other side of the person lacks, by its distance from the body, metres.
+_WORN = (0.015, 0.04, 0.10), (-1.0, 0.0, 0.6)
 _LENGTH_COST = 2.0  # square centimetres of evidence for one centimetre of a cut through smooth, plain surface
 
 
@@ -98,17 +97,19 @@ def find_objects(
     waist = 1.05
     chest = (region == TRUNK) & (own.height[nearest] > waist)
     evidence = _evidence(distance, region, chest)
-    # Below a hand clothes hang off the trunk: they look the way that it looks there.
+    # Below a hand clothes hang off the trunk: they face where it faces there.
     clothed = np.isin(own.region, (TRUNK, LEG))
     off, at = cKDTree(posed.vertices[clothed]).query(mesh.face_centers)
     looks = np.einsum("ij,ij->i", mesh.face_normals, posed.vertex_normals[clothed][at])
-    hangs = (region == HAND) & (off < _HANGS) & (looks > _LOOKS_OUT)
+    reach = 0.09  # metres within which a shirt or skirt hangs off them
+    hangs = (region == HAND) & (off < reach) & (looks > _LOOKS_OUT)
     evidence[hangs] = np.minimum(evidence[hangs], 0.0)
     lacked = np.zeros(mesh.face_count)
     beside = np.flatnonzero(np.isin(region, (TRUNK, LEG)) & (distance > _WORN[0][0]))
     if len(beside):
         away = _from_mirrored(mesh, body, params, posed, beside, np.flatnonzero(clothed)[at[beside]])
-        lacked[beside] = np.interp(away, *_LACKED)
+        # By how far the scan is from the mirrored place, metres.
+        lacked[beside] = np.interp(away, (0.03, 0.06), (0.0, 1.0))
         worn = (1.0 + np.interp(distance[beside], *_WORN)) * lacked[beside] - 1.0
         evidence[beside] = np.maximum(evidence[beside], worn)
         # Cloth looks away from the body: what looks at it may be the back of a thing, and is nearly free.
@@ -127,7 +128,7 @@ def find_objects(
     unary = np.stack([np.zeros(mesh.face_count), -evidence * mesh.face_areas * _CM2], axis=1)
     unary -= unary.min(axis=1, keepdims=True)
     cut = minimize_potts(PottsProblem.from_costs(unary, pairs, cost))[0].astype(bool)
-    # What is left of either hand, where a face takes the part of the body that looks the same way.
+    # What is left of either hand, where a face takes the part of the body that faces alike.
     charted, middle = chart_of_scan(mesh, body, params), posed.vertices[own.region == TRUNK].mean(axis=0)
     left = (charted.region == HAND) & ~cut
     hands = [

@@ -79,7 +79,7 @@ class Outfit:
         margins: by border, the additional cost of the best outline whose border is more than 6 cm away, nats.
         column: P(label) in the column's rings, over all outlines.
         sleeve: P(sleeve) in the arm's rings.
-        waist_step: nats by which the surface steps at the border of lower and upper garment; inf where colours, or
+        waist_step: nats of the surface's step at the border of lower and upper garment; inf where colours, or
             folds, show it.
     """
 

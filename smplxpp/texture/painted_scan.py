@@ -88,7 +88,7 @@ class LabelledSurface:
 
     @cached_property
     def _rim(self) -> Bool[np.ndarray, "m 3"]:
-        """Whether the edge opposite each corner ends these faces: another label or a hole lies beyond it."""
+        """Whether the edge opposite each corner ends these faces: another label or a hole lies behind it."""
         corners = self.mesh.faces[self.faces]
         ends = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2), axis=2)
         key = ends[..., 0] * self.mesh.vertex_count + ends[..., 1]

@@ -42,7 +42,7 @@ class LocateBounds:
             other facings and poses begin at 25 mm.
         least_head: visible share of the head below which it is cut off: 145 right bodies have .55 and more, people
             without a head at most .08.
-        least_carried: share of the surface from which a piece with a head of its own is somebody: a child of 0.4 of a
+        least_carried: share of the surface from which a piece with a head of its own is a person: a child of 0.4 of a
             person's size has .15, a ball of 22 cm in a hand .05; no right body has a head on a piece of .05.
         most_beyond: share of the body outside the silhouettes of the surface from which this is a part of a person: a
             head is .07 to .10, both arms .16, shins and feet .20, what a search puts into legs or a bust on a stand .26
@@ -133,7 +133,7 @@ def findings_of(
         out.append(f"{len(upper)} heads, {heights} m above the lowest point: two people, or {what}")
     elif four_legged and not out:
         out.append("it stands on more than two feet: a four-legged shape as an animal, or several people")
-    # Beside somebody whose hands, face and feet are there; crossed boards have round places, too.
+    # Beside a person whose hands, face and feet are there; crossed boards have round places, too.
     carried: tuple[tuple[Piece, float], ...] = ()
     if best.misfit.bare < _BOUNDS.good_bare:
         carried = others_carried(mesh, surface, best.misfit.unexplained, least=_BOUNDS.least_carried)
