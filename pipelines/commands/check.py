@@ -96,4 +96,4 @@ def _print(report: dict[str, Any], console: Console, out: Path | None) -> None:
             console.print(line, markup=False, highlight=False)
     verdict, where = report["verdict"], f"; faults in colour: {out / 'faults.ply'}" if out else ""
     passed = f"{len(report['checks']) - len(faults)} of {len(report['checks'])} checks pass"
-    console.print(f"[{styles[verdict]}]{verdict}[/]: {passed}; {size}{where}")
+    console.print(f"[{styles[verdict]}]{verdict}[/]: {passed}; {size}{where}", soft_wrap=True)

@@ -169,7 +169,7 @@ def part_legs(
         if len(changes) != 2 or old[loop[changes]].any():
             continue
         arcs = [np.roll(loop, -k)[: (m - k) % len(loop) + 1] for k, m in (changes, changes[::-1])]
-        if min(np.ptp(part.mesh.vertices[arc, 1]) for arc in arcs) < _LEG_CUT:
+        if min(np.ptp(part.mesh.vertices[arc, 1]) for arc in arcs) < LEG_CUT:
             continue
         ends = part.mesh.vertices[loop[changes]]
         usual = float(np.median(row_lengths(np.diff(part.mesh.vertices[part.mesh.edges], axis=1)[:, 0])))
@@ -188,7 +188,7 @@ def _across(arc: Int[np.ndarray, " A"], old: Bool[np.ndarray, " M"]) -> Int[np.n
     return np.concatenate([p if len(p) <= _FEW or not old[p[0]] else p[[0, -1]] for p in pieces])
 
 
-_LEG_CUT = 0.2
+LEG_CUT = 0.2
 """Metres that a cut reaches down both legs from which on it parts them; a hole between the thighs is closed across."""
 _FEW = 3
 """Vertices of an old segment up to which it is part of the polygon: the opening that was left would be a pinhole."""

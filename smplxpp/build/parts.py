@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Integer
 
 from smplxpp.assemble.build import is_shoe
+from smplxpp.assemble.fill_holes import LEG_CUT
 from smplxpp.body import BodyModel
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
@@ -18,6 +19,7 @@ from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, f
 from smplxpp.clean.shreds import cut_borders, drawn_out, find_shreds
 from smplxpp.core import LABELS, Check, GeometryWarning, InputError, Labels, SkinWeights, StageOutput, TriangleMesh
 from smplxpp.core.labels import PartRule
+from smplxpp.core.topology import face_components
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
 from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import UnposeConfig, Unposed, invertible_weights, unpose
@@ -172,6 +174,22 @@ def transfer_config(label: str, body: BodyModel, config: BuildConfig) -> Transfe
     return replace(base, joint_names=body.joint_names, max_influences=config.max_influences)
 
 
+def _long_stretches(part: TriangleMesh, joined: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
+    """Return those faces between two legs that belong to a stretch of `LEG_CUT` and more.
+
+    Only legs that were parted so far get their inner sides back. A shorter cut, as of shorts below the crotch, is
+    closed straight across with a patch from leg to leg, which a step tears more than the cloth that was there.
+    """
+    faces = np.flatnonzero(joined)
+    number = face_components(part.faces[faces])
+    kept = joined.copy()
+    for one in np.unique(number):
+        own = faces[number == one]
+        if np.ptp(part.vertices[part.faces[own]].reshape(-1, 3), axis=0).max() < LEG_CUT:
+            kept[own] = False
+    return kept
+
+
 def _without_bridges(
     part: TriangleMesh, fit: PosedFit, body: BodyModel, ruled: _Ruled, config: BridgeConfig
 ) -> tuple[TriangleMesh, np.ndarray, SkinWeights]:
@@ -189,7 +207,7 @@ def _without_bridges(
     apart = webs_to_hands(fit.mesh, body.weights, part, ruled.settings, limbs=limbs) & ~ruled.stiff(part, source)
     # Trouser legs that touch are parted, too. Which leg the cloth goes around is found before that opens its rings.
     if limbs is not None:
-        joined = limbs.joining_legs(part.faces) & ~ruled.stiff(part, source)
+        joined = _long_stretches(part, limbs.joining_legs(part.faces) & ~ruled.stiff(part, source))
         if joined.any():
             ruled, apart = replace(ruled, limbs=limbs), apart | joined
     if apart.any():
