@@ -189,7 +189,9 @@ def _across(arc: Int[np.ndarray, " A"], old: Bool[np.ndarray, " M"]) -> Int[np.n
 
 
 LEG_CUT = 0.2
-"""Metres that a cut reaches down both legs from which on it parts them; a hole between the thighs is closed across."""
+"""Metres that a cut reaches down both legs from which on it parts them; a hole between the thighs is closed across.
+
+Shorter stretches of fused legs are not cut at all (`smplxpp.build.parts`)."""
 _FEW = 3
 """Vertices of an old segment up to which it is part of the polygon: the opening that was left would be a pinhole."""
 

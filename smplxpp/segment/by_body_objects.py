@@ -113,7 +113,8 @@ def find_objects(
         worn = (1.0 + np.interp(distance[beside], *_WORN)) * lacked[beside] - 1.0
         evidence[beside] = np.maximum(evidence[beside], worn)
         # Cloth looks away from the body: what looks at it may be the back of a thing, and is nearly free.
-        evidence[beside[looks[beside] < -_LOOKS_OUT]] = np.maximum(evidence[beside[looks[beside] < -_LOOKS_OUT]], -0.02)
+        backs = beside[looks[beside] < -_LOOKS_OUT]
+        evidence[backs] = np.maximum(evidence[backs], -0.02)
     if not (mesh.face_areas[evidence > 0].sum() * _CM2 > _LEAST_AREA):
         return FoundObjects.none(mesh.face_count)
     # Boards at an arm or on the chest, from both sides.
