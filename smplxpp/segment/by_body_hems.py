@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
@@ -103,6 +104,16 @@ class Hems:
             return np.where(low, np.maximum(own, other - less), both)
 
         return Hems(either(self.outwards, lax.outwards), either(self.inwards, lax.inwards))
+
+    def beside_rolls(self) -> tuple[Float64[np.ndarray, " R1"], Float64[np.ndarray, " R1"]]:
+        """Return nats for hems outwards and inwards, less those of an opposite step within 4.5 cm across the cloth.
+
+        A roll of cloth at the waist, or a belt, steps away from the body and back again, and is no end of a garment.
+        """
+        away, back, rings = np.maximum(self.outwards, 0.0), np.maximum(self.inwards, 0.0), 3
+        above = sliding_window_view(np.pad(back, (0, rings)), rings + 1).max(axis=1)
+        below = sliding_window_view(np.pad(away, (rings, 0)), rings + 1).max(axis=1)
+        return self.outwards - above, self.inwards - below
 
 
 def _cells(

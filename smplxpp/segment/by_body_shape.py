@@ -210,7 +210,9 @@ def _chain(seen: ShapeEvidence, with_upper: float, without: float) -> Chain:
     # Into skirts they are tucked more often.
     thighs = (middle > 0.55) & (middle < 0.72)
     tucked = _TUCKED + _TUCKED * (1.0 - float(seen.apart[thighs].mean()))
-    ways = np.stack([np.log(1.0 - tucked - _FLUSH) + over + out, np.log(tucked) + waist + into, np.log(_FLUSH) + flush])
+    over_there, into_there = seen.column_hems.beside_rolls()
+    steps = np.log(1.0 - tucked - _FLUSH) + over + over_there, np.log(tucked) + waist + into_there
+    ways = np.stack([*steps, np.log(_FLUSH) + flush])
     change[_LOWER, _UPPER] = -np.log(_NEXT[_LOWER, _UPPER]) - logsumexp(ways, axis=0)
     ends = np.array(_ENDS)
     if not seen.chest:

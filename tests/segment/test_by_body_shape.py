@@ -9,7 +9,7 @@ import pytest
 
 from smplxpp.core import TriangleMesh
 from smplxpp.segment.by_body_hems import Hems, roughness
-from smplxpp.segment.by_body_rings import ARM_START, Rings
+from smplxpp.segment.by_body_rings import ARM_START, STEP, Rings
 from smplxpp.segment.by_body_shape import Chain, ShapeEvidence, outfit_by_shape
 
 
@@ -48,6 +48,41 @@ def test_a_limb_that_swells_and_thins_has_no_hems():
     # A cuff of 10 mm on the same arm remains one.
     cuff = tube(lambda place, turn: 0.006 * np.sin(2.0 * np.pi * place / 0.22) + 0.01 * (place < 0.36))
     assert 22 <= int(cuff.inwards.argmax()) <= 26 and cuff.inwards.max() > 2.0
+
+
+def test_a_roll_at_the_waist_is_no_end_of_a_garment():
+    """A dress with a fold all round the waist was a blouse and a skirt: it steps out, and back in 3 cm above."""
+    roll = tube(lambda place, turn: 0.012 * ((place > 0.3) & (place < 0.33)))
+    out, into = roll.beside_rolls()
+    assert roll.outwards[20] > 3.0 and roll.inwards[22] > 3.0
+    assert out[20] < 0.5 and into[22] < 0.5
+    # A garment that goes on above its hem keeps all of it.
+    hem = tube(lambda place, turn: 0.012 * (place > 0.3))
+    assert hem.beside_rolls()[0][20] == hem.outwards[20]
+
+
+@pytest.mark.parametrize("hem", [False, True])
+def test_what_goes_round_both_legs_is_a_dress_unless_it_ends_at_the_waist(hem):
+    rings, none = 88, np.full(89, -3.0)
+    place = STEP * np.arange(rings)
+    distance = np.where(place < 0.5, 0.0, np.where(place < 0.9, 0.06, 0.012))
+    apart = (place < 0.5).astype(np.float64)
+    nothing = np.zeros((rings, 2))
+    column = Rings(0.0, np.ones(rings), nothing, nothing, distance, np.full(rings, 0.005))
+    out, into = none.copy(), none.copy()
+    out[34] = 7.0  # the hem of the skirt
+    if hem:
+        out[59] = 4.5
+    else:
+        out[70], into[72] = 4.0, 4.5
+    bare = np.zeros((45, 2))
+    arm = Rings(ARM_START, np.ones(45), bare, bare, np.zeros(45), np.full(45, 0.003))
+    cuff = np.full(46, -3.0)
+    cuff[9] = 3.5
+    found = outfit_by_shape(
+        ShapeEvidence(column, arm, Hems(out, into), Hems(np.full(46, -3.0), cuff), -3.3, (0.5e-3, 0.7e-3), apart)
+    )
+    assert found.one_piece != hem
 
 
 def test_a_hem_may_lie_higher_on_one_side():
