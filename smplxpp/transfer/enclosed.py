@@ -131,8 +131,13 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         if not rings[k]:
             continue
         side, step = heights(axis, mesh), np.linalg.norm(axis.points[1] - axis.points[0])
+        # Planes across a leg that is spread in the T-pose leave a skirt's hem between the legs: below rings about both
+        # legs up to two (4 cm) about one are no leg of trousers.
+        most = 2
+        tube = k > 1 or len({plane for plane, ring in rings[k] if not ring.holds}) > most
+        tube |= not any(ring.holds for _, ring in rings[k])
         for plane, ring in rings[k]:
-            corners, single = ring.corners, not ring.holds
+            corners, single = ring.corners, not ring.holds and tube
             if wall is not None and plane >= wall.first and ring.neck is not None and ring.neck.width < 1.0:
                 # This limb's are the vertices on its axis' side of the wall.
                 here = np.full(len(corners), float(plane))

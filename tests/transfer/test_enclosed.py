@@ -192,6 +192,29 @@ def test_legs_that_a_scan_has_fused_are_told_by_their_necks_and_a_skirt_has_none
         assert len(joined) and np.abs(cloths[name].vertices[joined][:, :, 0]).max() < 0.05, name
 
 
+@pytest.mark.parametrize(("planes", "leg"), [(2, False), (8, True)])
+def test_the_tip_of_a_skirt_about_one_leg_is_no_leg_of_trousers(mannequin, worn, planes, leg):
+    """One plane in 18 that met a dancer's hem about one leg alone had a quarter of her skirt follow that leg: 166 mm."""
+    case = worn("wide trousers, hem 24 cm")
+    legs = limb_axes(case.source, mannequin.body.weights, extent(case.source), TransferConfig())[:2]
+    skirt = fused_legs(legs, neck=np.ones(40))
+    kept, _ = skirt.submesh(skirt.face_centers[:, 1] > legs[0].points[20, 1])
+    # A tube across the left leg that so many of its planes meet, and none meets with the skirt.
+    rows = np.linspace(legs[0].points[25], legs[0].points[25 + planes], planes + 1) - 0.5 * (
+        legs[0].points[26] - legs[0].points[25]
+    )
+    across = np.cross(legs[0].tangents[25], [0.0, 0.0, 1.0])
+    turns = np.linspace(0.0, 2 * np.pi, 32, endpoint=False)[:, None]
+    points = rows[:, None] + 0.11 * (np.cos(turns) * across + np.sin(turns) * np.cross(legs[0].tangents[25], across))
+    index = np.arange(len(rows) * 32).reshape(-1, 32)
+    a, b = index[:-1], index[1:]
+    quads = np.stack([a, np.roll(a, -1, 1), np.roll(b, -1, 1), b], axis=-1).reshape(-1, 4)
+    tip = TriangleMesh(points.reshape(-1, 3), np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
+    found = enclosure(mannequin, case, concatenate_meshes([kept, tip]))
+    assert bool((found.limb[kept.vertex_count :] == 0).mean() > 0.9) == leg
+    assert (found.limb == -1).all() != leg
+
+
 def test_axes_run_through_the_joints(mannequin, worn):
     """They are found from the weights alone; the skeleton's joints are the reference."""
     body = mannequin.body
