@@ -157,7 +157,10 @@ class _RunCosts:
         cloth_far, skin_far = _distance_costs(rings, config, misfit)
         like_skin = _between(config.skin_in_cloth * n * rings.skin[:, 0])
         cloth = cross + _between(cloth_far)
-        skin = cross + _between(config.other_in_skin * n * rings.skin[:, 1] + skin_far)
+        # An eighth of a ring of skin may be in shadow, below hair or stained: such colours are no cloth's.
+        stained = 0.15
+        other = np.maximum(rings.skin[:, 1] - stained * rings.skin[:, 0], 0.0)
+        skin = cross + _between(config.other_in_skin * n * other + skin_far)
         most = (config.skin_colored_shoe, config.skin_colored_top, config.skin_colored)
         runs = (*(cloth + np.minimum(like_skin, one) for one in most), skin, cloth, cross)
         there = np.triu(np.ones(cross.shape, dtype=bool))

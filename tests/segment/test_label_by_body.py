@@ -346,6 +346,20 @@ def test_legs_alone_wear_a_lower_garment(body, scanned):
     assert accuracy(part, found, truth[kept]) > 0.95 and not (found == UPPER.id).any()
 
 
+def test_bare_arms_in_changing_light_are_no_sleeves():
+    """A girl's bare arms, in shades of skin from the shoulder to the wrist with stains on each, were sleeves."""
+    count = 45
+    shade = np.linspace(1.0, 3.0, count)
+    colors = np.exp(-0.5 * ((np.arange(5) - shade[:, None]) / 0.9) ** 2)
+    colors = np.hstack([colors / colors.sum(axis=1, keepdims=True), np.zeros((count, 1))])
+    skin = np.tile([3.0, 0.45], (count, 1))
+    arm = Rings(ARM_START, np.ones(count), colors, skin, np.full(count, 0.002), np.full(count, 0.005))
+    rings = round(COLUMN_END / STEP)
+    red = np.tile(np.eye(6)[5], (rings, 1))
+    shirt = Rings(0.0, np.ones(rings), red, np.tile([0.0, 3.9], (rings, 1)), np.full(rings, 0.015), np.zeros(rings))
+    assert find_outfit(shirt, arm, OutfitConfig(), misfit=0.008).cuff <= 0.0
+
+
 def test_shares_of_labels_are_sums_over_all_outlines():
     rng = np.random.default_rng(0)
     rings = 5
