@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
@@ -22,37 +23,44 @@ class PosedBody:
     """A body in T poses; numpy float64, or torch tensors where the parameters were.
 
     `vertices = skin(rest_vertices, weights, posed_from_rest)` exactly: the translation is in the transforms, the
-    pose correctives are in the rest vertices.
+    pose correctives are in the rest vertices. Vertices are skinned when they are first asked for, because what cloth
+    and players need of most poses are the transforms alone.
 
     Attributes:
-        vertices: posed, metres.
-        joints: posed joints.
+        joints: posed joints, metres.
         rest_vertices: with shape, expression and pose correctives.
         rest_joints: joints of the shaped body, before posing.
         posed_from_rest: transforms of the joints.
         pose_offsets: the pose correctives within `rest_vertices`; None where the model has none.
+        weights: skin weights of the model.
     """
 
-    vertices: Float[Array, "*T V 3"]
     joints: Float[Array, "*T J 3"]
     rest_vertices: Float[Array, "*T V 3"]
     rest_joints: Float[Array, "*T J 3"]
     posed_from_rest: Float[Array, "*T J 4 4"]
     pose_offsets: Float[Array, "*T V 3"] | None
+    weights: Float[Array, "V J"]
+
+    @cached_property
+    def vertices(self) -> Float[Array, "*T V 3"]:
+        """Posed vertices, metres."""
+        return skin(self.rest_vertices, self.weights, self.posed_from_rest)
 
     def __len__(self) -> int:
-        return self.vertices.shape[0]
+        return self.rest_vertices.shape[0]
 
     def __repr__(self) -> str:
-        shape, joints = tuple(self.vertices.shape), self.joints.shape[-2]
+        shape, joints = tuple(self.rest_vertices.shape), self.joints.shape[-2]
         return f"PosedBody(vertices of shape {shape}, {joints} joints)"
 
     def frame(self, index: int) -> PosedBody:
         """Return one frame, its arrays without the leading axis."""
         if not -len(self) <= index < len(self):
             raise InputError("frame", expected=f"an index below {len(self)}", received=str(index))
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return PosedBody(**{name: None if value is None else value[index] for name, value in values.items()})
+        offsets = None if self.pose_offsets is None else self.pose_offsets[index]
+        arrays = (self.joints, self.rest_vertices, self.rest_joints, self.posed_from_rest)
+        return PosedBody(*(array[index] for array in arrays), offsets, self.weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,8 +229,8 @@ class BodyModel:
         # Correctives belong to the rest pose, before skinning. The translation is in the transforms of the joints.
         rest = shaped if offsets is None else shaped + offsets
         posed_from_rest, joints = forward_kinematics(rest_joints, self.parents, rotations, transl=arrays["transl"])
-        vertices = skin(rest, self._constant("weights", rest), posed_from_rest)
-        return PosedBody(vertices, joints, rest, rest_joints, posed_from_rest, offsets)
+        weights = self._constant("weights", rest)
+        return PosedBody(joints, rest, rest_joints, posed_from_rest, offsets, weights)
 
     def axis_angles(self, params: BodyParams) -> Float64[np.ndarray, "T J 3"]:
         """Return every joint's axis-angle vector relative to its parent's frame, including the mean hand and PCA."""

@@ -142,8 +142,8 @@ def fit_pose_regression(
         chosen[int(part)] = best = _cross_validate(poses, away, steps[own], smooth, config)
         # Normal equations (X^T X + lambda I) W = X^T Y on all frames, one solve for all points with equal features.
         away = smooth[best.reach](away)
-        for points, scale in _feature_groups(steps[own], best.fade):
-            at = own[points]
+        for points, kind in _feature_groups(steps[own]):
+            at, scale = own[points], _scale(kind, best.fade)
             # Features (T, 63) of these points and their targets (T, 3 P); W then takes in the factors, because F =
             # scale theta.
             x, y = (poses - center) * scale, away[:, points].reshape(len(poses), -1)
@@ -172,14 +172,16 @@ def _gaussian_filter(places: Float[np.ndarray, "P 3"], reach: float) -> Smooth:
     return lambda values: np.stack([weights @ one for one in values])
 
 
-def _feature_groups(
-    steps: Int[np.ndarray, "P 21"], fade: float
-) -> Iterator[tuple[np.ndarray, Float[np.ndarray, " 63"]]]:
-    """Yield groups of points with equal features: their indices, and the factor on each angle."""
-    # Points with equal steps to all joints have equal features.
+def _feature_groups(steps: Int[np.ndarray, "P 21"]) -> Iterator[tuple[np.ndarray, Int[np.ndarray, " 21"]]]:
+    """Yield groups of points with equal features: their indices, and their steps to each joint."""
     kinds, kind_of = np.unique(steps, axis=0, return_inverse=True)
     for k, kind in enumerate(kinds):
-        yield np.flatnonzero(kind_of.ravel() == k), np.repeat(fade ** kind.astype(float), 3)
+        yield np.flatnonzero(kind_of.ravel() == k), kind
+
+
+def _scale(kind: Int[np.ndarray, " 21"], fade: float) -> Float[np.ndarray, " 63"]:
+    """Return the factor `fade^steps` on each angle."""
+    return np.repeat(fade ** kind.astype(float), 3)
 
 
 def _cross_validate(
@@ -191,8 +193,9 @@ def _cross_validate(
 ) -> CrossValidated:
     """Return the hyperparameters with the least squared error over contiguous left-out blocks of frames.
 
-    With the eigendecomposition `X^T X = V S V^T`, predictions for all lambda share their products:
-    `X' W = (X' V) diag(1 / (s + lambda)) (V^T X^T Y)`.
+    With the eigendecomposition `X X^T = U S U^T` of the fit's T frames, predictions for all lambda share their products:
+    `X' W = (X' X^T U) diag(1 / (s + lambda)) (U^T Y)`. This dual form is as large as the number of frames; with more
+    frames than angles `X^T X = V S V^T` is smaller: `X' W = (X' V) diag(1 / (s + lambda)) (V^T X^T Y)`.
     """
     blocks = np.array_split(np.arange(len(poses)), min(config.blocks, len(poses)))
     if len(blocks) < 2:  # one frame determines no regression
@@ -205,18 +208,21 @@ def _cross_validate(
         kept = np.setdiff1d(np.arange(len(poses)), np.arange(block[0] - beside, block[-1] + 1 + beside))
         center, level = poses[kept].mean(axis=0), surfaces[kept].mean(axis=0)
         of_mean += float(((surfaces[block] - level) ** 2).sum())
-        for f, fade in enumerate(config.fades):
-            for points, scale in _feature_groups(steps, fade):
+        for points, kind in _feature_groups(steps):
+            truth = (surfaces[block][:, points] - level[points]).reshape(len(block), -1)
+            fits = [learned[kept][:, points] for learned in smoothed]
+            fits = [(y - y.mean(axis=0)).reshape(len(kept), -1) for y in fits]
+            for f, fade in enumerate(config.fades):
+                scale = _scale(kind, fade)
                 x, asked = (poses[kept] - center) * scale, (poses[block] - center) * scale
-                truth = (surfaces[block][:, points] - level[points]).reshape(len(block), -1)
                 # One eigendecomposition serves all filters and all lambda.
-                sizes, turned = np.linalg.eigh(x.T @ x)
-                left = asked @ turned
+                dual = len(x) < x.shape[1]
+                sizes, turned = np.linalg.eigh(x @ x.T if dual else x.T @ x)
+                left, onto = ((asked @ x.T) @ turned, turned.T) if dual else (asked @ turned, turned.T @ x.T)
                 # |L D R - Y|^2 for the diagonals D of all lambda, from products summed over the points.
                 shrunk = 1.0 / (np.maximum(sizes, 0.0) + np.array(config.ridges)[:, None])
-                for r, learned in enumerate(smoothed):
-                    y = learned[kept][:, points]
-                    right = turned.T @ (x.T @ (y - y.mean(axis=0)).reshape(len(kept), -1))
+                for r, y in enumerate(fits):
+                    right = onto @ y
                     squares = np.einsum("ai,ij,aj->a", shrunk, (left.T @ left) * (right @ right.T), shrunk)
                     both = np.einsum("ti,ti->i", left, truth @ right.T)
                     wrong[f, r] += squares - 2.0 * shrunk @ both + np.square(truth).sum()
