@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from time import perf_counter
 from typing import Annotated
 
@@ -12,9 +15,9 @@ import tyro
 from rich.console import Console
 
 import pipelines
+from pipelines.batch.process import meaning_of, own_program, run_process
 from pipelines.commands.animate import Animate
 from pipelines.commands.build import Build
-from pipelines.commands.evaluate import Evaluate
 from pipelines.commands.options import OptionalPath, require_avatar
 from pipelines.commands.talk import Talk
 from pipelines.commands.templates import BUNDLE_SUFFIX, export_bundle
@@ -56,6 +59,32 @@ def embedded_capture() -> Path:
     )
 
 
+def evaluate_beside(run: Path, capture: Path, stop: Event) -> None:
+    """Run `smplxpp evaluate` as a process of its own, with half of the cores, until `stop` is set.
+
+    Raises:
+        InputError: the evaluation has failed; its log is kept in the run folder.
+    """
+    log, answer = run / "evaluate.log", run / "evaluate.json"
+    program, variables = own_program()
+    half = str(max(1, (os.cpu_count() or 1) // 2))
+    ended = run_process(
+        (*program, "evaluate", str(run.resolve()), "--capture", str(capture.resolve()), "--no-report", "--json"),
+        log=log,
+        answer=answer,
+        environment={**variables, "OMP_NUM_THREADS": half},
+        folder=run,
+        stop=stop.is_set,
+        began=lambda pid: None,
+    )
+    meaning, error = meaning_of(ended, log=log, answer=answer, judged=False)
+    if meaning != "done":
+        words = str((error or {}).get("message") or f"exit status {ended.exit_status}").rstrip(".")
+        raise InputError("the evaluation of the demo", expected="its figures", received=words, remedy=f"see {log}")
+    log.unlink()
+    answer.unlink()
+
+
 @dataclass(frozen=True)
 class Demo:
     """Options of `smplxpp demo`.
@@ -90,19 +119,32 @@ class Demo:
         )
         # The report is written when all of its parts are there, because writing it takes nine seconds.
         Train(run_folder=out, capture=capture, preset="demo", no_report=True).run()
-        Evaluate(run_folder=out, capture=capture, no_report=True).run()
-        # Film, page and speech play one bundle.
+        # The evaluation reads nothing of the film and the pages, and none of them keeps two cores busy: side by side
+        # they take half the time. Film, page and speech play one bundle.
+        stop = Event()
+        with ThreadPoolExecutor(1) as beside:
+            measured = beside.submit(evaluate_beside, out, capture, stop)
+            try:
+                where = self._show(console)
+            except BaseException:  # an interrupt, too: nobody waits for the figures any more
+                stop.set()
+                raise
+            measured.result()
+        rewrite_report(out)
+        lines = [f"{name:7} {path.resolve()}" for name, path in where.items()]
+        console.print("\n" + "\n".join(lines), highlight=False, soft_wrap=True, markup=False)
+        return {"exit_status": built["exit_status"]}
+
+    def _show(self, console: Console) -> dict[str, Path]:
+        """Write the bundle of the avatar, its film and its pages; return them by name, the report first."""
+        out = self.run_folder
         avatar, params = out / f"me{BUNDLE_SUFFIX}", out / REFINED_PARAMS
         export_bundle(out, avatar, name=NAME, licence=LICENCE, params=params, exact=False)
         film, page = out / "motion.mp4", out / "player.html"
         Animate(run_folder=avatar, params=params, out=film, height=540).run()
         Web(source=avatar, single_file=page).run()
         where = {"report": out / "report.html", "film": film, "player": page, "avatar": avatar}
-        where |= self._talk(avatar, console)
-        rewrite_report(out)
-        lines = [f"{name:7} {path.resolve()}" for name, path in where.items()]
-        console.print("\n" + "\n".join(lines), highlight=False, soft_wrap=True, markup=False)
-        return {"exit_status": built["exit_status"]}
+        return where | self._talk(avatar, console)
 
     def _talk(self, avatar: Path, console: Console) -> dict[str, Path]:
         """Let the student speak, in the report and in a page; where the extra is not installed, print how to get it."""

@@ -193,9 +193,9 @@ def _cross_validate(
 ) -> CrossValidated:
     """Return the hyperparameters with the least squared error over contiguous left-out blocks of frames.
 
-    With the eigendecomposition `X X^T = U S U^T` of the fit's T frames, predictions for all lambda share their products:
-    `X' W = (X' X^T U) diag(1 / (s + lambda)) (U^T Y)`. This dual form is as large as the number of frames; with more
-    frames than angles `X^T X = V S V^T` is smaller: `X' W = (X' V) diag(1 / (s + lambda)) (V^T X^T Y)`.
+    With the eigendecomposition `X X^T = U S U^T` over the frames of a fit, predictions for all lambda share their
+    products: `X' W = (X' X^T U) diag(1 / (s + lambda)) (U^T Y)`. This dual form is as large as the number of frames;
+    with more frames than angles `X^T X = V S V^T` is smaller: `X' W = (X' V) diag(1 / (s + lambda)) (V^T X^T Y)`.
     """
     blocks = np.array_split(np.arange(len(poses)), min(config.blocks, len(poses)))
     if len(blocks) < 2:  # one frame determines no regression
