@@ -27,6 +27,7 @@ from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
 from avatar.rig.rig import AvatarModel, Pose, PosedAvatar, Rig, at_rest
 from smplxpp.core import BodyParams, InputError, ProgressCallback, TriangleMesh, ignore_progress, require_at_least
+from smplxpp.metrics.sampling import SurfaceSamples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,12 +148,13 @@ class _Run:
         heads = [head_box(corners, view.camera) for view in views]
         shown = [self._head_shown(skinned, view) for view in views]
         # The true surface, and the baseline that needs no training: linear blend skinning of the template.
-        truth = alone = None
+        truth = alone = points = None
         if any(frame in frames for frames in self.truths.values()):
             truth = sequence.capture.truth_mesh(frame)
             assert truth is not None  # `truth_frames` chose frames that have one
             mesh = _mesh(skinned, sequence.rig)
-            alone = self.skinning_alone[frame] = self._surface(mesh, sequence.rig, truth)
+            points = surface_quality.points_of_truth(truth, samples=self.config.samples, seed=self.config.seed)
+            alone = self.skinning_alone[frame] = self._surface(mesh, sequence.rig, truth, points)
             if frame in self._middle:
                 part = self._middle[frame]
                 self.meshes[part] = ShownSurface(part, frame, truth, {SKINNING_ALONE: mesh})
@@ -171,7 +173,7 @@ class _Run:
                     self.surfaces[name][frame] = alone
                     continue
                 mesh = _mesh(posed.vertices, model.rig)
-                self.surfaces[name][frame] = self._surface(mesh, model.rig, truth)
+                self.surfaces[name][frame] = self._surface(mesh, model.rig, truth, points)
                 if frame in self._middle:
                     self.meshes[self._middle[frame]].posed[name] = mesh
         for view, head, rendered in zip(views, heads, pictures, strict=True):
@@ -244,7 +246,9 @@ class _Run:
     def _sets_of(self, view: View, frame: int) -> list[str]:
         return [part for part, one in self.sets.items() if (view.name, frame) in one.views]
 
-    def _surface(self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh) -> SurfaceQuality:
+    def _surface(
+        self, mesh: TriangleMesh, rig: Rig, truth: TriangleMesh, of_truth: SurfaceSamples | None
+    ) -> SurfaceQuality:
         return surface_quality.surface_quality(
             mesh,
             rig.template.vertex_labels,
@@ -253,6 +257,7 @@ class _Run:
             samples=self.config.samples,
             seed=self.config.seed,
             labels=rig.template.labels,
+            of_truth=of_truth,
         )
 
     def _by_set(self, frames: Mapping[int, SurfaceQuality]) -> dict[str, Surfaces]:

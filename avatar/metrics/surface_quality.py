@@ -11,6 +11,8 @@ from jaxtyping import Bool, Int
 from smplxpp.core import LABELS, InputError, Labels, TriangleMesh
 from smplxpp.metrics import CompareConfig, DirectedDistances, MeshComparison, directed_distances, summarize
 from smplxpp.metrics.conventions import DEFAULT, convention_named
+from smplxpp.metrics.distance import visible_samples
+from smplxpp.metrics.sampling import SurfaceSamples, sample_surface
 
 CONVENTION = (
     "P2S: mean distance of points of the posed mesh to the nearest point of the true surface. Truth to mesh: the other "
@@ -23,6 +25,7 @@ HEAD = "head"
 """Name of the head among the labels: a region of the mesh, whose faces have labels of their own."""
 SAMPLES = 100_000
 """Points a mesh, before the choice of visible ones."""
+_VISIBLE = CompareConfig(visible_only=True)
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ def surface_quality(
     samples: int = SAMPLES,
     seed: int = 0,
     labels: Labels = LABELS,
+    of_truth: SurfaceSamples | None = None,
 ) -> SurfaceQuality:
     """Compare a posed mesh with the truth over the surfaces that can be seen; see `CONVENTION`.
 
@@ -64,14 +68,15 @@ def surface_quality(
         samples: points on each surface, before the choice of visible ones.
         seed: of the samples.
         labels: the template's.
+        of_truth: `points_of_truth`, where several meshes are compared with one truth.
 
     Raises:
         InputError: a mesh without area, or none of it to be seen.
     """
     # Points of one surface to the whole other one, both ways; labels of the truth are those of the nearest mesh point.
-    config = CompareConfig(visible_only=True)
-    forth = directed_distances(mesh, truth, samples=samples, seed=seed, source_labels=vertex_labels, config=config)
-    back = directed_distances(truth, mesh, samples=samples, seed=seed, target_labels=vertex_labels, config=config)
+    forth = directed_distances(mesh, truth, samples=samples, seed=seed, source_labels=vertex_labels, config=_VISIBLE)
+    of_truth = points_of_truth(truth, samples=samples, seed=seed) if of_truth is None else of_truth
+    back = directed_distances(of_truth, mesh, target_labels=vertex_labels, config=_VISIBLE)
     quality = _quality(_summary(forth, back, labels))
     if head is None or not head.any():
         return quality
@@ -83,6 +88,15 @@ def surface_quality(
     )
     found = _quality(_summary(*parts, labels)).labels.get(str(region))
     return quality if found is None else replace(quality, labels={**quality.labels, HEAD: found})
+
+
+def points_of_truth(truth: TriangleMesh, *, samples: int = SAMPLES, seed: int = 0) -> SurfaceSamples:
+    """Sample the true surface where a view from outside can see it.
+
+    Raises:
+        InputError: a mesh without area, or none of it to be seen.
+    """
+    return visible_samples(truth, sample_surface(truth, samples, seed=seed), _VISIBLE)
 
 
 def _summary(forth: DirectedDistances, back: DirectedDistances, labels: Labels) -> MeshComparison:

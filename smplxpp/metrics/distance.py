@@ -89,9 +89,8 @@ def directed_distances(
         points = one
     else:
         points = sample_surface(one, samples, seed=seed) if convention.points == "area" else vertex_samples(one)
-        # Inner sides and inner layers that no scanner sees exist in one of the meshes only and would count as errors.
         if config.visible_only:
-            points = points.select(_seen(one, points.points, config))
+            points = visible_samples(one, points, config)
     # Exact point-to-triangle distance, or, as some published protocols have it, to the nearest of sampled points.
     if not isinstance(other, SurfaceSamples) and convention.target == "surface":
         distance, closest, face = point_to_surface(points.points, other)
@@ -108,6 +107,23 @@ def directed_distances(
     elif target_labels is not None:
         label = _labels_of(other, target_labels, "target labels", face if face.min() >= 0 else index, closest)
     return DirectedDistances(points, distance, closest, face, _angle_deg(points.normals, normals), label)
+
+
+def visible_samples(mesh: TriangleMesh, samples: SurfaceSamples, config: CompareConfig) -> SurfaceSamples:
+    """Choose the samples that a view from outside can see, within the tolerance of a configuration.
+
+    Inner sides and inner layers that no scanner sees exist in one of two meshes only and would count as errors. Where
+    one mesh is compared with several, the choice can be made once and given to `directed_distances`.
+
+    Raises:
+        InputError: none of them is visible.
+
+    Example:
+        >>> seen = visible_samples(scan, sample_surface(scan, 1000), CompareConfig())
+        >>> len(seen) <= 1000
+        True
+    """
+    return samples.select(_seen(mesh, samples.points, config))
 
 
 def compare(
