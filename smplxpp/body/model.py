@@ -59,8 +59,14 @@ class PosedBody:
         if not -len(self) <= index < len(self):
             raise InputError("frame", expected=f"an index below {len(self)}", received=str(index))
         offsets = None if self.pose_offsets is None else self.pose_offsets[index]
-        arrays = (self.joints, self.rest_vertices, self.rest_joints, self.posed_from_rest)
-        return PosedBody(*(array[index] for array in arrays), offsets, self.weights)
+        return PosedBody(
+            self.joints[index],
+            self.rest_vertices[index],
+            self.rest_joints[index],
+            self.posed_from_rest[index],
+            offsets,
+            self.weights,
+        )
 
 
 @dataclass(frozen=True, eq=False)
