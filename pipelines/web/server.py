@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 import re
+import signal
 import socket
 import threading
 from collections.abc import Callable, Iterable, Mapping
@@ -159,7 +160,7 @@ class PageServer:
         return self.access.address(self.server_address[1])
 
     def serve_forever(self) -> None:
-        """Answer requests until `shutdown`, or Ctrl-C in the main thread."""
+        """Answer requests until `shutdown`; in the main thread until Ctrl-C or SIGTERM, too."""
         try:
             asyncio.run(self._serve())
         finally:
@@ -181,6 +182,10 @@ class PageServer:
             if self._stopped:
                 return
             self._loop = asyncio.get_running_loop()
+        # The first process of a container ignores what it does not ask for.
+        if threading.current_thread() is threading.main_thread():
+            with suppress(NotImplementedError):  # Windows
+                self._loop.add_signal_handler(signal.SIGTERM, self._ending.set)
         server = await asyncio.start_server(self._connected, sock=self._socket, limit=_MOST_HEADER)
         try:
             await self._ending.wait()

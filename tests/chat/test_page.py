@@ -10,12 +10,13 @@ import pytest
 
 from smplxpp.core.files.sound_file import Sound, wave_bytes
 from tests.chat.actors import A_CHARACTER, Script, Words, cast, doll
+from tests.chat.test_deploy import NEEDS_NGINX, PROXIED, behind_nginx
 from tests.chat.test_listening import sound
-from tests.chat.test_server import NEEDS_NGINX, PROXIED, behind_nginx
 from tests.web.chromium import Page, find_chromium
 from tests.web.ear import LISTEN
 from tests.web.modules import NEEDS_BUILD, node
-from tests.web.test_embed import SIZES, anybody_can_use
+from tests.web.test_embed import SIZES, anybody_can_use, react_files, show
+from tests.web.test_lips import dolls_lips
 
 pytest.importorskip("websockets", reason="extra chat")
 
@@ -58,8 +59,8 @@ def talking(request, browser, tmp_path_factory) -> Iterator[tuple[Page, ChatServ
     server.shutdown()
 
 
-def type_in(page: Page, text: str) -> None:
-    page.evaluate("document.querySelector('.talk input').focus()")
+def type_in(page: Page, text: str, where: str = ".talk input") -> None:
+    page.evaluate(f"document.querySelector('{where}').focus()")
     page.send("Input.insertText", text=text)
     for kind in ("keyDown", "keyUp"):
         page.send("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", windowsVirtualKeyCode=13, text="\r")
@@ -194,6 +195,33 @@ def test_behind_https_it_hears_who_lets_it(tmp_path):
         assert page.errors == []
 
 
+@pytest.mark.slow
+@NEEDS_NGINX
+@NEEDS_BUILD
+def test_in_a_react_page_behind_https_it_answers_what_is_typed(tmp_path):
+    """As somebody puts it into a page of her own: the package, the examples, nginx, a certificate."""
+    flags = [f"--host-resolver-rules=MAP {PROXIED} 127.0.0.1", "--ignore-certificate-errors"]
+    with (
+        behind_nginx(tmp_path, token="", partner=Script(("You are in React.",))) as it,
+        Page(tmp_path / "profile", size=(390, 844), flags=flags) as page,
+    ):
+        (tmp_path / "me.avatar").write_bytes(it.data)
+        files = {**react_files(tmp_path / "package"), "me.avatar": it.data}
+        files["lips.safetensors"] = dolls_lips(tmp_path / "me.avatar")
+        files["index.html"] = files.pop("react.html")
+        (tmp_path / "www").mkdir()
+        for name, data in files.items():
+            (tmp_path / "www" / name).write_bytes(data)
+        show(page, f"{it.base}/", "document.querySelector('[role=status]')?.textContent.endsWith('is here')")
+        page.click("button:nth-of-type(3)")
+        page.until("/answers/.test(document.querySelector('output')?.textContent)", "nobody is there")
+        type_in(page, "hello", "form input")
+        page.until("document.querySelectorAll('li').length === 2", "no answer")
+        told = page.evaluate("[...document.querySelectorAll('li')].map(one => one.textContent)")
+        assert told == ["You: hello", "Avatar: You are in React."]
+        assert page.errors == []
+
+
 def test_a_lost_server_is_said(talking):
     page, server = talking
     server.shutdown()
@@ -215,6 +243,20 @@ def test_a_dropped_connection_comes_back(talking):
     type_in(page, "hello")
     page.until("/How are you/.test(document.querySelector('.theirs')?.textContent)")
     assert page.errors == []
+
+
+def test_a_server_that_was_started_anew_is_found_by_pages_that_stay_open(talking, tmp_path_factory):
+    """Its socket has another secret then: pages asked the old one for ever, and told people to reload them."""
+    page, server = talking
+    server.shutdown()
+    page.until("/lost/.test(document.querySelector('.note').textContent)", "nothing is said")
+    data, body = doll(tmp_path_factory.getbasetemp())
+    again = ChatServer(data, cast(body, partner=Script(("I am back.",))), name="Doll", port=server.server_address[1])
+    threading.Thread(target=again.serve_forever, daemon=True).start()
+    page.until("conversation.connection.open && document.querySelector('.note').textContent == ''", "it stays lost")
+    type_in(page, "hello")
+    page.until("/back/.test(document.querySelector('.theirs')?.textContent)")
+    again.shutdown()
 
 
 def test_an_avatar_in_a_page_of_the_same_site_talks_with_the_server(talking):

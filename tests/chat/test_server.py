@@ -7,16 +7,11 @@ import json
 import random
 import re
 import socket
-import ssl
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from shutil import which
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,7 +25,6 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from pipelines.chat.server import MOST_BYTES, REPLACED, TAKEN, ChatServer
-from pipelines.web.access import Access, new_token
 
 LIMIT = 900
 ROOT = Path(__file__).resolve().parents[2]
@@ -252,101 +246,6 @@ def test_a_page_that_does_not_read_holds_nobody_up(serve):
         sent()
         it.server.shutdown()
         assert it.server._ended.is_set()
-
-
-NGINX = """daemon off; master_process off; worker_processes 1; pid {folder}/pid; error_log {folder}/errors.log;
-events {{}}
-http {{
-  client_body_temp_path {folder}/body; proxy_temp_path {folder}/proxy; fastcgi_temp_path {folder}/fast;
-  uwsgi_temp_path {folder}/uwsgi; scgi_temp_path {folder}/scgi;
-{site}
-}}"""
-
-
-NEEDS_NGINX = pytest.mark.skipif(
-    not (which("nginx") and which("openssl")), reason="no nginx, or no openssl (apt-get install nginx)"
-)
-PROXIED = "me.example.org"
-"""The name of the site that the examples write."""
-
-
-@contextmanager
-def behind_nginx(folder: Path, **changes: Any) -> Iterator[SimpleNamespace]:
-    """The site of the examples as it is written, with another port, certificate and folder, before a conversation."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    made = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2".split()
-    made += ["-subj", f"/CN={PROXIED}", "-addext", f"subjectAltName=DNS:{PROXIED}"]
-    made += ["-keyout", str(folder / "key.pem"), "-out", str(folder / "cert.pem")]
-    subprocess.run(["openssl", *made], check=True, capture_output=True)
-    base, token = f"https://{PROXIED}:{port}", new_token()
-    data, body = doll(folder)
-    access = Access(public_url=f"{base}/talk/", token=token)
-    server = ChatServer(data, cast(body, **changes), name="Doll", access=access)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    site = (ROOT / "examples" / "deploy" / "nginx.conf").read_text()
-    for written, here in (
-        ("listen 443", f"listen 127.0.0.1:{port}"),
-        ("127.0.0.1:8091", f"127.0.0.1:{server.server_address[1]}"),
-        (f"/etc/letsencrypt/live/{PROXIED}/fullchain.pem", str(folder / "cert.pem")),
-        (f"/etc/letsencrypt/live/{PROXIED}/privkey.pem", str(folder / "key.pem")),
-        ("/var/log/nginx", str(folder)),
-    ):
-        assert written in site
-        site = site.replace(written, here)
-    (folder / "nginx.conf").write_text(NGINX.format(folder=folder, site=site))
-    command = ["nginx", "-p", str(folder), "-c", str(folder / "nginx.conf"), "-e", str(folder / "errors.log")]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as nginx:
-        try:
-            end = time.monotonic() + LIMIT
-            while True:  # until it listens
-                try:
-                    assert nginx.poll() is None and time.monotonic() < end, (folder / "errors.log").read_text()
-                    socket.create_connection(("127.0.0.1", port)).close()
-                    break
-                except ConnectionError:
-                    time.sleep(0.02)
-            yield SimpleNamespace(base=base, port=port, token=token, data=data, server=server)
-        finally:
-            nginx.terminate()
-            server.shutdown()
-
-
-@NEEDS_NGINX
-def test_the_nginx_of_the_examples_offers_it_by_https(tmp_path):
-    with behind_nginx(tmp_path) as it:
-        trusted = ssl.create_default_context(cafile=tmp_path / "cert.pem")
-
-        def get(path: str, **headers: str) -> http.client.HTTPResponse:
-            connection = http.client.HTTPSConnection(PROXIED, it.port, timeout=LIMIT, context=trusted)
-            stream = socket.create_connection(("127.0.0.1", it.port), timeout=LIMIT)
-            connection.sock = trusted.wrap_socket(stream, server_hostname=PROXIED)
-            connection.request("GET", path, headers=headers)
-            reply = connection.getresponse()
-            reply.content = reply.read()
-            connection.close()
-            return reply
-
-        moved = get(f"/talk/?token={it.token}")
-        assert moved.status == 303 and get("/talk/").status == 403 and get("/other").status == 404
-        cookie = moved.headers["Set-Cookie"].split(";")[0]
-        page = get("/talk/", Cookie=cookie)
-        assert f"wss://{PROXIED}:{it.port}" in page.content.decode()
-        assert get("/talk/me.avatar", Cookie=cookie).content == it.data
-        secret = re.search('data-chat="([^"]+)"', page.content.decode())[1]
-
-        def open_socket(origin: str) -> Any:
-            stream = socket.create_connection(("127.0.0.1", it.port))
-            options: dict[str, Any] = {"additional_headers": {"Cookie": cookie}, "max_size": None, "ssl": trusted}
-            return connect(f"wss://{PROXIED}:{it.port}/talk/{secret}", sock=stream, origin=origin, **options)
-
-        with pytest.raises(InvalidStatus, match="403"):
-            open_socket("https://evil.example")
-        with open_socket(it.base) as talk:
-            talk.send(json.dumps({"kind": "say", "text": "hello"}))
-            assert told(talk, "heard")["text"] == "hello"
-    assert it.token not in (tmp_path / "smplxpp.log").read_text()  # the log does not let its readers in
 
 
 @pytest.mark.parametrize("path", [b"/\xff\xfe", b"http://["])

@@ -9,6 +9,7 @@ import subprocess
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -46,12 +47,7 @@ def site(avatar, browser, tmp_path_factory) -> Iterator[str]:
     files |= {name: (EXAMPLES / name).read_bytes() for name in ("plain.html", "three.html")}
     if (TOOLS / "esbuild").exists() and (WEB / "node_modules" / "three").exists():
         package = tmp_path_factory.mktemp("package") / "dist"
-        subprocess.run(["node", "build.mjs", "--package", str(package)], cwd=WEB, check=True, capture_output=True)
-        command = [str(TOOLS / "esbuild"), str(EXAMPLES / "react" / "main.jsx"), "--bundle", "--jsx=automatic"]
-        command += [f"--alias:smplxpp-player={package / 'index.js'}", "--log-level=error"]
-        paths = {**os.environ, "NODE_PATH": str(WEB / "node_modules")}
-        files["main.js"] = subprocess.run(command, env=paths, check=True, capture_output=True).stdout
-        files["react.html"] = (EXAMPLES / "react" / "index.html").read_bytes()
+        files |= react_files(package)
         files |= {f"smplxpp-player/{path.name}": path.read_bytes() for path in package.glob("*.js")}
         for name in ("three.module.js", "three.core.js"):
             files[f"three/{name}"] = (WEB / "node_modules" / "three" / "build" / name).read_bytes()
@@ -60,6 +56,16 @@ def site(avatar, browser, tmp_path_factory) -> Iterator[str]:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield server.address
         server.shutdown()
+
+
+def react_files(package: Path) -> dict[str, bytes]:
+    """The page of React, with the package that is built of `web/` into a new folder."""
+    subprocess.run(["node", "build.mjs", "--package", str(package)], cwd=WEB, check=True, capture_output=True)
+    command = [str(TOOLS / "esbuild"), str(EXAMPLES / "react" / "main.jsx"), "--bundle", "--jsx=automatic"]
+    command += [f"--alias:smplxpp-player={package / 'index.js'}", "--log-level=error"]
+    paths = {**os.environ, "NODE_PATH": str(WEB / "node_modules")}
+    script = subprocess.run(command, env=paths, check=True, capture_output=True).stdout
+    return {"main.js": script, "react.html": (EXAMPLES / "react" / "index.html").read_bytes()}
 
 
 def show(page: Page, address: str, condition: str) -> None:

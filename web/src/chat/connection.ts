@@ -1,14 +1,28 @@
 /** The websocket to the page's server, which is opened again when it is lost. */
 
-/** Seconds until it is tried again: each time longer. */
-const FIRST = 0.5, LONGEST = 8;
+/** Seconds until it is tried again: each time longer. How long the page may take, milliseconds. */
+const FIRST = 0.5, LONGEST = 8, PATIENCE = 10_000;
 /** The server's codes of a conversation that another page has taken over, and of one that finds all places taken. */
 const REPLACED = 4001, TAKEN = 4002;
+const FORBIDDEN = 403;
 
 /** What the server tells: an object with a kind. */
 export interface Told {
   kind: string;
   [name: string]: unknown;
+}
+
+/**
+ * The address of a server's socket, which its page alone knows.
+ *
+ * @throws Error no such server, or one that asks for a token.
+ */
+export async function socketOf(page: URL, signal: AbortSignal): Promise<URL> {
+  const reply = await fetch(page, { signal }), text = await reply.text();
+  const secret = new DOMParser().parseFromString(text, "text/html").body.getAttribute("data-chat");
+  if (reply.ok && secret) return new URL(secret, page);
+  const received = reply.ok ? "another page" : `${reply.status} ${text.slice(0, 200)}`;
+  throw new Error(`${page}: expected the page of smplxpp chat --serve, received ${received}`, { cause: reply.status });
 }
 
 export class Connection {
@@ -21,7 +35,8 @@ export class Connection {
   private wait = FIRST;
   private closed = false;
 
-  constructor(private readonly secret: string) {}
+  /** @param address of the socket, beside the page of the server: as safe as that, and perhaps in a folder of a proxy. */
+  constructor(private address: URL, private readonly page: URL) {}
 
   get open(): boolean {
     return this.socket?.readyState === WebSocket.OPEN;
@@ -29,8 +44,7 @@ export class Connection {
 
   connect(): void {
     if (this.closed) return;
-    // Beside the page, which may lie in a folder of a proxy, and as safe as the page.
-    const address = new URL(this.secret, location.href);
+    const address = new URL(this.address);
     address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
     const socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
@@ -49,9 +63,23 @@ export class Connection {
       this.onlost(final);
       if (code === TAKEN) this.ontold({ kind: "note", text: `${reason}; this page waits for its turn.` });
       if (final) return;
-      setTimeout(() => this.connect(), 1000 * this.wait);
-      this.wait = Math.min(2 * this.wait, LONGEST);
+      this.later();
     };
+  }
+
+  /** Tries again: a server that was started anew has another address for its socket. */
+  private later(): void {
+    setTimeout(() => {
+      if (this.closed) return;
+      socketOf(this.page, AbortSignal.timeout(PATIENCE)).then((address) => {
+        this.address = address;
+        this.connect();
+      }, (error: Error) => {
+        if (error.cause === FORBIDDEN) this.ontold({ kind: "note", text: error.message });
+        this.later();
+      });
+    }, 1000 * this.wait);
+    this.wait = Math.min(2 * this.wait, LONGEST);
   }
 
   /** Ends it for good; nothing is told any more. */

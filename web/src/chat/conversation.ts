@@ -28,7 +28,7 @@ export class Conversation {
   private answer: HTMLElement | null = null;
 
   constructor(player: Player, secret: string) {
-    const dialogue = (this.dialogue = new Dialogue(player, secret));
+    const dialogue = (this.dialogue = new Dialogue(player, new URL(secret, location.href), new URL(location.href)));
     this.speak.type = "button"; // else Enter in the text would press it
     document.body.classList.add("chatting");
     const bar = element("form", { class: "talk" }, this.input, this.speak);
@@ -44,7 +44,7 @@ export class Conversation {
     dialogue.on("open", () => this.say(""));
     dialogue.on("lost", ({ final }) => {
       this.thinking.remove();
-      this.say(final ? "Another page has taken over. Reload this one to talk here." : "The connection is lost; it is tried again. If the server was started anew, reload the page.");
+      this.say(final ? "Another page has taken over. Reload this one to talk here." : "The connection is lost; it is tried again.");
     });
     for (const event of ["answered", "stopped", "note", "hello", "listening"] as const) dialogue.on(event, () => this.thinking.remove());
     dialogue.on("hello", ({ partner, hears }) => {

@@ -40,11 +40,11 @@ export class Dialogue {
   /** What was typed before the first connection; null after it. */
   private early: string[] | null = [];
 
-  /** @param address of the websocket. */
-  constructor(private readonly player: Animator, address: string) {
+  /** @param socket its address. @param page that of the server, which is asked for the socket when that is lost. */
+  constructor(private readonly player: Animator, socket: URL, page: URL) {
     const { jointNames, expressionNames } = player.summary!;
     this.stage = new Stage(jointNames.length, expressionNames.length);
-    this.connection = new Connection(address);
+    this.connection = new Connection(socket, page);
     player.performer = this.stage;
     this.stage.onbegin = ({ turn, text }) => {
       this.emit("answer", { turn, text });

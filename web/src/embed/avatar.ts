@@ -2,12 +2,13 @@
 
 import type { Animator } from "../animator.ts";
 import type { Motion } from "../avatar/avatar.ts";
+import { socketOf } from "../chat/connection.ts";
+import { Dialogue } from "../chat/dialogue.ts";
 import { WHITE, harmonicsOf } from "../light/irradiance.ts";
 import { readRadiance } from "../light/radiance.ts";
 import { SpeakingFace } from "../lips/face.ts";
 import { LiveLips } from "../lips/lips.ts";
 import type { Viseme } from "../lips/visemes.ts";
-import { Dialogue } from "../chat/dialogue.ts";
 import { Soundtrack } from "../sound/soundtrack.ts";
 import { Standing } from "../stance/standing.ts";
 import type { Summary } from "../worker/protocol.ts";
@@ -117,6 +118,8 @@ export class Avatar<P extends Animator = Animator> {
   private readonly listeners = new Map<string, Set<(detail: never) => void>>();
   private sound: Soundtrack | null = null;
   private dialogue: Dialogue | null = null;
+  /** How many conversations were asked for: the last one counts. */
+  private asked = 0;
   private standing: Standing | null = null;
 
   /** @param make makes what animates the avatar. */
@@ -267,20 +270,16 @@ export class Avatar<P extends Animator = Animator> {
    * Talks with a server of `smplxpp chat`, whose voice, face and gestures the avatar has until the dialogue is closed.
    *
    * @param server the address of its page, which has to be of the same site as this one.
-   * @returns before the server answers: `on("hello")` tells. @throws Error no such server, or one that asks for a token.
+   * @returns before the server answers: `on("hello")` tells. @throws Error no such server, one that asks for a token, or another conversation was asked for meanwhile.
    */
   async converse(server: string | URL): Promise<Dialogue> {
     const player = this.alive(await this.opened()), { signal } = this.disposing, page = new URL(server, document.baseURI);
-    const reply = await fetch(page, { signal }), text = await reply.text();
-    // The page of the server knows the secret of its socket.
-    const secret = new DOMParser().parseFromString(text, "text/html").body.getAttribute("data-chat");
-    if (!reply.ok || !secret) {
-      throw new Error(`${page}: expected the page of smplxpp chat --serve, received ${reply.ok ? "another page" : `${reply.status} ${text.slice(0, 200)}`}`);
-    }
+    const mine = ++this.asked, socket = await socketOf(page, signal);
     this.alive(this.player);
+    if (mine !== this.asked) throw new Error(`${page}: another conversation was asked for`);
     this.hush();
     this.dialogue?.close();
-    this.dialogue = new Dialogue(player, String(new URL(secret, page)));
+    this.dialogue = new Dialogue(player, socket, page);
     this.dialogue.connect();
     return this.dialogue;
   }
