@@ -352,8 +352,8 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             # Few steps, of one view each: colours need a high rate.
             rates=LearningRates(dc=6e-3, offset=0.03),
             # Where poses are tracked, networks of few frames learn the poses' errors; colours, which all frames share,
-            # do not. So networks learn slowly after their pretraining, and colours fast.
-            teacher=_Steps(250, 3e-4, 3.5),
+            # do not. So networks learn slowly and in few steps after their pretraining, and colours fast.
+            teacher=_Steps(125, 3e-4, 3.5),
             bake=_Steps(250, 3e-4, 2.0),
             # Faster networks overfit to the poses of few frames.
             compensate=_Steps(500, 1.5e-4, 2.0),
