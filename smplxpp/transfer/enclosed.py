@@ -13,7 +13,7 @@ from smplxpp.body.layout import JOINT_NAMES
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.core.topology import component_labels
 from smplxpp.transfer.config import TransferConfig
-from smplxpp.transfer.rings import Septum, heights, rings_around, septum_of
+from smplxpp.transfer.rings import LimbAxis, Septum, heights, rings_around, septum_of
 
 _SPACING = 0.01
 """Distance of the planes along a limb, as a share of the body's extent: less than a ring of a coarse garment."""
@@ -21,25 +21,6 @@ _BEYOND = 0.1
 """How far a limb's axis continues past ankle and wrist, as a share of the body's extent: hems reach lower."""
 _KERNEL = 0.006
 """Standard deviation of the mean of weights along a limb, as a share of the body's extent (1 cm)."""
-
-
-@dataclass(frozen=True, eq=False)
-class LimbAxis:
-    """A polyline through the middle of a limb, and the mean weights of the skin around it.
-
-    Attributes:
-        joints: indices of the joints that the limb consists of.
-        points: metres, from the trunk outwards, evenly spaced.
-        tangents: unit length.
-        weights: mean weights of the limb's skin at each point.
-        whole: points of the axis as it counts for the rings of other limbs: a leg's continues to the floor.
-    """
-
-    joints: tuple[int, ...]
-    points: Float64[np.ndarray, "K 3"]
-    tangents: Float64[np.ndarray, "K 3"]
-    weights: Float64[np.ndarray, "K J"]
-    whole: Float64[np.ndarray, "L 3"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from smplxpp.core import TriangleMesh, row_lengths
 from smplxpp.transfer.anchors import smooth_step
 from smplxpp.transfer.checks import extent
-from smplxpp.transfer.enclosed import Enclosure, LimbAxis
+from smplxpp.transfer.enclosed import Enclosure
+from smplxpp.transfer.rings import LimbAxis
 
 _RAMP = (-0.05, 0.1)
 """From how far above the hip joints (negative) to how far below them the bound grows from 0 on, as shares of the body's

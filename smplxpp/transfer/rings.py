@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core import TriangleMesh, normalize_rows
 from smplxpp.core.topology import component_labels
-
-if TYPE_CHECKING:
-    from smplxpp.transfer.enclosed import LimbAxis
 
 _CLOSED = 0.99
 """Least share of a turn about the axis that a ring has to make: a plane that leaves through a hem makes no ring."""
@@ -23,6 +19,25 @@ garments have none below 1.0, the simulated one of the embedded person none belo
 _LONG = 20
 """Planes (36 cm) with a neck from which on a shallow groove is that between two legs. The skirt of a dancer's scan is
 drawn in between her striding legs over ten, the more the farther down."""
+
+
+@dataclass(frozen=True, eq=False)
+class LimbAxis:
+    """A polyline through the middle of a limb, and the mean weights of the skin around it.
+
+    Attributes:
+        joints: indices of the joints that the limb consists of.
+        points: metres, from the trunk outwards, evenly spaced.
+        tangents: unit length.
+        weights: mean weights of the limb's skin at each point.
+        whole: points of the axis as it counts for the rings of other limbs: a leg's continues to the floor.
+    """
+
+    joints: tuple[int, ...]
+    points: Float64[np.ndarray, "K 3"]
+    tangents: Float64[np.ndarray, "K 3"]
+    weights: Float64[np.ndarray, "K J"]
+    whole: Float64[np.ndarray, "L 3"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from smplxpp.core.topology import border_loops, manifold_corners
 from smplxpp.transfer.checks import extent
 from smplxpp.transfer.config import TransferConfig
 from smplxpp.transfer.correspond import closest_points
-from smplxpp.transfer.enclosed import Enclosure, LimbAxis, enclosed_by_one, limb_axes
-from smplxpp.transfer.rings import piercings, rings_around
+from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
+from smplxpp.transfer.rings import LimbAxis, piercings, rings_around
 
 _LEAST_TUBE = 0.1
 """Length of the border of the narrowest empty tube, as a share of the body's extent; of the widest, three times it."""
