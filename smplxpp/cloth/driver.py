@@ -32,6 +32,8 @@ class DriverConfig:
         hold: seconds for which it then stays there.
         teleport: speed, in metres a second, of the cloth's attachments above which a motion is a cut and restarts.
         most_stretch: length of the longest edge over that at rest from which the cloth is taken to have exploded.
+        most_drawn: longest drawn edge over its length at rest; above `SolverConfig.most_stretch`, because the drawn
+            surface bends about the simulated one at a distance.
         solver: how time is stepped.
     """
 
@@ -39,6 +41,7 @@ class DriverConfig:
     hold: float = 0.2
     teleport: float = 12.0
     most_stretch: float = 4.0
+    most_drawn: float = 1.5
     solver: SolverConfig = field(default_factory=SolverConfig)
 
     def __post_init__(self) -> None:
@@ -46,6 +49,7 @@ class DriverConfig:
             require_at_least(f"cloth driver: {name}", getattr(self, name), 0.0)
         for name in ("teleport", "most_stretch"):
             require_positive(f"cloth driver: {name}", getattr(self, name))
+        require_at_least("cloth driver: most_drawn", self.most_drawn, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

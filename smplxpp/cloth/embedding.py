@@ -23,11 +23,14 @@ class _Carried(ctypes.Structure):
     _fields_ = [
         *(
             (name, ctypes.c_int64)
-            for name in ("vertices", "triangles", "particles", "faces", "collider_vertices", "collider_faces")
+            for name in ("vertices", "triangles", "particles", "faces", "collider_vertices", "collider_faces", "edges")
         ),
         *(
             (name, ctypes.c_void_p)
-            for name in ("triangle", "which", "weight", "offset", "face", "collider_face", "deepest")
+            for name in (
+                *("triangle", "which", "weight", "offset", "face", "collider_face", "deepest"),
+                *("edge", "most"),
+            )
         ),
     ]
 
@@ -40,11 +43,20 @@ class CarriedVertices:
         faces: of the particles.
         collider: what they keep out of.
         particles: their number n.
+        bounds: pairs of vertices and the longest distances between them, metres; None: none.
     """
 
-    def __init__(self, embedding: Embedding, faces: Int[np.ndarray, "m 3"], collider: Collider, particles: int) -> None:
+    def __init__(
+        self,
+        embedding: Embedding,
+        faces: Int[np.ndarray, "m 3"],
+        collider: Collider,
+        particles: int,
+        bounds: tuple[Int[np.ndarray, "e 2"], Float[np.ndarray, " e"]] | None = None,
+    ) -> None:
         # Many vertices ride on one triangle; each distinct triangle is posed once.
         triangles, which = np.unique(embedding.corners, axis=0, return_inverse=True)
+        edges, most = bounds if bounds is not None else (np.zeros((0, 2), np.int32), np.zeros(0))
         self._count, self._shapes = len(embedding.corners), ((particles, 3), (len(collider.margin), 3))
         arrays = (
             *((np.ascontiguousarray(triangles, dtype=np.int32), "int32"),),
@@ -55,11 +67,12 @@ class CarriedVertices:
             ),
             *((np.ascontiguousarray(faces, dtype=np.int32), "int32"), (collider.faces, "int32")),
             (collider.deepest, "float32"),
+            *((np.ascontiguousarray(edges, dtype=np.int32), "int32"), (most.astype(np.float32), "float32")),
         )
         self._kept = [address(array, dtype) for array, dtype in arrays]
         self._native = _Carried(
             *(self._count, len(triangles), particles, len(faces), len(collider.margin), len(collider.faces)),
-            *self._kept,
+            *(len(edges), *self._kept),
         )
 
     def at(
@@ -185,9 +198,19 @@ class Embedding:
         return triangles, in_plane, _rows(self.weights, self.corners, count)
 
 
-def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
-    """Bind points to the nearest triangles of a mesh; `carried` by that mesh they stay where they are."""
-    face, near = igl.point_mesh_squared_distance(np.ascontiguousarray(points), coarse.vertices, coarse.faces)[1:3]
+def embed(
+    points: Float[np.ndarray, "N 3"], coarse: TriangleMesh, *, cell: Int[np.ndarray, " N"] | None = None
+) -> Embedding:
+    """Bind points to the nearest triangles of a mesh; `carried` by that mesh they stay where they are.
+
+    Args:
+        points: metres.
+        coarse: the mesh at rest.
+        cell: of each point its vertex of the coarse mesh along the cloth, -1: none. Only triangles at that vertex and
+            at its neighbours carry it: the nearest one may belong to another layer, a second leg or the other end of a
+            scarf, and would draw it along when that swings.
+    """
+    face, near = _nearest(points, coarse, cell)
     # Barycentric coordinates of the foot point; those of triangles without area fall back to equal weights. Clipping
     # and normalising keep them a convex combination.
     corners = coarse.faces[face].astype(np.int32)
@@ -211,6 +234,29 @@ def embed(points: Float[np.ndarray, "N 3"], coarse: TriangleMesh) -> Embedding:
     offset = np.stack([np.einsum("ni,ni->n", left, first), np.einsum("ni,ni->n", left, second), along], axis=1)
     offset[exact] = np.linalg.solve(frame[exact], missing[exact][:, :, None])[:, :, 0]
     return Embedding(zero.corners, zero.weights, offset.astype(np.float32))
+
+
+def _nearest(
+    points: Float[np.ndarray, "N 3"], coarse: TriangleMesh, cell: Int[np.ndarray, " N"] | None
+) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
+    """The triangle that carries each point, and its nearest place there, metres."""
+    points, faces = np.ascontiguousarray(points), coarse.faces
+    found, near = igl.point_mesh_squared_distance(points, coarse.vertices, faces)[1:3]
+    face = found.astype(np.int64)
+    known = np.flatnonzero(cell >= 0) if cell is not None else np.zeros(0, np.int64)
+    if cell is None or not len(known):
+        return face, near
+    # Faces with a corner that is the cell's vertex or beside it; most nearest faces are among them already.
+    n, corners = coarse.vertex_count, faces.ravel()
+    at = csr_matrix((np.ones(len(corners), bool), (corners, np.repeat(np.arange(len(faces)), 3))), (n, len(faces)))
+    about = (at @ at.T @ at).tocsr()
+    away = known[~np.asarray(about[cell[known], face[known]]).ravel().astype(bool)]
+    for one in np.unique(cell[away]):
+        mine, few = away[cell[away] == one], about[one].indices
+        if len(few):
+            found, near[mine] = igl.point_mesh_squared_distance(points[mine], coarse.vertices, faces[few])[1:3]
+            face[mine] = few[found]
+    return face, near
 
 
 def _rows(values: Float[np.ndarray, "N k"], columns: np.ndarray, width: int) -> csr_matrix:

@@ -25,6 +25,7 @@ from smplxpp.cloth.embedding import Embedding, embed
 from smplxpp.cloth.model import ClothModel, Fabric, build_model
 from smplxpp.core import BodyParams, TriangleMesh, require_at_least, require_choice, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError, one_line
+from smplxpp.core.mesh import row_lengths
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.topology import border_loops, component_labels
 from smplxpp.template.template import BODY_PART, Template
@@ -214,9 +215,13 @@ def cut_garment(template: Template, part: str, reference: BodyParams, config: Ga
         raise InputError(
             f"loose part {part!r}", expected="a piece of cloth that hangs from the body", received="shreds"
         )
-    embedding = embed(cloth.vertices, rest)
+    place = np.full(cloth.vertex_count, -1)
+    place[of_cloth[seeds]] = np.arange(len(seeds))
+    source = geodesics(cloth, of_cloth[seeds])[1]
+    embedding = embed(cloth.vertices, rest, cell=np.where(source >= 0, place[source], -1))
     nearest = depth[seeds][embedding.corners[np.arange(cloth.vertex_count), embedding.weights.argmax(axis=1)]]
     all_depth = np.where(np.isfinite(all_depth), all_depth, nearest)
+    all_depth[_far_pieces(cloth, embedding, source)] = 0.0
     return Garment(
         part=part,
         config=config,
@@ -246,6 +251,20 @@ def _held(
     least = np.full(piece.max(initial=-1) + 1, np.inf)
     np.minimum.at(least, piece, depth[seeds])
     return least[piece[faces[:, 0]]] <= config.spacing
+
+
+def _far_pieces(cloth: TriangleMesh, embedding: Embedding, source: Int64[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+    """The vertices of pieces of their own that reach away from the simulated one: skinning moves them.
+
+    On its nearest triangle such a piece, the end of a scarf beside its roll, would swing like a flag on a pole.
+    """
+    # Metres from the triangle that carries a vertex: shreds and buttons lie within, and ride along.
+    beside = 0.03
+    piece = _pieces(cloth)
+    off = np.where(source < 0, row_lengths(embedding.offset), 0.0)
+    most = np.zeros(piece.max(initial=-1) + 1)
+    np.maximum.at(most, piece, off)
+    return most[piece] > beside
 
 
 def _pieces(mesh: TriangleMesh) -> Int64[np.ndarray, " n"]:

@@ -22,8 +22,7 @@ Woven cloth tears or is cut on the bias above a quarter; the eye sees a taut str
 """
 SPIKE = Gate("x", 2.0, 10.0, higher_is_better=False)
 """Longest edge of the drawn surface over its length at rest. It bends about the simulated one at a distance, so that
-its outer side is longer in every fold: most garments reach 1.8, lips of a folded hem, which hang on another side of the
-cloth, 3 to 6, and pieces beside the simulated one 10 and more."""
+its outer side is longer in every fold. `DriverConfig.most_drawn` is kept but where sweeps do not suffice."""
 INSIDE = Gate("% of particles", 5.0, 20.0, higher_is_better=False)
 """Mean share of particles more than 2 mm inside of what they touch: a limb shows through a larger patch."""
 
@@ -171,20 +170,41 @@ def drawn_edges(garment: Garment, faces: Int[np.ndarray, "F 3"]) -> EdgeLengths:
     Args:
         faces: of the template, over its vertices.
     """
+    edges, rest = carried_edges(garment, faces)
+    alone = (garment.share() >= 1.0)[edges].all(axis=1)
     # Metres: shorter edges are slivers, of which a scan's decimation leaves some of a millimetre.
-    least = 0.01
-    own = garment.embedding
+    return EdgeLengths(edges[alone], rest[alone], 0.01)
+
+
+def drawn_bounds(
+    garment: Garment, faces: Int[np.ndarray, "F 3"], most: float
+) -> tuple[Int[np.ndarray, "e 2"], Float[np.ndarray, " e"]]:
+    """Return the edges of a drawn garment, as pairs of its vertices, and how long each may be drawn, metres.
+
+    Args:
+        faces: of the template, over its vertices.
+        most: times the length at rest.
+    """
+    least = 0.005  # metres; shorter edges are slivers, which count as that long
+    edges, rest = carried_edges(garment, faces)
+    return edges, most * np.maximum(rest, least)
+
+
+def carried_edges(
+    garment: Garment, faces: Int[np.ndarray, "F 3"]
+) -> tuple[Int[np.ndarray, "e 2"], Float[np.ndarray, " e"]]:
+    """Return the edges of what a garment carries, as pairs of its vertices, and their lengths at rest, metres.
+
+    Vertices of bridges over an opening lie beside the triangle that carries them: they are no cloth.
+    """
     at = np.full(int(max(faces.max(initial=-1), garment.vertices.max(initial=-1))) + 1, -1)
     at[garment.vertices] = np.arange(len(garment.vertices))
-    inside = at[faces[(at[faces] >= 0).all(axis=1)]]
-    edges = np.unique(
-        np.sort(np.concatenate([inside[:, [0, 1]], inside[:, [1, 2]], inside[:, [2, 0]]]), axis=1), axis=0
-    )
-    # Vertices of bridges over an opening lie beside the triangle that carries them: they are no cloth.
     beside = 0.005  # metres
-    cloth = (garment.share() >= 1.0) & (np.abs(own.offset[:, :2]).max(axis=1, initial=0.0) < beside)
-    edges = edges[cloth[edges].all(axis=1)]
-    return EdgeLengths(edges, lengths_of(own.carried(garment.rest), edges), least)
+    at[garment.vertices[np.abs(garment.embedding.offset[:, :2]).max(axis=1, initial=0.0) >= beside]] = -1
+    corners = at[faces]
+    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    edges = np.unique(np.sort(pairs[(pairs >= 0).all(axis=1)], axis=1), axis=0)
+    return edges, lengths_of(garment.embedding.carried(garment.rest), edges)
 
 
 def lengths_of(places: Float[np.ndarray, "N 3"], edges: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, " e"]:

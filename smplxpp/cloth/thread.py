@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int, Int64
 
 from smplxpp.cloth.embedding import CarriedVertices
 from smplxpp.cloth.garment import Garment
-from smplxpp.cloth.quality import ClothQuality, EdgeLengths, drawn_edges
+from smplxpp.cloth.quality import ClothQuality, EdgeLengths, drawn_bounds, drawn_edges
 from smplxpp.cloth.solver import ClothSolver, ClothState, move_before_collider
 from smplxpp.core.mesh import row_lengths
 
@@ -42,7 +42,8 @@ class GarmentThread:
         collider = garment.collider
         self._solver = ClothSolver(self._model, collider.native, garment.config.fabric, config.solver)
         self._carried = CarriedVertices(
-            garment.embedding, garment.rest.faces, self._solver.collider, len(garment.particles)
+            *(garment.embedding, garment.rest.faces, self._solver.collider, len(garment.particles)),
+            drawn_bounds(garment, faces, config.most_drawn),
         )
         self._particles = np.searchsorted(rows, garment.particles)
         self._skin = np.searchsorted(rows, collider.vertices)

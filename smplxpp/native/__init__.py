@@ -19,7 +19,7 @@ from typing import Any
 LEVELS = ("avx512", "avx2", "generic")
 """Instruction sets that the library is built for, the fastest first."""
 
-INTERFACE = 9
+INTERFACE = 10
 """Version of the C interface; `smplxpp_interface` of the library must return the same."""
 MOST_THREADS = min(256, max(16, 4 * (os.cpu_count() or 1)))
 """Upper bound of the number of threads of a kernel."""

@@ -163,6 +163,13 @@ def test_a_torn_garment_hangs_from_what_is_tight_and_its_scraps_ride_along():
     assert np.isfinite(garment.vertex_depth[-3:]).all()
 
 
+def test_a_scrap_that_lies_away_from_the_cloth_was_swung_like_a_flag_on_a_pole():
+    """The end of a scarf went through chest and arms, on a triangle of the roll about the neck."""
+    garment = cut(torn=True)
+    assert np.linalg.norm(garment.embedding.offset[-3:], axis=1).min() > 0.1
+    assert (garment.share()[-3:] == 0.0).all() and (garment.share()[:-3] == 1.0).any()
+
+
 def test_what_is_no_garment_is_refused():
     template = person()
     for part in (BODY_PART, "cape"):

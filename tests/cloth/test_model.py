@@ -129,6 +129,22 @@ def test_what_is_carried_by_a_bent_mesh_stays_at_its_distance():
     np.testing.assert_allclose(height, 0.004, atol=0.0015)
 
 
+def test_a_vertex_beside_another_layer_was_drawn_along_by_that():
+    """Legs of wide trousers hang side by side: edges from one to the other were drawn to 38 times their length."""
+    sheet = hanging(4, 4, 0.03)
+    n = sheet.vertex_count
+    both = TriangleMesh(
+        np.concatenate([sheet.vertices, sheet.vertices + [0, 0, 0.006]]), np.concatenate([sheet.faces, sheet.faces + n])
+    )
+    # Vertices of the first sheet that lie nearer to the second one.
+    points, cell = sheet.vertices + [0.004, -0.002, 0.004], np.arange(n)
+    apart = both.with_vertices(both.vertices + [0, 0, 0.2] * (np.arange(2 * n) >= n)[:, None])
+    assert (embed(points, both).carried(apart)[:, 2] > 0.1).any()
+    np.testing.assert_allclose(embed(points, both, cell=cell).carried(apart), points, atol=1e-6)
+    # Without a vertex along the cloth the nearest triangle has to do.
+    np.testing.assert_array_equal(embed(points, both, cell=0 * cell - 1).corners, embed(points, both).corners)
+
+
 def test_triangles_without_area_carry_without_nan():
     needle = TriangleMesh(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[0, 1, 2]]))
     points = np.array([[0.5, 0.1, 0.0], [3.0, 0.0, 1.0]])

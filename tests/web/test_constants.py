@@ -56,6 +56,7 @@ REPEATED = {
     "src/chat/connection.ts": {"REPLACED": REPLACED},
     "src/chat/conversation.ts": {"MOST_TYPED": MOST_TYPED},
     "src/chat/microphone.ts": {"RATE": RATE},
+    "src/cloth/carried.ts": {"MOST_DRAWN": DRIVER.most_drawn},
     "src/cloth/driver.ts": {
         "LONGEST_STEP": LONGEST_STEP,
         "RAMP": DRIVER.ramp,

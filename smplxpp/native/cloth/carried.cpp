@@ -16,10 +16,10 @@ using smplxpp::Contact;
 using smplxpp::Surface;
 using smplxpp::Vec3;
 
-// N vertices in the frames of t triangles of n particles with m faces, and a collider of c vertices and d faces.
-// smplxpp/cloth/embedding.py says the same.
+// N vertices in the frames of t triangles of n particles with m faces, a collider of c vertices and d faces, and e edges between
+// the vertices. smplxpp/cloth/embedding.py says the same.
 struct Carried {
-    int64_t vertices, triangles, particles, faces, collider_vertices, collider_faces;
+    int64_t vertices, triangles, particles, faces, collider_vertices, collider_faces, edges;
     const int32_t* triangle;       // 3 t: particles
     const int32_t* which;          // N: the triangle that carries each
     const float* weight;           // 3 N: barycentric
@@ -27,6 +27,8 @@ struct Carried {
     const int32_t* face;           // 3 m
     const int32_t* collider_face;  // 3 d
     const float* deepest;          // c: metres; deeper cloth is on the other side
+    const int32_t* edge;           // 2 e
+    const float* most;             // e: metres that it may be long
 };
 
 // Skinning weights of V vertices over J joints, and the R of them that are meant. smplxpp/cloth/embedding.py says the same.
@@ -65,6 +67,30 @@ Vec3 pushed_out(Vec3 p, Vec3 cloth_normal, Surface& surface, const int32_t* face
     return p + normal * ((margin - height) * std::clamp(2.0f + height / whole, 0.0f, 1.0f));
 }
 
+constexpr int kSweeps = 12;  // over the drawn edges that are too long
+
+// Draws the ends of edges that are too long together, sweep after sweep until none is; marks what was moved. Frames of triangles
+// that turn against each other draw what lies off them apart.
+bool drawn_together(const Carried& in, Vec3* points, std::vector<uint8_t>& moved) {
+    bool any = false, within = false;
+    for (int sweep = 0; sweep < kSweeps && !within; ++sweep) {
+        within = true;
+        for (int64_t k = 0; k < in.edges; ++k) {
+            const int64_t e = sweep % 2 ? in.edges - 1 - k : k;
+            const int32_t i = in.edge[2 * e], j = in.edge[2 * e + 1];
+            const Vec3 d = points[i] - points[j];
+            const float squared = dot(d, d), most = in.most[e];
+            if (!(squared > most * most)) continue;
+            const float l = std::sqrt(squared);
+            const Vec3 step = d * (0.5f * (l - most) / l);
+            points[i] = points[i] - step, points[j] = points[j] + step;
+            moved[size_t(i)] = moved[size_t(j)] = 1;
+            within = false, any = true;
+        }
+    }
+    return any;
+}
+
 // The transform of a vertex: its joints' (J, 3, 4), blended.
 void blend(const Skinned& in, const float* transforms, int64_t vertex, float* __restrict m) {
     float sum[12] = {};
@@ -86,6 +112,7 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_carry(const Carried* in, const float* x, co
         check_indices(in->which, in->vertices, in->triangles);
         check_indices(in->face, 3 * in->faces, in->particles);
         check_indices(in->collider_face, 3 * in->collider_faces, in->collider_vertices);
+        check_indices(in->edge, 2 * in->edges, in->vertices);
         const Vec3* place = (const Vec3*)x;
         std::vector<Vec3> normal(size_t(in->particles)), tangent(2 * size_t(in->triangles));
         smplxpp::normals(place, in->face, in->faces, normal);
@@ -98,15 +125,25 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_carry(const Carried* in, const float* x, co
         }
         Surface surface(in->collider_vertices, in->collider_face, in->collider_faces);
         surface.look((const Vec3*)skin);
+        std::vector<Vec3> up(size_t(in->vertices));
+        const auto out = [&](Vec3 p, size_t v) {
+            return pushed_out(p, up[v], surface, in->collider_face, (const Vec3*)skin, margin, in->deepest, kDrawnOut);
+        };
         for (int64_t v = 0; v < in->vertices; ++v) {
             const int64_t t = in->which[v];
             const int32_t* q = in->triangle + 3 * t;
             const float *w = in->weight + 3 * v, *by = in->offset + 3 * v;
-            const Vec3 up = unit(normal[size_t(q[0])] * w[0] + normal[size_t(q[1])] * w[1] + normal[size_t(q[2])] * w[2]);
             const Vec3 there = place[q[0]] * w[0] + place[q[1]] * w[1] + place[q[2]] * w[2] + tangent[size_t(2 * t)] * by[0] +
-                               tangent[size_t(2 * t + 1)] * by[1] + up * by[2];
-            ((Vec3*)points)[v] = pushed_out(there, up, surface, in->collider_face, (const Vec3*)skin, margin, in->deepest, kDrawnOut);
+                               tangent[size_t(2 * t + 1)] * by[1];
+            up[size_t(v)] = unit(normal[size_t(q[0])] * w[0] + normal[size_t(q[1])] * w[1] + normal[size_t(q[2])] * w[2]);
+            ((Vec3*)points)[v] = out(there + up[size_t(v)] * by[2], size_t(v));
         }
+        // What was drawn together may lie in the skin then; the lengths have the last word.
+        std::vector<uint8_t> moved(size_t(in->vertices), 0);
+        if (!drawn_together(*in, (Vec3*)points, moved)) return;
+        for (size_t v = 0; v < moved.size(); ++v)
+            if (moved[v]) ((Vec3*)points)[v] = out(((Vec3*)points)[v], v);
+        drawn_together(*in, (Vec3*)points, moved);
     });
 }
 

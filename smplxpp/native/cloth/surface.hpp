@@ -104,8 +104,9 @@ public:
     }
     Vec3 normal(int32_t i) const { return normal_[size_t(i)]; }
 
-    // The nearest vertex within reach that faces as the cloth does, -1: none.
-    int32_t nearest(Vec3 p, Vec3 cloth_normal) {
+    // The nearest vertex within reach that faces as the cloth does, -1: none. `other`: among those that face against this
+    // normal, the other side of a fold.
+    int32_t nearest(Vec3 p, Vec3 cloth_normal, Vec3 other = {0, 0, 0}) {
         const Gathered& about = gather(grid_.block(p));
         int32_t near = -1;
         float best = kReach * kReach;
@@ -115,8 +116,11 @@ public:
             for (int k = 0; k < kWide; ++k) {
                 const Vec3 d = {p.x - c.x[k], p.y - c.y[k], p.z - c.z[k]};
                 const float covers = c.nx[k] * cloth_normal.x + c.ny[k] * cloth_normal.y + c.nz[k] * cloth_normal.z;
-                // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact.
-                squared[k] = covers > kCovers ? dot(d, d) : kReach * kReach;
+                // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact with cloth that lies in it;
+                // cloth before it stays there, whichever way its folds look.
+                const float against = c.nx[k] * other.x + c.ny[k] * other.y + c.nz[k] * other.z;
+                const float height = c.nx[k] * d.x + c.ny[k] * d.y + c.nz[k] * d.z;
+                squared[k] = (covers > kCovers || height > -kShallow) && against <= 0 ? dot(d, d) : kReach * kReach;
             }
             for (int k = 0; k < kWide; ++k)
                 if (squared[k] < best) best = squared[k], near = c.vertex[k];
@@ -144,7 +148,8 @@ public:
                 if (q[j] == near && found.weight[j] > 0) return found;
                 if (found.weight[j] > most) most = found.weight[j], next = q[j];
             }
-            if (!(dot(normal_[size_t(next)], cloth_normal) > kCovers)) break;
+            const Vec3 n = normal_[size_t(next)];
+            if (!(dot(n, cloth_normal) > kCovers || dot(p - vertex_[next], n) > -kShallow)) break;
             near = next;
         }
         return found;
@@ -201,6 +206,7 @@ private:
     static constexpr float kReach = 0.035f;   // metres within which a vertex is found
     static constexpr float kClear = 0.01f;    // metres before a vertex
     static constexpr float kCovers = -0.3f;   // least cosine between skin's and cloth's normals
+    static constexpr float kShallow = 0.002f; // metres behind a vertex's plane up to which cloth counts as before it
     const int32_t* face_;
     int64_t faces_;
     const Vec3* vertex_ = nullptr;

@@ -75,7 +75,7 @@ public:
         : m_(m), f_(f), position_(position), velocity_(velocity), n_(size_t(m.particles)), x_(n_), v_(n_), before_(n_),
           place_(n_), normal_(n_),
           skin_(size_t(m.collider_vertices)), skin_before_(skin_.size()),
-          surface_(m.collider_vertices, m.collider_face, m.collider_faces), contact_(n_, Contact{-1, {0, 0, 0}}) {}
+          surface_(m.collider_vertices, m.collider_face, m.collider_faces), contact_(2 * n_, Contact{-1, {0, 0, 0}}) {}
 
     void advance(const Moments& moments, float seconds, int32_t substeps, int32_t contacts_every) {
         substeps = std::max(substeps, std::min(kShorter * substeps, needed(moments, seconds)));
@@ -284,8 +284,16 @@ private:
 
     void find_contacts() {
         surface_.look(skin_.data());
-        for (size_t i = 0; i < n_; ++i)
-            contact_[i] = w(int64_t(i)) == 0 ? Contact{-1, {0, 0, 0}} : surface_.find(narrowed(x_[i]), narrowed(normal_[i]));
+        for (size_t i = 0; i < n_; ++i) {
+            Contact &first = contact_[i], &second = contact_[n_ + i];
+            first = second = Contact{-1, {0, 0, 0}};
+            if (w(int64_t(i)) == 0) continue;
+            const Vec3 p = narrowed(x_[i]), normal = narrowed(normal_[i]);
+            const int32_t near = surface_.nearest(p, normal);
+            first = surface_.find_from(near, p, normal);
+            // A lap, an armpit, a bent knee: cloth lies between two sides of the body that come together.
+            if (near >= 0) second = surface_.find_from(surface_.nearest(p, normal, surface_.normal(near)), p, normal);
+        }
     }
 
     // The place of the collider that a particle touches, now and before the substep.
@@ -293,10 +301,10 @@ private:
         Vec3 point, was, normal;
         float margin, deepest;
     };
-    bool place_on(size_t i, Place& at) const {
-        if (contact_[i].face < 0 || w(int64_t(i)) == 0) return false;
-        const int32_t* q = m_.collider_face + 3 * int64_t(contact_[i].face);
-        const float* b = contact_[i].weight;
+    bool place_on(size_t k, Place& at) const {
+        if (contact_[k].face < 0) return false;
+        const int32_t* q = m_.collider_face + 3 * int64_t(contact_[k].face);
+        const float* b = contact_[k].weight;
         at = {{0, 0, 0}, {0, 0, 0}, {0, 0, 0}, 0, 0};
         for (int j = 0; j < 3; ++j) {
             at.point = at.point + skin_[size_t(q[j])] * b[j];
@@ -316,8 +324,9 @@ private:
     void touch() {
         const float friction = float(f_.friction);
         Place at;
-        for (size_t i = 0; i < n_; ++i) {
-            if (!place_on(i, at)) continue;
+        for (size_t k = 0; k < 2 * n_; ++k) {
+            if (!place_on(k, at)) continue;
+            const size_t i = k % n_;
             Vec3 x = narrowed(x_[i]);
             const float height = dot(x - at.point, at.normal);
             if (at.margin - height <= 0 || height < -at.deepest) continue;
@@ -335,8 +344,9 @@ private:
     // The same without friction, between sweeps of the bound.
     void push() {
         Place at;
-        for (size_t i = 0; i < n_; ++i) {
-            if (!place_on(i, at)) continue;
+        for (size_t k = 0; k < 2 * n_; ++k) {
+            if (!place_on(k, at)) continue;
+            const size_t i = k % n_;
             const float height = dot(narrowed(x_[i]) - at.point, at.normal);
             if (at.margin - height > 0 && height > -at.deepest)
                 x_[i] = x_[i] + widened(at.normal * std::min(kOut, at.margin - height));
@@ -423,7 +433,7 @@ private:
     Surface surface_;
     std::vector<Edge> edges_;
     std::vector<Hinge> hinges_;
-    std::vector<Contact> contact_;
+    std::vector<Contact> contact_;  // 2 n: the nearest place of each particle, then that on the other side of a fold
     std::vector<Pair> pairs_;
     std::vector<int64_t> linked_;
     Grid own_;

@@ -2,4 +2,4 @@
 // not called with arguments that it does not know.
 #include "common/status.hpp"
 
-SMPLXPP_EXPORT int32_t smplxpp_interface() { return 9; }
+SMPLXPP_EXPORT int32_t smplxpp_interface() { return 10; }

@@ -2,10 +2,16 @@
 
 import type { Deformer } from "../avatar/deform.ts";
 import type { Block, Native } from "../native/memory.ts";
-import type { Garment } from "./garment.ts";
+import { edgesOf, type Garment } from "./garment.ts";
 
 /** Of a blend of rotations; below, its inverse blows up what the cloth did. */
 const LEAST_DETERMINANT = 0.2;
+/** How long a drawn edge may be over its length at rest, metres at least (`smplxpp/cloth/quality.py`). */
+const MOST_DRAWN = 1.5, LEAST = 0.005;
+/** Metres in the plane of the triangle that carries a vertex, beyond which that is no cloth but a bridge over an opening. */
+const BESIDE = 0.005;
+/** Metres at which there is nothing. */
+const FAR_AWAY = 1e6;
 
 /** N vertices in the frames of coarse triangles: barycentric places, and offsets along tangents and smooth normal. */
 export class CarriedVertices {
@@ -13,8 +19,10 @@ export class CarriedVertices {
   readonly points: Block<Float32Array>;
   private readonly carried: Block<Uint8Array>;
 
-  /** @param deepest of the collider, @param faces its faces. */
-  constructor(private readonly native: Native, garment: Garment, deepest: Block<Float32Array>, faces: Block<Int32Array>) {
+  /** @param deepest of the collider, @param faces its faces, @param drawn the faces of the avatar. */
+  constructor(
+    private readonly native: Native, garment: Garment, deepest: Block<Float32Array>, faces: Block<Int32Array>, drawn: ArrayLike<number>,
+  ) {
     const { corners, weights, offset, rest, collider } = garment, n = rest.length / 3, which = new Int32Array(corners.length / 3);
     const known = new Map<number, number>(), triangles: number[] = [];
     for (let v = 0; v < which.length; ++v) {
@@ -25,17 +33,34 @@ export class CarriedVertices {
       }
       which[v] = known.get(key)!;
     }
+    const edges = carriedEdges(garment, drawn), most = native.keep(new Float32Array(edges.length / 2).fill(Infinity));
     this.points = native.floats(corners.length);
     this.carried = native.struct(
-      [which.length, known.size, n, garment.faces.length / 3, collider.vertices.length, collider.faces.length / 3],
-      [...[Int32Array.from(triangles), which, weights, offset, garment.faces].map((array) => native.keep<Float32Array | Int32Array>(array)), faces, deepest],
+      [which.length, known.size, n, garment.faces.length / 3, collider.vertices.length, collider.faces.length / 3, edges.length / 2],
+      [...[Int32Array.from(triangles), which, weights, offset, garment.faces].map((array) => native.keep<Float32Array | Int32Array>(array)),
+        faces, deepest, native.keep(edges), most],
     );
+    // Where the garment carries them at rest, with nothing about, says how long edges are.
+    const nothing = native.keep(new Float32Array(3 * collider.vertices.length).fill(FAR_AWAY));
+    this.carry(native.keep(Float32Array.from(rest)), nothing, 0);
+    const x = this.points.view;
+    most.view.forEach((_, e) => {
+      const [a, b] = [3 * edges[2 * e], 3 * edges[2 * e + 1]];
+      most.view[e] = MOST_DRAWN * Math.max(Math.hypot(x[a] - x[b], x[a + 1] - x[b + 1], x[a + 2] - x[b + 2]), LEAST);
+    });
   }
 
   /** Moves the vertices to where particles (n, 3) take them, `margin` metres before the collider's surface (c, 3). */
   carry(particles: Block<Float32Array>, surface: Block<Float32Array>, margin: number): void {
     this.native.run("cloth_carry", this.carried, particles, surface, margin, this.points);
   }
+}
+
+/** The edges of faces (F, 3) of the avatar that a garment carries, as pairs of its vertices; bridges over openings are none. */
+function carriedEdges({ vertices, offset }: Garment, faces: ArrayLike<number>): Int32Array {
+  const at = new Map<number, number>();
+  vertices.forEach((vertex, i) => Math.max(Math.abs(offset[3 * i]), Math.abs(offset[3 * i + 1])) < BESIDE && at.set(vertex, i));
+  return edgesOf(Int32Array.from(faces, (vertex) => at.get(vertex) ?? -1), vertices.length);
 }
 
 /** R vertices under linear blend skinning, there and back. */

@@ -55,7 +55,7 @@ export class ClothDriver {
 
   constructor(private readonly deformer: Deformer, garments: readonly Garment[], private readonly start: Start = { ramp: RAMP, hold: HOLD }) {
     const { native, avatar: { mesh, gaussians } } = deformer, V = mesh.vertices.length / 3;
-    this.threads = garments.map((garment) => new GarmentThread(native, garment));
+    this.threads = garments.map((garment) => new GarmentThread(native, garment, mesh.faces));
     this.rows = garments.map(({ particles, collider, vertices }, k) => {
       const under = new Map<number, [number, number]>();
       garments.slice(0, k).forEach(({ vertices }, inner) => {

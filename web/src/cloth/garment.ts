@@ -42,13 +42,13 @@ export interface Garment {
   collider: { vertices: Int32Array; faces: Int32Array; margin: Float32Array; deepest: Float32Array };
 }
 
-/** The undirected edges of faces over n vertices, each once, lower index first, sorted: (E, 2). */
+/** The undirected edges of faces over n vertices, each once, lower index first, sorted: (E, 2); -1: no vertex. */
 export function edgesOf(faces: Int32Array, n: number): Int32Array {
   const keys = new Set<number>();
   for (let f = 0; f < faces.length; f += 3) {
     for (let k = 0; k < 3; ++k) {
       const a = faces[f + k], b = faces[f + ((k + 1) % 3)];
-      keys.add(Math.min(a, b) * n + Math.max(a, b));
+      if (a >= 0 && b >= 0) keys.add(Math.min(a, b) * n + Math.max(a, b));
     }
   }
   return Int32Array.from([...keys].sort((a, b) => a - b).flatMap((key) => [Math.floor(key / n), key % n]));

@@ -72,7 +72,8 @@ export class GarmentThread {
   private readonly places: Moments;
   private readonly surfaces: Moments;
 
-  constructor(private readonly native: Native, readonly garment: Garment) {
+  /** @param drawn the faces of the avatar. */
+  constructor(private readonly native: Native, readonly garment: Garment, drawn: ArrayLike<number>) {
     const { fabric, collider } = garment, n = garment.particles.length, c = collider.vertices.length;
     const fixed = pinned(garment), model = buildModel(garment, fixed);
     this.pins = Int32Array.from([...fixed.keys()].filter((i) => fixed[i]));
@@ -81,7 +82,7 @@ export class GarmentThread {
     this.mostSquared = Float64Array.from(model.lengths, (length) => (MOST_STRETCH * length + 0.01) ** 2);
     [this.position, this.velocity] = [native.floats(3 * n), native.floats(3 * n)];
     const colliderFaces = native.keep(collider.faces), deepest = native.keep(collider.deepest);
-    this.fine = new CarriedVertices(native, garment, deepest, colliderFaces);
+    this.fine = new CarriedVertices(native, garment, deepest, colliderFaces, drawn);
     this.model = native.struct([n, garment.faces.length / 3, model.edges.length / 2, model.bend.length, c, collider.faces.length / 3], [
       ...[model.inverseMass, garment.faces, model.edges, model.lengths, model.stretch, model.compress, model.hinges, model.curvature,
         model.restCurvature, model.bend].map((array) => native.keep<Float32Array | Int32Array>(array)),
