@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from types import UnionType
@@ -171,6 +172,7 @@ def _entry(option: Option, width: int) -> list[str]:
     return [*first, *(" " * column + line for line in text)]
 
 
+@cache  # because the interpreter parses the whole file of a class to find its source
 def _words(command: type) -> dict[str, str]:
     """Read the docstrings below the fields of a dataclass and of those that it extends."""
     out: dict[str, str] = {}

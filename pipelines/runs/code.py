@@ -237,4 +237,9 @@ def sha256_file(path: str | Path) -> str:
 
 def versions(libraries: Iterable[str] = GEOMETRY) -> dict[str, str]:
     """Return the versions of Python and of the libraries that compute the result."""
-    return {"python": platform.python_version(), **{name: version(name) for name in libraries}}
+    return {"python": platform.python_version(), **{name: _version(name) for name in libraries}}
+
+
+@cache  # because every stage asks, and reads the metadata of five packages
+def _version(library: str) -> str:
+    return version(library)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float64
@@ -249,6 +250,7 @@ def _cost(surface: SurfacePoints, bodies: _Bodies, up: str) -> float:
     return best
 
 
+@cache
 def _bodies() -> _Bodies:
     """Return 250 points with normals of the open body in standing poses, centred on the vertical axis."""
     # Three poses of the legs suffice: more do not change which axis is up.

@@ -41,6 +41,13 @@ def test_vertices_are_the_skinned_rest_vertices_exactly(open_body, moving):
     assert one.posed_from_rest.shape == (55, 4, 4) and len(posed) == 3
 
 
+def test_vertices_are_skinned_when_they_are_asked_for_first(open_body, moving):
+    """Poses of an avatar and steps of cloth take the transforms, and waited for a product over all vertices."""
+    posed = open_body.forward(moving(1))
+    assert len(posed) == 1 and "13,886" not in repr(posed) and "vertices" not in vars(posed)
+    assert posed.vertices is posed.vertices
+
+
 def test_a_frame_alone_is_the_frame_of_the_batch(open_body, moving):
     params = moving(3)
     np.testing.assert_allclose(
