@@ -215,30 +215,34 @@ def _without_bridges(
     weights = ruled.weights(fit, body, part, source)
     # Folded vertices lose their fold for the trial alone: those that are left with the part are counted later.
     limits = UnposeConfig(warn_below=0.0, fail_below=_FOLDED)
+    rest = _at_rest(part, weights, fit, limits)
     # Bridges in folds first, because these are cut where the scan lacks the gap; then what still tears.
-    for find in [*(find_bridges,) * config.rounds, *(find_tears,) * config.rounds]:
-        tried = invertible_weights(weights, fit.posed_from_rest, least=_FOLDED)[0]
-        rest = unpose(part.vertices, tried, fit.posed_from_rest, config=limits)
-        bridge = find(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, config=config)
-        bridge &= ~ruled.stiff(part, source)
-        if not bridge.any():
-            continue
-        part, kept = cut_bridges(part, bridge, config=config)
-        source = source[kept]
-        weights = ruled.weights(fit, body, part, source)
+    for find in (find_bridges, find_tears):
+        for _ in range(config.rounds):
+            bridge = find(part, rest, fit.mesh, fit.at_rest, config=config) & ~ruled.stiff(part, source)
+            if not bridge.any():
+                break
+            part, kept = cut_bridges(part, bridge, config=config)
+            source = source[kept]
+            weights = ruled.weights(fit, body, part, source)
+            rest = _at_rest(part, weights, fit, limits)
     # What cuts leave of the other limb hangs in the air at rest; without it the weights get better, which shows more.
     for _ in range(config.rounds):
-        tried = invertible_weights(weights, fit.posed_from_rest, least=_FOLDED)[0]
-        rest = unpose(part.vertices, tried, fit.posed_from_rest, config=limits)
         cut = cut_borders(part, np.isin(source, opened))
-        shred = find_shreds(part, part.with_vertices(rest.vertices), fit.mesh, fit.at_rest, cut)
-        shred &= ~ruled.stiff(part, source)
+        shred = find_shreds(part, rest, fit.mesh, fit.at_rest, cut) & ~ruled.stiff(part, source)
         if not shred.any():
             break
         part, kept = cut_bridges(part, shred, config=config)
         source = source[kept]
         weights = ruled.weights(fit, body, part, source)
+        rest = _at_rest(part, weights, fit, limits)
     return part, source, weights
+
+
+def _at_rest(part: TriangleMesh, weights: SkinWeights, fit: PosedFit, limits: UnposeConfig) -> TriangleMesh:
+    """Return a part in the T-pose, by weights without the folds that cannot be inverted."""
+    tried = invertible_weights(weights, fit.posed_from_rest, least=_FOLDED)[0]
+    return part.with_vertices(unpose(part.vertices, tried, fit.posed_from_rest, config=limits).vertices)
 
 
 def unpose_parts(

@@ -14,7 +14,7 @@ from pipelines.runs.artefacts import load_parts, load_weights
 from pipelines.runs.layout import METRICS_FILE, TEMPLATE
 from pipelines.stages.build import build
 from smplxpp.body import load_params
-from smplxpp.build import BuildConfig, build_template, template
+from smplxpp.build import BuildConfig, build_template, parts, template
 from smplxpp.build.config import STEPS
 from smplxpp.build.data import LocatedInScan
 from smplxpp.capture import open_capture
@@ -63,11 +63,11 @@ def test_both_doors_give_the_same_template(by_command, built, tmp_path):
     result, _ = built
     result.template.save(tmp_path / "template.npz")
     assert (tmp_path / "template.npz").read_bytes() == (by_command / TEMPLATE).read_bytes()
-    parts = load_parts(by_command)
-    weights = load_weights(by_command, parts)
-    assert list(result.parts) == list(parts)
+    theirs = load_parts(by_command)
+    weights = load_weights(by_command, theirs)
+    assert list(result.parts) == list(theirs)
     for name, part in result.parts.items():
-        assert np.array_equal(part.posed.mesh.vertices, parts[name].mesh.vertices)
+        assert np.array_equal(part.posed.mesh.vertices, theirs[name].mesh.vertices)
         assert np.array_equal(part.weights.joint_weights, weights[name].joint_weights)
 
 
@@ -99,19 +99,41 @@ def test_a_file_and_a_mesh_in_memory_are_the_same_input(small, monkeypatch):
     assert all(np.array_equal(a, b) for a, b in zip(its.as_dict().values(), others.as_dict().values(), strict=True))
 
 
-def test_labels_in_memory_are_used(small):
+@pytest.fixture
+def unmeasured(monkeypatch):
+    """Templates are not measured, which is half of the time."""
+    monkeypatch.setattr(template, "validate_template", lambda *made: (None, StageOutput([], {})))
+
+
+def test_labels_in_memory_are_used(small, unmeasured, monkeypatch):
     mesh, _ = small
+    searched = searches(monkeypatch)
     labels = np.where(mesh.face_centers[:, 1] < 0.5, 5, 0)
     config = BuildConfig(budgets=FEW, samples=2000)
     result = build_template(mesh, params=PARAMS, labels=labels, config=config)
     assert result.template.part_names == ("body", "lower") or len(result.template.part_names) == 2
     assert result.report.numbers["segment"]["labels_from"] == "file"
+    # Bridges and tears are searched once of every part that a cut has left: an empty search was repeated six times.
+    assert searched and len({(find, id(part)) for find, part in searched}) == len(searched)
     with pytest.raises(InputError, match="labels of the scan"):
         build_template(mesh, params=PARAMS, labels=labels[:-1], config=config)
 
 
-def test_the_capture_comes_back_with_the_parameters_that_were_used(small, tmp_path, monkeypatch):
-    monkeypatch.setattr(template, "validate_template", lambda *made: (None, StageOutput([], {})))  # half of the time
+def searches(monkeypatch) -> list[tuple[str, TriangleMesh]]:
+    """Return a list that gets the parts of which bridges and tears are searched."""
+    seen: list[tuple[str, TriangleMesh]] = []
+    for name in ("find_bridges", "find_tears"):
+        find = getattr(parts, name)
+
+        def counted(part, *others, name=name, find=find, **config):
+            seen.append((name, part))
+            return find(part, *others, **config)
+
+        monkeypatch.setattr(parts, name, counted)
+    return seen
+
+
+def test_the_capture_comes_back_with_the_parameters_that_were_used(small, tmp_path, unmeasured):
     root = tmp_path / "capture"
     (root / "scans").mkdir(parents=True)
     for name in ("cameras.json", "rgbs", "masks", "params"):
