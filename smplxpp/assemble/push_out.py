@@ -153,20 +153,24 @@ class _Wall:
     """
 
     def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, clearance: float) -> None:
-        self._mesh, self._centers = mesh, face_centers(mesh, mesh.vertices)
+        self._mesh, self._centers, self._solid = mesh, face_centers(mesh, mesh.vertices), obstacle.solid
         # Face centres keep half the clearance, because a chord runs below its arc.
         self._of_vertices = _Distances(obstacle, mesh.vertices, mesh.vertex_normals, clearance)
         self._of_centers = _Distances(obstacle, self._centers, mesh.face_normals, 0.5 * clearance)
 
     def vertex_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the vertices that are too near after a displacement d (N, 3), and their (n, 3) pushes."""
-        normals = (facing or self._mesh).vertex_normals
+        normals = self._facing(facing).vertex_normals
         return self._push(self._mesh.vertices, d, normals, self._of_vertices, facing is None)
 
     def center_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the faces whose centres are too near after a displacement d (N, 3), and their (m, 3) pushes."""
-        normals, moved = (facing or self._mesh).face_normals, face_centers(self._mesh, d)
+        normals, moved = self._facing(facing).face_normals, face_centers(self._mesh, d)
         return self._push(self._centers, moved, normals, self._of_centers, facing is None)
+
+    def _facing(self, displaced: TriangleMesh | None) -> TriangleMesh:
+        """Return the layer whose normals decide; a solid asks for none of a displaced layer, and they take long."""
+        return self._mesh if displaced is None or self._solid else displaced
 
     def _push(self, origin, moved, normals, distances, facing_only):
         # A signed distance changes by at most the length of the displacement, so that most points need no query.

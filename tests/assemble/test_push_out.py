@@ -49,6 +49,15 @@ def test_a_dent_is_pushed_out_to_the_clearance():
     assert way[outer.vertices[:, 0] < 0].max() < 1e-6
 
 
+def test_a_body_asks_for_no_normals_of_the_displaced_layer(monkeypatch):
+    """They were computed in each of hundreds of projections, though only garments ask which way a point faces."""
+    outer, asked, compute = dented(depth=0.014), [], TriangleMesh.vertex_normals.func
+    counted = property(lambda mesh: (asked.append(mesh), compute(mesh))[1])
+    monkeypatch.setattr(TriangleMesh, "vertex_normals", counted)
+    push_out(outer, [solid(ball(0.1, subdivisions=3))], PushConfig(clearance=2e-3))
+    assert {id(mesh) for mesh in asked if mesh.face_count == outer.face_count} == {id(outer)}
+
+
 @pytest.mark.parametrize("is_solid", [True, False])
 def test_points_that_stay_are_not_asked_again_and_no_bit_changes(is_solid, monkeypatch):
     """Hundreds of projections asked of the same distances again and again."""
