@@ -41,6 +41,41 @@ def test_the_silhouette_is_the_spheres(sphere, camera):
     assert not maps.mask[distance > 0.5].any()
 
 
+@pytest.mark.parametrize("parallel", [False, True])
+def test_every_pixel_has_the_bits_of_the_formula_for_it_alone(parallel):
+    """Pixels are computed several at once: none may differ at the ends of rows, on edges, or on slivers."""
+    rng = np.random.default_rng(5)
+    points = np.round(rng.normal(0.0, 0.4, (60, 3)), 1)  # many share a plane, an edge or a pixel's centre
+    mesh = TriangleMesh(points, rng.integers(0, 60, (80, 3)))
+    if parallel:
+        view = Camera.orthographic_view(center=np.zeros(3), direction=(0, 0, 1), half_extent=1.0, size=21)
+    else:
+        view = Camera.look_at(eye=(0, 0, 3.0), target=(0, 0, 0), fov_y_deg=35, width=31, height=22)
+    face_id, depth = np.full((view.height, view.width), -1), np.full((view.height, view.width), np.inf, np.float32)
+    barycentric = np.zeros((view.height, view.width, 3), np.float32)
+    y, x = np.mgrid[: view.height, : view.width]
+    for f, (a, b, c) in enumerate(view.screen_from_world(points)[mesh.faces]):
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+        if area == 0.0:
+            continue
+        inv, px, py = 1.0 / area, x + 0.5 - c[0], y + 0.5 - c[1]
+        wa = (b[1] - c[1]) * inv * px + (c[0] - b[0]) * inv * py
+        wb = (c[1] - a[1]) * inv * px + (a[0] - c[0]) * inv * py
+        wc = 1.0 - wa - wb
+        qa, qb, qc = wa * a[3], wb * b[3], wc * c[3]
+        inside = (wa >= 0) & (wb >= 0) & (wc >= 0)
+        q = np.divide(1.0, qa + qb + qc, out=np.ones_like(qa), where=inside)
+        z = ((qa * a[2] + qb * b[2] + qc * c[2]) * q).astype(np.float32)
+        won = inside & (z < depth)
+        face_id[won], depth[won] = f, z[won]
+        barycentric[won] = np.stack([qa * q, qb * q, qc * q], axis=2)[won]
+    maps = rasterize_mesh(mesh, view)
+    np.testing.assert_array_equal(maps.face_id, face_id)
+    np.testing.assert_array_equal(maps.depth, depth)
+    np.testing.assert_array_equal(maps.barycentric, barycentric)
+    assert (face_id >= 0).mean() > 0.2
+
+
 def test_every_thread_count_gives_the_same_bits(sphere, camera):
     one, three = (rasterize_mesh(sphere, camera, threads=n) for n in (1, 3))
     for name in ("face_id", "barycentric", "depth"):

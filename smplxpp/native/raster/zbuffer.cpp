@@ -15,6 +15,12 @@ namespace {
 
 constexpr int kBandRows = 8;
 
+// Neighbouring pixels of a row are computed at once, each as it would be alone, to the bit.
+constexpr int kLanes = 4;
+typedef double Lanes __attribute__((vector_size(32)));
+typedef int64_t Flags __attribute__((vector_size(32)));
+constexpr Lanes kLane = {0.0, 1.0, 2.0, 3.0};
+
 struct Target {
     int width, height;
     int32_t* face_id;   // (H,W), -1 = background
@@ -69,20 +75,24 @@ void raster_rows(const double* screen, const int32_t* faces, int64_t first, int6
         const double ax = (b[1] - c[1]) * inv, ay = (c[0] - b[0]) * inv;
         const double bx = (c[1] - a[1]) * inv, by = (a[0] - c[0]) * inv;
         for (int y = y0; y <= y1; ++y) {
-            const double py = y + 0.5 - c[1];
-            for (int x = box.x0; x <= box.x1; ++x) {
-                const double px = x + 0.5 - c[0];
-                const double wa = ax * px + ay * py, wb = bx * px + by * py, wc = 1.0 - wa - wb;
-                if (wa < 0 || wb < 0 || wc < 0) continue;
-                const double qa = wa * a[3], qb = wb * b[3], qc = wc * c[3], q = 1.0 / (qa + qb + qc);
-                const float z = float((qa * a[2] + qb * b[2] + qc * c[2]) * q);
-                const size_t i = size_t(y) * t.width + x;
-                if (z < t.depth[i]) {
+            const double py = y + 0.5 - c[1], ya = ay * py, yb = by * py;
+            for (int x = box.x0; x <= box.x1; x += kLanes) {
+                const Lanes px = (kLane + double(x)) + 0.5 - c[0];
+                const Lanes wa = ax * px + ya, wb = bx * px + yb, wc = 1.0 - wa - wb;
+                const Flags outside = (wa < 0.0) | (wb < 0.0) | (wc < 0.0);
+                if ((outside[0] & outside[1] & outside[2] & outside[3]) != 0) continue;
+                const Lanes qa = wa * a[3], qb = wb * b[3], qc = wc * c[3], q = 1.0 / (qa + qb + qc);
+                const Lanes depth = (qa * a[2] + qb * b[2] + qc * c[2]) * q;
+                const int lanes = std::min(kLanes, box.x1 - x + 1);  // those beyond the box are left out
+                for (int k = 0; k < lanes; ++k) {
+                    const float z = float(depth[k]);
+                    const size_t i = size_t(y) * t.width + x + k;
+                    if (outside[k] || !(z < t.depth[i])) continue;
                     t.depth[i] = z;
                     t.face_id[i] = f;
-                    t.barycentric[3 * i] = float(qa * q);
-                    t.barycentric[3 * i + 1] = float(qb * q);
-                    t.barycentric[3 * i + 2] = float(qc * q);
+                    t.barycentric[3 * i] = float(qa[k] * q[k]);
+                    t.barycentric[3 * i + 1] = float(qb[k] * q[k]);
+                    t.barycentric[3 * i + 2] = float(qc[k] * q[k]);
                 }
             }
         }
