@@ -1,6 +1,7 @@
 """Costly pure functions, run once for the same input in a test process.
 
-The small trainings of many tests start from the same dolls: every one would look at the same mesh from 32 sides.
+The small trainings of many tests start from the same dolls: every one would look at the same mesh from 32 sides. The
+small builds have the same body, in the scan's pose and in those that try the clothes.
 """
 
 from __future__ import annotations
@@ -12,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.raster import zbuffer
 
 
 def install() -> None:
     """Remember what is seen of a mesh from outside; before a module that imports the functions by name."""
     from smplxpp import raster
+
+    SignedDistanceField._unburied = of_a_solid(SignedDistanceField._unburied)
 
     raster.outer_visible_faces = zbuffer.outer_visible_faces = of_a_mesh(zbuffer.outer_visible_faces)
     raster.outer_visible_points = zbuffer.outer_visible_points = of_a_mesh(zbuffer.outer_visible_points)
@@ -36,5 +40,19 @@ def of_a_mesh(function: Any) -> Any:
         if key not in known:
             known[key] = function(mesh, *arrays, **options)
         return known[key].copy()
+
+    return call
+
+
+def of_a_solid(method: Any) -> Any:
+    """The method of a mesh alone, called once for the same bytes; nobody changes its array."""
+    known: dict[bytes, np.ndarray] = {}
+
+    @functools.wraps(method)
+    def call(field: SignedDistanceField, mesh: TriangleMesh) -> np.ndarray:
+        key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).digest()
+        if key not in known:
+            known[key] = method(field, mesh)
+        return known[key]
 
     return call

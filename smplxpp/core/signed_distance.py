@@ -90,15 +90,18 @@ class SignedDistanceField:
             return outer
         self._winding = igl.FastWindingNumberBVH()
         self._winding.init(mesh.vertices, mesh.faces)
-        # A face is buried if the point a thousandth of the mesh's size (2 mm on a body) in front of it is inside: the
-        # face lies within the solid or in a slit, such as a closed mouth or the fold of an eyelid.
-        in_front = mesh.face_centers + 1e-3 * mesh.bbox_diagonal * mesh.face_normals
-        outer = np.flatnonzero(~self._inside(in_front))
+        outer = self._unburied(mesh)
         assert len(outer), "a solid with a positive volume has an outside"
         _SOLIDS[key] = self._winding, outer
         for oldest in list(_SOLIDS)[:-_REMEMBERED]:
             _SOLIDS.pop(oldest, None)
         return outer
+
+    def _unburied(self, mesh: TriangleMesh) -> np.ndarray:
+        # A face is buried if the point a thousandth of the mesh's size (2 mm on a body) in front of it is inside: the
+        # face lies within the solid or in a slit, such as a closed mouth or the fold of an eyelid.
+        in_front = mesh.face_centers + 1e-3 * mesh.bbox_diagonal * mesh.face_normals
+        return np.flatnonzero(~self._inside(in_front))
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         assert self._winding is not None, "asked of solids alone"
