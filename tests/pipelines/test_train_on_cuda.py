@@ -29,7 +29,7 @@ from tests.cloth.persons import PART, person, standing
 from tests.dolls.dancing import write_dance, write_dance_run
 from tests.dolls.skirted import write_skirted
 from tests.dolls.tiny import tiny_preset
-from tests.pipelines.training_runs import QUICK
+from tests.pipelines.training_runs import QUICK, few_trials
 from tests.pretended_cuda import PretendedTensor, pretended_cuda
 
 SELDOM = {"evaluations": 1, "evaluated": 1}
@@ -47,7 +47,7 @@ MEASURED = EvaluationConfig(
 
 
 def on_cuda(command: str, run: Path, capture: Path, *options: str) -> None:
-    with pretended_cuda(), mock.patch.dict(TRAINING_PRESETS, demo=DEMO):
+    with pretended_cuda(), few_trials(), mock.patch.dict(TRAINING_PRESETS, demo=DEMO):
         assert main([command, str(run), *_told(capture), *options]) == 0
 
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from unittest import mock
 
 from avatar.models.networks.presets import NetworkPreset
+from avatar.training import recipe
+from avatar.training.loose_clothes import ClothConfig
 from avatar.training.presets import TRAINING_PRESETS
-from avatar.training.student import compensate
+from avatar.training.student import compensate, regress_poses
 from avatar.training.tracking.config import Level, TrackConfig
 from pipelines.cli import main
+from smplxpp.cloth.calibrate import CalibrationConfig
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
 
 STAGES = ("80_teacher", "85_bake", "90_compensate")
@@ -44,12 +48,31 @@ QUICK = replace(
 )
 
 
-def quick() -> AbstractContextManager:
+# Two of the ten simulations that choose how cloth hangs, a tenth of the fits that choose how poses are regressed.
+CALIBRATION = CalibrationConfig(drags=(1.25, 2.5), pin_depths=(0.014,))
+REGRESSION = regress_poses.RegressionConfig(blocks=3, fades=(0.5,), reaches=(0.0, 0.02))
+
+
+@contextmanager
+def few_trials() -> Iterator[None]:
+    """Within the block trainings choose among few values of what they search over grids."""
+    regression = partial(regress_poses.fit_pose_regression, config=REGRESSION)
+    with (
+        mock.patch.object(regress_poses, "fit_pose_regression", regression),
+        mock.patch.object(recipe, "ClothConfig", partial(ClothConfig, calibration=CALIBRATION)),
+    ):
+        yield
+
+
+@contextmanager
+def quick() -> Iterator[None]:
     """Tiny networks as the preset "demo", whose blend shapes start from a fit of a thirtieth of its steps."""
-    stack = ExitStack()
-    stack.enter_context(mock.patch.dict(TRAINING_PRESETS, demo=QUICK))
-    stack.enter_context(mock.patch.object(compensate, "_fit", partial(compensate._fit, steps=20)))
-    return stack
+    with (
+        few_trials(),
+        mock.patch.dict(TRAINING_PRESETS, demo=QUICK),
+        mock.patch.object(compensate, "_fit", partial(compensate._fit, steps=20)),
+    ):
+        yield
 
 
 def train(run: Path, capture: Path, *options: str) -> int:

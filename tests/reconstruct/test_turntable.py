@@ -13,13 +13,19 @@ from smplxpp.body import load_body
 from smplxpp.build.turning import posed_person
 from smplxpp.core import InputError
 from smplxpp.core.topology import face_components
-from smplxpp.reconstruct import PhotoView, ReconstructConfig
+from smplxpp.reconstruct import PhotoView, ReconstructConfig, turntable
 from smplxpp.reconstruct.turntable import reconstruct_turntable
 from tests.register import turns
 from tests.register.turns import turned_person
 
 BODY = load_body()
 COARSE = ReconstructConfig(cell=0.016)
+
+
+@pytest.fixture(autouse=True)
+def coarse_first_hull(monkeypatch):
+    """The hull that frames are judged by, which leaves out what is ten pixels off, from cells of 2 cm."""
+    monkeypatch.setattr(turntable, "_COARSE_M", 0.02)
 
 
 @pytest.fixture(scope="module")
