@@ -194,7 +194,7 @@ def test_legs_that_a_scan_has_fused_are_told_by_their_necks_and_a_skirt_has_none
 
 @pytest.mark.parametrize(("planes", "leg"), [(2, False), (8, True)])
 def test_the_tip_of_a_skirt_about_one_leg_is_no_leg_of_trousers(mannequin, worn, planes, leg):
-    """One plane in 18 that met a dancer's hem about one leg alone had a quarter of her skirt follow that leg: 166 mm."""
+    """One plane of 18 met a dancer's hem about one leg alone: a quarter of her skirt followed that leg, 166 mm off."""
     case = worn("wide trousers, hem 24 cm")
     legs = limb_axes(case.source, mannequin.body.weights, extent(case.source), TransferConfig())[:2]
     skirt = fused_legs(legs, neck=np.ones(40))

@@ -10,7 +10,7 @@ At the end the feet are turned to where their shoes are (`settle_feet`), because
 and a step of the whole body moves them little: with the depth d of a point of the foot in the shoe (negative
 outside), and e the distance of a point of the shoe from the foot, pitch, toes, turn and tilt of each foot minimise
 
-    mean min(|d|, 5 cm)^2 [d < 0] + mean clip(d - 15 mm, 0, 3 cm)^2 [d > 0] + mean clip(e - 8 mm, 0, 4 cm)^2.
+    mean (2 min(|d|, 5 cm))^2 [d < 0] + mean clip(d - 15 mm, 0, 3 cm)^2 [d > 0] + mean clip(e - 8 mm, 0, 4 cm)^2.
 """
 
 from __future__ import annotations
@@ -71,14 +71,24 @@ def lift_heels(search: Search, found: Found, skin: np.ndarray | None = None) -> 
 
 
 def settle_feet(search: Search, found: Found) -> Found:
-    """Return the body with its lifted feet turned into their shoes; flat feet stay.
+    """Return the body with its lifted feet turned into their shoes, on shorter legs where they still end below these.
+
+    A step of the whole body leaves a leg too long for its heel, because a sole is small beside trousers, and a foot
+    that lies below the sole cannot be turned into the shoe. Flat feet stay.
 
     The cost of the pose stays that before, because toes that a heel bends are no odd pose.
     """
     lifted = [side for side in ("left", "right") if _pitch(search, found.state, side) > _LIFTED]
     if not lifted:
         return found
-    state = _on_their_shoes(search, found.state, lifted)
+    shoes = [_Shoe.of(search, found.state, side) for side in lifted]
+    state, least = found.state, np.inf
+    for length in (0.0, 0.015, 0.03, 0.045):
+        shorter = _with_shorter_legs(search, found.state, length) if length else found.state
+        tried = _on_their_shoes(search, shorter, lifted)
+        cost = sum(shoe.cost(search, tried) for shoe in shoes if len(shoe.surface))
+        if cost < _BETTER * least:
+            state, least = tried, cost
     now = search.polished(found.name, state, None, steps=0)
     return replace(found, state=state, misfit=now.misfit)
 
@@ -166,7 +176,8 @@ class _Shoe:
         distance, nearest = self.tree.query(places)
         offset = places - self.surface.points[nearest]
         outside = np.einsum("ij,ij->i", self.surface.normals[nearest], offset) > 0
-        depth = np.where(outside, np.minimum(distance, 0.05), np.clip(distance - 0.015, 0.0, 0.03))
+        # A foot leaves its shoe less than it leaves it empty, as heels and pointed tips are.
+        depth = np.where(outside, 2.0 * np.minimum(distance, 0.05), np.clip(distance - 0.015, 0.0, 0.03))
         empty = np.clip(cKDTree(places).query(self.surface.points)[0] - 0.008, 0.0, 0.04)
         return 1e6 * float(self.weight @ depth**2 + (empty**2).mean())
 

@@ -73,6 +73,17 @@ def test_toes_of_a_lifted_foot_are_bent_as_its_shoe_is(flat):
     assert settle_feet(flat, flat.polished("flat", FLAT, None, steps=0)).state is FLAT
 
 
+def test_a_foot_that_ends_below_its_sole_gets_a_shorter_leg(flat):
+    """A walking woman's front foot lay 30 mm below the sole of her pump, where no turn of it could lift it."""
+    heel = (0.0, 35.0, -25.0)
+    truth = on_heel(flat, _with_shorter_legs(flat, FLAT, 0.03), "left", heel)
+    search = _search(truth, points=1500)
+    low = search.polished("low", on_heel(flat, FLAT, "left", heel), None, steps=0)
+    settled = settle_feet(search, low)
+    right, before, after = (_places(search, state, "left_foot")[0, 1] for state in (truth, low.state, settled.state))
+    assert right - before > 0.025 and abs(right - after) < 0.008
+
+
 def test_straight_legs_that_are_too_long_get_shorter_and_the_rest_of_the_body_stays():
     search = _search(FLAT)
     short = _with_shorter_legs(search, FLAT, 0.04)
