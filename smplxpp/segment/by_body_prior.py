@@ -21,7 +21,7 @@ _ELSE: dict[int, dict[int, float]] = {
     LEG: {SKIN.id: 0.04, SHOE.id: 0.01, UPPER.id: 0.02, LOWER.id: 0.04, OUTER.id: 0.003},
     FOOT: {SKIN.id: 0.03, SHOE.id: 0.06, LOWER.id: 0.02, UPPER.id: 0.001},
 }
-_BEYOND = 1e-3  # probability that a garment continues past a border that the surface shows
+_BEYOND = 1e-3  # probability of what the surface shows not to be: a garment past its border, skin far off the face
 
 
 def place_prior(
@@ -75,6 +75,11 @@ def place_prior(
     out[neck] += _neck(chart.azimuth[neck])
     head = chart.region == HEAD
     out[head] += _head(chart.azimuth[head], chart.face_height[head], body_softness)
+    # What stands farther off a face than nose and ears do is hair, a beard, or the brim of a hat.
+    off_face = 0.035
+    off = head & (chart.distance > off_face)
+    out[off, HAIR.id] += (1.0 - _BEYOND) * out[off, SKIN.id]
+    out[off, SKIN.id] *= _BEYOND
     out /= out.sum(axis=1, keepdims=True)
     # Layers replace the outline where they were found.
     if layers.bald:

@@ -236,10 +236,13 @@ def test_under_a_hat_the_face_is_found_and_a_bag_on_a_strap_is_told(open_body, s
         worn = thing_mesh(Thing(kind), open_body, stance[1])
         mesh = concatenate_meshes([skin, TriangleMesh(*igl.upsample(worn.vertices, worn.faces, 4))])
         found[kind] = mesh, chart_of_scan(mesh, open_body, stance[0])
-    mesh, _ = found["brimmed hat"]
+    mesh, chart = found["brimmed hat"]
     hat = label_by_body(mesh, open_body, stance[0])
     assert not any("no label can be trusted" in note for note in hat.notes)
     assert (hat.face_labels[skin.face_count :] == HAIR.id).mean() > 0.7
+    # What of its brim hangs over the face was skin.
+    brim = (np.arange(mesh.face_count) >= skin.face_count) & (chart.distance > 0.04)
+    assert (hat.face_labels[brim] == HAIR.id).mean() > 0.995
     # The bag as a shirt, as skin, and on both sides, as a coat would stand off.
     mesh, chart = found["shoulder bag"]
     for label, words in ((UPPER, "off the left side alone"), (SKIN, "labelled skin stand more than 5 cm off")):
