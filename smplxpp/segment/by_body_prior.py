@@ -54,6 +54,9 @@ def place_prior(
     column, arm = np.isin(chart.region, (TRUNK, LEG, FOOT)), chart.region == ARM
     rest = 1.0 - out.sum(axis=1)
     out[column] += rest[column, None] * _column(chart.height[column], outfit, softness)
+    # What hangs farther off a foot than leather is no shoe: the hem of wide trousers or of a dress over it.
+    off_foot = 0.08
+    out[column & (chart.distance > off_foot), SHOE.id] *= _BEYOND
     top = chart.region == TRUNK
     if waist is not None:
         _cut_at(waist, out, softness)

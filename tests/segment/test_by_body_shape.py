@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from smplxpp.core import TriangleMesh
+from smplxpp.core.labels import HAIR, LABELS, LOWER, SHOE, SKIN
+from smplxpp.segment.by_body_chart import FOOT, HEAD, BodyChart
 from smplxpp.segment.by_body_hems import Hems, roughness
+from smplxpp.segment.by_body_layers import Layers
+from smplxpp.segment.by_body_outfit import Outfit
+from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.by_body_rings import ARM_START, STEP, Rings
 from smplxpp.segment.by_body_shape import Chain, ShapeEvidence, outfit_by_shape
 
@@ -83,6 +88,25 @@ def test_what_goes_round_both_legs_is_a_dress_unless_it_ends_at_the_waist(hem):
         ShapeEvidence(column, arm, Hems(out, into), Hems(np.full(46, -3.0), cuff), -3.3, (0.5e-3, 0.7e-3), apart)
     )
     assert found.one_piece != hem
+
+
+def test_what_hangs_far_off_feet_and_face_is_no_shoe_and_no_skin():
+    """Hems of a hakama at the height of the shoes were shoes, and what of a brim hangs over the face was skin."""
+    nought = np.zeros(4)
+    place = BodyChart(
+        region=np.array([FOOT, FOOT, HEAD, HEAD]),
+        height=np.array([0.05, 0.05, 1.6, 1.6]),
+        reach=nought,
+        azimuth=nought,
+        turn=nought,
+        face_height=np.array([0.0, 0.0, 0.5, 0.5]),
+        distance=np.array([0.01, 0.09, 0.01, 0.06]),
+        side=np.ones(4, dtype=np.int64),
+    )
+    outfit = Outfit(0.09, 0.09, 1.0, 1.0, 0.1, {}, np.zeros((88, len(LABELS))), np.zeros(45))
+    prior = place_prior(place, outfit, Layers.none(4), softness=0.035, body_softness=0.03)
+    assert prior[0].argmax() == SHOE.id and prior[2].argmax() == SKIN.id
+    assert prior[1, SHOE.id] < prior[1, LOWER.id] and prior[3].argmax() == HAIR.id
 
 
 def test_a_hem_may_lie_higher_on_one_side():
