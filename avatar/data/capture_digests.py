@@ -12,13 +12,20 @@ from smplxpp.capture.recording import ParamSource
 from smplxpp.core.params import ARRAY_NAMES, BodyParams
 
 
-def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[str, str]:
+def capture_digests(
+    capture: Capture, params: Mapping[int, BodyParams], *, files: Mapping[str, str] | None = None
+) -> dict[str, str]:
     """Return the SHA-256 of cameras, parameters, splits, and of names and sizes of all files that training may read.
 
     The content of the files is left out, because a sequence has hundreds of gigabytes of them.
+
+    Args:
+        capture: with its splits.
+        params: of its frames.
+        files: `names_and_sizes` of the same views, where they are known.
     """
-    # Three digests, so that a change can be attributed to cameras, parameters or images.
-    cameras, numbers, files = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
+    # Digests apart, so that a change can be attributed to cameras, parameters or images.
+    cameras, numbers, splits = hashlib.sha256(), hashlib.sha256(), capture.splits
     for name, camera in capture.cameras.items():
         cameras.update(name.encode() + camera.K.tobytes() + camera.cam_from_world.tobytes())
         cameras.update(f"{camera.width} {camera.height}".encode())
@@ -26,20 +33,33 @@ def capture_digests(capture: Capture, params: Mapping[int, BodyParams]) -> dict[
             cameras.update(repr(capture.recording.distortions[name]).encode())
     for frame, row in params.items():
         _add_frame(numbers, frame, row)
-    # Names and sizes reveal a replaced or missing file at the cost of a directory listing.
-    splits, used = capture.splits, 0
-    for view, frame in capture.views(frames=(*splits.train_frames, *splits.novel_pose_frames)):
-        for kind in ("image", "mask", "normal"):
-            path = capture.file(view, frame, kind)
-            if path is not None:
-                files.update(f"{kind} {view} {frame} {path.name} {path.stat().st_size}\n".encode())
-                used += 1
     return {
         "capture/cameras": cameras.hexdigest(),
         "capture/parameters": numbers.hexdigest(),
-        f"capture/names and sizes of {used} files": files.hexdigest(),
+        **(names_and_sizes(capture) if files is None else files),
         "capture/splits": hashlib.sha256(repr((splits, capture.recording.background)).encode()).hexdigest(),
     }
+
+
+def names_and_sizes(capture: Capture) -> dict[str, str]:
+    """Return the SHA-256 of names and sizes of the files of all views that training may read, by their number.
+
+    They reveal a replaced or missing file at the cost of a directory listing.
+    """
+    digest, used = hashlib.sha256(), 0
+    wanted = np.isin(capture.frames, (*capture.splits.train_frames, *capture.splits.novel_pose_frames))
+    frames, views = np.array(capture.frames, dtype=np.int64), capture.presence() & wanted
+    for kind in ("image", "mask", "normal"):
+        for view, present in zip(capture.recording.cameras, views & capture.presence(kind), strict=True):
+            series = capture.recording.series(kind, view)
+            if series is None or not present.any():
+                continue
+            own = series.only(np.isin(series.numbers, frames[present]))
+            digest.update(f"{kind} {view} {own.names.dtype}\n".encode())
+            for array in (own.numbers, own.names, own.sizes()):
+                digest.update(array.tobytes())
+            used += len(own)
+    return {f"capture/names and sizes of {used} files": digest.hexdigest()}
 
 
 def params_digest(source: ParamSource) -> str:

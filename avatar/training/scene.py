@@ -46,13 +46,16 @@ class TrainScene:
         return params
 
 
-def prepare_scene(template: Template, capture: Capture, *, built_frame: int | None) -> TrainScene:
+def prepare_scene(
+    template: Template, capture: Capture, *, built_frame: int | None, before: TrainScene | None = None
+) -> TrainScene:
     """Check a capture against a template, and leave out frames and views that cannot be trained on.
 
     Args:
         template: the clothed body.
         capture: opened with the parameters of its frames; its splits name the training and the held-out frames.
         built_frame: frame that the template was built from; None: not known.
+        before: scene of the same capture with other parameters, whose files are not looked at again.
 
     Returns:
         The scene; its digests are those of the capture, and `template_frame` is `built_frame`.
@@ -87,7 +90,12 @@ def prepare_scene(template: Template, capture: Capture, *, built_frame: int | No
             capture.foreground(name, frame)  # a damaged image or one of another size is an error now
     compare_shapes(template, [params[f] for f in frames])
     overlap = overlap_of(template, capture, params)
-    return TrainScene(template, capture, frame, trained, built_frame, overlap, capture_digests(capture, params))
+    # A capture of a million files takes minutes to look at on a shared disk.
+    files = None
+    if before is not None and (before.capture.splits, before.capture.excluded) == (capture.splits, capture.excluded):
+        files = {name: digest for name, digest in before.digests.items() if " files" in name}
+    digests = capture_digests(capture, params, files=files)
+    return TrainScene(template, capture, frame, trained, built_frame, overlap, digests)
 
 
 def hold_out_cameras(capture: Capture, names: Sequence[str]) -> Capture:

@@ -110,7 +110,9 @@ def open_frame(run: Path, inputs: TrainInputs, frame: int) -> TrainScene:
     return TrainScene(template, capture, frame, frame, _template_frame(run, inputs), overlap, digests)
 
 
-def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures: bool = False) -> TrainScene:
+def open_scene(
+    run: Path, inputs: TrainInputs, *, refined: bool = True, measures: bool = False, before: TrainScene | None = None
+) -> TrainScene:
     """Open the template of a run and a capture, and check that they fit together.
 
     Training frames and views that lack parameters or a mask are left out with a warning, if others remain.
@@ -120,6 +122,7 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
         inputs: capture, parameters, held-out cameras and scale.
         refined: whether to read the run's refined parameters, if it has any that started from these.
         measures: whether the caller only measures; then another protocol than the run's is logged instead of refused.
+        before: scene of the same inputs with other parameters, whose files are not looked at again.
 
     Raises:
         InputError: no template; another protocol than the template's; no training camera, image, mask or parameters;
@@ -137,7 +140,7 @@ def open_scene(run: Path, inputs: TrainInputs, *, refined: bool = True, measures
         made = {name: sha256_file(run / name) for name in (REFINED_PARAMS, REFINED_CAMERAS) if (run / name).is_file()}
         capture = _corrected(run, capture)
     built = load_build(run)
-    scene = prepare_scene(template, capture, built_frame=None if built is None else built[0].frame)
+    scene = prepare_scene(template, capture, built_frame=None if built is None else built[0].frame, before=before)
     # What the run made from photographs must not have seen those that are held out now.
     splits = scene.capture.splits
     if inputs.params == run / layout.REGISTERED_PARAMS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,6 +116,17 @@ class FileSeries:
     def has(self, frames: Int[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
         """Return for each frame whether it has a file."""
         return np.isin(frames, self.numbers)
+
+    def sizes(self) -> Int64[np.ndarray, " F"]:
+        """Return the bytes of each file; -1 where it is gone.
+
+        A call of the system a file and little beside: captures have a million files.
+        """
+        out, folder = np.full(len(self), -1), os.fsencode(self.folder) + b"/"
+        for row, name in enumerate(self.names.tolist()):
+            with suppress(OSError):
+                out[row] = os.stat(folder + name).st_size
+        return out
 
     def only(self, keep: Bool[np.ndarray, " F"]) -> FileSeries:
         """Return the files that a (F,) bool array selects."""
