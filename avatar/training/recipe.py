@@ -32,6 +32,7 @@ class TrainConfig:
         template_frame: frame of the capture that the template was built from, whose parameters pose it as the scan;
             None: not known, then no clothes are simulated.
         refine_cameras: correct the poses of the training cameras together with those of the person.
+        refine_frames: frames of a chunk of the refinement, which several processes share.
         max_minutes: stop after as many minutes of work; the same call continues.
         iterations_share: share of the preset's iterations, of all steps.
         iterations: iterations by step ("fit", "teacher", "bake", "compensate"); they replace the preset's.
@@ -57,6 +58,7 @@ class TrainConfig:
 
     template_frame: int | None = 0
     refine_cameras: bool = False
+    refine_frames: int = 200
     max_minutes: float = math.inf
     iterations_share: float = 1.0
     iterations: Mapping[str, int] = field(default_factory=dict)
@@ -80,6 +82,7 @@ class TrainConfig:
             ("batch", self.batch, 1),
             ("seed", self.seed, 0),
             ("max-megabytes", self.max_megabytes, 0),
+            ("refine-frames", self.refine_frames, 1),
             *((f"{step}-iterations", value, 1) for step, value in self.iterations.items()),
         ):
             if value is not None and not value >= least:
@@ -140,7 +143,9 @@ class TrainConfig:
                 received="parameters that stand as they are",
                 remedy="add --refine-poses on",
             )
-        return RefineConfig(seed=self.seed, cameras=self.refine_cameras) if wanted else None
+        if not wanted:
+            return None
+        return RefineConfig(seed=self.seed, cameras=self.refine_cameras, chunk_frames=self.refine_frames)
 
     @property
     def checkpoint_seconds(self) -> float | None:

@@ -32,6 +32,7 @@ from avatar.training.fit.fit import fit_gaussians, fit_scene
 from avatar.training.loose_clothes import find_garments, with_simulated
 from avatar.training.presets import TrainingPreset
 from avatar.training.recipe import STEPS, Recipe, TrainConfig
+from avatar.training.refinement.board import RefinementStoppedError
 from avatar.training.refinement.refine_capture import refine_capture, with_refined_poses
 from avatar.training.scene import TrainScene, hold_out_cameras, prepare_scene
 from avatar.training.student.bake import bake
@@ -125,7 +126,8 @@ def train(
     if how is not None:
         settings = {"refinement": how, "reference": scene.frame}
         found = training.once("refine", settings, scene, {}, lambda session, made: _refine(scene, how, session, made))
-        scene = prepare_scene(template, with_refined_poses(capture, found), built_frame=config.template_frame)
+        refined = with_refined_poses(capture, found)
+        scene = prepare_scene(template, refined, built_frame=config.template_frame, before=scene)
     note_missing_normals(scene.capture, recipe, steps)
     training.models(scene, reference)
     return open_student(folder, TRAINING_FILES, device=training.device)
@@ -156,7 +158,11 @@ def _refine(scene: TrainScene, config: Any, session: Session, folder: Path) -> P
     def show(step: str, share: float) -> None:
         session.report(Progress(round(100 * share), 100, 0.0, 0.0))
 
-    refine_capture(scene, config, folder, work=session.folder / session.key[:16], progress=show)
+    until, work = time.monotonic() + session.max_seconds, session.folder / session.key[:16]
+    try:
+        refine_capture(scene, config, folder, work=work, progress=show, stop=lambda: time.monotonic() > until)
+    except RefinementStoppedError:
+        return Progress(0, 1, 0.0, 0.0)
     return Progress(1, 1, 0.0, 0.0)
 
 

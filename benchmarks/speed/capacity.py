@@ -18,15 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.support.results import store_results
+from pipelines.batch.amounts import Facts, facts_of
 from pipelines.batch.plan import (
     Cost,
-    Facts,
     Rates,
     Site,
     breaks_first,
     cost_of,
     demands,
-    facts_of,
     learned,
     read_rates,
 )
@@ -76,7 +75,7 @@ def main() -> int:
 
 def foretell(subjects: int, facts: Facts, rates: Rates, site: Site, steps: list[str], preset: str) -> dict[str, Any]:
     """Return costs by step, hours by resource, and what breaks first."""
-    one = {step: cost_of(step, facts, rates, preset=preset, gpu=site.gpus > 0) for step in steps}
+    one = {step: cost_of(step, facts, rates, options={"preset": preset}, gpu=site.gpus > 0) for step in steps}
     low = replace(rates, convert_mb_mp=(rates.convert_mb_mp[0], rates.convert_mb_mp[0]))
     least = cost_of("convert", facts, low).written_gb
     whole = {step: cost.times(subjects) for step, cost in one.items()}
@@ -108,7 +107,8 @@ def compare(runs: Path, rates: Rates) -> dict[str, list[dict[str, Any]]]:
             if facts is None or step.state != "done" or step.attempts != 1:
                 continue
             words = dict(zip(step.command, [*step.command[1:], ""], strict=True))
-            cost = cost_of(step.step, facts, rates, preset=words.get("--preset", "cpu"), gpu=bool(step.gpu))
+            options = {word[2:].replace("-", "_"): value for word, value in words.items() if word.startswith("--")}
+            cost = cost_of(step.step, facts, rates, options=options, gpu=bool(step.gpu))
             foretold, measured = 3600.0 * cost.core_hours, step.cpu_seconds
             row = {"subject": record.subject, "foretold_s": rounded(foretold), "measured_s": rounded(measured)}
             out.setdefault(step.step, []).append({**row, "ratio": rounded(measured / max(foretold, 1e-9))})

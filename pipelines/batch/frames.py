@@ -7,7 +7,7 @@
 | `register` | its frames and `OVERLAP` more on each side, of one shape | rows of its own | others by what smoothness \
 carries across a border, which the seams show |
 
-A refinement is not split, because all frames share the Gaussians whose colours it solves for.
+Chunks of a refinement are sums of one solve over all frames: it has no seams, see `avatar.training.refinement.board`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,12 +28,13 @@ from pipelines.runs.manifest import read_record
 from pipelines.runs.stage import MANIFEST
 from smplxpp.body import BodyModel
 from smplxpp.build.register import BODY_JOINTS, stacked_rows
-from smplxpp.core import BodyParams, Check, InputError, require_at_least, spread
+from smplxpp.core import BodyParams, Check, InputError, spread
 from smplxpp.core.checks import Gate
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.core.files.atomic import atomic_path, atomic_write_text
 from smplxpp.core.files.json_file import as_object, jsonable, read_json
 from smplxpp.core.mesh_files.mesh_io import read_mesh
+from smplxpp.core.spread import Chunk
 from smplxpp.metrics import point_to_surface
 
 OVERLAP = 10
@@ -44,55 +44,6 @@ JUMP = Gate("x", 1.5, 3.0, higher_is_better=False)
 1 to 1.4 there; a chunk with 10 mm more of one thing reaches 3 and more."""
 DISAGREEMENT = Gate("mm", 3.0, 10.0, higher_is_better=False)
 """Largest mean distance of the body's joints between two chunks in the frames that both have solved."""
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Frames that one process computes.
-
-    Attributes:
-        frames: all of them, ascending.
-        kept: those whose results are joined, each in one chunk alone.
-    """
-
-    frames: tuple[int, ...]
-    kept: tuple[int, ...]
-
-    @property
-    def name(self) -> str:
-        """Return a name that sorts as the frames do."""
-        return f"{self.kept[0]:06d}_{self.kept[-1]:06d}"
-
-
-def split_frames(frames: Sequence[int], size: int, *, overlap: int = 0) -> tuple[Chunk, ...]:
-    """Split frames into chunks of about equal length.
-
-    Args:
-        frames: numbers, ascending, not necessarily without gaps.
-        size: most frames that a chunk keeps.
-        overlap: frames beside its own that it computes on each side.
-
-    Raises:
-        InputError: no frames, or a size below 1.
-
-    Example:
-        >>> [(chunk.frames, chunk.kept) for chunk in split_frames(range(5), 3, overlap=1)]
-        [((0, 1, 2, 3), (0, 1, 2)), ((2, 3, 4), (3, 4))]
-    """
-    numbers = sorted(set(frames))
-    require_at_least("frames of a chunk", size, 1)
-    if not numbers:
-        raise InputError("frames to split", expected="at least one", received="none")
-    # Equal lengths, because a short last chunk has little that holds its first frames.
-    count = -(-len(numbers) // size)
-    parts = np.array_split(np.arange(len(numbers)), count)
-    return tuple(
-        Chunk(
-            tuple(numbers[max(0, int(part[0]) - overlap) : int(part[-1]) + 1 + overlap]),
-            tuple(numbers[int(part[0]) : int(part[-1]) + 1]),
-        )
-        for part in parts
-    )
 
 
 def frames_option(frames: Sequence[int]) -> str:

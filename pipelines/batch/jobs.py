@@ -27,7 +27,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pipelines.batch.steps import SPLIT, STEPS, Needs
+from pipelines.batch.steps import OF_REFINEMENT, SPLIT, STEPS, Needs
 from smplxpp.core.errors import InputError, did_you_mean, require_choice
 from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, as_text, shown
 from smplxpp.core.files.markup_file import read_yaml
@@ -76,7 +76,8 @@ class Job:
             folder: the subject's folder in RUNS.
             capture: where the capture lies on this machine.
         """
-        run, given = str(folder / "run"), self.options.get(step, {})
+        given = self._given(step)
+        run = str(given.pop("run", folder / "run"))
         if "convert" in self.steps and step != "convert":
             capture = str(folder / "capture")
         if self.frames and step in SPLIT:
@@ -92,6 +93,7 @@ class Job:
             "register": [run, "--capture", capture],
             "metrics": [capture, str(given.get("truth", "")), "--out", str(folder / "metrics.json")],
             "build": [run, *source],
+            "refine": [run, *source, "--stage", "refine"],
             "train": [run, *source],
             "evaluate": [run, *source],
             # A student for our players; without a training the rigged template.
@@ -102,17 +104,33 @@ class Job:
         words = places[step]
         if step in ("export", "web") and own & {"out", "solid", "single-file"}:
             words = words[:1]
-        given = {name: value for name, value in given.items() if (step, name) != ("metrics", "truth")}
+        given.pop("truth", None)
         return [*STEPS[step].words, *words, *option_words(given, subject=self.subject), "--json"]
+
+    def _given(self, step: str) -> dict[str, Any]:
+        """Return the options of a step; a refinement has those of the training that it is for."""
+        given = dict(self.options.get(step, {}))
+        if step == "refine":
+            training = self.options.get("train", {})
+            given = {**{name: training[name] for name in OF_REFINEMENT if name in training}, **given}
+        # The training takes a refinement in chunks only where it would be split alike.
+        if self.frames and "refine" in self.steps and step in ("refine", "train"):
+            given.setdefault("refine_frames", self.frames)
+        return given
 
     def _chunks(self, step: str, folder: Path, capture: str) -> list[str]:
         """Return the words of the command that runs a step in chunks of frames and joins them."""
-        given = dict(self.options.get(step, {}))
+        given = self._given(step)
+        if step == "refine":
+            given.pop("refine_frames")
+            if "register" in self.steps and "params" not in given:
+                given["params"] = str(folder / "register" / "params.npz")
         truth = ["--truth", str(given.pop("truth"))] if "truth" in given else []
         if step == "register" and "reconstruct" in self.steps and "scans" not in given:
             given["scans"] = str(folder / "reconstruct" / "scans")
         words = ["batch", "frames", step, str(folder / step), "--capture", capture, *truth]
         words += ["--size", str(self.frames), "--local", str(self.needs.cores or 1)]
+        words += ["--into", str(folder / "run")] if step == "refine" else []
         also = []
         for name, value in given.items():
             for one in value if isinstance(value, list) else [value]:

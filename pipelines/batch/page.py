@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +16,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from pipelines.batch.plan import Cost
 from pipelines.batch.records import read_batch
 from pipelines.batch.table import BatchTable, Row, count_states, csv_text
 from smplxpp.core.files.atomic import atomic_write_text
@@ -171,3 +172,15 @@ def terminal_table(rows: Sequence[Row], *, most: int = 40) -> Group:
 
 def _cell(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def cost_table(costs: Mapping[str, Cost], head: str) -> Table:
+    """Return hours, gigabytes and files by step, and their sums, as a terminal shows them."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    table.add_column(head)
+    for name in ("core hours", "GPU hours", "GB read", "GB kept", "files"):
+        table.add_column(name, justify="right")
+    for step, cost in [*costs.items(), ("sum", sum(costs.values(), Cost()))]:
+        numbers = (cost.core_hours, cost.gpu_hours, cost.read_gb, cost.written_gb)
+        table.add_row(step, *(f"{number:,.3f}" for number in numbers), f"{cost.files:,.0f}")
+    return table

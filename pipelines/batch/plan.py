@@ -14,37 +14,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pipelines.batch.jobs import Job, is_address
-from smplxpp.capture import open_capture
-from smplxpp.core import spread
+from pipelines.batch.amounts import Facts, TrainingRates, Work, facts_of, recipe_of, training_works
+from pipelines.batch.jobs import Job
 from smplxpp.core.errors import InputError, require_known
 from smplxpp.core.files.json_file import as_list, as_number, as_object, read_json
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What decides the cost of a subject.
-
-    Attributes:
-        frames: of the capture.
-        cameras: of the capture.
-        megapixels: of an image that is trained on.
-        source_mb: of an image as it was recorded, with its mask, MB.
-        held_out_cameras: cameras that are measured.
-        held_out_frames: frames that are measured.
-    """
-
-    frames: int
-    cameras: int
-    megapixels: float
-    source_mb: float
-    held_out_cameras: int = 2
-    held_out_frames: int = 0
-
-    @property
-    def images(self) -> int:
-        """Return the number of images."""
-        return self.frames * self.cameras
 
 
 @dataclass(frozen=True)
@@ -58,13 +31,12 @@ class Rates:
         check_s: `capture check`, an image and a megapixel of it, of at most `check_images` images.
         check_images: images that a check opens by default.
         start_s: a command's imports and first files.
-        build_s: a template (real.json: 0.5 to 1.5 minutes; less where parameters are given).
+        build_s: a template, and a MB of its scan: of PLY, a fifth for text.
         register_s: registration by keypoints, masks, labels and scans, a frame and camera (registration_*.json).
         reconstruct_s_mp: surface of a frame, a megapixel of all its cameras (reconstruction_*.json: 6 to 11).
-        train_core_hours: training on a CPU by preset (training_*.json, hardware.md).
+        training: rates of the stages of a training on a CPU.
         train_gpu_hours: training on one H200 by preset (gpu*.json); `gpu` and `paper` are their iterations over steps
             that were timed of `paper` and of an earlier `gpu`; neither was run to its end.
-        train_images: images that a training reads, by preset: steps times cameras; each is decoded when it is read.
         evaluate_s_mp: rendering and comparison, a megapixel of a measured image and model, on a core.
         evaluate_gpu_s: the same on a GPU, an image and model.
         models: models that are measured.
@@ -79,17 +51,12 @@ class Rates:
     check_s: tuple[float, float] = (0.014, 0.014)
     check_images: int = 2000
     start_s: float = 2.0
-    build_s: float = 30.0
+    build_s: tuple[float, float] = (12.0, 9.4)
     register_s: float = 0.12
     reconstruct_s_mp: float = 8.0
-    train_core_hours: Mapping[str, float] = field(
-        default_factory=lambda: {"demo": 0.12, "cpu": 1.0, "paper-small": 0.35}
-    )
+    training: TrainingRates = field(default_factory=TrainingRates)
     train_gpu_hours: Mapping[str, float] = field(
         default_factory=lambda: {"demo": 0.03, "cpu": 0.07, "paper-small": 0.1, "gpu": 4.0, "paper": 94.0}
-    )
-    train_images: Mapping[str, float] = field(
-        default_factory=lambda: {"demo": 2e3, "cpu": 1e4, "paper-small": 1e4, "gpu": 1.5e5, "paper": 1e6}
     )
     evaluate_s_mp: float = 1.5
     evaluate_gpu_s: float = 0.1
@@ -149,14 +116,16 @@ class Site:
     files: float = 1e9
 
 
-def cost_of(step: str, facts: Facts, rates: Rates, *, preset: str = "cpu", gpu: bool = False) -> Cost:
+def cost_of(
+    step: str, facts: Facts, rates: Rates, *, options: Mapping[str, Any] | None = None, gpu: bool = False
+) -> Cost:
     """Return what a step costs for a subject, at the most bytes that an image may have.
 
     Args:
         step: convert, check, reconstruct (every frame), register, build, train, evaluate, export, web.
         facts: of the subject.
         rates: of the site.
-        preset: of the training.
+        options: of the training, by its names.
         gpu: whether training and evaluation have one.
 
     Raises:
@@ -186,19 +155,12 @@ def cost_of(step: str, facts: Facts, rates: Rates, *, preset: str = "cpu", gpu: 
         seconds += rates.register_s * facts.images
         files = 2.0 * facts.images
     elif step == "build":
-        seconds, written, made = seconds + rates.build_s, 0.5 * rates.run_mb, 100.0
-    elif step == "train":
-        rate = rates.train_gpu_hours if gpu else rates.train_core_hours
-        if preset not in rate:
-            where = "a GPU" if gpu else "cores"
-            raise InputError(
-                f"preset {preset}", expected=f"one with a rate on {where}: {', '.join(rate)}", received=preset
-            )
-        # A GPU's training keeps a core busy with reading.
-        gpu_hours, hours = (rate[preset], rate[preset]) if gpu else (0.0, rate[preset])
-        seconds += 3600.0 * hours
-        looks = rates.train_images.get(preset, 0.0)
-        read, written, files = image_mb * looks, 0.5 * rates.run_mb, 2.0 * looks
+        seconds += rates.build_s[0] + rates.build_s[1] * facts.scan_mb
+        written, made = 0.5 * rates.run_mb, 100.0
+    elif step in ("refine", "train"):
+        stages = training_costs(facts, rates, options or {}, gpu=gpu)
+        own = [cost for name, cost in stages.items() if step == "train" or name == step]
+        return replace(sum(own, Cost(rates.start_s / 3600.0)), made=made)
     elif step == "evaluate":
         looks = _measured(facts)
         work = rates.models * looks
@@ -212,33 +174,41 @@ def cost_of(step: str, facts: Facts, rates: Rates, *, preset: str = "cpu", gpu: 
     return replace(cost, core_hours=factor * cost.core_hours, gpu_hours=factor * cost.gpu_hours)
 
 
-def facts_of(place: str | Path, *, protocol: str | None = None) -> Facts | None:
-    """Return what a capture's files say about its cost; None where it is elsewhere, or cannot be opened.
+def training_costs(facts: Facts, rates: Rates, options: Mapping[str, Any], *, gpu: bool) -> dict[str, Cost]:
+    """Return what each stage of a training costs, by the name of its step.
+
+    On a GPU the hours of the preset are shared out as the seconds of a core are, by its share of the iterations.
 
     Args:
-        place: its folder, or an address.
-        protocol: of the capture.
+        facts: of the subject.
+        rates: of the site.
+        options: of `smplxpp train`, by its names.
+        gpu: whether it has one.
+
+    Raises:
+        InputError: an option out of range, or a preset without a rate on a GPU.
+        MissingExtraError: torch is not installed.
     """
-    if is_address(str(place)) or not Path(place).is_dir():
-        return None
-    try:
-        capture = open_capture(Path(place), protocol=protocol)
-    except InputError:  # the batch itself says what is wrong with it
-        return None
-    cameras, splits = list(capture.cameras.values()), capture.splits
-    # A few views stand for all.
-    frames = spread(list(capture.frames), 4)
-    views = [(name, frame) for name in capture.cameras for frame in frames][:64]
-    files = [capture.file(*view, kind) for view in views for kind in ("image", "mask")]
-    sizes = [file.stat().st_size for file in files if file is not None]
-    return Facts(
-        frames=len(capture.frames),
-        cameras=len(cameras),
-        megapixels=sum(camera.width * camera.height for camera in cameras) / max(len(cameras), 1) / 1e6,
-        source_mb=1e-6 * sum(sizes) / max(len(views), 1),
-        held_out_cameras=len(splits.novel_view_cameras),
-        held_out_frames=len(splits.novel_pose_frames),
-    )
+    name, tracked = str(options.get("preset", "cpu")), facts.tracked or options.get("refine_poses") == "on"
+
+    def seconds_of(chosen: Mapping[str, Any]) -> tuple[dict[str, Work], dict[str, float]]:
+        works = training_works(recipe_of(chosen, tracked=tracked), facts, rates.training)
+        return works, {step: work.takes(rates.training) for step, work in works.items()}
+
+    works, seconds = seconds_of(options)
+    whole = sum(seconds_of({"preset": name})[1].values())
+    if gpu and name not in rates.train_gpu_hours:
+        known = ", ".join(rates.train_gpu_hours)
+        raise InputError(f"preset {name}", expected=f"one with a rate on a GPU: {known}", received=name)
+    image_mb, factor, out = facts.megapixels * rates.convert_mb_mp[1], rates.factors.get("train", 1.0), {}
+    for step, work in works.items():
+        # A GPU's training keeps a core busy with reading. Each look reads an image and its mask.
+        hours = seconds[step] / 3600.0
+        hours = rates.train_gpu_hours[name] * seconds[step] / whole if gpu else hours
+        kept = 1e-3 * rates.run_mb / 2.0 / len(works)
+        looks = Cost(factor * hours, factor * hours * gpu, 1e-3 * image_mb * work.looks, kept, 2.0 * work.looks, 3.0)
+        out[step] = looks
+    return out
 
 
 def plan_jobs(jobs: Sequence[Job], rates: Rates, site: Site) -> tuple[dict[str, Cost], list[str]]:
@@ -260,7 +230,9 @@ def plan_jobs(jobs: Sequence[Job], rates: Rates, site: Site) -> tuple[dict[str, 
         device = train.get("device", "auto")
         gpu = device == "cuda" or (device == "auto" and site.gpus > 0 and job.needs.gpus > 0)
         for step in job.steps:
-            cost = cost_of(step, facts, rates, preset=str(train.get("preset", "cpu")), gpu=gpu)
+            # A step of its own has refined them.
+            own = {**train, "refine_poses": "off"} if step == "train" and "refine" in job.steps else train
+            cost = cost_of(step, facts, rates, options=own, gpu=gpu)
             costs[step] = costs.get(step, Cost()) + cost
     # Captures at an address are taken to be like the others.
     seen = len(jobs) - len(unknown)
@@ -316,17 +288,24 @@ def read_rates(path: Path | None) -> tuple[Rates, Site]:
     for given, cls in ((content, Rates), (site, Site)):
         require_known(f"rates {path}", given, [one.name for one in fields(cls)])
     for name, value in {**content, **site}.items():
-        values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else [value]
-        for one in values:
+        for one in _leaves(value):
             as_number(one, subject=f"rates {path}: {name}", least=0.0)
-    for name in {"convert_mb_mp", "check_s"} & content.keys():
+    for name in {"convert_mb_mp", "check_s", "build_s"} & content.keys():
         first, second = as_list(content[name], subject=f"rates {path}: {name}")
         content[name] = (first, second)
-    # Presets that a file does not name keep their rate.
-    for name in ("train_core_hours", "train_gpu_hours", "train_images"):
-        if name in content:
-            content[name] = {**getattr(Rates(), name), **content[name]}
+    # What a file does not name keeps its rate.
+    if "train_gpu_hours" in content:
+        content["train_gpu_hours"] = {**Rates().train_gpu_hours, **content["train_gpu_hours"]}
+    if "training" in content:
+        require_known(f"rates {path}: training", content["training"], [one.name for one in fields(TrainingRates)])
+        content["training"] = replace(TrainingRates(), **content["training"])
     return Rates(**content), Site(**site)
+
+
+def _leaves(value: Any) -> list[Any]:
+    """Return the values in nested lists and objects."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    return [value] if inside is None else [leaf for one in inside for leaf in _leaves(one)]
 
 
 def learned(rates: Rates, spent: Mapping[str, Iterable[tuple[float, float]]]) -> Rates:

@@ -256,7 +256,7 @@ class _Chain:
 
     def _limit(self, step: StepRecord) -> list[str]:
         """Return the option that ends a training before the machine does; its own option goes first."""
-        if step.step != "train" or not self.resources.minutes or "--max-minutes" in step.command:
+        if step.step not in ("refine", "train") or not self.resources.minutes or "--max-minutes" in step.command:
             return []
         # The last models, the report and a checkpoint are written after the limit.
         left = self.resources.minutes - (time.monotonic() - self.begin) / 60

@@ -67,6 +67,7 @@ STEPS: Mapping[str, StepKind] = {
     ),
     "metrics": StepKind(("metrics",), "pipelines.commands.metrics", "Metrics", files=("metrics.json",)),
     "build": StepKind(("build",), "pipelines.commands.build", "Build", stages=BUILD_STAGES),
+    "refine": StepKind(("train",), "pipelines.commands.train", "Train", stages=(REFINE_STAGE,)),
     "train": StepKind(
         ("train",), "pipelines.commands.train", "Train", on_gpu=True, stages=(REFINE_STAGE, *MODEL_STAGES)
     ),
@@ -77,8 +78,10 @@ STEPS: Mapping[str, StepKind] = {
     "web": StepKind(("web",), "pipelines.commands.web", "Web", files=("player.html",)),
 }
 """The steps in the order in which they run."""
-SPLIT = ("reconstruct", "register", "metrics")
+SPLIT = ("reconstruct", "register", "metrics", "refine")
 """Steps that can be split into chunks of frames: `frames` of a job."""
+OF_REFINEMENT = ("params", "body", "protocol", "hold_out", "scale", "seed", "refine_poses", "refine_cameras")
+"""Options of a training that decide its refinement."""
 
 
 @dataclass(frozen=True)

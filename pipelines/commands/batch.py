@@ -16,7 +16,6 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from rich.text import Text
 
 from pipelines.batch.driver import Progress as State
@@ -24,7 +23,7 @@ from pipelines.batch.driver import begin_batch, drive, retry, take_batch
 from pipelines.batch.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor, gpus_here
 from pipelines.batch.hold import BATCH_HOLD, at_work, request_stop
 from pipelines.batch.jobs import Job, JobFile, option_words, read_jobs
-from pipelines.batch.page import INDEX_FILE, STATE_STYLES, IndexWriter, terminal_table
+from pipelines.batch.page import INDEX_FILE, STATE_STYLES, IndexWriter, cost_table, terminal_table
 from pipelines.batch.plan import Cost, Site, breaks_first, demands, plan_jobs, read_rates
 from pipelines.batch.records import Batch, read_batch
 from pipelines.batch.run_job import Resources
@@ -230,7 +229,8 @@ def check_options(jobs: tuple[Job, ...]) -> None:
     for job in jobs:
         for step in job.steps:
             try:
-                given = {name: value for name, value in job.options.get(step, {}).items() if name != "truth"}
+                own = ("truth", "run")  # the runner writes them in their places
+                given = {name: value for name, value in job.options.get(step, {}).items() if name not in own}
                 _parsed(step, tuple(option_words(given, subject="subject")))
             except InputError as error:
                 raise InputError(
@@ -249,7 +249,7 @@ def _parsed(step: str, words: tuple[str, ...]) -> None:
     checked = checked_arguments(name, options, words)
     # What the runner adds itself; an option of the job that says it again is the user's.
     of_capture = ["--capture", "capture"]
-    more = dict.fromkeys(("train", "evaluate", "reconstruct"), of_capture)
+    more = dict.fromkeys(("refine", "train", "evaluate", "reconstruct"), of_capture)
     places = {**more, "convert": ["--out", "out"], "metrics": ["truth"]}.get(step, [])
     places = [] if places and places[0] in checked else places
     printed = io.StringIO()
@@ -294,14 +294,7 @@ def print_status(summary: Mapping[str, Any], rows: Sequence[Row], console: Conso
 
 def print_plan(costs: Mapping[str, Cost], site: Site, unknown: Sequence[str], console: Console) -> None:
     """Print what the steps cost over all subjects, how long the site is busy, and what it lacks."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
-    table.add_column("all subjects")
-    for name in ("core hours", "GPU hours", "GB read", "GB kept", "files"):
-        table.add_column(name, justify="right")
-    for step, cost in [*costs.items(), ("sum", sum(costs.values(), Cost()))]:
-        numbers = (cost.core_hours, cost.gpu_hours, cost.read_gb, cost.written_gb)
-        table.add_row(step, *(f"{number:,.2f}" for number in numbers), f"{cost.files:,.0f}")
-    console.print(table)
+    console.print(cost_table(costs, "all subjects"))
     hours = ", ".join(f"{name} {hours:,.1f} h" for name, hours in demands(costs.values(), site).items() if hours)
     console.print(f"busy on {site.cores} cores and {site.gpus} GPUs: {hours}", highlight=False, soft_wrap=True)
     console.print(f"breaks first: {breaks_first(costs, site)}", highlight=False, soft_wrap=True)

@@ -14,23 +14,22 @@ from rich.console import Console
 from pipelines.batch.driver import begin_batch, drive, retry, take_batch
 from pipelines.batch.frames import (
     OVERLAP,
-    Chunk,
     frames_option,
     join_metrics,
     join_reconstructions,
     join_registrations,
     shape_frames,
-    split_frames,
 )
 from pipelines.batch.jobs import Job, JobFile, Needs
 from pipelines.batch.page import IndexWriter
 from pipelines.batch.records import BATCH_FILE
-from pipelines.batch.table import Row
 from pipelines.commands.batch import Machines, check_options, shown
 from pipelines.commands.metrics import frame_number, over_frames, pair_frames
 from pipelines.commands.options import OptionalPath, OptionalText, frame_numbers, selected_frames
 from pipelines.commands.terminal import print_checks, print_paths
-from pipelines.runs.layout import REGISTERED_PARAMS
+from pipelines.runs.layout import REFINE_STAGE, REGISTERED_PARAMS
+from pipelines.runs.manifest import read_record
+from pipelines.runs.stage import MANIFEST
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
 from smplxpp.capture.recording import TURNTABLE
@@ -38,6 +37,7 @@ from smplxpp.core import Check, InputError, require_at_least
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import as_object, jsonable, read_json
 from smplxpp.core.files.paths import absolute
+from smplxpp.core.spread import Chunk, split_frames
 from smplxpp.register import RegisterConfig
 
 
@@ -45,8 +45,9 @@ from smplxpp.register import RegisterConfig
 class BatchFrames:
     """Options of `smplxpp batch frames`. The same command continues one that was interrupted."""
 
-    step: Annotated[Literal["reconstruct", "register", "metrics"], tyro.conf.Positional]
-    """Command that computes a chunk. All frames of a registration share the shape of frames all over the take."""
+    step: Annotated[Literal["reconstruct", "register", "metrics", "refine"], tyro.conf.Positional]
+    """Command that computes a chunk. All frames of a registration share the shape of frames all over the take; the
+    processes of a refinement of poses share each of its passes."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder of the chunks, and of what they are joined to: params.npz of a registration, scans/ of a reconstruction,
     metrics.json; seams.json says how far the chunks fit together."""
@@ -54,6 +55,8 @@ class BatchFrames:
     """Folder of the capture; for metrics the folder of the frames that are measured."""
     truth: OptionalPath = None
     """For metrics: folder of the true frames."""
+    into: OptionalPath = None
+    """For refine: RUN, whose template and capture they are; the result is its stage 66_refine."""
     frames: OptionalText = None
     """Frames: numbers and ranges START:STOP:STEP with commas; by default all that the split names."""
     size: int = 200
@@ -73,46 +76,55 @@ class BatchFrames:
         """
         require_at_least("option size", self.size, 1)
         given, out = options_of(self.also), absolute(self.out)
+        if self.step == "refine":
+            return self._refine(given, out)
         frames, told = self._frames(given)
         chunks = split_frames(frames, self.size, overlap=OVERLAP if self.step == "register" else 0)
-        rows: list[Row] = []
         # A chunk alone would fit a shape of its own, and the body would change at every border.
         if self.step == "register" and "shape" not in given:
-            name, needs = f"shape_of_{len(told)}", Needs(cores=1, gpus=0.0)
-            options: dict[str, dict[str, Any]] = {self.step: self._options(given, told)}
-            first = Job(name, self._place, (self.step,), options, needs=needs, accept=(self.step,))
-            rows = self._drive(out / "shape", [first])
+            first = self._job(f"shape_of_{len(told)}", self._options(given, told))
+            self._drive(out / "shape", [first])
             given = {**given, "shape": str(out / "shape" / first.subject / "run" / REGISTERED_PARAMS)}
-        failed = [row for row in rows if row.state != "done"]
-        if not failed:
-            jobs = [
-                Job(
-                    f"{self.step}_{chunk.name}",
-                    self._place,
-                    (self.step,),
-                    {self.step: self._options(given, chunk.frames)},
-                    needs=Needs(cores=1, gpus=0.0),
-                    accept=(self.step,),
-                )
-                for chunk in chunks
-            ]
-            rows = self._drive(out / "chunks", jobs)
-            failed = [row for row in rows if row.state != "done"]
-        if failed:
-            raise InputError(
-                f"chunk {failed[0].subject}",
-                expected="all chunks done",
-                received=f"{len(failed)} that are not; {failed[0].reason or failed[0].state}",
-                remedy="give the same command again, which runs what does not stand",
-            )
+        jobs = [self._job(f"{self.step}_{chunk.name}", self._options(given, chunk.frames)) for chunk in chunks]
+        self._drive(out / "chunks", jobs)
         folders = [out / "chunks" / job.subject for job in jobs]
         checks = self._join(chunks, folders, out)
+        return self._answer(out, len(chunks), len(frames), [check.as_dict() for check in checks])
+
+    def _refine(self, given: dict[str, Any], out: Path) -> dict[str, Any]:
+        """Run as many processes as there are chunks, which share the passes, and one that ends the stage of RUN."""
+        if self.into is None or self.frames is not None:
+            raise InputError(
+                "batch frames refine",
+                expected="--into RUN, the folder with the template, and no --frames: its training frames are refined",
+                received="no --into" if self.into is None else "--frames",
+            )
+        run = absolute(self.into)
+        given = {**given, "run": str(run), "refine_frames": self.size, "no_report": True}
+        splits = open_capture(self.capture, protocol=given.get("protocol")).splits
+        count = -(-len(splits.train_frames) // self.size)
+        if count > 1:
+            self._drive(
+                out / "chunks", [self._job(f"refine_{k:04d}", {**given, "refine_help": True}) for k in range(count)]
+            )
+        self._drive(out / "end", [self._job("refine", given)])
+        record = read_record(run / REFINE_STAGE / MANIFEST)
+        frames = len(record["numbers"]["training"]["frames"])
+        return self._answer(run / REFINE_STAGE, count, frames, record["checks"])
+
+    def _job(self, name: str, options: dict[str, Any]) -> Job:
+        """Return a job of one command."""
+        needs = Needs(cores=1, gpus=0.0)
+        return Job(name, self._place, (self.step,), {self.step: options}, needs=needs, accept=(self.step,))
+
+    def _answer(self, out: Path, chunks: int, frames: int, checks: list[dict[str, Any]]) -> dict[str, Any]:
+        """Print the checks, and return the summary."""
         if not self.json:
-            print_checks([check.as_dict() for check in checks], Console())
+            print_checks(checks, Console())
             print_paths({"joined": out}, Console())
-        worst = any(check.status == "fail" for check in checks)
-        found = {"out": str(out), "chunks": len(chunks), "frames": len(frames)}
-        return {**found, "checks": [check.as_dict() for check in checks], "exit_status": int(worst)}
+        worst = any(check["status"] == "fail" for check in checks)
+        found = {"out": str(out), "chunks": chunks, "frames": frames}
+        return {**found, "checks": checks, "exit_status": int(worst)}
 
     @property
     def _place(self) -> str:
@@ -147,8 +159,12 @@ class BatchFrames:
         named |= {} if self.truth is None else {"truth": str(absolute(self.truth))}
         return {**given, **named, **({} if self.step == "metrics" else {"no_report": True})}
 
-    def _drive(self, runs: Path, jobs: list[Job]) -> list[Row]:
-        """Run the jobs that do not stand, as `smplxpp batch` does."""
+    def _drive(self, runs: Path, jobs: list[Job]) -> None:
+        """Run the jobs that do not stand, as `smplxpp batch` does.
+
+        Raises:
+            InputError: one that did not come to its end.
+        """
         check_options(tuple(jobs))
         file = JobFile(self.step, runs, Path.cwd(), "", tuple(jobs))
         with take_batch(runs) as held:
@@ -158,7 +174,14 @@ class BatchFrames:
             executor, index = self.machines.executor(file, batch), IndexWriter(runs)
             with shown(index, enabled=not self.json) as report:
                 drive(runs, left, executor, total=len(jobs), report=report, held=held)
-            return index.write()
+            failed = [row for row in index.write() if row.state != "done"]
+        if failed:
+            raise InputError(
+                f"chunk {failed[0].subject}",
+                expected="all chunks done",
+                received=f"{len(failed)} that are not; {failed[0].reason or failed[0].state}",
+                remedy="give the same command again, which runs what does not stand",
+            )
 
     def _join(self, chunks: tuple[Chunk, ...], folders: list[Path], out: Path) -> list[Check]:
         """Join what the chunks made, and return the checks of the seams."""

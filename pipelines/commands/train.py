@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import os
+import shutil
+import time
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +25,9 @@ from smplxpp.core.errors import InputError
 
 if TYPE_CHECKING:
     from avatar.training.recipe import TrainConfig
+    from avatar.training.refinement.config import RefineConfig
+    from avatar.training.scene import TrainScene
+    from pipelines.stages.scene import TrainInputs
 
 log = logging.getLogger(__name__)
 # As `avatar.training.recipe` has them, which would pull torch into `smplxpp train --help`.
@@ -55,6 +60,11 @@ class Train:
     refine_cameras: bool = False
     """Refine the poses of the training cameras together with the body poses. Their mean, all intrinsics and held-out
     cameras stay fixed. For slightly wrong calibrations of many cameras."""
+    refine_frames: int = 200
+    """Frames of a chunk of the refinement, which several processes share (docs/batch.md)."""
+    refine_help: bool = False
+    """Help other processes with the refinement of the same run, chunk by chunk, and leave its end to one without this
+    option."""
     max_minutes: float = math.inf
     """Stop after this many minutes and write the models reached so far. The same command then resumes, without --force,
     which would start again."""
@@ -109,6 +119,10 @@ class Train:
     """Minutes between checkpoints; by default half a minute, or longer for writing to take 2 % of the time."""
     no_report: bool = False
     """Leave report.html as it is."""
+    dry_run: bool = False
+    """Print hours, gigabytes and disk of each stage, and train nothing; see docs/batch.md."""
+    rates: OptionalPath = None
+    """With --dry-run: JSON with rates of this machine, as `smplxpp batch --rates` takes it."""
     json: bool = False
     """Print the summary as JSON."""
 
@@ -132,6 +146,9 @@ class Train:
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         config, steps = self.config(), self.steps()
         config.recipe(self.preset, cloth=self.cloth)
+        if self.dry_run:
+            refines = wants_refinement(self.run_folder, inputs, self.refine_poses)
+            return self._plan(choose_device(self.device) == "cuda", steps, refines=refines)
         with join_processes(choose_device(self.device)) as together:
             # Rank 0 decides and opens the scene, so that all ranks train with the same steps on the same data.
             first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
@@ -152,6 +169,8 @@ class Train:
             def bar(name: str, total: int) -> AbstractContextManager:
                 return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
 
+            if self.refine_help:
+                return self._help(inputs, scene, recipe.refine)
             options = TrainOptions(
                 max_seconds=60.0 * self.max_minutes,
                 force=self.force,
@@ -163,6 +182,41 @@ class Train:
             if not together.first:
                 return None
         return self._finish(records)
+
+    def _plan(self, gpu: bool, steps: tuple[str, ...], *, refines: bool) -> dict[str, Any]:
+        """Foretell what the stages take, as `smplxpp batch --dry-run` does for a fleet."""
+        from pipelines.batch.amounts import facts_of
+        from pipelines.batch.page import cost_table
+        from pipelines.batch.plan import read_rates, training_costs
+
+        facts = facts_of(self.capture, protocol=self.protocol, params=self.params)
+        if facts is None:
+            raise InputError("capture", expected="one that can be opened", received=str(self.capture))
+        held_out = len(self.hold_out) or facts.held_out_cameras
+        facts = replace(facts, megapixels=facts.megapixels * self.scale**2, held_out_cameras=held_out)
+        options = {**vars(self), "refine_poses": "on" if refines else "off"}
+        costs = training_costs(facts, read_rates(self.rates)[0], options, gpu=gpu)
+        costs = {step: cost for step, cost in costs.items() if step in steps}
+        free = shutil.disk_usage(
+            next(f for f in (self.run_folder, *self.run_folder.absolute().parents) if f.exists())
+        ).free
+        kept = sum(cost.written_gb for cost in costs.values())
+        if not self.json:
+            Console().print(cost_table(costs, "stage"))
+            words = f"{facts.frames} frames of {facts.cameras} cameras, {facts.megapixels:.2f} megapixels"
+            Console().print(f"{words}; {kept:.2f} GB are kept, {free / 1e9:.1f} GB are free", highlight=False)
+        plan = {step: vars(cost) for step, cost in costs.items()}
+        return {"run": str(self.run_folder), "facts": vars(facts), "plan": plan, "free_gb": free / 1e9}
+
+    def _help(self, inputs: TrainInputs, scene: TrainScene, config: RefineConfig | None) -> dict[str, Any]:
+        """Compute chunks of the refinement; nothing where poses are not refined, or are already."""
+        from pipelines.stages.refine import help_refine
+
+        until, finished = time.monotonic() + 60.0 * self.max_minutes, True
+        if config is not None:
+            stop = lambda: time.monotonic() > until  # noqa: E731
+            finished = help_refine(self.run_folder, inputs, config, scene=scene, stop=stop)
+        return {"run": str(self.run_folder), "finished": finished}
 
     def steps(self) -> tuple[str, ...]:
         """Return the steps to train, in order.
@@ -183,6 +237,8 @@ class Train:
                     expected="a teacher, to whose followed surface clothes are fitted",
                     received=f"none, with {asked}",
                 )
+        if self.refine_help and self.stage != "refine":
+            raise InputError("option refine-help", expected="--stage refine", received=str(self.stage or "none"))
         if self.stage is not None:
             return (self.stage,)
         return STEPS[: STEPS.index(self.until) + 1]
@@ -199,6 +255,7 @@ class Train:
         given = {step: getattr(self, f"{step}_iterations") for step in ("fit", "teacher", "bake", "compensate")}
         return TrainConfig(
             refine_cameras=self.refine_cameras,
+            refine_frames=self.refine_frames,
             max_minutes=self.max_minutes,
             iterations_share=1.0 if self.iterations_share is None else self.iterations_share,
             iterations={step: count for step, count in given.items() if count is not None},

@@ -192,23 +192,33 @@ def run_stage(run: Path, stage: Stage, work: Callable[[Path], StageOutput], *, f
         return StageRecord(folder, read_manifest(folder) or {}, ran=False)
     if decision == "redo":
         shutil.rmtree(state, ignore_errors=True)
-    # The record of the state is written before the work, so that a killed stage can be told from another one's.
     if stage.resumable:
         _warn_of_replacement(folder, stage)
-        forced = force or bool((_record(state / STATE_RECORD) or {}).get("forced"))
-        state.mkdir(parents=True, exist_ok=True)
-        record = {"key": stage.key, "forced": forced, **stage.recorded}
-        atomic_write_text(state / STATE_RECORD, json.dumps(record, indent=1))
+        begin_state(run, stage, force=force)
     # The folder appears whole, with the manifest as its last file.
-    begin = time.perf_counter()
+    begin, own = time.perf_counter(), time.process_time()
     with atomic_folder(folder) as temporary:
         output = work(temporary)
         manifest = _manifest(stage, output, temporary, time.perf_counter() - begin)
+        manifest["core_seconds"] = round(time.process_time() - own, 4)
         (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1))
     if is_finished(manifest):
         shutil.rmtree(state, ignore_errors=True)
     log.info("%s: %.2f s", stage.name, manifest["seconds"])
     return StageRecord(folder, manifest, ran=True)
+
+
+def begin_state(run: Path, stage: Stage, *, force: bool = False) -> Path:
+    """Make the folder of a stage's state, and return it.
+
+    Its record is written before any work, so that the state of a killed stage can be told from another one's.
+    """
+    state = run / stage.work_name
+    forced = force or bool((_record(state / STATE_RECORD) or {}).get("forced"))
+    state.mkdir(parents=True, exist_ok=True)
+    record = {"key": stage.key, "forced": forced, **stage.recorded}
+    atomic_write_text(state / STATE_RECORD, json.dumps(record, indent=1))
+    return state
 
 
 def _warn_of_replacement(folder: Path, stage: Stage) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import tempfile
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -16,16 +19,17 @@ from avatar.metrics.view_quality import eight_bit
 from avatar.models.student import Student, StudentConfig
 from avatar.rendering.avatar_view import render_view
 from avatar.rig.rig import at_rest
+from avatar.training.refinement.board import RefinementStoppedError
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.refine import Refinement
-from avatar.training.refinement.refine_capture import refine_capture
+from avatar.training.refinement.refine_capture import RefinedCapture, refine_capture
 from avatar.training.scene import TrainScene
 from pipelines.figures.comparison import write_tiles
 from pipelines.runs import gates
 from pipelines.runs.code import TRAINING
 from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import REFINE_STAGE, REFINED_PARAMS, REGISTERED_PARAMS
-from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
+from pipelines.runs.stage import Stage, StageOutput, StageRecord, begin_state, decide, run_stage
 from pipelines.stages.run_inputs import params_in_use, params_to_begin_with, record_of_given
 from pipelines.stages.scene import TrainInputs, of_protocol, open_scene, open_views
 from smplxpp.capture.declared import has_estimated_params
@@ -65,9 +69,11 @@ def refine(
     inputs: TrainInputs,
     config: RefineConfig,
     *,
+    scene: TrainScene | None = None,
     held_out: bool = True,
     force: bool = False,
     progress: ProgressCallback = ignore_progress,
+    stop: Callable[[], bool] = lambda: False,
 ) -> StageRecord:
     """Refine the poses of a run's capture, unless template, capture, code and choices are unchanged.
 
@@ -77,16 +83,72 @@ def refine(
         run: folder of the run.
         inputs: sources of the views, with the initial parameters.
         config: choices of the refinement.
+        scene: of these inputs, opened without refined poses; None: it is opened.
         held_out: whether held-out frames are refined too.
         force: refine even if the stage stands.
         progress: called with the share of the evaluations of frames that are done.
+        stop: asked after every pass and every chunk; then the record is unfinished, and the same call continues.
 
     Raises:
         InputError: see `open_scene`.
     """
     # Start from the parameters before any refinement, so that the result does not depend on how often it ran.
-    scene = open_scene(run, inputs, refined=False)
-    stage = Stage(
+    scene = open_scene(run, inputs, refined=False) if scene is None else scene
+    stage = _stage(scene, inputs, config, held_out=held_out)
+
+    def work(folder: Path) -> StageOutput:
+        begin, state = time.perf_counter(), run / stage.work_name
+        try:
+            refined = refine_capture(scene, config, folder, held_out=held_out, work=state, progress=progress, stop=stop)
+        except RefinementStoppedError:
+            seconds = time.perf_counter() - begin
+            return StageOutput(
+                [], {"finished": False, "iterations": 1, "iterations_done": 0, "seconds_of_steps": seconds}
+            )
+        return _output(refined, scene, inputs, folder, begin)
+
+    with own_run_folder(run, (REFINE_STAGE, "report")):
+        return run_stage(run, stage, work, force=force)
+
+
+def help_refine(
+    run: Path,
+    inputs: TrainInputs,
+    config: RefineConfig,
+    *,
+    scene: TrainScene | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Compute chunks of a refinement that other processes work at, too; `refine` then finds them, and ends the stage.
+
+    Any number of processes may call it, on all machines that see the run. None of them holds its lock.
+
+    Args:
+        run: folder of the run.
+        inputs: as of `refine`.
+        config: as of `refine`.
+        scene: as of `refine`.
+        stop: asked after every pass and every chunk.
+
+    Returns:
+        Whether nothing is left to compute.
+
+    Raises:
+        InputError: the state of a refinement with other choices.
+    """
+    scene = open_scene(run, inputs, refined=False) if scene is None else scene
+    stage = _stage(scene, inputs, config, held_out=True)
+    if decide(run, stage) == "skip":
+        return True
+    state = begin_state(run, stage)
+    with tempfile.TemporaryDirectory() as folder, suppress(RefinementStoppedError):
+        refine_capture(scene, config, Path(folder), work=state, stop=stop)
+        return True
+    return False
+
+
+def _stage(scene: TrainScene, inputs: TrainInputs, config: RefineConfig, *, held_out: bool) -> Stage:
+    return Stage(
         name=REFINE_STAGE,
         config={"refinement": config, "reference": scene.frame, "scale": inputs.scale, "held_out": held_out},
         inputs=scene.digests,
@@ -95,29 +157,11 @@ def refine(
         seed=config.seed,
         resumable=True,
     )
-    with own_run_folder(run, (REFINE_STAGE, "report")):
-        return run_stage(
-            run,
-            stage,
-            lambda folder: _work(scene, inputs, config, folder, run / stage.work_name, progress, held_out=held_out),
-            force=force,
-        )
 
 
-def _work(
-    scene: TrainScene,
-    inputs: TrainInputs,
-    config: RefineConfig,
-    folder: Path,
-    state: Path,
-    progress: ProgressCallback,
-    *,
-    held_out: bool,
-) -> StageOutput:
-    """Refine, write the files with pictures, and measure against the gates."""
-    begin = time.perf_counter()
+def _output(refined: RefinedCapture, scene: TrainScene, inputs: TrainInputs, folder: Path, begin: float) -> StageOutput:
+    """Write the figures and pictures, and measure against the gates."""
     # Frames whose loss rose keep their initial poses; a warning names them.
-    refined = refine_capture(scene, config, folder, held_out=held_out, work=state, progress=progress)
     found = refined.training
     if found.kept:
         log.warning("frames %s keep their poses: refined ones fit worse", " ".join(map(str, found.kept)))

@@ -24,7 +24,7 @@ from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.fit import FitStage
 from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
-from pipelines.stages.refine import refine
+from pipelines.stages.refine import help_refine, refine
 from pipelines.stages.scene import TrainInputs, open_scene
 from pipelines.stages.teacher import TeacherStage
 
@@ -85,7 +85,7 @@ def train(
     Args:
         run: folder of the run.
         inputs: sources of the views.
-        scene: the opened scene; it is opened again after a refinement of the poses.
+        scene: the opened scene, without refined poses where they are refined now; then it is opened again.
         config: configuration of all stages.
         options: limits and display.
         together: processes that train together.
@@ -107,9 +107,11 @@ def train(
     # Refinement changes poses and cameras, so that the scene is opened again. Its time counts against the limit, which
     # rank 0 measures for all.
     if "refine" in steps and how is not None:
-        begin = time.monotonic()
-        records["refine"] = together.run_on_rank0(lambda: _refined(run, inputs, how, options))
-        scene = together.run_on_rank0(lambda: open_scene(run, inputs))
+        begin, start = time.monotonic(), scene
+        records["refine"] = _refined(run, inputs, start, how, options, together)
+        if not records["refine"].finished:
+            return records
+        scene = together.run_on_rank0(lambda: open_scene(run, inputs, before=start))
         left = options.max_seconds - (time.monotonic() - begin)
         options = replace(options, max_seconds=together.run_on_rank0(lambda: max(0.0, left)))
     # Models of one run share the trainer: its scene, metric and deadline.
@@ -133,14 +135,35 @@ def train(
     return records
 
 
-def _refined(run: Path, inputs: TrainInputs, config: RefineConfig, options: TrainOptions) -> StageRecord:
-    """Refine the poses of the training frames, and show the percentage done in a bar."""
-    with options.bar(layout.REFINE_STAGE, 0) as report:
+def _refined(
+    run: Path,
+    inputs: TrainInputs,
+    scene: TrainScene,
+    config: RefineConfig,
+    options: TrainOptions,
+    together: Distributed,
+) -> StageRecord:
+    """Refine the poses of the training frames, with all processes, and show the percentage done in a bar."""
+    until = time.monotonic() + options.max_seconds
 
-        def show(step: str, share: float) -> None:
-            report(Progress(round(100 * share), 100, 0.0, 0.0))
+    def stop() -> bool:
+        return time.monotonic() > until
 
-        return refine(run, inputs, config, force=options.force, progress=show)
+    def whole() -> StageRecord:
+        with options.bar(layout.REFINE_STAGE, 0) as report:
+
+            def show(step: str, share: float) -> None:
+                report(Progress(round(100 * share), 100, 0.0, 0.0))
+
+            return refine(run, inputs, config, scene=scene, force=options.force, progress=show, stop=stop)
+
+    # Processes share the chunks of a long take, see `Board`; the first one ends the stage.
+    if len(scene.capture.splits.train_frames) > config.chunk_frames and together.world_size > 1 and not options.force:
+        together.run_on_rank0(lambda: help_refine(run, inputs, config, scene=scene, stop=lambda: True))
+        together.share_out(
+            range(together.world_size), lambda _: help_refine(run, inputs, config, scene=scene, stop=stop)
+        )
+    return together.run_on_rank0(whole)
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:

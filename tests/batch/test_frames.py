@@ -13,7 +13,6 @@ from pipelines.batch.frames import (
     join_metrics,
     join_reconstructions,
     join_registrations,
-    split_frames,
 )
 from pipelines.batch.jobs import Job
 from pipelines.cli import main
@@ -26,6 +25,7 @@ from smplxpp.build.register import stacked_rows
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.core.mesh_files.mesh_io import write_ply
+from smplxpp.core.spread import split_frames
 from tests.batch.made import write_manifest
 
 BODY = load_body()

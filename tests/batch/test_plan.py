@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
+from pipelines.batch.amounts import Facts, TrainingRates, facts_of, recipe_of, training_works
 from pipelines.batch.jobs import Job, Needs
 from pipelines.batch.plan import (
     Cost,
-    Facts,
     Rates,
     Site,
     breaks_first,
     cost_of,
     demands,
-    facts_of,
     learned,
     plan_jobs,
     read_rates,
+    training_costs,
 )
+from pipelines.cli import main
 from smplxpp.core import InputError
 from tests.capture.scene import make_scene
 from tests.capture.writers import WRITERS
@@ -36,8 +38,10 @@ def test_a_conversion_costs_its_megapixels_and_files():
     on_cores = cost_of("evaluate", facts, Rates(start_s=0.0))
     assert on_cores.core_hours == pytest.approx(3 * looks * 3.0 * 1.5 / 3600) and on_cores.gpu_hours == 0.0
     assert cost_of("evaluate", facts, Rates(), gpu=True).gpu_hours == pytest.approx(3 * looks * 0.1 / 3600)
-    with pytest.raises(InputError, match="preset paper"):
-        cost_of("train", facts, Rates(), preset="paper")
+    # A template costs a constant and its scan's bytes.
+    small, large = (cost_of("build", replace(facts, scan_mb=mb), Rates(start_s=0.0)) for mb in (0.0, 2.0))
+    a, b = Rates().build_s
+    assert [3600 * cost.core_hours for cost in (small, large)] == pytest.approx([a, a + 2.0 * b])
 
 
 def test_what_a_site_lacks_is_said_first():
@@ -56,11 +60,19 @@ def test_what_a_site_lacks_is_said_first():
 
 def test_rates_of_a_file_replace_ours(tmp_path):
     path = tmp_path / "rates.json"
-    path.write_text(json.dumps({"build_s": 99, "train_gpu_hours": {"gpu": 7}, "site": {"gpus": 4, "disk_tb": 2.5}}))
+    given = {"build_s": [99, 1], "train_gpu_hours": {"gpu": 7}, "site": {"gpus": 4, "disk_tb": 2.5}}
+    given |= {"training": {"look_s": 2.0}}
+    path.write_text(json.dumps(given))
     rates, site = read_rates(path)
-    assert (rates.build_s, rates.register_s, site.gpus, site.disk_tb) == (99, Rates().register_s, 4, 2.5)
+    assert (rates.build_s, rates.register_s, site.gpus, site.disk_tb) == ((99, 1), Rates().register_s, 4, 2.5)
+    assert rates.training == replace(TrainingRates(), look_s=2.0)
     assert rates.train_gpu_hours == {**Rates().train_gpu_hours, "gpu": 7}
-    for wrong, words in (({"bild_s": 1}, "bild_s"), ({"build_s": -1}, "build_s"), ({"site": {"gpu": 1}}, "gpu")):
+    for wrong, words in (
+        ({"bild_s": 1}, "bild_s"),
+        ({"build_s": [-1, 0]}, "build_s"),
+        ({"training": {"loock": 1}}, "loock"),
+        ({"site": {"gpu": 1}}, "gpu"),
+    ):
         path.write_text(json.dumps(wrong))
         with pytest.raises(InputError, match=words):
             read_rates(path)
@@ -83,8 +95,51 @@ def test_jobs_are_planned_by_their_captures(tmp_path):
     jobs = [Job("a", str(root), steps, {"train": {"preset": "demo"}}), Job("b", "s3://bucket/b", steps)]
     costs, unknown = plan_jobs(jobs, Rates(start_s=0.0), Site())
     assert unknown == ["b"]  # which counts as the other
-    assert costs["train"].core_hours == pytest.approx(2 * Rates().train_core_hours["demo"])
+    alone = training_costs(facts, Rates(), {"preset": "demo"}, gpu=False)
+    assert costs["train"].core_hours == pytest.approx(2 * sum(cost.core_hours for cost in alone.values()))
     on_gpu, _ = plan_jobs(jobs[:1], Rates(), Site(gpus=1))
-    assert on_gpu["train"].gpu_hours == Rates().train_gpu_hours["demo"]
+    assert on_gpu["train"].gpu_hours == pytest.approx(Rates().train_gpu_hours["demo"])
     without, _ = plan_jobs([Job("a", str(root), steps, needs=Needs(gpus=0.0))], Rates(), Site(gpus=1))
     assert without["train"].gpu_hours == 0.0
+
+
+def test_the_work_of_a_training_follows_from_frames_cameras_pixels_and_options():
+    rates = TrainingRates(start_s=0.0, look_s=0.0, look_s_mp=1.0, look_s_kg=0.0, frame_s=0.0, cloth_s=0.0)
+    rates = replace(rates, pose_s=dict.fromkeys(rates.pose_s, 0.0))
+    facts = Facts(50, 7, 0.5, 1.0, held_out_cameras=1, held_out_frames=10, tracked=True)
+    options = {"preset": "demo", "teacher_iterations": 250}
+
+    def seconds(changed: Facts = facts, **more) -> dict[str, float]:
+        works = training_works(recipe_of({**options, **more}, tracked=changed.tracked), changed, rates)
+        return {step: work.takes(rates) for step, work in works.items()}
+
+    one = seconds()
+    assert list(one) == ["refine", "fit", "teacher", "bake", "compensate", "cloth"]
+    # By hand: passes of three, three, three and four at an eighth, a quarter, a half and the whole size, and two looks
+    # without derivatives; six cameras, 50 frames, and the reference frame alone.
+    passes = 3 / 64 + 3 / 16 + 3 / 4 + 4 + 0.8
+    assert one["refine"] == pytest.approx(0.5 * 6 * (50 * passes + 4 / 64 + 3 / 16 + 3 / 4))
+    # 40 tracked frames of 12 + 12 steps, four views each, half of them halved once; 250 steps of three views; six
+    # evaluations of a camera and two held-out ones in two frames.
+    tracked = 40 * 4 * 12 * (1 + 1 / 4)
+    assert one["teacher"] == pytest.approx(0.5 * (tracked + 250 * 3 + 0.4 * 6 * (2 + 4)))
+    bigger = seconds(replace(facts, megapixels=1.0))
+    assert all(bigger[step] == pytest.approx(2 * one[step]) for step in one)
+    assert seconds(iterations_share=0.5)["bake"] < 0.6 * one["bake"]
+    assert "refine" not in seconds(replace(facts, tracked=False)) and "refine" in seconds(refine_poses="on")
+    assert "teacher" not in seconds(no_teacher=True)
+
+
+def test_a_training_tells_its_cost_before_it_begins(tmp_path, capsys):
+    from tests.dolls.gesturing import doll, write_gestures
+
+    capture, run = write_gestures(tmp_path / "capture"), doll().write_run(tmp_path / "run")
+    words = ["train", str(run), "--capture", str(capture), "--preset", "demo", "--device", "cpu", "--dry-run", "--json"]
+    assert main([*words, "--refine-poses", "on"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    facts = facts_of(capture)
+    alone = training_costs(facts, Rates(), {"preset": "demo", "refine_poses": "on"}, gpu=False)
+    assert answer["plan"] == {step: vars(cost) for step, cost in alone.items()} and answer["free_gb"] > 0
+    assert main([*words, "--until", "fit"]) == 0
+    assert list(json.loads(capsys.readouterr().out)["plan"]) == ["fit"]
+    assert not (run / "70_fit").exists()

@@ -26,8 +26,8 @@ from tests.dolls.gesturing import FRAMES, NOVEL_POSES, disturbed, doll, gestures
 from tests.training.refinement.test_refine import QUICK
 
 
-def quick(seed: int = 0, cameras: bool = False) -> RefineConfig:
-    return replace(QUICK, seed=seed, cameras=cameras)
+def quick(seed: int = 0, cameras: bool = False, chunk_frames: int = 200) -> RefineConfig:
+    return replace(QUICK, seed=seed, cameras=cameras, chunk_frames=chunk_frames)
 
 
 @pytest.fixture(autouse=True)
@@ -163,3 +163,37 @@ def test_the_report_shows_it(refined):
     assert number.value.endswith("degrees")
     seen = read_manifest(refined / "66_refine")["numbers"]["seen"]
     assert seen["cameras"] == ["Ring0", "Ring1", "Ring2", "Ring3"] and NOVEL_POSES[0] not in seen["frames"]
+
+
+def test_a_process_that_helps_leaves_the_end_to_another_one(capture, tmp_path, capsys):
+    run, alone = (doll().write_run(tmp_path / name) for name in ("run", "alone"))
+    chunks, helps = ("--refine-frames", "3"), ("--stage", "refine", "--refine-help")
+
+    def helped(*more: str) -> bool:
+        assert refine(run, capture, *chunks, *helps, *more) == 0
+        return json.loads(capsys.readouterr().out)["finished"]
+
+    assert refine(run, capture, *chunks, "--refine-help") == 2 and "--stage refine" in capsys.readouterr().err
+    assert not helped("--max-minutes", "1e-6")  # it stops after a chunk
+    assert helped() and (run / "66_refine_work").is_dir() and not (run / "66_refine").exists()
+    # Another one finds all sums there, so that no limit of time stops it.
+    assert refine(run, capture, *chunks, "--stage", "refine", "--max-minutes", "1e-6") == 0
+    assert json.loads(capsys.readouterr().out)["finished"] and not (run / "66_refine_work").exists()
+    assert helped()  # it stands
+    assert refine(alone, capture, *chunks) == 0
+    made, whole = (load_params(folder / REFINED_PARAMS).as_dict() for folder in (run, alone))
+    for name, array in whole.items():
+        np.testing.assert_array_equal(made[name], array)
+
+
+def test_a_refinement_ends_within_the_limit_of_time_and_goes_on(capture, tmp_path, capsys):
+    run, stops = doll().write_run(tmp_path / "run"), 0
+    while True:
+        assert refine(run, capture, "--max-minutes", "1e-6") == 0
+        answer = json.loads(capsys.readouterr().out)
+        if answer["finished"]:
+            break
+        stops += 1
+        assert not (run / REFINED_PARAMS).exists() and (run / "66_refine_work").is_dir()
+    # Of two passes over the training frames and two over the held-out ones, the first of each is followed by others.
+    assert stops == 2 and (run / REFINED_PARAMS).is_file()

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float64
 
 from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
+from avatar.training.refinement.board import Arrays, Board, OvertakenError, RefinementStoppedError
 from avatar.training.refinement.config import Level, RefineConfig
 from avatar.training.refinement.nuisance import AppearanceUpdate, CameraCorrections
 from avatar.training.refinement.photometric import Linearization, PhotometricLoss
@@ -23,6 +24,7 @@ from avatar.training.refinement.posing import PosedTemplate
 from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_prior
 from avatar.training.refinement.variables import CentreJacobian, Variables
 from smplxpp.core.files.array_file import read_arrays, write_arrays
+from smplxpp.core.spread import split_frames
 from smplxpp.register import BodyState
 
 Views = Callable[[int], Sequence[View]]
@@ -93,6 +95,8 @@ class Alignment:
         start: registered poses of the frames, a row each.
         views: returns the photographs of a frame.
         learns_appearance: whether colours and depths are updated.
+        board: shares the chunks of each pass with other processes; None: this one computes all.
+        name: of the alignment on the board.
 
     Attributes:
         state: current poses.
@@ -109,8 +113,13 @@ class Alignment:
         views: Views,
         *,
         learns_appearance: bool = True,
+        board: Board | None = None,
+        name: str = "frames",
     ) -> None:
         assert len(frames) == len(start), "a row a frame"
+        chunks = split_frames(range(len(frames)), scene.config.chunk_frames)
+        self._chunks = [chunk.kept for chunk in chunks]
+        self._board, self._name = (board if len(chunks) > 1 else None), name
         self.scene, self.gaussians, self.frames = scene, gaussians, frames
         self.learns_appearance = learns_appearance
         self.start = self.state = start
@@ -125,7 +134,12 @@ class Alignment:
         self._jacobian = CentreJacobian(scene.posed, gaussians, self.variables)
 
     def run(
-        self, levels: Sequence[Level], on_frame: Callable[[], None] = lambda: None, *, file: Path | None = None
+        self,
+        levels: Sequence[Level],
+        on_frame: Callable[[], None] = lambda: None,
+        *,
+        file: Path | None = None,
+        stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """Run the passes of all levels, each one more than steps, because the result of the last step is evaluated too.
 
@@ -133,7 +147,12 @@ class Alignment:
             levels: from coarse to fine.
             on_frame: called after every frame of a pass.
             file: written after every pass; where it exists, the run continues from it, to the same bits.
+            stop: whether to end after a pass.
+
+        Raises:
+            RefinementStoppedError: `stop` said so before the last pass.
         """
+        passes = sum(level.steps + 1 for level in levels)
         done, carried = self._restore(file) if file is not None and file.is_file() else (0, None)
         number = 0
         for level in levels:
@@ -143,7 +162,13 @@ class Alignment:
                     for _ in self.frames:
                         on_frame()
                     continue
-                carried = self._pass(level, self._begin() if carried is None or step == 0 else carried, on_frame)
+                try:
+                    before = self._begin() if carried is None or step == 0 else carried
+                    carried = self._pass(level, before, on_frame, f"{self._name}_{number:02d}")
+                except OvertakenError:
+                    assert file is not None
+                    done, carried = self._restore(file)
+                    continue
                 # One step each of poses and of cameras; nothing follows the last pass of a level.
                 if step < level.steps:
                     assert carried.normal is not None
@@ -151,9 +176,13 @@ class Alignment:
                     if self.scene.cameras is not None:
                         self.scene.cameras.step()
                 if file is not None:
-                    self._save(file, number, carried)
+                    self._keep(file, number, carried)
+                if number < passes and stop():
+                    raise RefinementStoppedError(f"stopped after {number} of {passes} passes")
 
-    def losses(self, state: BodyState, on_frame: Callable[[], None] = lambda: None) -> Float64[np.ndarray, " F"]:
+    def losses(
+        self, state: BodyState, on_frame: Callable[[], None] = lambda: None, *, name: str = "losses"
+    ) -> Float64[np.ndarray, " F"]:
         """Return `PhotometricLoss.rigid_loss` of every frame in a state, at the size of the finest level."""
         halvings, rigid = self.scene.config.levels[-1].halvings, self._jacobian.rigidity
 
@@ -161,32 +190,33 @@ class Alignment:
             vertices = self.scene.posed.place(state, row).vertices.detach()
             return self.scene.photometric.rigid_loss(self.gaussians, vertices, rigid, self._photographs(row, halvings))
 
-        return np.array(list(self._of_frames(loss, on_frame)))
+        def compute(rows: Sequence[int]) -> dict[str, np.ndarray]:
+            return {"loss": np.array(list(self._of_frames(loss, rows, on_frame)))}
+
+        return np.concatenate([part["loss"] for part in self._gather(f"{self._name}_{name}", compute, on_frame)])
 
     def _begin(self) -> _Carried:
         """Return what a level's first pass starts from."""
         initial_damping, count = 1e-2, len(self.frames)
         return _Carried(np.full(count, initial_damping), np.full(count, np.inf), self.state, None)
 
-    def _pass(self, level: Level, before: _Carried, on_frame: Callable[[], None]) -> _Carried:
+    def _pass(self, level: Level, before: _Carried, on_frame: Callable[[], None], name: str) -> _Carried:
         """Evaluate all frames, reset those whose loss grew, and take a step of colours and depths."""
         # Levenberg-Marquardt damping: least value, factors after a good and after a bad pass. The loss of a bad frame
         # grew by more than `worse`; less may come from the change of the shared colours.
         least_damping, good_factor, bad_factor, worse = 1e-4, 0.3, 10.0, 1.01
-        # Linearise the photometric loss of every frame about the current poses.
+        # Linearise the photometric loss of every frame about the current poses. What frames share is summed in their
+        # order within a chunk, and then in that of the chunks, so that it does not matter who computes one.
+        parts = self._gather(name, lambda rows: self._sums(rows, level.halvings, on_frame), on_frame)
         appearance = AppearanceUpdate(self._groups, self._jacobian.rigidity)
         if self.scene.cameras is not None:
             self.scene.cameras.clear()
-        losses, gradients, curvatures = [], [], []
-        for linear, gradient, curvature in self._of_frames(lambda row: self._linearize(row, level.halvings), on_frame):
-            # What frames share is summed in their order.
-            appearance.add(linear)
+        for part in parts:
+            appearance.add_sums(part)
             if self.scene.cameras is not None:
-                self.scene.cameras.add(linear, self._jacobian.rigidity)
-            losses.append(linear.loss)
-            gradients.append(gradient)
-            curvatures.append(curvature)
-        found, loss = Normal(np.stack(gradients), np.stack(curvatures)), np.array(losses)
+                self.scene.cameras.add_sums(part)
+        loss, *normal = (np.concatenate([part[key] for part in parts]) for key in ("loss", "slope", "block"))
+        found = Normal(*normal)
         # Reset frames whose loss grew, with their earlier normal equations, and damp them more.
         bad, damping = loss > worse * before.best, before.damping
         if before.normal is not None:
@@ -201,12 +231,55 @@ class Alignment:
             self.gaussians = appearance.stepped(self.gaussians, len(self.frames))
         return _Carried(damping, np.where(bad, before.best, loss), self.state, found)
 
-    def _of_frames(self, work: Callable[[int], _T], on_frame: Callable[[], None]) -> Iterator[_T]:
-        """Yield what `work` returns for the row of each frame, in order; as many frames at a time as torch has threads.
+    def _sums(self, rows: Sequence[int], halvings: int, on_frame: Callable[[], None]) -> dict[str, np.ndarray]:
+        """Linearise the loss of the frames of a chunk, and sum what they share."""
+        appearance, cameras = AppearanceUpdate(self._groups, self._jacobian.rigidity), self.scene.cameras
+        if cameras is not None:
+            cameras.clear()
+        losses, gradients, curvatures = [], [], []
+        for linear, gradient, curvature in self._of_frames(lambda row: self._linearize(row, halvings), rows, on_frame):
+            appearance.add(linear)
+            if cameras is not None:
+                cameras.add(linear, self._jacobian.rigidity)
+            losses.append(linear.loss)
+            gradients.append(gradient)
+            curvatures.append(curvature)
+        frames = {"loss": np.array(losses), "slope": np.stack(gradients), "block": np.stack(curvatures)}
+        return {**frames, **appearance.sums(), **({} if cameras is None else cameras.sums())}
+
+    def _gather(
+        self, name: str, compute: Callable[[Sequence[int]], Arrays], on_frame: Callable[[], None]
+    ) -> list[Arrays]:
+        """Return what `compute` gives for the rows of each chunk, here or in other processes."""
+        if self._board is None:
+            return [compute(rows) for rows in self._chunks]
+        board, own = self._board, set[int]()
+
+        def counted(chunk: int) -> Arrays:
+            own.add(chunk)
+            return compute(self._chunks[chunk])
+
+        found = board.gather(name, len(self._chunks), counted)
+        for chunk, rows in enumerate(self._chunks):
+            for _ in () if chunk in own else rows:
+                on_frame()
+        return found
+
+    def _keep(self, file: Path, number: int, carried: _Carried) -> None:
+        """Save the state after a pass, by one of the processes that share it."""
+        name = f"{self._name}_{number:02d}"
+        if self._board is None:
+            self._save(file, number, carried)
+        elif self._board.first(f"{name}.saved"):
+            self._save(file, number, carried)
+            self._board.end(name)
+
+    def _of_frames(self, work: Callable[[int], _T], rows: Sequence[int], on_frame: Callable[[], None]) -> Iterator[_T]:
+        """Yield what `work` returns for each row, in order; as many frames at a time as torch has threads.
 
         Pictures of a few hundred pixels keep several threads waiting for each other, so that each frame has one thread.
         """
-        threads, rows = torch.get_num_threads(), range(len(self.frames))
+        threads = torch.get_num_threads()
         results: Iterator[_T] = map(work, rows)
         pool = None
         if min(threads, len(rows)) > 1:
@@ -215,6 +288,8 @@ class Alignment:
         try:
             for result in results:
                 on_frame()
+                if self._board is not None:
+                    self._board.touch()
                 yield result
         finally:
             if pool is not None:

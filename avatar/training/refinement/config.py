@@ -47,6 +47,7 @@ class RefineConfig:
             fast motion is kept.
         translation_acceleration_sigma: the same for the translation, metres a frame squared.
         reach: distance from the skin over which the rigidity of clothes falls to 1/e, metres.
+        chunk_frames: frames whose sums are computed together; several processes share the chunks of a take.
         seed: of the Gaussians' positions.
     """
 
@@ -71,6 +72,7 @@ class RefineConfig:
     acceleration_sigma: float = 0.4
     translation_acceleration_sigma: float = 0.003
     reach: float = 0.01
+    chunk_frames: int = 200
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -82,6 +84,7 @@ class RefineConfig:
         if not self.levels:
             raise InputError("refinement: levels", expected="one or more", received="none")
         require_at_least("refinement: alpha", self.alpha, 0.0)
+        require_at_least("refinement: chunk_frames", self.chunk_frames, 1)
         for name in _POSITIVE:
             require_positive(f"refinement: {name}", getattr(self, name))
 

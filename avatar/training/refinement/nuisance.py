@@ -40,8 +40,8 @@ class AppearanceUpdate:
         N, G = len(groups), int(groups.max()) + 1 if len(groups) else 0
         self.groups, self.rigidity = groups, rigidity
         self.gradient, self.mass = torch.zeros(N, 3), torch.zeros(N)
-        self._depth_gradient = torch.zeros(G, dtype=torch.float64)
-        self._depth_curvature = torch.zeros(G, dtype=torch.float64)
+        self.depth_gradient = torch.zeros(G, dtype=torch.float64)
+        self.depth_curvature = torch.zeros(G, dtype=torch.float64)
 
     def add(self, linear: Linearization) -> None:
         """Add the views of a frame to the sums."""
@@ -51,8 +51,17 @@ class AppearanceUpdate:
         normals, rigid = linear.normals, self.rigidity
         gradient = rigid * (normals * linear.mean_gradient).sum(-1)
         curvature = rigid * (normals * (linear.curvature @ normals[..., None])[..., 0]).sum(-1)
-        self._depth_gradient.index_add_(0, self.groups, gradient.double())
-        self._depth_curvature.index_add_(0, self.groups, curvature.double())
+        self.depth_gradient.index_add_(0, self.groups, gradient.double())
+        self.depth_curvature.index_add_(0, self.groups, curvature.double())
+
+    def sums(self) -> dict[str, np.ndarray]:
+        """Return the sums as arrays by name."""
+        return {name: getattr(self, name).numpy() for name in _APPEARANCE}
+
+    def add_sums(self, sums: Mapping[str, np.ndarray]) -> None:
+        """Add what another update has summed."""
+        for name in _APPEARANCE:
+            getattr(self, name).add_(torch.from_numpy(sums[name]))
 
     def stepped(self, gaussians: BoundGaussians, frames: int) -> BoundGaussians:
         """Return the Gaussians after one step of colours and depths; Gaussians that no pixel shows keep their colour.
@@ -69,10 +78,13 @@ class AppearanceUpdate:
         # Gauss-Newton step of the depths with a Gaussian prior about 0.
         prior = frames / depth_sigma**2
         # The current depth of each group: all its Gaussians have the same, so any of them gives it.
-        depth = torch.zeros_like(self._depth_gradient).index_copy_(0, self.groups, gaussians.normal_offset.double())
-        depth = depth - (self._depth_gradient + prior * depth) / (self._depth_curvature + prior)
+        depth = torch.zeros_like(self.depth_gradient).index_copy_(0, self.groups, gaussians.normal_offset.double())
+        depth = depth - (self.depth_gradient + prior * depth) / (self.depth_curvature + prior)
         depth = depth.clamp(deepest, highest)
         return replace(gaussians, dc=(gaussians.dc - step).clamp(0.0, 1.0), normal_offset=depth[self.groups].float())
+
+
+_APPEARANCE = ("gradient", "mass", "depth_gradient", "depth_curvature")
 
 
 class CameraCorrections:
@@ -124,6 +136,17 @@ class CameraCorrections:
             gradient[row] += torch.einsum("nij,ni,n->j", J, mean_gradient, rigidity).double().numpy()
             moved = (own * rigidity[:, None, None]) @ J
             curvature[row] += (J.reshape(-1, 6).T @ moved.reshape(-1, 6)).double().numpy()
+
+    def sums(self) -> dict[str, np.ndarray]:
+        """Return the normal equations that were summed, as arrays by name."""
+        gradient, curvature = self._sums
+        return {"camera_gradient": gradient.copy(), "camera_curvature": curvature.copy()}
+
+    def add_sums(self, sums: Mapping[str, np.ndarray]) -> None:
+        """Add normal equations of other frames."""
+        gradient, curvature = self._sums
+        gradient += sums["camera_gradient"]
+        curvature += sums["camera_curvature"]
 
     def clear(self) -> None:
         """Begin the sums of a pass."""

@@ -15,6 +15,7 @@ from avatar.data.views import View, read_view
 from avatar.gaussians.binding import BoundGaussians
 from avatar.training.fit.initial_gaussians import initial_gaussians
 from avatar.training.refinement.align import Alignment, PassReport, Scene
+from avatar.training.refinement.board import Board
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.nuisance import CameraCorrections
 from avatar.training.refinement.photometric import PhotometricLoss
@@ -64,6 +65,7 @@ def refine_poses(
     frames: Sequence[int] | None = None,
     state: Path | None = None,
     progress: ProgressCallback = ignore_progress,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Refinement:
     """Refine training frames: the reference frame first, then all together, with the colours of the Gaussians.
 
@@ -76,10 +78,14 @@ def refine_poses(
         reference: frame that colours start from; None: the first.
         frames: some of the training frames; None: all.
         state: file that is written after every pass over the frames. Where it exists, the same call continues from it.
+            Any number of processes that make this call at the same time share the chunks of `chunk_frames` frames in
+            a folder beside it, and get the same bits as one.
         progress: called with the finished share of the frames' evaluations.
+        stop: asked after every pass and every chunk.
 
     Raises:
         InputError: frames that are not training frames, or a frame without parameters or photographs.
+        RefinementStoppedError: `stop` said so; the same call continues.
     """
     config = config or RefineConfig()
     chosen = tuple(sorted(sequence.train_frames if frames is None else frames))
@@ -96,10 +102,19 @@ def refine_poses(
     # Refine the reference frame alone, which sharpens the colours.
     counter = _EvaluationCounter(progress, config, len(chosen))
     view = _training_views(sequence)
+    board = _board(state, stop)
     if state is None or not state.is_file():
-        alone = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
-        alone.run(config.reference_levels, counter.step)
-        gaussians = alone.gaussians
+
+        def alone(chunk: int) -> dict[str, np.ndarray]:
+            one = Alignment(scene, gaussians, (first,), _state(posed, reference_start), view)
+            one.run(config.reference_levels, counter.step)
+            return {"dc": one.gaussians.dc.numpy(), "normal_offset": one.gaussians.normal_offset.numpy()}
+
+        # The number of threads would show in the bits, so that all processes take what one has computed.
+        shared = board is not None and len(chosen) > config.chunk_frames
+        learned = board.gather("reference", 1, alone)[0] if board is not None and shared else alone(0)
+        dc, depth = (torch.from_numpy(learned[name]) for name in ("dc", "normal_offset"))
+        gaussians = replace(gaussians, dc=dc, normal_offset=depth)
     else:
         for _ in range(sum(level.steps + 1 for level in config.reference_levels)):
             counter.step()
@@ -107,8 +122,8 @@ def refine_poses(
     if scene.cameras is not None:
         scene = replace(scene, cameras=_corrections(sequence, config))
     # Refine all frames together.
-    together = Alignment(scene, gaussians, chosen, _state(posed, start), view)
-    return _finish(together, start, sequence, counter, state)
+    together = Alignment(scene, gaussians, chosen, _state(posed, start), view, board=board)
+    return _finish(together, start, sequence, counter, state, stop)
 
 
 def refine_held_out(
@@ -119,6 +134,7 @@ def refine_held_out(
     frames: Sequence[int] | None = None,
     state: Path | None = None,
     progress: ProgressCallback = ignore_progress,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Refinement:
     """Refine the poses of held-out frames on the photographs of training cameras; everything else stays.
 
@@ -132,6 +148,7 @@ def refine_held_out(
         frames: some held-out frames; None: all.
         state: as of `refine_poses`.
         progress: called with the finished share of the frames' evaluations.
+        stop: as of `refine_poses`.
 
     Raises:
         InputError: frames that are not held out, none, or one without parameters or photographs.
@@ -144,9 +161,16 @@ def refine_held_out(
         raise InputError(f"capture {sequence.capture.name}", expected="held-out frames", received="none")
     scene, start = _scene(sequence, config), _start(sequence, chosen)
     view = _training_views(sequence)
-    alignment = Alignment(scene, gaussians, chosen, _state(scene.posed, start), view, learns_appearance=False)
+    alignment = Alignment(
+        scene, gaussians, chosen, _state(scene.posed, start), view, learns_appearance=False, board=_board(state, stop)
+    )
     counter = _EvaluationCounter(progress, replace(config, reference_levels=()), len(chosen))
-    return _finish(alignment, start, sequence, counter, state)
+    return _finish(alignment, start, sequence, counter, state, stop)
+
+
+def _board(state: Path | None, stop: Callable[[], bool]) -> Board | None:
+    """Return the folder beside a state in which processes share chunks."""
+    return None if state is None else Board(state.with_suffix(""), stop)
 
 
 class _EvaluationCounter:
@@ -169,13 +193,14 @@ def _finish(
     sequence: AvatarSequence,
     counter: _EvaluationCounter,
     state: Path | None,
+    stop: Callable[[], bool],
 ) -> Refinement:
     """Run an alignment of all frames, and keep for each frame the better of its start and its result."""
     scene, frames = alignment.scene, alignment.frames
-    alignment.run(scene.config.levels, counter.step, file=state)
+    alignment.run(scene.config.levels, counter.step, file=state, stop=stop)
     # Losses of start and result with the same, final colours.
-    before = alignment.losses(alignment.start, counter.step)
-    after = alignment.losses(alignment.state, counter.step)
+    before = alignment.losses(alignment.start, counter.step, name="before")
+    after = alignment.losses(alignment.state, counter.step, name="after")
     # Frames that did not improve keep the start.
     worse = ~(after < before)
     # Parameters of the better ones.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ def refine_capture(
     held_out: bool = True,
     work: Path | None = None,
     progress: ProgressCallback = ignore_progress,
+    stop: Callable[[], bool] = lambda: False,
 ) -> RefinedCapture:
     """Refine the poses of a capture on the photographs of its training cameras, and write them.
 
@@ -68,26 +69,32 @@ def refine_capture(
         config: choices of the refinement.
         folder: an existing folder for the files.
         held_out: whether held-out frames are refined too.
-        work: folder of the state, from which the same call continues after a kill; None: none is kept.
+        work: folder of the state, from which the same call continues after a kill, and which any number of processes
+            that make it at the same time share; None: none is kept.
         progress: called with the share of the frames' evaluations that are done.
+        stop: asked after every pass and every chunk of frames.
 
     Raises:
         InputError: a frame without parameters or photographs.
+        RefinementStoppedError: `stop` said so; the same call continues.
     """
     sequence = AvatarSequence(scene.capture, scene.template, SequenceConfig(normals=False))
     if work is not None:
         work.mkdir(parents=True, exist_ok=True)
     training, apart_state = (None, None) if work is None else (work / TRAINING_STATE, work / HELD_OUT_STATE)
-    found = refine_poses(sequence, config, reference=scene.frame, state=training, progress=progress)
+    found = refine_poses(sequence, config, reference=scene.frame, state=training, progress=progress, stop=stop)
     capture, template = scene.capture, scene.template
+    if found.cameras:
+        sequence.capture = with_cameras(capture, found.cameras)
+    apart = None
+    if held_out and capture.splits.novel_pose_frames:
+        apart = refine_held_out(sequence, found.gaussians, config, state=apart_state, stop=stop)
+    # Nothing is written before everything is computed: half a refinement may not pass for one.
     _write_params(folder / PARAMS_FILE, _rows(capture, template, [found]))
     if found.cameras:
         corrected = {name: replace(capture.cameras[name], cam_from_world=pose) for name, pose in found.cameras.items()}
         write_plain_cameras_json(folder / CAMERAS_FILE, corrected)
-        sequence.capture = with_cameras(capture, found.cameras)
-    apart = None
-    if held_out and capture.splits.novel_pose_frames:
-        apart = refine_held_out(sequence, found.gaussians, config, state=apart_state)
+    if apart is not None:
         _write_params(folder / HELD_OUT_PARAMS_FILE, _rows(capture, template, [found, apart]))
     save_bound(found.gaussians, folder / GAUSSIANS_FILE)
     return RefinedCapture(sequence, found, apart)

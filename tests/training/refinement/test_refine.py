@@ -111,7 +111,7 @@ def test_what_changed_is_told(found, start):
 
 
 def test_frames_whose_photographs_like_the_start_better_keep_it(frames, found, start, monkeypatch):
-    def astray(self, levels, on_frame, *, file):
+    def astray(self, levels, on_frame, *, file, stop):
         self.state = replace(self.state, transl=self.state.transl + [0.1, 0.0, 0.0])
 
     monkeypatch.setattr(Alignment, "run", astray)
