@@ -49,7 +49,7 @@ FACES = {"hair": 400, "shoe": 400, "upper": 1500, "lower": 1500}
 GAUSSIANS = 6000
 NOTEBOOKS = {"avatar": {"me.avatar", "training"}, "metrics": set(), "template": {"me.glb", "me.npz"}}
 """What each writes beside itself."""
-BY_COMMAND = "03_metrics"
+BY_COMMAND = "06_own_meshes"
 """The one that runs in a process of its own; imports of the libraries cost each of those seconds."""
 
 
