@@ -65,6 +65,7 @@ def test_the_image_has_no_compiler_and_no_rights(stages):
     build, last = stages
     assert [build[0][1].split()[0]] == last[0][1].split()  # one release: the environment of one Python works in both
     assert {"g++", "cmake", "python3-dev"} <= packages(build) and not packages(last) & COMPILES
+    assert {"espeak-ng", "ca-certificates"} <= packages(last)  # without the latter no model behind https was reached
     assert all(rest.startswith("--from=build /opt/smplxpp ") for word, rest in last if word == "COPY")
     words = [word for word, _ in last]
     (user,) = (rest for word, rest in last if word == "USER")
