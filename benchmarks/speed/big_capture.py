@@ -77,22 +77,31 @@ def _write_view(source: Capture, out: Path, camera: str, frame: int, size: tuple
     return files
 
 
-def measure(capture: Path, run: Path, images: int) -> dict[str, dict[str, float]]:
-    """Time opening, `capture check`, a dry run of a training, and opening for one; each in a process of its own."""
+def measure(capture: Path, run: Path, checked: str) -> dict[str, dict[str, float]]:
+    """Time opening, `capture check`, a dry run of a training, and opening for one; each in its own process."""
     given = ["--capture", str(capture), "--params", "params.npz"]
-    scene = f"open_scene(Path({str(run)!r}), TrainInputs(Path({str(capture)!r}), Path('params.npz')), refined=False)"
-    parts = (
+    scene = (
         "from pathlib import Path; from pipelines.stages.scene import TrainInputs, open_scene; "
-        "from avatar.training.refinement.config import RefineConfig; "
-        "from avatar.training.refinement.refine_capture import take_of; "
-        f"print(len(take_of({scene}, RefineConfig()).parts))"
+        f"open_scene(Path({str(run)!r}), TrainInputs(Path({str(capture)!r}), Path('params.npz')), refined=False)"
     )
-    check = ["capture", "check", str(capture), "--images", str(images), "--json"]
+    check = ["capture", "check", str(capture), "--frames", checked, "--json"]
     commands = {
         "open": ["-c", f"import smplxpp; smplxpp.open_capture({str(capture)!r}).frames"],
-        f"capture check of {images} images": ["-m", "pipelines.cli", *check],
-        "train --dry-run": ["-m", "pipelines.cli", "train", str(run), *given, "--preset", "gpu", "--dry-run", "--json"],
-        "open for a training, plan its refinement": ["-c", parts],
+        f"capture check of frames {checked}": ["-m", "pipelines.cli", *check],
+        "train --dry-run": [
+            "-m",
+            "pipelines.cli",
+            "train",
+            str(run),
+            *given,
+            "--preset",
+            "gpu",
+            "--device",
+            "cpu",
+            "--dry-run",
+            "--json",
+        ],
+        "open for a training": ["-c", scene],
     }
     return {name: _run([sys.executable, *words]) for name, words in commands.items()}
 
@@ -116,7 +125,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--cameras", type=int, default=60)
     parser.add_argument("--size", type=int, nargs=2, default=(1500, 2000))
-    parser.add_argument("--images", type=int, default=2000, help="that `capture check` opens")
+    parser.add_argument("--check", default="0:600:150", help="frames whose images `capture check` opens")
     parser.add_argument("--store", action="store_true", help="keep the figures in benchmarks/results")
     args = parser.parse_args()
     rows = {}
@@ -125,10 +134,13 @@ def main() -> int:
         make_capture(args.out, args.cameras, args.frames, (args.size[0], args.size[1]))
         seconds = {"seconds": time.perf_counter() - begin, "core_seconds": time.process_time() - own}
         rows["make"] = {name: round(value, 2) for name, value in seconds.items()}
-    rows |= measure(args.out, args.run, args.images)
+    rows |= measure(args.out, args.run, args.check)
     print(json.dumps(rows, indent=1))
     if args.store:
-        command = f"python -m benchmarks big_capture {' '.join(sys.argv[1:])}".replace(" --store", "")
+        given = (
+            f"--frames {args.frames} --cameras {args.cameras} --size {args.size[0]} {args.size[1]} --check {args.check}"
+        )
+        command = f"python -m benchmarks big_capture --out DIR --run RUN {given}"
         store_results(f"big_capture_{args.cameras}_{args.frames}", command, {"rows": rows})
     return 0
 

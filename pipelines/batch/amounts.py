@@ -60,49 +60,58 @@ class Facts:
 
 @dataclass(frozen=True)
 class TrainingRates:
-    """Rates of the stages of a training, seconds of one core.
+    """Rates of the stages of a training, seconds of one core; measured on two captures at two sizes each.
 
     Attributes:
-        start_s: of each stage: opening, the first pictures, its files.
+        start_s: of each stage: opening, what it takes over, its files and figures.
         look_s: a look, beside its pixels and Gaussians.
         look_s_mp: a megapixel of the whole image, of which a person fills a part.
         look_s_kg: a thousand Gaussians.
         drawn: share of a look that drawing alone takes.
-        pose_s: rig and networks of a pose in a step, by stage, of presets that are named "STAGE PRESET" or of all.
-        frame_s: of tracking, a frame beside its looks.
-        cloth_s: of finding clothes, a frame.
+        pose_s: networks and rig of a pose in a step, by stage; of the field a thousand control points.
+        frame_s: of a frame beside its looks: following it, finding clothes in it, relating its pose to the surface.
     """
 
-    start_s: float = 2.5
-    look_s: float = 0.012
-    look_s_mp: float = 0.45
+    start_s: Mapping[str, float] = field(
+        default_factory=lambda: {
+            **{"refine": 3.0, "fit": 2.3, "teacher": 6.8, "cloth": 11.2, "bake": 3.8, "compensate": 6.8}
+        }
+    )
+    look_s: float = 0.001
+    look_s_mp: float = 0.13
     look_s_kg: float = 0.0006
     drawn: float = 0.4
     pose_s: Mapping[str, float] = field(
-        default_factory=lambda: {"pretrain": 0.04, "teacher": 0.1, "field": 0.005, "bake": 0.03, "compensate": 0.03}
+        default_factory=lambda: {
+            **{"pretrain": 0.0155, "teacher": 0.063, "field": 0.006, "bake": 0.005, "compensate": 0.005}
+        }
     )
-    frame_s: float = 0.3
-    cloth_s: float = 0.2
+    frame_s: Mapping[str, float] = field(
+        default_factory=lambda: {"teacher": 0.15, "cloth": 0.15, "bake": 0.08, "compensate": 0.05}
+    )
 
 
 @dataclass
 class Work:
-    """Looks of a stage, and the megapixels of all of them; what the rest of it takes, seconds."""
+    """Looks of a stage, the images that they read, and their megapixels; what the rest of it takes, seconds."""
 
-    looks: float = 0.0
-    megapixels: float = 0.0
+    stage: str
     gaussians: int = 0
+    looks: float = 0.0
+    reads: float = 0.0
+    megapixels: float = 0.0
     seconds: float = 0.0
 
-    def look(self, count: float, megapixels: float, halvings: int = 0) -> None:
-        """Add looks at photographs that are halved."""
+    def look(self, count: float, megapixels: float, halvings: int = 0, *, reads: float | None = None) -> None:
+        """Add looks at photographs that are halved; each reads its image, unless `reads` of them are kept."""
         self.looks += count
+        self.reads += count if reads is None else reads
         self.megapixels += count * megapixels / 4.0**halvings
 
     def takes(self, rates: TrainingRates) -> float:
         """Return the seconds of one core."""
         each = rates.look_s + rates.look_s_kg * 1e-3 * self.gaussians
-        return rates.start_s + self.looks * each + self.megapixels * rates.look_s_mp + self.seconds
+        return rates.start_s[self.stage] + self.looks * each + self.megapixels * rates.look_s_mp + self.seconds
 
 
 def recipe_of(options: Mapping[str, Any], *, tracked: bool = True) -> Recipe:
@@ -153,38 +162,43 @@ def training_works(recipe: Recipe, facts: Facts, rates: TrainingRates) -> dict[s
     if recipe.refine is not None:
         works["refine"] = _refinement(recipe.refine, facts)
     measured = min(2, facts.frames) * max(facts.held_out_cameras, 1) + 2.0 * min(2, facts.held_out_frames)
-    fit = Work(gaussians=count)
+    fit = Work("fit", count)
     fit.look(preset.fit.iterations, size)
     fit.look(rates.drawn * preset.fit.evaluations * max(facts.held_out_cameras, 1), size)
     works["fit"] = fit
     for step in ("teacher", "bake", "compensate"):
         if step == "teacher" and not recipe.teacher:
             continue
-        config, work = getattr(preset, step), Work(gaussians=count)
+        config, work = getattr(preset, step), Work(step, count)
         poses = config.iterations * config.poses_per_step
         work.look(poses * config.views, size)
         work.look(rates.drawn * config.evaluations * measured, size)
         work.seconds += rates.pose_s[step] * poses
         pretrain = getattr(config, "pretrain", None)
         if pretrain is not None:
-            name = "pretrain" if step == "teacher" else "field"
-            work.seconds += rates.pose_s[name] * pretrain.iterations * pretrain.batch
+            a_pose = rates.pose_s["pretrain"]
+            if step == "bake":
+                a_pose = rates.pose_s["field"] * 1e-3 * (preset.control_points or 2400)
+            work.seconds += a_pose * pretrain.iterations * pretrain.batch
         works[step] = work
     track = preset.teacher.track
     if recipe.follows and track is not None:
         frames = facts.frames - facts.held_out_frames
         for level in track.levels:
-            views = min(track.views, facts.cameras - facts.held_out_cameras)
-            works["teacher"].look(frames * level.steps * views, size, level.halvings)
-        works["teacher"].seconds += rates.frame_s * frames
+            # A frame's photographs are read once, for all of its steps.
+            cameras = facts.cameras - facts.held_out_cameras
+            looks, reads = frames * level.steps * min(track.views, cameras), frames * cameras / len(track.levels)
+            works["teacher"].look(looks, size, level.halvings, reads=reads)
+        for step in ("teacher", "bake", "compensate"):
+            works[step].seconds += rates.frame_s[step] * frames
         if recipe.cloth is not None:
-            works["cloth"] = Work(seconds=rates.cloth_s * frames)
+            works["cloth"] = Work("cloth", seconds=rates.frame_s["cloth"] * frames)
     return works
 
 
 def _refinement(config: RefineConfig, facts: Facts) -> Work:
     """Return the looks of a refinement: passes over all frames, then start and result drawn once more."""
-    work, cameras = Work(gaussians=config.sampling.count), facts.cameras - facts.held_out_cameras
+    work, cameras = Work("refine", config.sampling.count), facts.cameras - facts.held_out_cameras
     for level in config.levels:
         work.look(facts.frames * cameras * (level.steps + 1), facts.megapixels, level.halvings)
     work.look(0.8 * facts.frames * cameras, facts.megapixels, config.levels[-1].halvings)

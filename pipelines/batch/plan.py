@@ -206,8 +206,8 @@ def training_costs(facts: Facts, rates: Rates, options: Mapping[str, Any], *, gp
         hours = seconds[step] / 3600.0
         hours = rates.train_gpu_hours[name] * seconds[step] / whole if gpu else hours
         kept = 1e-3 * rates.run_mb / 2.0 / len(works)
-        looks = Cost(factor * hours, factor * hours * gpu, 1e-3 * image_mb * work.looks, kept, 2.0 * work.looks, 3.0)
-        out[step] = looks
+        cost = Cost(factor * hours, factor * hours * gpu, 1e-3 * image_mb * work.reads, kept, 2.0 * work.reads, 3.0)
+        out[step] = cost
     return out
 
 
@@ -298,7 +298,9 @@ def read_rates(path: Path | None) -> tuple[Rates, Site]:
         content["train_gpu_hours"] = {**Rates().train_gpu_hours, **content["train_gpu_hours"]}
     if "training" in content:
         require_known(f"rates {path}: training", content["training"], [one.name for one in fields(TrainingRates)])
-        content["training"] = replace(TrainingRates(), **content["training"])
+        own, given = TrainingRates(), content["training"]
+        merged = {k: {**getattr(own, k), **v} if isinstance(v, dict) else v for k, v in given.items()}
+        content["training"] = replace(own, **merged)
     return Rates(**content), Site(**site)
 
 

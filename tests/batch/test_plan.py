@@ -61,11 +61,12 @@ def test_what_a_site_lacks_is_said_first():
 def test_rates_of_a_file_replace_ours(tmp_path):
     path = tmp_path / "rates.json"
     given = {"build_s": [99, 1], "train_gpu_hours": {"gpu": 7}, "site": {"gpus": 4, "disk_tb": 2.5}}
-    given |= {"training": {"look_s": 2.0}}
+    given |= {"training": {"look_s": 2.0, "start_s": {"fit": 1.0}}}
     path.write_text(json.dumps(given))
     rates, site = read_rates(path)
     assert (rates.build_s, rates.register_s, site.gpus, site.disk_tb) == ((99, 1), Rates().register_s, 4, 2.5)
-    assert rates.training == replace(TrainingRates(), look_s=2.0)
+    starts = {**TrainingRates().start_s, "fit": 1.0}
+    assert rates.training == replace(TrainingRates(), look_s=2.0, start_s=starts)
     assert rates.train_gpu_hours == {**Rates().train_gpu_hours, "gpu": 7}
     for wrong, words in (
         ({"bild_s": 1}, "bild_s"),
@@ -104,8 +105,8 @@ def test_jobs_are_planned_by_their_captures(tmp_path):
 
 
 def test_the_work_of_a_training_follows_from_frames_cameras_pixels_and_options():
-    rates = TrainingRates(start_s=0.0, look_s=0.0, look_s_mp=1.0, look_s_kg=0.0, frame_s=0.0, cloth_s=0.0)
-    rates = replace(rates, pose_s=dict.fromkeys(rates.pose_s, 0.0))
+    nothing = {name: dict.fromkeys(getattr(TrainingRates(), name), 0.0) for name in ("start_s", "pose_s", "frame_s")}
+    rates = TrainingRates(look_s=0.0, look_s_mp=1.0, look_s_kg=0.0, **nothing)
     facts = Facts(50, 7, 0.5, 1.0, held_out_cameras=1, held_out_frames=10, tracked=True)
     options = {"preset": "demo", "teacher_iterations": 250}
 
