@@ -1,6 +1,7 @@
 """Simulate procedural garments in rough motion: breakdowns, stretch, penetration, milliseconds a step.
 
     python -m benchmarks cloth_stress [--garments "long skirt"] [--motions kneel] [--sheet worst.png] [--no-store]
+        [--keep DIR] [--blender PYTHON]
 
 17 garments and hairstyles are made by procedure on the open body in the T-pose, cut as a run cuts its loose parts, and
 stepped through 10 motions of 1.5 s at 30 frames a second, from a cold start each. None of it was fitted to a person.
@@ -11,10 +12,17 @@ stepped through 10 motions of 1.5 s at 30 frames a second, from a cold start eac
 - *inside*: drawn vertices that the simulation moves and that are more than 3 mm inside of the whole body, the mean of
   every sixth frame, and the deepest of the 99 % that are least deep, mm; the collider is coarser than this body.
 - *ms*: CPU milliseconds a step, the median, with the measuring.
+
+`--blender` simulates the same particles, pins and body in Blender, too, by its cloth as it comes (cotton, quality 5,
+collisions 2, at 6 mm), over the same ramp. *own* and *blender* are of the free particles, over lengths along the cloth;
+*blender_s*: its CPU seconds a frame. It is under the GPL: it runs in a process of its own, and nothing here needs it.
 """
 
 from __future__ import annotations
 
+import json
+import subprocess
+import tempfile
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -34,9 +42,12 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.body.model import PosedBody
 from smplxpp.cloth import ClothDriver, DriverConfig, cut_garment
 from smplxpp.cloth import Garment as Simulated
+from smplxpp.cloth.poses import pose_between, reference_facing_as
+from smplxpp.cloth.quality import EdgeLengths
 from smplxpp.core import LABELS, BodyParams, GeometryWarning, InputError, SkinWeights, TriangleMesh
-from smplxpp.core.files import atomic_write_bytes
+from smplxpp.core.files import atomic_write_bytes, atomic_write_text
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.export.fbx import blender_command
 from smplxpp.people.garments.cut import Garment
 from smplxpp.people.garments.loose import hung
 from smplxpp.people.garments.mannequin import Mannequin
@@ -45,6 +56,39 @@ from smplxpp.raster import render_shaded
 from smplxpp.template.template import Template
 
 FPS, SECONDS = 30.0, 1.5
+START = DriverConfig(ramp=0.4, hold=0.2)
+_BLENDER = """
+import struct, sys, time, bpy, numpy as np
+path = sys.argv[-1]
+given, scene = np.load(path), bpy.context.scene
+frames = len(given["body"])
+scene.render.fps, scene.gravity = int(given["fps"]), (0.0, -9.81, 0.0)
+scene.frame_start, scene.frame_end = 1, frames
+def moving(name):
+    points = given[name].astype("<f4")
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(points[0].tolist(), [], given[name + "_faces"].tolist())
+    thing = bpy.data.objects.new(name, mesh)
+    scene.collection.objects.link(thing)
+    with open(path + name + ".pc2", "wb") as file:
+        file.write(struct.pack("<12siiffi", b"POINTCACHE2", 1, points.shape[1], 1.0, 1.0, frames) + points.tobytes())
+    cache = thing.modifiers.new("cache", "MESH_CACHE")
+    cache.cache_format, cache.filepath, cache.frame_start = "PC2", path + name + ".pc2", 1.0
+    return thing
+body, cloth = moving("body"), moving("cloth")
+body.modifiers.new("collision", "COLLISION")
+body.collision.thickness_outer = 0.001
+cloth.vertex_groups.new(name="pins").add(given["pinned"].tolist(), 1.0, "REPLACE")
+made = cloth.modifiers.new("cloth", "CLOTH")
+made.settings.vertex_group_mass, made.collision_settings.distance_min = "pins", 0.006
+made.point_cache.frame_start, made.point_cache.frame_end = 1, frames
+found, began = np.empty((frames, given["cloth"].shape[1], 3), np.float32), time.process_time()
+for k in range(frames):
+    scene.frame_set(k + 1)
+    shape = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    shape.vertices.foreach_get("co", found[k].reshape(-1))
+np.savez(path, cloth=found, seconds=(time.process_time() - began) / frames)
+"""
 GARMENTS = (
     *("mini skirt", "knee skirt", "mid-calf skirt", "long skirt", "flared skirt", "full circle skirt"),
     *("pleated skirt", "dress", "open coat", "cape", "wide trousers, hem 24 cm", "hakama", "wide sleeves"),
@@ -173,6 +217,10 @@ class Stress:
     sheet: Path | None = None
     """A picture of every sixth frame of each row, for looking at; PNG."""
     store: bool = True
+    keep: Path | None = None
+    """Folder of finished cases, a file each: what lies there is not run again, so that a bench may run in pieces."""
+    blender: str | None = None
+    """Blender, or a Python with bpy, to hold each case against."""
     _pictures: tyro.conf.Suppress[list[np.ndarray]] = field(default_factory=list, init=False)
 
     def run(self) -> None:
@@ -181,26 +229,39 @@ class Stress:
         mannequin = Mannequin.of(body, np.zeros(body.num_betas))
         known = wardrobe(mannequin)
         rows: dict[str, dict[str, dict[str, float]]] = {}
-        garments = {name: self._cut(mannequin, known[name]) for name in self.garments}
+        cuts: dict[str, tuple[Template, Simulated] | None] = {}
         for name in self.motions:
             params = motion(body, MOTIONS[name], mannequin.params.betas[0])
             bodies: list[PosedBody] = []
-            for garment, made in garments.items():
-                if made is None:
+            for garment in self.garments:
+                kept = self.keep / f"{garment}-{name}.json".replace(" ", "_").replace(",", "") if self.keep else None
+                if kept is not None and kept.exists():
+                    rows.setdefault(garment, {})[name] = json.loads(kept.read_text())
+                    continue
+                if garment not in cuts:
+                    cuts[garment] = self._cut(mannequin, known[garment])
+                if (made := cuts[garment]) is None:
                     continue
                 template, cut = made
                 bodies = bodies or [template.posed_body(params.frame(k)) for k in range(len(params))]
-                figures = self._stepped(template, cut, params, bodies)
+                figures, ours = self._stepped(template, cut, params, bodies)
+                if self.blender is not None:
+                    figures |= self._peer(made, params, ours)
                 rows.setdefault(garment, {})[name] = figures
+                if kept is not None:
+                    atomic_write_text(kept, json.dumps(figures))
                 print(f"{garment:26s} {name:8s} {figures}", flush=True)
         summary = _summary(rows)
         print(summary)
-        if self.sheet is not None:
+        if self.sheet is not None and self._pictures:
             atomic_write_bytes(self.sheet, encode_png(np.concatenate(self._pictures)))
         if self.store:
-            command = "python -m benchmarks cloth_stress"
+            name = "cloth_stress_blender" if self.blender else "cloth_stress"
+            command = "python -m benchmarks cloth_stress" + " --blender PYTHON" * bool(self.blender)
+            by_motion = {m: _summary({g: {m: found[m]} for g, found in rows.items()}) for m in self.motions}
             flat = {garment: _summary({garment: found}) for garment, found in rows.items()}
-            print(f"stored {store_results('cloth_stress', command, {'all': summary, 'garments': flat}).name}")
+            figures = {"all": summary, "motions": by_motion, "garments": flat}
+            print(f"stored {store_results(name, command, figures).name}")
 
     def _cut(self, mannequin: Mannequin, garment: Garment) -> tuple[Template, Simulated] | None:
         template = dressed(mannequin, garment)
@@ -214,9 +275,10 @@ class Stress:
 
     def _stepped(
         self, template: Template, cut: Simulated, params: BodyParams, bodies: Sequence[PosedBody]
-    ) -> dict[str, float]:
-        driver = ClothDriver(template, [cut], DriverConfig(ramp=0.4, hold=0.2))
-        weights, took, inside, beyond = template.weights.dense(), [], [], 0
+    ) -> tuple[dict[str, float], list[Float[np.ndarray, "n 3"]]]:
+        """What was measured, and where the particles were."""
+        driver = ClothDriver(template, [cut], START)
+        weights, took, inside, particles, beyond = template.weights.dense(), [], [], [], 0
         simulated = np.flatnonzero(np.isin(np.arange(template.vertex_count), cut.vertices[cut.share() > 0.5]))
         some = simulated[:: max(1, len(simulated) // 1500)]
         for k, posed in enumerate(bodies):
@@ -224,6 +286,7 @@ class Stress:
             driver.measure_anew()
             shape = driver.step(params.frame(k), 1.0 / FPS, posed=posed)
             took.append(time.process_time() - begin)
+            particles.append(driver.particles(cut.part).astype(float))
             beyond += driver.quality[0].longest > 1.25 or driver.quality[0].resets > 0
             driver.quality[0] = before.with_(driver.quality[0]) if k else driver.quality[0]
             if k % 6:
@@ -237,7 +300,7 @@ class Stress:
             if self.sheet is not None:
                 self._draw(template, surface, first=k == 0)
         found, depth = driver.quality[0], np.concatenate(inside)
-        return {
+        figures = {
             "beyond": int(beyond),
             "resets": found.resets,
             "longest": round(min(found.longest, 99.0), 2),
@@ -247,6 +310,41 @@ class Stress:
             "released": found.released,
             "ms": round(1e3 * float(np.median(took[1:])), 2),
         }
+        return figures, particles
+
+    def _peer(
+        self, made: tuple[Template, Simulated], params: BodyParams, ours: Sequence[Float[np.ndarray, "n 3"]]
+    ) -> dict[str, float]:
+        """What both have of the free particles, over the same ramp from the pose at rest."""
+        template, cut = made
+        first, ramp, still = params.frame(0), round(START.ramp * FPS), round(START.hold * FPS)
+        start = reference_facing_as(cut.reference, first)
+        way = [pose_between(start, first, (t := k / ramp) * t * (3.0 - 2.0 * t)) for k in range(1, ramp)]
+        lead = [start, start, *way, *[first] * (still + 1)]
+        poses = [*lead, *(params.frame(k) for k in range(1, len(params)))]
+        surfaces = np.array([template.pose(one)[0] for one in poses], np.float32)
+        bodies = surfaces[:, : template.body.vertex_count]
+        with tempfile.TemporaryDirectory() as folder:
+            script, path = Path(folder) / "peer.py", Path(folder) / "case.npz"
+            script.write_text(_BLENDER)
+            np.savez(
+                path,
+                **{"body": bodies, "body_faces": template.body.faces, "pinned": np.flatnonzero(cut.pinned)},
+                **{"cloth": surfaces[:, cut.particles], "cloth_faces": cut.rest.faces, "fps": np.array(FPS)},
+            )
+            subprocess.run([*blender_command(self.blender), str(script), str(path)], check=True, capture_output=True)
+            with np.load(path) as found:
+                theirs, seconds = found["cloth"][len(lead) - 1 :], float(found["seconds"])
+        free, out = ~cut.pinned, {"blender_s": round(seconds, 4)}
+        lengths = EdgeLengths(cut.model().edges, cut.model().lengths, 0.0)
+        skins = [TriangleMesh(body.astype(float), template.body.faces) for body in bodies[len(lead) - 1 :: 6]]
+        solids = [SignedDistanceField(skin, solid=True) for skin in skins]
+        for name, run in (("own", ours), ("blender", theirs.astype(float))):
+            depth = -np.concatenate([solid.query(run[6 * k][free]).distance for k, solid in enumerate(solids)])
+            out[f"{name}_longest"] = round(max(lengths.longest(x.astype(np.float32)) for x in run), 2)
+            out[f"{name}_inside"] = round(100.0 * float((depth > 0.003).mean()), 2)
+            out[f"{name}_deep"] = round(1e3 * max(float(np.quantile(depth, 0.99)), 0.0), 1)
+        return out
 
     def _draw(self, template: Template, surface: Float[np.ndarray, "V 3"], *, first: bool) -> None:
         mesh = template.mesh.with_vertices(surface)
@@ -260,10 +358,16 @@ class Stress:
 
 def _summary(rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
     every = [figures for found in rows.values() for figures in found.values()]
-    total = {name: sum(int(one[name]) for one in every) for name in ("beyond", "resets", "released")}
-    worst = {name: max(one[name] for one in every) for name in ("longest", "drawn")}
-    means = {name: round(float(np.mean([one[name] for one in every])), 2) for name in ("inside", "deep", "ms")}
-    return {"cases": len(every), **total, **worst, **means}
+    out: dict[str, float] = {"cases": len(every)}
+    for name in every[0]:
+        values = [one[name] for one in every]
+        if name in ("beyond", "resets", "released"):
+            out[name] = int(sum(values))
+        elif name.endswith(("longest", "drawn")):
+            out[name] = max(values)
+        else:
+            out[name] = round(float(np.mean(values)), 4 if name.endswith("s") and name != "ms" else 2)
+    return out
 
 
 if __name__ == "__main__":
