@@ -74,7 +74,7 @@ def test_the_largest_piece_is_kept_and_another_body_is_named():
 
 
 def test_a_hull_holds_the_body_and_no_dent():
-    silhouettes = [Silhouette.of(view) for view in dented_views()]
+    silhouettes = [Silhouette.of(view) for view in dented_views(plain=True)]
     hull = soft_hull(silhouettes, BOX, cell=0.04)
     truth = zero_surface(inside_dented, BOX, cell=0.0125)
     outside = SignedDistanceField(hull, solid=True).query(truth.vertices).distance
@@ -84,13 +84,13 @@ def test_a_hull_holds_the_body_and_no_dent():
 
 
 def test_dissent_makes_the_hull_larger():
-    silhouettes = [Silhouette.of(view) for view in dented_views()]
+    silhouettes = [Silhouette.of(view) for view in dented_views(plain=True)]
     volumes = [volume(soft_hull(silhouettes, BOX, cell=0.03, dissent=k)) for k in (0, 1)]
     assert volumes[1] > 1.01 * volumes[0]
 
 
 def test_a_pixel_takes_as_many_metres_as_it_is_far():
-    silhouettes = [Silhouette.of(view) for view in dented_views()]
+    silhouettes = [Silhouette.of(view) for view in dented_views(plain=True)]
     camera = silhouettes[0].camera
     expected = np.linalg.norm(camera.position) / camera.K[0, 0]
     assert pixel_footprint(silhouettes, np.zeros(3)) == pytest.approx(expected, rel=1e-6)
