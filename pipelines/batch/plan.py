@@ -297,9 +297,14 @@ def read_rates(path: Path | None) -> tuple[Rates, Site]:
     if "train_gpu_hours" in content:
         content["train_gpu_hours"] = {**Rates().train_gpu_hours, **content["train_gpu_hours"]}
     if "training" in content:
-        require_known(f"rates {path}: training", content["training"], [one.name for one in fields(TrainingRates)])
-        own, given = TrainingRates(), content["training"]
-        merged = {k: {**getattr(own, k), **v} if isinstance(v, dict) else v for k, v in given.items()}
+        own, given = TrainingRates(), as_object(content["training"], subject=f"rates {path}: training")
+        require_known(f"rates {path}: training", given, [one.name for one in fields(TrainingRates)])
+        merged: dict[str, Any] = dict(given)
+        for name, usual in ((name, getattr(own, name)) for name in given):
+            if isinstance(usual, dict):
+                merged[name] = {**usual, **as_object(given[name], subject=f"rates {path}: training: {name}")}
+            else:
+                merged[name] = as_number(given[name], subject=f"rates {path}: training: {name}", least=0.0)
         content["training"] = replace(own, **merged)
     return Rates(**content), Site(**site)
 

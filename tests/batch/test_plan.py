@@ -72,6 +72,9 @@ def test_rates_of_a_file_replace_ours(tmp_path):
         ({"bild_s": 1}, "bild_s"),
         ({"build_s": [-1, 0]}, "build_s"),
         ({"training": {"loock": 1}}, "loock"),
+        ({"training": [1]}, "training"),
+        ({"training": {"start_s": 1.0}}, "start_s"),
+        ({"training": {"look_s": {"fit": 1.0}}}, "look_s"),
         ({"site": {"gpu": 1}}, "gpu"),
     ):
         path.write_text(json.dumps(wrong))
