@@ -198,12 +198,16 @@ def serve(tmp_path) -> Iterator[Callable[..., Served]]:
 
 
 def test_several_talk_at_once_and_one_more_is_told_to_wait(serve):
-    it = serve(sessions=2, partner=Script(("One. ", "...", "Two.")))
+    partner = Script(("One. ", "...", "Two."))
+    it = serve(sessions=2, partner=partner)
     with it.open() as first, it.open() as second:
         for page, words in ((first, "a"), (second, "b")):
             assert told(page, "hello")
             page.send(json.dumps({"kind": "say", "text": words}))
             assert told(page, "heard")["text"] == words
+            # The first one that is asked waits in its answer: that has to be the first page.
+            while not partner.asked:
+                time.sleep(0.01)
         assert told(second, "answered")["turn"] == 1
         with it.open() as third, pytest.raises(ConnectionClosed) as closed:
             third.recv(timeout=LIMIT)
