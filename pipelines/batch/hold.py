@@ -21,13 +21,13 @@ import json
 import os
 import secrets
 import socket
-import tempfile
 import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from pipelines.batch.records import now
+from smplxpp.core.claims import age_of, process_runs
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text, try_lock
 from smplxpp.core.files.json_file import as_object, parse_json
@@ -129,25 +129,6 @@ def read_holder(path: Path) -> dict[str, Any]:
         return as_object(parse_json(text, subject="lock"), subject="lock") if text else {}
     except (OSError, InputError):
         return {}
-
-
-def age_of(path: Path) -> float:
-    """Return the seconds since a file was changed, by the clock of the machine that keeps the disk."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".clock.") as clock:
-        return os.stat(clock.name).st_mtime - os.stat(path).st_mtime
-
-
-def process_runs(pid: int) -> bool:
-    """Return whether this machine has a process of this number."""
-    if pid <= 0:
-        return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # another user's
-        return True
-    return True
 
 
 def at_work(path: Path, *, stale: float = 120.0) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from smplxpp.core.claims import age_of, process_runs
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.core.files.atomic import atomic_write_text
@@ -92,7 +93,7 @@ class Board:
         """Return whether this process is the first that asks for a name."""
         try:
             (self.folder / name).touch(exist_ok=False)
-        except OSError:
+        except FileExistsError:
             return False
         return True
 
@@ -111,12 +112,8 @@ class Board:
         """Begin a chunk unless another process has begun it; one that is silent for ten minutes counts as lost."""
         lost_after = 600.0  # seconds
         claim = file.with_suffix(".claim")
-        with suppress(OSError):
-            # The disk's own clock: machines may disagree.
-            probe = self.folder / f".clock.{os.getpid()}"
-            probe.touch()
-            silent = probe.stat().st_mtime - claim.stat().st_mtime
-            if silent > lost_after or _is_dead(_who_of(claim)):
+        with suppress(FileNotFoundError):  # nobody has begun it, or it is over
+            if age_of(claim) > lost_after or _is_dead(_who_of(claim)):
                 claim.unlink()
         if not self.first(claim.name):
             return False
@@ -134,12 +131,4 @@ def _who_of(claim: Path) -> str:
 def _is_dead(who: str) -> bool:
     """Return whether a claim is of a process of this machine that has ended."""
     node, _, process = who.rpartition(" ")
-    if node != platform.node() or not process.isdigit():
-        return False
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return True
-    except OSError:
-        return False
-    return False
+    return node == platform.node() and process.isdigit() and not process_runs(int(process))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -107,3 +109,13 @@ def test_a_chunk_of_a_process_that_died_is_computed_again(tmp_path, monkeypatch)
     board.end("next")
     with pytest.raises(OvertakenError):
         board.gather("next", 1, compute)
+
+
+def test_a_disk_that_takes_no_claim_ends_the_work_and_makes_nobody_wait(tmp_path, monkeypatch):
+    def full(self, **options):
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    board = Board(tmp_path)
+    monkeypatch.setattr(Path, "touch", full)
+    with pytest.raises(OSError, match="no space"):
+        board.gather("pass_00", 1, lambda chunk: {"sum": np.zeros(1)})
