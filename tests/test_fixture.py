@@ -9,8 +9,6 @@ import igl
 import numpy as np
 import pytest
 
-from pipelines.synth.checks import depths, free_edge_strain
-from pipelines.synth.simulate import Take
 from smplxpp.body import load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core import BodyParams, TriangleMesh
@@ -19,6 +17,8 @@ from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.fixture_person import load_person
 from smplxpp.raster import rasterize_mesh
 from smplxpp.skinning import skin
+from smplxpp.synth.checks import depths, free_edge_strain
+from smplxpp.synth.simulate import Take
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "fixtures" / "person"
 

@@ -19,8 +19,8 @@ from pipelines.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("smplxpp", "avatar", "pipelines")
-TOP = {"build", "people"}
-"""Rooms above the stages, which nothing of the package imports: the order of the stages, and procedural people."""
+TOP = {"build", "people", "synth"}
+"""Rooms above the stages, which nothing below imports: the stages in order, procedural people, captures of them."""
 SHARED = {"core", "native", "raster", "skinning", "body", "template", "cloth", "data"}
 STAGES = {
     "capture",
@@ -55,7 +55,6 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"figures"},
         {"stages"},
         {"report"},
-        {"synth"},
         {"captures"},
         {"ablation"},
         {"batch"},
@@ -69,12 +68,11 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
 # Rooms that reach even less than what lies below them.
 NARROW = {
     "avatar.evaluation": {"training", "baselines"},
-    "pipelines.synth": {"runs", "stages", "report"},
-    "pipelines.captures": {"stages", "synth"},
-    "pipelines.batch": {"stages", "report", "synth", "captures", "ablation"},
-    "pipelines.viewer": {"report", "synth", "captures", "ablation"},
-    "pipelines.chat": {"runs", "figures", "stages", "report", "synth", "captures", "ablation", "viewer"},
-    "pipelines.web": {"runs", "figures", "stages", "report", "synth", "captures", "ablation", "viewer"},
+    "pipelines.captures": {"stages"},
+    "pipelines.batch": {"stages", "report", "captures", "ablation"},
+    "pipelines.viewer": {"report", "captures", "ablation"},
+    "pipelines.chat": {"runs", "figures", "stages", "report", "captures", "ablation", "viewer"},
+    "pipelines.web": {"runs", "figures", "stages", "report", "captures", "ablation", "viewer"},
 }
 
 

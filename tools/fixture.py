@@ -16,8 +16,6 @@ import tyro
 from jaxtyping import Float, Float32
 
 from pipelines.commands.options import OptionalPath
-from pipelines.synth.config import SynthConfig
-from pipelines.synth.make_capture import add_tracked_inputs, make_capture
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture.writers.frame_files import save_compact
 from smplxpp.core import BodyParams, TriangleMesh
@@ -31,6 +29,8 @@ from smplxpp.people.fixture_person import (
     face_landmarks,
     face_marks,
 )
+from smplxpp.synth.config import SynthConfig
+from smplxpp.synth.write_capture import add_tracked_inputs, make_capture
 from tools.anny_base import BaseMesh, load_base
 from tools.garments import DressForm, make_shirt, make_shoes, make_skirt
 from tools.hair import make_hair

@@ -10,11 +10,9 @@ from jaxtyping import Bool, Float64
 
 from avatar.speech.standing_body import StandingBody
 from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.body.named_poses import ARM_JOINTS, ARM_POSES, MIRROR, ArmPose
 from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
-MIRROR = np.array([1.0, -1.0, -1.0])
-"""Factors that take a rotation vector of the left side to the mirrored one of the right side."""
-ARM_JOINTS = ("shoulder", "elbow", "wrist")
 MAX_DEVIATION = np.radians(20.0)
 """Largest rotation, in radians, between a joint of a gesture and the nearest observed arm."""
 STATE_SIZE = 22
@@ -24,51 +22,6 @@ _ARM_ROWS = {side: [SMPLX_JOINTS.index(f"{side}_{name}") - 1 for name in ARM_JOI
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 
 
-@dataclass(frozen=True)
-class ArmPose:
-    """A pose of the left arm in degrees, from the T-pose; the right arm's is its mirror image.
-
-    Attributes:
-        down: lowering of the upper arm.
-        forward: its swing to the front after that.
-        inward: rotation about its own axis; positive values bring a bent forearm before the body.
-        bend: flexion of the elbow.
-        palm: rotation of the hand about the forearm.
-        fingers: flexion a joint, of the index finger and of the other fingers.
-    """
-
-    down: float
-    forward: float
-    inward: float
-    bend: float
-    palm: float = 0.0
-    fingers: tuple[float, float] = (12.0, 16.0)
-
-    @property
-    def rotations(self) -> Float64[np.ndarray, "3 3"]:
-        """Rotation vectors of the left `ARM_JOINTS`, radians."""
-        down, forward, inward, bend, palm = np.radians([self.down, self.forward, self.inward, self.bend, self.palm])
-
-        def rotation(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
-            return matrix_from_rotvec(angle * np.eye(3)[axis])
-
-        # From right to left: about the arm's own axis x, down about z, then to the front about x of the body.
-        shoulder = rotation(0, -forward) @ rotation(2, -down) @ rotation(0, inward)
-        return np.stack([rotvec_from_matrix(shoulder), [0.0, -bend, 0.0], [palm, 0.0, 0.0]])
-
-
-ARM_POSES = {
-    "hanging": ArmPose(66, 3, 0, 14),
-    "belly": ArmPose(68, 12, 20, 76, 10, (16.0, 22.0)),
-    "front": ArmPose(68, 16, 4, 80, 20, (6.0, 8.0)),
-    "offered": ArmPose(62, 12, -22, 68, -60, (4.0, 6.0)),
-    "raised": ArmPose(60, 24, 6, 108, -10, (8.0, 14.0)),
-    "chest": ArmPose(60, 25, 38, 110, 0, (10.0, 12.0)),
-    "low": ArmPose(62, 12, 2, 44, 15, (14.0, 20.0)),
-    "wide": ArmPose(46, 14, -10, 54, -35, (3.0, 4.0)),
-    "counting": ArmPose(60, 26, 14, 100, 30, (2.0, 48.0)),
-}
-"""Poses of an arm by name."""
 _SYMMETRIC = ("belly", "front", "offered", "wide", "low", "raised")
 _ASYMMETRIC = (
     *(("raised", "low"), ("belly", "offered"), ("front", "belly"), ("counting", "belly"), ("hanging", "chest")),

@@ -28,7 +28,6 @@ from scipy.spatial import cKDTree
 
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
-from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import simplify
 from smplxpp.core import LABELS, BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
@@ -36,6 +35,7 @@ from smplxpp.people import CAST, OUTSIDERS, PersonScan, person
 from smplxpp.people.outside import reachable
 from smplxpp.people.textures import smooth_noise
 from smplxpp.segment import label_by_body
+from smplxpp.synth.tracker import tracker_noise
 
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 _RINGS, _NOISE = 6, 0.003

@@ -34,11 +34,11 @@ from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS, STUDENT
 from pipelines.stages.scene import TrainInputs, open_scene
-from pipelines.synth.tracker import tracker_noise
 from smplxpp.cloth import ClothDriver, ClothShape, Garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.poses import CausalSmoother
 from smplxpp.core import BodyParams, InputError, TriangleMesh
+from smplxpp.synth.tracker import tracker_noise
 
 SAMPLES = 50_000
 MOVED = 5e-4

@@ -26,12 +26,12 @@ from avatar.runtime import AvatarPlayer
 from benchmarks.support.results import FIXTURE, store_results
 from pipelines.commands.templates import export_bundle
 from pipelines.stages.run_inputs import params_in_use
-from pipelines.synth.views import LitFrame, hidden_faces, normal_map, render_view
 from smplxpp.capture import Capture, open_capture
 from smplxpp.core.light import Irradiance, Relighting, panoramas
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.people.fixture_person import person_of, read_layers
 from smplxpp.raster.soft_light import LightConfig, environment_light, stage_light, vertex_light
+from smplxpp.synth.views import LitFrame, hidden_faces, normal_map, render_view
 
 _LIGHT = LightConfig(directions=144)
 

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.support.results import store_results
-from pipelines.synth.tracker import estimated_labels
 from smplxpp.capture.cameras import read_cameras
 from smplxpp.core.labels import BACKGROUND, LABELS
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.segment import map_labels, read_label_map, read_labels, segment_scan, vote_on_faces
+from smplxpp.synth.tracker import estimated_labels
 
 
 def corrupt(label_map: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -40,7 +40,7 @@ def corrupt(label_map: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def tracked(label_maps: list[np.ndarray], seed: int) -> list[np.ndarray]:
-    """The maps with a parser's errors (`pipelines.synth.tracker.estimated_labels`)."""
+    """The maps with a parser's errors (`smplxpp.synth.tracker.estimated_labels`)."""
     numbers = [(labels - BACKGROUND).astype(np.uint8) for labels in label_maps]
     found = [estimated_labels(labels, seed=[seed, k], background=[0]) for k, labels in enumerate(numbers)]
     return [labels.astype(np.int64) + BACKGROUND for labels in found]

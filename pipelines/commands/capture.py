@@ -286,8 +286,8 @@ class CaptureDegradeCommand:
 
     def run(self) -> dict:
         """Degrade the capture and return a summary."""
-        from pipelines.synth.degrade import DegradeConfig, degrade_capture
         from smplxpp.body import load_body
+        from smplxpp.synth.degrade import DegradeConfig, degrade_capture
 
         config = DegradeConfig(seed=self.seed, copy=self.copy, rig=self.rig, size=self.size)
         body = None if self.body is None else load_body(self.body)

@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
-from pipelines.synth.config import SynthConfig, motion_kind
-from pipelines.synth.make_capture import make_capture
 from smplxpp.core import InputError, require_at_least, require_between, require_choice
 from smplxpp.core.files.panorama_file import read_panorama
 from smplxpp.people.fixture_person import CLOTHES
 from smplxpp.raster.soft_light import Environment
+from smplxpp.synth.config import SynthConfig, motion_kind
+from smplxpp.synth.write_capture import make_capture
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 

@@ -6,6 +6,7 @@ Angles follow SMPL-X's T-pose (x to the person's left, y up, z to the front; joi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,6 +14,9 @@ from jaxtyping import Float64
 from smplxpp.body.layout import JOINT_NAMES, SMPLX_JOINTS
 from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
 
+MIRROR = np.array([1.0, -1.0, -1.0])
+"""Factors that take a rotation vector of the left side to the mirrored one of the right side."""
+ARM_JOINTS = ("shoulder", "elbow", "wrist")
 _Rotations = Mapping[str, tuple[tuple[float, float, float], ...]]
 # Rotation vectors of the left side's joints, degrees, of which the first is applied last; the right side is the mirror
 # image. Arms of the T-pose point along x: a rotation about -z lowers them, about x twists them, about -y takes them
@@ -123,13 +127,12 @@ def rare_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, "J 3
 
 def _pose_of(joint_count: int, *parts: _Rotations, trunk: _Rotations | None = None) -> Float64[np.ndarray, "J 3"]:
     """Return the axis-angle vectors of left arm, right arm, left leg, right leg and trunk, other joints at rest."""
-    mirror = np.array([1.0, -1.0, -1.0])
     place = {name: k for k, name in enumerate(JOINT_NAMES[joint_count])}
     out = np.tile(np.eye(3), (joint_count, 1, 1))
     for side, rotations in zip(("left", "right", "left", "right"), parts, strict=True):
         for joint, vectors in rotations.items():
             for vector in vectors:
-                degrees = np.array(vector, dtype=np.float64) * (1.0 if side == "left" else mirror)
+                degrees = np.array(vector, dtype=np.float64) * (1.0 if side == "left" else MIRROR)
                 k = place[f"{side}_{joint}"]
                 out[k] = out[k] @ matrix_from_rotvec(np.radians(degrees))
     for joint, vectors in (trunk or {}).items():
@@ -240,3 +243,50 @@ def _posed(reference: BodyParams, poses: Mapping[str, Mapping[str, tuple[float, 
         expression=np.zeros((count, first.expression.shape[1])),
         transl=np.repeat(first.transl, count, axis=0),
     )
+
+
+@dataclass(frozen=True)
+class ArmPose:
+    """A pose of the left arm in degrees, from the T-pose; the right arm's is its mirror image.
+
+    Attributes:
+        down: lowering of the upper arm.
+        forward: its swing to the front after that.
+        inward: rotation about its own axis; positive values bring a bent forearm before the body.
+        bend: flexion of the elbow.
+        palm: rotation of the hand about the forearm.
+        fingers: flexion a joint, of the index finger and of the other fingers.
+    """
+
+    down: float
+    forward: float
+    inward: float
+    bend: float
+    palm: float = 0.0
+    fingers: tuple[float, float] = (12.0, 16.0)
+
+    @property
+    def rotations(self) -> Float64[np.ndarray, "3 3"]:
+        """Rotation vectors of the left `ARM_JOINTS`, radians."""
+        down, forward, inward, bend, palm = np.radians([self.down, self.forward, self.inward, self.bend, self.palm])
+
+        def rotation(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
+            return matrix_from_rotvec(angle * np.eye(3)[axis])
+
+        # From right to left: about the arm's own axis x, down about z, then to the front about x of the body.
+        shoulder = rotation(0, -forward) @ rotation(2, -down) @ rotation(0, inward)
+        return np.stack([rotvec_from_matrix(shoulder), [0.0, -bend, 0.0], [palm, 0.0, 0.0]])
+
+
+ARM_POSES = {
+    "hanging": ArmPose(66, 3, 0, 14),
+    "belly": ArmPose(68, 12, 20, 76, 10, (16.0, 22.0)),
+    "front": ArmPose(68, 16, 4, 80, 20, (6.0, 8.0)),
+    "offered": ArmPose(62, 12, -22, 68, -60, (4.0, 6.0)),
+    "raised": ArmPose(60, 24, 6, 108, -10, (8.0, 14.0)),
+    "chest": ArmPose(60, 25, 38, 110, 0, (10.0, 12.0)),
+    "low": ArmPose(62, 12, 2, 44, 15, (14.0, 20.0)),
+    "wide": ArmPose(46, 14, -10, 54, -35, (3.0, 4.0)),
+    "counting": ArmPose(60, 26, 14, 100, 30, (2.0, 48.0)),
+}
+"""Poses of an arm by name."""

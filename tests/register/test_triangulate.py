@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.synth.motion import Performance
-from pipelines.synth.tracker import DetectorConfig, detector_keypoints
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture.camera_rig import camera_rig
@@ -17,6 +15,8 @@ from smplxpp.core import Camera, InputError, Keypoints2D, matrix_from_rotvec
 from smplxpp.people.fixture_person import PERSON_BETAS
 from smplxpp.register.keypoint_faults import mirror_index, number_ranges
 from smplxpp.register.triangulate import Triangulation, TriangulationConfig, triangulate
+from smplxpp.synth.motion import Performance
+from smplxpp.synth.tracker import DetectorConfig, detector_keypoints
 
 FRAMES, SIZE = 12, 640
 EXACT = DetectorConfig(pixels=1e-9, outliers=0.0, missing=0.0)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.build.locate import certain_labels
 from smplxpp.clean import simplify
@@ -22,6 +21,7 @@ from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.segment import UNSURE, SegmentedScan, label_by_body, read_labels, segment_scan
 from smplxpp.segment.by_body_outfit import NAT, RUNS, OutfitConfig, find_outfit, label_shares
 from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
+from smplxpp.synth.tracker import tracker_noise
 
 PERSON = Path(__file__).resolve().parents[2] / "data/fixtures/person"
 _SKIN_RGB, _BLUE, _GREY = (222, 176, 150), (58, 98, 170), (90, 90, 94)

@@ -7,11 +7,11 @@ from unittest import mock
 
 import pytest
 
-from pipelines.synth import make_capture
 from smplxpp.core.files.array_file import write_arrays
+from smplxpp.synth import write_capture
 
 
 @pytest.fixture(scope="session", autouse=True)
 def packed_fast() -> Iterator[None]:
-    with mock.patch.object(make_capture, "save_compact", write_arrays):
+    with mock.patch.object(write_capture, "save_compact", write_arrays):
         yield

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.synth.views import LitFrame, hidden_faces, normal_map, render_view
 from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.core.light import Irradiance, Relighting
 from smplxpp.people.fixture_person import load_person
 from smplxpp.raster.soft_light import Environment, LightConfig, environment_light, stage_light, vertex_light
+from smplxpp.synth.views import LitFrame, hidden_faces, normal_map, render_view
 from tests.core.test_light import evening
 from tests.synth.test_synth import FIXTURE, TOPOLOGY, slab
 

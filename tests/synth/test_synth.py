@@ -11,11 +11,6 @@ import pytest
 from PIL import Image
 
 from pipelines.cli import main
-from pipelines.synth.config import SynthConfig, split_frames
-from pipelines.synth.make_capture import make_capture
-from pipelines.synth.motion import Performance
-from pipelines.synth.simulate import SimulationConfig
-from pipelines.synth.views import LitFrame, normal_map, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
 from smplxpp.capture.camera_rig import camera_rig
@@ -26,6 +21,11 @@ from smplxpp.core import InputError, TriangleMesh
 from smplxpp.people.fixture_person import load_person
 from smplxpp.raster import rasterize_mesh
 from smplxpp.raster.soft_light import Environment, LightConfig, bounced, vertex_light
+from smplxpp.synth.config import SynthConfig, split_frames
+from smplxpp.synth.motion import Performance
+from smplxpp.synth.simulate import SimulationConfig
+from smplxpp.synth.views import LitFrame, normal_map, render_view
+from smplxpp.synth.write_capture import make_capture
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 TOPOLOGY = FIXTURE / "geometry" / "topology.npz"

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.synth.checks import depths, free_edge_strain
-from pipelines.synth.garment_dynamics import ContactSurface, GarmentConfig, GarmentDynamics
-from pipelines.synth.motion import Performance
-from pipelines.synth.simulate import HairLag, SimulationConfig, simulate
 from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from smplxpp.people.fixture_person import load_person
+from smplxpp.synth.checks import depths, free_edge_strain
+from smplxpp.synth.garment_dynamics import ContactSurface, GarmentConfig, GarmentDynamics
+from smplxpp.synth.motion import Performance
+from smplxpp.synth.simulate import HairLag, SimulationConfig, simulate
 from tests.cloth.sheets import ball, hanging, held, lying
 
 TOPOLOGY = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person" / "geometry" / "topology.npz"

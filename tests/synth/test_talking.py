@@ -11,12 +11,6 @@ import pytest
 
 from pipelines.cli import main
 from pipelines.commands.synth import Synth
-from pipelines.synth.config import SynthConfig
-from pipelines.synth.make_capture import make_capture
-from pipelines.synth.motion import Performance
-from pipelines.synth.simulate import SimulationConfig, _Stage, attachment
-from pipelines.synth.talking import GESTURES, Talking
-from pipelines.synth.views import Atlas, LitFrame, _cell_centers, paint_atlas, render_view
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import open_capture
@@ -25,6 +19,12 @@ from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.fixture_person import load_person, read_layers
 from smplxpp.raster.soft_light import LightConfig
+from smplxpp.synth.config import SynthConfig
+from smplxpp.synth.motion import Performance
+from smplxpp.synth.simulate import SimulationConfig, _Stage, attachment
+from smplxpp.synth.talking import GESTURES, Talking
+from smplxpp.synth.views import Atlas, LitFrame, _cell_centers, paint_atlas, render_view
+from smplxpp.synth.write_capture import make_capture
 
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 TOPOLOGY = FIXTURE / "geometry" / "topology.npz"

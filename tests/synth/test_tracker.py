@@ -10,12 +10,12 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from pipelines.cli import main
-from pipelines.synth.make_capture import add_tracked_inputs
-from pipelines.synth.tracker import DetectorConfig, detector_keypoints, estimated_labels
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.core import BodyParams, Camera, InputError
+from smplxpp.synth.tracker import DetectorConfig, detector_keypoints, estimated_labels
+from smplxpp.synth.write_capture import add_tracked_inputs
 from tests.capture.scene import LENS, make_scene
 from tests.capture.writers import write_simple
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.synth.motion import Turntable, relaxed_pose
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core import matrix_from_rotvec
+from smplxpp.synth.motion import Turntable, relaxed_pose
 
 
 def test_one_turn_with_limbs_that_are_not_held_still():

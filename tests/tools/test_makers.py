@@ -8,14 +8,14 @@ import igl
 import numpy as np
 import pytest
 
-from pipelines.synth.motion import Performance
-from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import load_body
 from smplxpp.core import TriangleMesh, matrix_from_rotvec
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.cloth_mesh import ClothMesh, clip, diffuse, lift_outside, loop_subdivide, smooth
 from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
 from smplxpp.people.textures import band
+from smplxpp.synth.motion import Performance
+from smplxpp.synth.tracker import tracker_noise
 from tools.anny_base import JOINT_NAMES, PARENTS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -17,13 +17,13 @@ import pytest
 
 from avatar.runtime import AvatarPlayer, load_bundle
 from avatar.speech import Face, Speech, articulate
-from avatar.speech.gesture_lexicon import ARM_JOINTS
 from avatar.speech.gesture_planner import GesturePlanner
 from avatar.speech.phonemes import Phoneme
 from pipelines.web.page import PageContent, page_files
 from pipelines.web.server import PageServer
 from smplxpp.body.blendshapes import ARKIT
 from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.body.named_poses import ARM_JOINTS
 from smplxpp.core.files.sound_file import wave_bytes
 from smplxpp.core.files.tensor_bytes import unpack_tensors
 from tests.web.avatars import BACKGROUND, NAME, asked, camera, decibels, motion

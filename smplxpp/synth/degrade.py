@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.synth import tracked_inputs as tracked
-from pipelines.synth.tracker import tracker_noise
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.camera_rig import camera_rig
@@ -19,6 +17,17 @@ from smplxpp.capture.writers.frame_files import save_params_by_row
 from smplxpp.capture.writers.metadata import write_cameras_json, write_description
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_at_least
 from smplxpp.core.files import atomic_folder, atomic_write_text, read_json
+from smplxpp.synth.tracker import (
+    ESTIMATED_LABELS,
+    EXACT_PARAMETERS,
+    INPUTS,
+    KEYPOINTS,
+    TRACKED_PARAMETERS,
+    protocols,
+    tracker_noise,
+    write_estimated_labels,
+    write_tracked_keypoints,
+)
 
 _DESCRIPTIONS = ("capture.json", "manifest.json")
 
@@ -106,22 +115,20 @@ def degrade_capture(
         else:
             shown = capture
         if shown.cameras:
-            tracked.write_tracked_keypoints(
+            write_tracked_keypoints(
                 root, shown, body, params, seed=config.seed, progress=lambda share: progress("keypoints", share)
             )
         else:
             left_out.append("keypoints: the capture has no cameras; --rig N makes a ring of them")
-        wrong = tracked.write_estimated_labels(
-            root, shown, seed=config.seed, progress=lambda share: progress("labels", share)
-        )
+        wrong = write_estimated_labels(root, shown, seed=config.seed, progress=lambda share: progress("labels", share))
         has = {kind: any(capture.recording.files.get(kind, {}).values()) for kind in ("label", "normal")}
         if not has["label"]:
             left_out.append("label maps: the capture has none to degrade")
         if not description:
             write_description(root / _DESCRIPTIONS[0], capture.recording, shown.splits, capture.frames)
             description = _description(root)
-        kinds = tracked.protocols(labels=has["label"], normals=has["normal"], keypoints=bool(shown.cameras))
-        content = {**description, "inputs": description.get("inputs", tracked.INPUTS), "protocols": kinds}
+        kinds = protocols(labels=has["label"], normals=has["normal"], keypoints=bool(shown.cameras))
+        content = {**description, "inputs": description.get("inputs", INPUTS), "protocols": kinds}
         atomic_write_text(root / _DESCRIPTIONS[0], json.dumps(content, indent=1) + "\n")
     return Degraded(out, len(params), len(shown.cameras), wrong, tuple(left_out))
 
@@ -157,7 +164,7 @@ def _link(source: Path, root: Path, *, copy: bool) -> None:
         place = Path(folder).relative_to(source)
         # Keypoints, labels and description of the source are replaced.
         if place == Path():
-            folders[:] = [name for name in folders if name not in (tracked.KEYPOINTS, tracked.ESTIMATED_LABELS)]
+            folders[:] = [name for name in folders if name not in (KEYPOINTS, ESTIMATED_LABELS)]
             files = [name for name in files if name not in _DESCRIPTIONS]
         (root / place).mkdir(parents=True, exist_ok=True)
         for name in sorted(files):
@@ -170,13 +177,11 @@ def _link(source: Path, root: Path, *, copy: bool) -> None:
 
 def _write_params(folder: Path, params: dict[int, BodyParams], seed: int) -> None:
     """Write the files of parameters that the protocols name, where they are missing."""
-    if not (folder / tracked.EXACT_PARAMETERS).exists():
-        save_params_by_row(folder / tracked.EXACT_PARAMETERS, params)
-    if not (folder / tracked.TRACKED_PARAMETERS).exists():
+    if not (folder / EXACT_PARAMETERS).exists():
+        save_params_by_row(folder / EXACT_PARAMETERS, params)
+    if not (folder / TRACKED_PARAMETERS).exists():
         noisy = tracker_noise(BodyParams.concatenate(list(params.values())), seed=seed)
-        save_params_by_row(
-            folder / tracked.TRACKED_PARAMETERS, {frame: noisy.frame(row) for row, frame in enumerate(params)}
-        )
+        save_params_by_row(folder / TRACKED_PARAMETERS, {frame: noisy.frame(row) for row, frame in enumerate(params)})
 
 
 def _write_rig(path: Path, body: BodyModel, params: dict[int, BodyParams], config: DegradeConfig) -> None:

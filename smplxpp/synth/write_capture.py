@@ -11,12 +11,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipelines.synth.checks import scan_checks, take_checks
-from pipelines.synth.config import SynthConfig, motion_kind, split_frames
-from pipelines.synth.simulate import Take, simulate
-from pipelines.synth.tracked_inputs import INPUTS, protocols, write_estimated_labels, write_tracked_keypoints
-from pipelines.synth.tracker import tracker_noise
-from pipelines.synth.views import Atlas, LitFrame, RenderedView, hidden_faces, normal_map, paint_atlas, render_view
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
 from smplxpp.capture.camera_rig import camera_rig
@@ -35,6 +29,11 @@ from smplxpp.people.fixture_person import PART_LABELS, PART_NAMES, Person, perso
 from smplxpp.people.outside import Outside, with_offsets
 from smplxpp.people.scan_simulation import ScanConfig, SimulatedScan, merge_islands, simulate_scan
 from smplxpp.raster.soft_light import Environment, LightConfig, vertex_light
+from smplxpp.synth.checks import scan_checks, take_checks
+from smplxpp.synth.config import SynthConfig, motion_kind, split_frames
+from smplxpp.synth.simulate import Take, simulate
+from smplxpp.synth.tracker import INPUTS, protocols, tracker_noise, write_estimated_labels, write_tracked_keypoints
+from smplxpp.synth.views import Atlas, LitFrame, RenderedView, hidden_faces, normal_map, paint_atlas, render_view
 
 
 def make_capture(

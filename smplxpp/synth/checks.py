@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipelines.synth.simulate import Take
 from smplxpp.core import BodyParams, TriangleMesh, row_lengths
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.fixture_person import PART_NAMES, Person
 from smplxpp.people.scan_simulation import SimulatedScan
+from smplxpp.synth.simulate import Take
 
 _MM = 1e3
 _GARMENTS = ("upper", "lower")

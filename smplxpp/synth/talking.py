@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-from avatar.speech.gesture_lexicon import ARM_JOINTS, ARM_POSES, MIRROR, ArmPose
-from pipelines.synth.motion import JAW_DEGREES, SeededMotion, relaxed_pose, wander
 from smplxpp.body.layout import SMPLX_JOINTS
+from smplxpp.body.named_poses import ARM_JOINTS, ARM_POSES, MIRROR, ArmPose
 from smplxpp.core import BodyParams, require_positive
+from smplxpp.synth.motion import JAW_DEGREES, SeededMotion, relaxed_pose, wander
 
 # Mouth shapes, and looks of the rest of the face, as weights of expressions.
 _VISEMES: tuple[dict[str, float], ...] = (

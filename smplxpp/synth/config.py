@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipelines.synth.motion import Motion, Performance, Turntable
-from pipelines.synth.simulate import SimulationConfig
-from pipelines.synth.talking import Talking
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core.errors import require_at_least, require_choice, require_positive
 from smplxpp.people.fixture_person import CLOTHES
 from smplxpp.people.textures import SKIRT_PATTERNS
 from smplxpp.raster.soft_light import LightConfig
+from smplxpp.synth.motion import Motion, Performance, Turntable
+from smplxpp.synth.simulate import SimulationConfig
+from smplxpp.synth.talking import Talking
 
 
 @dataclass(frozen=True)

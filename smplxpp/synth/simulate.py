@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipelines.synth.garment_dynamics import ContactSurface, GarmentConfig, GarmentDynamics
-from pipelines.synth.motion import Motion
 from smplxpp.core import BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.fixture_person import PART_NAMES, Person, rest_joints
 from smplxpp.people.textures import ramp
+from smplxpp.synth.garment_dynamics import ContactSurface, GarmentConfig, GarmentDynamics
+from smplxpp.synth.motion import Motion
 
 UPPER, LOWER, HAIR = (PART_NAMES.index(name) for name in ("upper", "lower", "hair"))
 
