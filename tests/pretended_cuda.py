@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
@@ -263,6 +264,7 @@ def pretended_cuda() -> Iterator[None]:
             "get_device_name": lambda device=None: "pretended",
         }.items():
             stack.enter_context(mock.patch.object(torch.cuda, name, value))
+        stack.enter_context(mock.patch.object(Tensor, "pin_memory", lambda self: self))
         # What `Module.to` sets in place would stay what it was to Python.
         swapped = torch.__future__.get_swap_module_params_on_conversion()
         stack.callback(torch.__future__.set_swap_module_params_on_conversion, swapped)
@@ -278,28 +280,52 @@ def _rasterize(*tensors: Any) -> Any:
     from avatar.rendering.cpu import rasterize_cpu
 
     assert all(isinstance(one, PretendedTensor) for one in tensors if isinstance(one, Tensor))
-    image, alpha, meta = rasterize_cpu(*(one.cpu() if isinstance(one, Tensor) else one for one in tensors))
-    fields = {field.name: getattr(meta, field.name) for field in dataclasses.fields(meta)}
-    moved = {name: value.to(CUDA) if isinstance(value, Tensor) else value for name, value in fields.items()}
-    return image.to(CUDA), alpha.to(CUDA), dataclasses.replace(meta, **moved)
+    with _uncounted():
+        image, alpha, meta = rasterize_cpu(*(one.cpu() if isinstance(one, Tensor) else one for one in tensors))
+        fields = {field.name: getattr(meta, field.name) for field in dataclasses.fields(meta)}
+        moved = {name: value.to(CUDA) if isinstance(value, Tensor) else value for name, value in fields.items()}
+        return image.to(CUDA), alpha.to(CUDA), dataclasses.replace(meta, **moved)
+
+
+_COUNTED = [True]
+
+
+@contextmanager
+def _uncounted() -> Iterator[None]:
+    _COUNTED[0] = False
+    try:
+        yield
+    finally:
+        _COUNTED[0] = True
 
 
 class CountedWaits(TorchDispatchMode):
     """Counts calls for which a real device would have to be waited for: numbers, and the indices of a mask.
 
-    Copies to the CPU are not counted, because the pretended gsplat makes them.
+    Copies to the CPU are not counted, because the gradients of the pretended gsplat make them.
 
     Attributes:
         count: of such calls, since the mode was entered.
+        calls: of every call by its name, of which each would be a launch or some Python's time.
+        sent: number of copies from the CPU.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.count = 0
+        self.count = self.sent = 0
+        self.calls: Counter[str] = Counter()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if any(isinstance(one, PretendedTensor) for one in _tensors_in(args)):
+        if not _COUNTED[0]:
+            return func(*args, **kwargs)
+        self.calls[str(func)] += 1
+        tensors = _tensors_in(args)
+        ours = [isinstance(one, PretendedTensor) for one in tensors]
+        if any(ours):
             masks = [one for one in _tensors_in(args[1:2]) if one.dtype == torch.bool]
             self.count += func in _WAITS or (func in _INDEXED and bool(masks))
+        if func in _COPIES:
+            to = kwargs.get("device")
+            self.sent += ours == [True, False] or (ours == [False] and to is not None and to.type == "meta")
         return func(*args, **kwargs)

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +20,7 @@ from avatar.rig.rig import Pose, Rig
 from smplxpp.capture import Capture
 from smplxpp.core import BodyParams, Camera, InputError, require_at_least
 from smplxpp.core.spread import spread_inside
+from smplxpp.native import thread_count
 from smplxpp.template.template import Template
 
 
@@ -32,15 +33,19 @@ class SequenceConfig:
         normals: read the capture's normal maps where it has them.
         kept_poses: number of poses kept in memory, the latest used; one has about 1.3 MB for 22k vertices. The
             capture keeps the images, within its own bound.
+        readers: threads that decode images of the next steps; None: one on the CPU, which computes the step, and up to
+            eight beside a GPU.
     """
 
     margin: int = 12
     normals: bool = True
     kept_poses: int = 256
+    readers: int | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("margin", 0), ("kept_poses", 1)):
-            require_at_least(f"sequence: {name}", getattr(self, name), least)
+        for name, least in (("margin", 0), ("kept_poses", 1), ("readers", 1)):
+            if getattr(self, name) is not None:
+                require_at_least(f"sequence: {name}", getattr(self, name), least)
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ class AvatarSequence:
         device: str = "cpu",
         cloth: ClothMotions | None = None,
     ) -> None:
-        # One reader thread: the next step's images are decoded while the current step computes.
+        # Images and, for a GPU, poses of the next steps are made while the current step computes.
         self.capture, self.config, self.device = capture, config or SequenceConfig(), device
         self.rig = Rig(template, device)
         self.train_cameras, self.train_frames = _training_part(capture)
@@ -140,7 +145,11 @@ class AvatarSequence:
         self.cloth = cloth
         self._poses: OrderedDict[int, Pose] = OrderedDict()
         self._expected: dict[tuple[str, int], Future[View]] = {}
-        self._reader = ThreadPoolExecutor(1, thread_name_prefix="views")
+        self._expected_poses: dict[int, Future[Pose]] = {}
+        self._of_gpu = self.rig.device.type == "cuda"
+        readers = self.config.readers or (thread_count(None) if self._of_gpu else 1)
+        self._reader = ThreadPoolExecutor(readers, thread_name_prefix="views")
+        self._poser = ThreadPoolExecutor(1, thread_name_prefix="poses")
 
     def with_cloth(self, cloth: ClothMotions) -> AvatarSequence:
         """Return the sequence with simulated clothes; both share the images."""
@@ -166,7 +175,9 @@ class AvatarSequence:
         """
         # Least recently used poses are dropped, since a sequence may have thousands of frames.
         if frame not in self._poses:
-            self._poses[frame] = self._read_pose(frame)
+            expected = self._expected_poses.pop(frame, None)
+            found = None if expected is None else expected.result().to(self.device)
+            self._poses[frame] = found or self._read_pose(frame)
             if len(self._poses) > self.config.kept_poses:
                 self._poses.popitem(last=False)
         self._poses.move_to_end(frame)
@@ -219,8 +230,10 @@ class AvatarSequence:
         return self.rig.skin(self.pose(self.train_frames[0])).mean(0).cpu().numpy()
 
     def expect(self, items: Sequence[Item]) -> None:
-        """Start to read the views of items in the background."""
+        """Start to read the views of items in the background, and on a GPU their poses."""
         for item in items:
+            if self._of_gpu and item.frame not in self._poses and item.frame not in self._expected_poses:
+                self._expected_poses[item.frame] = self._poser.submit(self._pinned_pose, item.frame)
             for camera in item.cameras:
                 if (camera, item.frame) not in self._expected:
                     read = self._reader.submit(self._read_view, camera, item.frame)
@@ -273,6 +286,10 @@ class AvatarSequence:
             )
         return params
 
+    def _pinned_pose(self, frame: int) -> Pose:
+        """Return the pose of a training frame on the CPU; ten milliseconds of numpy that a GPU would wait for."""
+        return self.rig.pose(self.params(frame), frame=frame, device="cpu").pinned()
+
     def _read_pose(self, frame: int) -> Pose:
         # Training frames keep the number that selects their code; all others may have simulated clothes.
         if frame in self.train_frames:
@@ -297,7 +314,8 @@ class AvatarSequence:
 
     def _read_view(self, camera: str, frame: int) -> View:
         whole = read_view(self.capture, camera, frame, normals=self.config.normals)
-        return whole.cropped(self.config.margin)
+        view = whole.cropped(self.config.margin)
+        return view.pinned() if self._of_gpu else view
 
 
 def camera_centers_of(views: Sequence[View]) -> Float[Tensor, "C 3"]:
@@ -322,5 +340,6 @@ def _training_part(capture: Capture) -> tuple[tuple[str, ...], tuple[int, ...]]:
     return cameras, frames
 
 
+@lru_cache(maxsize=1024)
 def _shuffled(seed: tuple[int, ...], count: int) -> np.ndarray:
     return np.random.default_rng(seed).permutation(count)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -95,9 +95,27 @@ class View:
         return View(camera, small[..., :3].contiguous(), small[..., 3].contiguous(), normals)
 
     def to(self, device: torch.device | str) -> View:
-        """Return the same view on another device."""
-        normals = None if self.normals is None else self.normals.to(device)
-        return View(self.camera, self.foreground.to(device), self.alpha.to(device), normals)
+        """Return the same view on another device; a GPU is not waited for where its memory is pinned."""
+        return self._with(lambda pixels: pixels.to(device, non_blocking=True))
+
+    def pinned(self) -> View:
+        """Return the same view in memory that a GPU reads by itself."""
+        return self._with(torch.Tensor.pin_memory)
+
+    def _with(self, change: Callable[[Tensor], Tensor]) -> View:
+        normals = None if self.normals is None else change(self.normals)
+        changed = View(self.camera, change(self.foreground), change(self.alpha), normals)
+        # All numbers of the camera in one copy.
+        numbers = change(self._numbers)
+        viewmat, K, position = numbers.split([16, 9, 3])
+        vars(changed).update(_numbers=numbers, viewmat=viewmat.view(4, 4), K=K.view(3, 3), position=position)
+        return changed
+
+    @cached_property
+    def _numbers(self) -> Float32[Tensor, " 28"]:
+        camera = self.camera
+        parts = (camera.cam_from_world.ravel(), camera.K.ravel(), camera.position)
+        return torch.tensor(np.concatenate(parts), dtype=torch.float32, device=self.alpha.device)
 
 
 def read_view(capture: Capture, camera: str, frame: int, *, normals: bool = False) -> View:

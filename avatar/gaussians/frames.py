@@ -116,7 +116,10 @@ def triangle_frames_reference(
         # A direction to keep for a triangle without area: its median, else an edge, else the x axis if it is a point.
         along = torch.where((median.norm(dim=-1) > tolerance * lengths)[..., None], median, to_second)
         short = along.norm(dim=-1, keepdim=True) <= tolerance * MIN_EDGE
-        along = torch.where(short, along.new_tensor([1.0, 0.0, 0.0]), along)
+        # The x axis without a copy from the CPU, for which a GPU would be waited.
+        x_axis = torch.zeros_like(along)
+        x_axis[..., 0] = 1.0
+        along = torch.where(short, x_axis, along)
         # The axis that is farthest from `along`, so that the cross product is long.
         axis = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along)
         across = torch.linalg.cross(along, axis)

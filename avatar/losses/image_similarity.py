@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from functools import cache
 from typing import Any, overload
 
 import torch
@@ -38,8 +39,8 @@ def ssim(
 ) -> Float[Tensor, ""]:
     """Return the mean structural similarity of two images over pixels, channels and batch; 1 where they are equal.
 
-    float32 tensors on the CPU go through the fused kernel, everything else through `ssim_reference`. The kernel gives
-    the same bits at any number of threads.
+    float32 tensors on the CPU go through the fused kernel, which gives the same bits at any number of threads. Those on
+    a GPU are blurred along one axis after the other, all others go through `ssim_reference`.
 
     Args:
         x: one image or B of them, in [0, 1]. Gradients flow to it where it requires them.
@@ -52,7 +53,7 @@ def ssim(
         InputError: different shapes, types or devices; a mask without weight; "valid" on images under 11 pixels.
     """
     if not _native(x):
-        return ssim_reference(x, y, mask=mask, padding=padding)
+        return _mean_of_map(ssim_map(x, y, padding=padding), x, y, mask, padding)
     x, y, mask = _checked(x, y, mask, padding)
     return _SsimMean.apply(x, y, mask, _BORDER[padding], torch.is_grad_enabled())
 
@@ -65,7 +66,7 @@ def ssim_map(
     Arguments and errors are those of `ssim`.
     """
     if not _native(x):
-        return ssim_map_reference(x, y, padding=padding)
+        return (_ssim_map_separable if x.is_cuda else ssim_map_reference)(x, y, padding=padding)
     batched = x.dim() == 4
     x, y, _ = _checked(x, y, None, padding)
     value = _SsimMap.apply(x, y, _BORDER[padding])
@@ -80,9 +81,7 @@ def ssim_reference(
     padding: str = "zero",
 ) -> Float[Tensor, ""]:
     """Return `ssim` in plain torch, in the images' own precision and on their device."""
-    value = ssim_map_reference(x, y, padding=padding)
-    _check_images(x, y, mask)
-    return _masked_mean(value, None if mask is None else _inner(mask, _BORDER[padding]))
+    return _mean_of_map(ssim_map_reference(x, y, padding=padding), x, y, mask, padding)
 
 
 def ssim_map_reference(
@@ -93,21 +92,62 @@ def ssim_map_reference(
     x, y, _ = _checked(x, y, None, padding)
     C = x.shape[-1]
     # Separable Gaussian window, then local means, variances and covariance.
-    k = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    g = torch.exp(-(k**2) / (2 * 1.5**2))
-    g = (g / g.sum()).to(x)
+    g = _taps(x.device, x.dtype)
     kernel = torch.outer(g, g).expand(C, 1, WINDOW, WINDOW)
 
     def blur(v: Tensor) -> Tensor:
         return F.conv2d(v, kernel, groups=C, padding=WINDOW // 2 if padding == "zero" else 0)
 
     x, y = x.permute(0, 3, 1, 2), y.permute(0, 3, 1, 2)
-    mu_x, mu_y = blur(x), blur(y)
-    # Biased moments, E[x^2] - E[x]^2; rounding may leave a variance slightly below 0, which C2 covers.
-    var_x, var_y, cov = blur(x * x) - mu_x**2, blur(y * y) - mu_y**2, blur(x * y) - mu_x * mu_y
-    value = (2 * mu_x * mu_y + _C1) * (2 * cov + _C2) / ((mu_x**2 + mu_y**2 + _C1) * (var_x + var_y + _C2))
-    value = value.permute(0, 2, 3, 1)
+    value = _similarity(*(blur(moment) for moment in (x, y, x * x, y * y, x * y))).permute(0, 2, 3, 1)
     return value if batched else value[0]
+
+
+def _ssim_map_separable(x: Tensor, y: Tensor, *, padding: str) -> Tensor:
+    """Return `ssim_map_reference` by two convolutions of 11 taps for all moments, where that has five of 121."""
+    batched = x.dim() == 4
+    x, y, _ = _checked(x, y, None, padding)
+    x, y = x.permute(0, 3, 1, 2), y.permute(0, 3, 1, 2)
+    moments = torch.stack([x, y, x * x, y * y, x * y])
+    blurred = _Blur.apply(moments.flatten(0, 2)[:, None], WINDOW // 2 if padding == "zero" else 0)
+    value = _similarity(*blurred[:, 0].unflatten(0, moments.shape[:3])).permute(0, 2, 3, 1)
+    return value if batched else value[0]
+
+
+def _similarity(mu_x: Tensor, mu_y: Tensor, square_x: Tensor, square_y: Tensor, product: Tensor) -> Tensor:
+    # Biased moments, E[x^2] - E[x]^2; rounding may leave a variance slightly below 0, which C2 covers.
+    var_x, var_y, cov = square_x - mu_x**2, square_y - mu_y**2, product - mu_x * mu_y
+    return (2 * mu_x * mu_y + _C1) * (2 * cov + _C2) / ((mu_x**2 + mu_y**2 + _C1) * (var_x + var_y + _C2))
+
+
+@cache
+def _taps(device: torch.device, dtype: torch.dtype) -> Float[Tensor, " 11"]:
+    """Return the window along one axis; made once, because a GPU would wait for its copy in every step."""
+    k = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    g = torch.exp(-(k**2) / (2 * 1.5**2))
+    return (g / g.sum()).to(device, dtype)
+
+
+class _Blur(torch.autograd.Function):
+    """Blurs planes (N, 1, H, W) by the window, whose adjoint is the same blur with the complementary padding."""
+
+    @staticmethod
+    def forward(ctx: Any, planes: Tensor, padding: int) -> Tensor:
+        ctx.padding = padding
+        return _blurred(planes, padding)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return _blurred(grad, WINDOW - 1 - ctx.padding), None
+
+
+def _blurred(planes: Tensor, padding: int) -> Tensor:
+    taps, cudnn = _taps(planes.device, planes.dtype), torch.backends.cudnn
+    # TF32, which torch allows convolutions, would round pixels to 11 bits, and leave nothing of E[x^2] - E[x]^2.
+    with cudnn.flags(cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False):
+        rows = F.conv2d(planes, taps[None, None, None], padding=(0, padding))
+        return F.conv2d(rows, taps[None, None, :, None], padding=(padding, 0))
 
 
 @overload
@@ -284,6 +324,12 @@ def _total_weight(mask: Shaped[Tensor, "... H W"], shape: tuple[int, ...]) -> Sh
     if not total > 0:
         raise InputError("mask of an image loss", expected="some weight above 0", received=f"a sum of {float(total)}")
     return total
+
+
+def _mean_of_map(value: Tensor, x: Tensor, y: Tensor, mask: Tensor | None, padding: str) -> Tensor:
+    """Return the mean of a map of two images, weighted by a mask of them."""
+    _check_images(x, y, mask)
+    return _masked_mean(value, None if mask is None else _inner(mask, _BORDER[padding]))
 
 
 def _masked_mean(

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
+from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
@@ -70,6 +71,18 @@ class Pose:
 
     __repr__ = one_line
 
+    def to(self, device: torch.device | str) -> Pose:
+        """Return the same pose on another device; a GPU is not waited for where its memory is pinned."""
+        moved = {name: value.to(device, non_blocking=True) for name, value in self._tensors().items()}
+        return replace(self, **moved)
+
+    def pinned(self) -> Pose:
+        """Return the same pose in memory that a GPU reads by itself."""
+        return replace(self, **{name: value.pin_memory() for name, value in self._tensors().items()})
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
     def without_cloth(self) -> Pose:
         """Return the same pose without simulated clothes, so that the model alone moves them."""
         return replace(self, cloth=None)
@@ -108,12 +121,13 @@ class Rig:
         """Number of the template's expression coefficients."""
         return self.template.body.num_expressions
 
-    def pose(self, params: BodyParams, *, frame: int | None = None) -> Pose:
+    def pose(self, params: BodyParams, *, frame: int | None = None, device: torch.device | str | None = None) -> Pose:
         """Return one frame's parameters as a pose of the template: rest shape and blended transforms.
 
         Args:
             params: parameters of one frame.
             frame: its number, where the student has a code for it.
+            device: of the pose; None: the rig's.
 
         Raises:
             InputError: several frames, or parameters that the body refuses.
@@ -121,7 +135,8 @@ class Rig:
         if len(params) != 1:
             raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
         # One BLAS thread: idle BLAS threads spin and would take the cores from torch's threads, which run next.
-        with _thread_pools().limit(limits=1, user_api="blas"):
+        # One pose at a time, because the limit is of the process.
+        with _POSING, _thread_pools().limit(limits=1, user_api="blas"):
             posed = self.template.posed_body(params)
             transforms = posed.posed_from_rest[0]
             blended = self._weights @ transforms[:, :3].reshape(len(transforms), 12).astype(np.float32)
@@ -130,15 +145,15 @@ class Rig:
         rest[: self.template.body.vertex_count] = posed.rest_vertices[0]
         expression = np.zeros(self.expression_size)
         expression[: params.expression.shape[1]] = params.expression[0]
-        return Pose(
-            frame,
-            body_pose=self._tensor(params.body_pose[0]),
-            expression=self._tensor(expression),
-            jaw=self._tensor(params.jaw_pose[0]),
-            rest=self._tensor(rest),
-            world_from_rest=self._tensor(blended.reshape(-1, 3, 4)),
-            root_from_world=self._tensor(np.linalg.inv(transforms[0])),
-        )
+        arrays = {
+            "body_pose": params.body_pose[0],
+            "expression": expression,
+            "jaw": params.jaw_pose[0],
+            "rest": rest,
+            "world_from_rest": blended.reshape(-1, 3, 4),
+            "root_from_world": np.linalg.inv(transforms[0]),
+        }
+        return Pose(frame, **{name: self._tensor(array, device) for name, array in arrays.items()})
 
     def pose_from_vertices(self, vertices: Float[np.ndarray, "V 3"]) -> Pose:
         """Return the pose whose skinned mesh equals `vertices`, metres, to the bit.
@@ -199,8 +214,11 @@ class Rig:
         """Return the vertices of `skin` as a numpy array, without gradients."""
         return self.skin(pose, displacements).double().cpu().numpy()
 
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.tensor(array, dtype=torch.float32, device=self.device)
+    def _tensor(self, array: np.ndarray, device: torch.device | str | None = None) -> Tensor:
+        return torch.tensor(array, dtype=torch.float32, device=self.device if device is None else device)
+
+
+_POSING = Lock()
 
 
 @cache

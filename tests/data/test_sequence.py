@@ -5,15 +5,18 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from itertools import pairwise
+from threading import current_thread
 
 import numpy as np
 import pytest
 import torch
 
 from avatar.data.sequence import Item, SequenceConfig, camera_centers_of
+from avatar.rig.rig import Rig
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import HEIGHT, HELD_OUT, NOVEL_POSES, TRAIN, WIDTH, dance, sequence, template, write_dance
+from tests.pretended_cuda import pretended_cuda
 
 TRAIN_FRAMES = (0, 1, 2, 3)
 
@@ -111,6 +114,28 @@ def test_views_read_ahead_are_the_same(root, made):
         for camera in item.cameras:
             a, b = other.view(camera, item.frame), made.view(camera, item.frame)
             assert torch.equal(a.foreground, b.foreground) and torch.equal(a.K, b.K)
+
+
+def test_beside_a_gpu_other_threads_make_poses_and_views_ahead(root, made, monkeypatch):
+    """A pose took ten milliseconds of the thread that steps, in each step of a capture of thousands of frames."""
+    threads, pose = [], Rig.pose
+
+    def noted(*arguments, **named):
+        threads.append(current_thread().name.split("_")[0])
+        return pose(*arguments, **named)
+
+    monkeypatch.setattr(Rig, "pose", noted)
+    with pretended_cuda():
+        other = sequence(root, device="cuda", readers=3)
+        items = other.items(0, count=3, views=2, seed=0)
+        other.expect(items)
+        for item in items:
+            found, truth = other.pose(item.frame), made.pose(item.frame)
+            assert found.rest.is_cuda and found.frame == item.frame
+            assert torch.equal(found.world_from_rest.cpu(), truth.world_from_rest)
+            for camera in item.cameras:
+                assert torch.equal(other.view(camera, item.frame).alpha.cpu(), made.view(camera, item.frame).alpha)
+    assert threads[: len(items)].count("poses") == len(items)
 
 
 @pytest.mark.parametrize("margin", [0, 5, 12])

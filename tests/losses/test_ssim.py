@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from avatar.losses.image_similarity import ssim, ssim_map, ssim_map_reference, ssim_reference
 from smplxpp.core.errors import InputError
 from smplxpp.native import _FEATURES, LEVELS, _cpu_features, native_library
+from tests.pretended_cuda import CountedWaits, pretended_cuda
 
 SHAPES = [(37, 53, 3), (24, 270, 3), (140, 20, 1), (3, 2, 5), (20, 121, 7), (1, 1, 1), (11, 11, 3), (2, 24, 30, 2)]
 
@@ -54,6 +55,20 @@ def test_map_and_its_gradient_equal_the_reference(padding):
     truth = gradients(ssim_map_reference, x.double(), y.double(), padding=padding)
     assert got[0].shape == truth[0].shape
     assert_equal_to_reference(got, truth, 2e-5)
+
+
+@pytest.mark.parametrize("padding", ["zero", "valid"])
+def test_a_gpu_blurs_along_one_axis_after_the_other_and_gets_the_same(padding):
+    x, y = (image.double() for image in pair((2, 23, 31, 3)))
+    truth = gradients(ssim_map_reference, x, y, padding=padding)
+    with pretended_cuda(), CountedWaits() as counted:
+        images = [image.to("cuda").requires_grad_() for image in (x, y)]
+        value = ssim_map(*images, padding=padding)
+        weight = torch.linspace(-1, 1, value.numel(), dtype=x.dtype).reshape(value.shape).to("cuda")
+        value.backward(weight)
+        found = [one.cpu() for one in (value.detach(), images[0].grad, images[1].grad)]
+    assert_equal_to_reference(found, truth, 1e-10)
+    assert counted.count == 0 and counted.calls["aten.convolution.default"] == 4  # two forward, two backward
 
 
 def test_only_the_asked_gradient_is_given():

@@ -289,6 +289,11 @@ class FrameCodes(nn.Module):
                 remedy="drive new frames with the null code, or fit codes to them",
             )
         # None takes row 0, which is z_0, and is multiplied by 0 where training has shown the zero vector.
+        if len(frames) == 1:
+            # The usual case, without indices that would be copied to a GPU.
+            (frame,) = frames
+            row = 0 if frame is None else self.row[frame]
+            return self.codes[row : row + 1] * float(frame is not None or not self.null_code_shown)
         rows = torch.tensor([0 if frame is None else self.row[frame] for frame in frames], device=self.codes.device)
         coded = [frame is not None or not self.null_code_shown for frame in frames]
         known = torch.tensor(coded, device=self.codes.device)

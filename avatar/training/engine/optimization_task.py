@@ -177,10 +177,11 @@ def _copy_in_layout(content: Tensor, parameter: Tensor) -> Tensor:
     return torch.empty_like(parameter).copy_(content)
 
 
+@torch.no_grad()
 def _finite(values: Iterable[Tensor]) -> bool:
     """Return whether all values are finite: the largest magnitude is NaN or infinite when any of them is."""
     # One call for all tensors, which is a few launches on a GPU, and one transfer of the answer.
-    largest = torch._foreach_norm([value.detach() for value in values], ord=torch.inf)
+    largest = torch._foreach_norm(list(values), ord=torch.inf)
     return bool(torch.isfinite(torch.stack(largest)).all())
 
 

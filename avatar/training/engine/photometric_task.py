@@ -178,14 +178,17 @@ class PhotometricTask(OptimizationTask[Item]):
         hold_unseen(sequence, model.gaussians, getattr(model, "blend_shapes", None))
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
-        """Return the step's frames and cameras, and start to read those of the next step in the background."""
+        """Return the step's frames and cameras, and start to read those of the next steps in the background."""
         self.iteration = iteration
-        # Each process reads ahead its own items alone, every world_size-th.
-        now, soon = (
+        # A GPU's steps are shorter than a photograph takes to decode, so that several are read at a time.
+        ahead = min(self.config.iterations - 1 - iteration, 3 if self.device.type == "cuda" else 1)
+        now, *soon = (
             self.sequence.items(k, count=self.config.poses_per_step, views=self.config.views, seed=self.config.seed)
-            for k in (iteration, iteration + 1)
+            for k in range(iteration, iteration + 1 + max(ahead, 0))
         )
-        self.sequence.expect(soon[self.distributed.rank :: self.distributed.world_size])
+        # Each process reads ahead its own items alone, every world_size-th.
+        for items in soon:
+            self.sequence.expect(items[self.distributed.rank :: self.distributed.world_size])
         return now
 
     @abstractmethod
