@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 import smplxpp
-from pipelines.figures import VIEWS, encode_png, fit_cameras, render_shaded
 from smplxpp.assemble import CanonicalPart, assemble_template
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core.labels import LABEL_BY_NAME
 from smplxpp.core.mesh_files.mesh_io import write_ply
+from smplxpp.figures import VIEWS, encode_png, fit_cameras, render_shaded
 
 PERSON = Path(__file__).parents[1] / "data" / "fixtures" / "person"
 

@@ -19,8 +19,8 @@ from pipelines.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("smplxpp", "avatar", "pipelines")
-TOP = {"build", "people", "synth"}
-"""Rooms above the stages, which nothing below imports: the stages in order, procedural people, captures of them."""
+TOP = {"build", "people", "synth", "figures"}
+"""Rooms above the stages, which nothing below imports: stages in order, procedural people, their captures, pictures."""
 SHARED = {"core", "native", "raster", "skinning", "body", "template", "cloth", "data"}
 STAGES = {
     "capture",
@@ -52,7 +52,6 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
     ),
     "pipelines": (
         {"runs"},
-        {"figures"},
         {"stages"},
         {"report"},
         {"captures"},
@@ -71,8 +70,8 @@ NARROW = {
     "pipelines.captures": {"stages"},
     "pipelines.batch": {"stages", "report", "captures", "ablation"},
     "pipelines.viewer": {"report", "captures", "ablation"},
-    "pipelines.chat": {"runs", "figures", "stages", "report", "captures", "ablation", "viewer"},
-    "pipelines.web": {"runs", "figures", "stages", "report", "captures", "ablation", "viewer"},
+    "pipelines.chat": {"runs", "stages", "report", "captures", "ablation", "viewer"},
+    "pipelines.web": {"runs", "stages", "report", "captures", "ablation", "viewer"},
 }
 
 
@@ -197,8 +196,8 @@ class Missing:
         if name.split(".")[0] in ("torch", "safetensors", "threadpoolctl"):
             raise ModuleNotFoundError(name, name=name)
 sys.meta_path.insert(0, Missing())
-import pipelines.commands, pipelines.figures, pipelines.report, pipelines.stages.build
-for package in (pipelines.commands, pipelines.figures, pipelines.report):
+import pipelines.commands, smplxpp.figures, pipelines.report, pipelines.stages.build
+for package in (pipelines.commands, smplxpp.figures, pipelines.report):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         importlib.import_module(module.name)
 """

@@ -14,14 +14,14 @@ import tyro
 from jaxtyping import UInt8
 from PIL import Image
 
-from pipelines.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
-from pipelines.figures.comparison import read_tiles
 from pipelines.runs.artefacts import load_labels, load_params_of_run, load_scan
 from pipelines.runs.layout import EVALUATE_STAGE
 from pipelines.runs.stage import read_manifest
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.files.atomic import atomic_write_bytes
+from smplxpp.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
+from smplxpp.figures.comparison import read_tiles
 from smplxpp.template.template import Template
 
 HEIGHT = 420

@@ -14,13 +14,13 @@ import tyro
 from jaxtyping import UInt8
 
 from avatar.evaluation.report import EvalReport, view_key
-from pipelines.figures import caption, encode_jpeg, row
-from pipelines.figures.comparison import enlarge, error_colors, read_tiles
 from pipelines.runs.layout import EVALUATE_STAGE, HELD_OUT_VIEWS
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.evaluate_inputs import REPORT_FILE
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import atomic_write_bytes, path_inside
+from smplxpp.figures import caption, encode_jpeg, row
+from smplxpp.figures.comparison import enlarge, error_colors, read_tiles
 
 HEIGHT = 480
 MARGIN = 8

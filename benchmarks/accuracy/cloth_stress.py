@@ -37,7 +37,6 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
 from benchmarks.support.results import store_results
-from pipelines.figures import encode_png, fit_cameras
 from smplxpp.body import BodyModel, load_body
 from smplxpp.body.model import PosedBody
 from smplxpp.cloth import ClothDriver, DriverConfig, cut_garment
@@ -48,6 +47,7 @@ from smplxpp.core import LABELS, BodyParams, GeometryWarning, InputError, SkinWe
 from smplxpp.core.files import atomic_write_bytes, atomic_write_text
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.export.fbx import blender_command
+from smplxpp.figures import encode_png, fit_cameras
 from smplxpp.people.garments.cut import Garment
 from smplxpp.people.garments.loose import hung
 from smplxpp.people.garments.mannequin import Mannequin

@@ -35,7 +35,6 @@ from avatar.runtime.skeleton import skeleton_body
 from avatar.runtime.splatting import Splatter
 from benchmarks.support.results import store_results
 from pipelines.commands.export import Export
-from pipelines.figures import VIEWS, fit_cameras
 from pipelines.runs import layout
 from pipelines.runs.artefacts import load_params_of_run, load_prepared_scan, load_scan_labels
 from pipelines.stages.build_config import load_build
@@ -47,6 +46,7 @@ from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core import Camera, TriangleMesh
 from smplxpp.core.colors import linear_from_srgb, srgb_from_linear
 from smplxpp.core.spread import spread
+from smplxpp.figures import VIEWS, fit_cameras
 from smplxpp.raster import rasterize_mesh
 from smplxpp.raster.viewpoints import turntable_cameras
 from smplxpp.template.template import BODY_PART, Template

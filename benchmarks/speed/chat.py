@@ -46,10 +46,10 @@ from pipelines.chat.conversation import ChatParts
 from pipelines.chat.hearing import BLOCK, RATE
 from pipelines.chat.server import ChatServer
 from pipelines.commands.chat import Chat
-from pipelines.figures import fit_cameras
 from pipelines.web.page import PLAYER
 from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.files.tensor_bytes import unpack_tensors
+from smplxpp.figures import fit_cameras
 from tests.web.chromium import Page
 
 SENTENCES = (

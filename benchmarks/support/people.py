@@ -14,7 +14,6 @@ import tyro
 from jaxtyping import Bool
 
 from benchmarks.support.results import ROOT
-from pipelines.figures.sheets import caption, contact_sheet, encode_png, row
 from smplxpp.body import BodyModel, load_body, load_params
 from smplxpp.core import (
     LABEL_BY_NAME,
@@ -28,6 +27,7 @@ from smplxpp.core import (
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.figures.sheets import caption, contact_sheet, encode_png, row
 from smplxpp.people import PersonScan, people, variant
 from smplxpp.people.bodies import FINGERS
 from smplxpp.people.garments.mannequin import shares

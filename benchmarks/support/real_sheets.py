@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.support.real_truth import found_body, found_frame, skin_mesh
-from pipelines.figures import VIEWS, caption, contact_sheet, encode_png, fit_cameras, render_overlay, row
 from pipelines.runs.artefacts import load_scan, load_scan_labels
 from pipelines.runs.layout import SCAN, SCAN_LABELS, TEMPLATE
 from smplxpp.body import BodyModel
@@ -16,6 +15,7 @@ from smplxpp.build.scan import read_scan
 from smplxpp.core import Camera, InputError, TriangleMesh, display_colors
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from smplxpp.figures import VIEWS, caption, contact_sheet, encode_png, fit_cameras, render_overlay, row
 from smplxpp.raster import render_shaded
 from smplxpp.raster.viewpoints import body_cameras
 from smplxpp.template import Template

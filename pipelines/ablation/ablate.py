@@ -21,7 +21,6 @@ from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset
 from pipelines.ablation.measure import PICTURES, AblationResult, ablation_table, closure, measure_row, row_figures
 from pipelines.ablation.rows import Row, ablation_stages
-from pipelines.figures import caption, contact_sheet, encode_png
 from pipelines.runs.layout import ABLATION
 from pipelines.stages.evaluate_inputs import input_protocol
 from pipelines.stages.models import CLOTHED, Bar, ModelStage, Trainer, TrainOptions
@@ -30,6 +29,7 @@ from smplxpp.capture import Capture
 from smplxpp.core.errors import ProgressCallback, ignore_progress
 from smplxpp.core.files import atomic_write_bytes, atomic_write_text, jsonable
 from smplxpp.core.files.image_file import open_image
+from smplxpp.figures import caption, contact_sheet, encode_png
 
 RESULTS_FILE = "results.json"
 COLUMNS = 7

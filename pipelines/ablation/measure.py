@@ -16,7 +16,6 @@ from avatar.evaluation.summary import REFINED_POSES, garments, summary_figures
 from avatar.evaluation.tables import Column, FigureTable
 from avatar.rig.rig import AvatarModel
 from pipelines.ablation.rows import Row
-from pipelines.figures import encode_png
 from pipelines.runs.code import TRAINING
 from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import ABLATION
@@ -28,6 +27,7 @@ from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.capture import Capture
 from smplxpp.core import ProgressCallback, ignore_progress
 from smplxpp.core.files import as_integer, as_number, atomic_write_bytes
+from smplxpp.figures import encode_png
 
 ROWS_FOLDER = f"{ABLATION}/rows"
 PLAYER_FILE, REPORT_FILE, PICTURES = "player.safetensors", "report.json", "pictures"

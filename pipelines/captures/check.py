@@ -14,7 +14,6 @@ from rich.table import Table as TextTable
 from rich.text import Text
 from scipy import ndimage
 
-from pipelines.figures import caption, contact_sheet, encode_jpeg, encode_png, row
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.runs.code import versions
 from smplxpp.capture.check.check import CaptureCheck
@@ -24,6 +23,7 @@ from smplxpp.capture.check.views import OPAQUE, ViewCheck
 from smplxpp.capture.check.without_images import in_ranges
 from smplxpp.core import InputError, spread
 from smplxpp.core.files import atomic_write_bytes, atomic_write_text, jsonable
+from smplxpp.figures import caption, contact_sheet, encode_jpeg, encode_png, row
 
 _STYLES = {"fail": "red", "warn": "yellow", "good": "green", "doubtful": "yellow", "bad": "red"}
 

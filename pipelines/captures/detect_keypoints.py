@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from pipelines.figures import contact_sheet
-from pipelines.figures.body_drawings import draw_keypoints
 from smplxpp.capture import Capture
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color
@@ -24,6 +22,8 @@ from smplxpp.capture.writers.frame_files import write_keypoints
 from smplxpp.core import InputError, Keypoints2D, ProgressCallback, ignore_progress
 from smplxpp.core.files import read_arrays, read_bytes
 from smplxpp.detect import Box, DetectedPerson, Detector, mask_box
+from smplxpp.figures import contact_sheet
+from smplxpp.figures.body_drawings import draw_keypoints
 
 _SAVE_EVERY_S = 20.0  # a file is written this often, so that a kill loses at most that much work
 

@@ -18,8 +18,6 @@ from pipelines.commands.animate_student import StudentFilm, student_frames
 from pipelines.commands.driving import Driving, unshaped
 from pipelines.commands.options import ClothMode, Lighting, OptionalFloat, OptionalInt
 from pipelines.commands.templates import BUNDLE_SUFFIX, load_run_template
-from pipelines.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
-from pipelines.figures.film import FRAME_FOLDER, SUFFIXES, write_film
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS, STUDENT
 from smplxpp.cloth import Garment, cut_garment
@@ -28,6 +26,8 @@ from smplxpp.cloth.play import play
 from smplxpp.cloth.quality import ClothQuality, all_checks
 from smplxpp.core import DEFAULT_FPS, BodyParams, InputError, require_at_least, require_positive, spread
 from smplxpp.core.camera import Camera
+from smplxpp.figures import VIEWS, blend_joint_colors, fit_cameras, render_shaded, turntable_cameras
+from smplxpp.figures.film import FRAME_FOLDER, SUFFIXES, write_film
 from smplxpp.raster.shading import ShadeStyle
 from smplxpp.template.template import Template
 

@@ -13,11 +13,11 @@ from jaxtyping import UInt8
 
 from pipelines.commands.driving import Driving
 from pipelines.commands.options import ClothMode
-from pipelines.figures import VIEWS, fit_cameras, turntable_cameras
 from smplxpp.cloth.play import ways
 from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import BodyParams, Camera, spread
 from smplxpp.core.light import Relighting
+from smplxpp.figures import VIEWS, fit_cameras, turntable_cameras
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle, AvatarPlayer

@@ -16,10 +16,10 @@ from pipelines.commands.animate_student import StudentFilm, student_frames
 from pipelines.commands.options import ClothMode, OptionalPath, OptionalText
 from pipelines.commands.templates import BUNDLE_SUFFIX, person_of_run
 from pipelines.commands.web import PAGES, live_lips
-from pipelines.figures.film import write_film
 from smplxpp.core import BodyParams, InputError, require_at_least
 from smplxpp.core.files import atomic_write_bytes, read_bytes
 from smplxpp.core.files.sound_file import Sound, wave_bytes
+from smplxpp.figures.film import write_film
 
 if TYPE_CHECKING:
     from avatar.runtime import AvatarBundle

@@ -100,7 +100,7 @@ PARTS: dict[str, _Part] = {
         (layout.POSE_BODY_STAGE, layout.SEGMENT_STAGE, layout.CLEAN_STAGE),
         settings=("max_influences", "method", "bridges", "rules"),
         files=("body",),
-        writers=("pipelines.figures.colors",),
+        writers=("smplxpp.figures.colors",),
     ),
     layout.UNPOSE_STAGE: _Part(
         template_stages.unpose, "parts", (layout.POSE_BODY_STAGE, layout.TRANSFER_STAGE), files=("body",)

@@ -18,8 +18,6 @@ from avatar.models.model_file import load_avatar
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import AvatarModel, Rig
 from avatar.training.engine.learning_rates import pixel_size
-from pipelines.figures import encode_png
-from pipelines.figures.comparison import surface_picture, write_tiles
 from pipelines.runs import gates
 from pipelines.runs.code import TRAINING, sha256_file
 from pipelines.runs.folders import own_run_folder
@@ -45,6 +43,8 @@ from smplxpp.capture import Capture
 from smplxpp.cloth.quality import ClothQuality, all_checks, merged
 from smplxpp.core import Check, InputError, ProgressCallback, ignore_progress, require_known
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
+from smplxpp.figures import encode_png
+from smplxpp.figures.comparison import surface_picture, write_tiles
 from smplxpp.metrics.comparison import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
 from smplxpp.template.template import Template

@@ -23,13 +23,13 @@ from avatar.training.engine.session import Session
 from avatar.training.fit.config import FitConfig
 from avatar.training.fit.fit import FitResult, fit_gaussians, fit_scene
 from avatar.training.scene import silhouette_overlap
-from pipelines.figures.comparison import write_strip
 from pipelines.runs import gates
 from pipelines.runs.code import sha256_file
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import GROUNDS, ModelStage, Trainer
 from smplxpp.core.spread import spread
+from smplxpp.figures.comparison import write_strip
 
 PREVIEWED_TRAINING_VIEWS = 3
 

@@ -20,7 +20,6 @@ from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import explain_resource_errors, keep_freed_memory
 from avatar.training.engine.session import Session
-from pipelines.figures.comparison import preview_writer
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.code import TRAINING
 from pipelines.runs.folders import own_run_folder
@@ -35,7 +34,7 @@ from pipelines.runs.stage import (
     standing,
 )
 from pipelines.stages.held_out import seen_of
-from pipelines.stages.scene import TrainScene
+from pipelines.stages.scene import TrainScene, preview_writer
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 

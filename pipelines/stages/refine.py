@@ -24,7 +24,6 @@ from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.refine import Refinement
 from avatar.training.refinement.refine_capture import RefinedCapture, refine_capture
 from avatar.training.scene import TrainScene
-from pipelines.figures.comparison import write_tiles
 from pipelines.runs import gates
 from pipelines.runs.code import TRAINING
 from pipelines.runs.folders import own_run_folder
@@ -35,6 +34,7 @@ from pipelines.stages.scene import TrainInputs, of_protocol, open_scene, open_vi
 from smplxpp.capture.declared import has_estimated_params
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files import atomic_write_text, jsonable
+from smplxpp.figures.comparison import write_tiles
 
 log = logging.getLogger(__name__)
 

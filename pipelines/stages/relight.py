@@ -13,7 +13,6 @@ from avatar.models.model_file import load_avatar
 from avatar.models.student import Student
 from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
-from pipelines.figures import VIEWS, encode_png, fit_cameras
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.code import TRAINING, sha256_file
 from pipelines.runs.folders import own_run_folder
@@ -22,6 +21,7 @@ from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.light import Relighting
+from smplxpp.figures import VIEWS, encode_png, fit_cameras
 from smplxpp.template.template import Template
 
 HEIGHT = 560

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from avatar.data.one_frame import frames_beside
-from avatar.data.views import read_views
+from avatar.data.views import read_view, read_views
 from avatar.training.scene import TrainScene, hold_out_cameras, prepare_scene, silhouette_overlap, with_cameras
 from pipelines.runs import layout
 from pipelines.runs.code import sha256_file
@@ -19,6 +22,7 @@ from smplxpp.capture import Capture, Splits, open_capture, read_cameras
 from smplxpp.capture.readers.simple import stacked_params
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.paths import lies_in
+from smplxpp.figures.comparison import write_strip
 from smplxpp.template.template import Template
 
 REGISTER_AGAIN = "register without them (smplxpp register --hold-out, or the capture's split)"
@@ -198,3 +202,16 @@ def open_views(inputs: TrainInputs) -> Capture:
     if not 0.0 < inputs.scale <= 1.0:
         raise InputError("option scale", expected="a number above 0 and at most 1", received=f"{inputs.scale:g}")
     return capture if inputs.scale == 1.0 else capture.resized(inputs.scale)
+
+
+def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
+    """Return what writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
+    background = capture.recording.background or (0.0, 0.0, 0.0)
+
+    def write(images: Mapping[str, np.ndarray]) -> None:
+        for name, image in images.items():
+            camera, frame = name.rsplit(" ", 1)
+            real = read_view(capture, camera, int(frame)).photograph(background)
+            write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
+
+    return write

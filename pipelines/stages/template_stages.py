@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.figures.colors import blend_joint_colors
-from pipelines.figures.sheets import encode_png
 from pipelines.runs.artefacts import (
     load_canonical,
     load_cleaned_parts,
@@ -60,6 +58,8 @@ from smplxpp.build.verdict import LEAST_CONFIDENCE, require_found
 from smplxpp.core import BodyParams, StageOutput, write_ply
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export import write_glb, write_obj
+from smplxpp.figures.colors import blend_joint_colors
+from smplxpp.figures.sheets import encode_png
 from smplxpp.metrics.comparison import MM
 from smplxpp.register.locate import BodyNotFoundError
 from smplxpp.segment import UNSURE, Corrections

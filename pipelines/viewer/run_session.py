@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
-from pipelines.figures import blend_joint_colors, heat_colors
 from pipelines.viewer.run_models import (
     ShownMotion,
     SplatSource,
@@ -28,6 +27,7 @@ from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import Capture
 from smplxpp.core import POSE_BLOCKS, BodyParams, matrix_from_rotvec, require_choice, rotvec_from_matrix
 from smplxpp.core.light import Relighting
+from smplxpp.figures import blend_joint_colors, heat_colors
 from smplxpp.template.template import Template
 
 if TYPE_CHECKING:

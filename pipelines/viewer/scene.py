@@ -9,11 +9,11 @@ import pygltflib
 from jaxtyping import Float, Float64, Int64, UInt8
 from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 
-from pipelines.figures.colors import heat_colors
 from pipelines.viewer.session import LabelSession, UncertainRegion, lies_within
 from smplxpp.core import LABELS, Labels, TriangleMesh
 from smplxpp.export.gltf import linear_rgba16
 from smplxpp.export.gltf_buffers import BufferBuilder, index_dtype
+from smplxpp.figures.colors import heat_colors
 
 
 def confidence_colors(confidence: Float64[np.ndarray, " M"]) -> UInt8[np.ndarray, "M 3"]:

@@ -10,7 +10,6 @@ import pygltflib
 import pytest
 
 from pipelines.commands.build import Build
-from pipelines.figures import body_cameras
 from pipelines.report.sections.template import scan_section, weights_section
 from pipelines.runs.artefacts import load_scan
 from pipelines.runs.layout import ASSEMBLE_STAGE, SEGMENT_STAGE, TEMPLATE, TRANSFER_STAGE
@@ -20,6 +19,7 @@ from smplxpp.body.named_poses import worn_poses
 from smplxpp.build import BuildConfig, build_template
 from smplxpp.cloth.collider import _layers_under
 from smplxpp.core import BodyParams, InputError
+from smplxpp.figures import body_cameras
 from smplxpp.segment import find_label_set
 from smplxpp.template.template import Template
 from tests.build.many_classes import CLASSES, dressed_scan, many_classes

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.figures import (
+from smplxpp.core import Camera, InputError, SkinWeights, TriangleMesh
+from smplxpp.core.colors import linear_from_oklab, linear_from_srgb, oklab_from_linear, srgb8_from_linear
+from smplxpp.figures import (
     ShadeStyle,
     blend_joint_colors,
     body_cameras,
@@ -25,8 +27,6 @@ from pipelines.figures import (
     row,
     turntable_cameras,
 )
-from smplxpp.core import Camera, InputError, SkinWeights, TriangleMesh
-from smplxpp.core.colors import linear_from_oklab, linear_from_srgb, oklab_from_linear, srgb8_from_linear
 
 FLAT = ShadeStyle(relief=0.0, occlusion=0.0)
 

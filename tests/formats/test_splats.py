@@ -9,9 +9,9 @@ import torch
 from avatar.formats import world_splats
 from avatar.runtime import AvatarPlayer
 from avatar.runtime.splatting import Splatter
-from pipelines.figures import VIEWS, fit_cameras
 from smplxpp.core.rotations import matrix_from_rotvec
 from smplxpp.core.spherical_harmonics import rotate_sh, sh_basis
+from smplxpp.figures import VIEWS, fit_cameras
 from tests.formats.foreign import as_world
 from tests.formats.test_ply import random_splats
 from tests.runtime.bundles import EXACT, dance, student, write

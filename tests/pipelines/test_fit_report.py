@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from pipelines.cli import main
-from pipelines.figures import colormap
-from pipelines.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend, read_strip, write_strip
 from pipelines.report import Curve, Report, write_report
 from pipelines.report.builder import curve_svg
 from pipelines.report.sections.build import rewrite_report
@@ -29,6 +27,8 @@ from pipelines.stages.build_config import (
     save_register,
 )
 from smplxpp.core.errors import InputError
+from smplxpp.figures import colormap
+from smplxpp.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend, read_strip, write_strip
 from tests.dolls.standing import HELD_OUT, TRAIN, write_capture, write_run
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.figures import encode_jpeg, encode_png
 from pipelines.report import (
     CheckRow,
     Comparison,
@@ -34,6 +33,7 @@ from pipelines.report.sections.evaluation import talking_section
 from pipelines.report.words import next_steps, uses_of, verdict_of
 from pipelines.runs.layout import TALKING_FILM
 from smplxpp.core import Check, InputError
+from smplxpp.figures import encode_jpeg, encode_png
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
 

@@ -16,12 +16,12 @@ from avatar.rig.rig import Rig
 from avatar.training.presets import TRAINING_PRESETS
 from avatar.training.student.bake import BakeTask
 from pipelines.cli import main
-from pipelines.figures.comparison import read_strip
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import read_manifest
 from pipelines.stages import train as train_stage
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.errors import InputError
+from smplxpp.figures.comparison import read_strip
 from tests.cloth.persons import person
 from tests.dolls.dancing import HELD_OUT, template, write_dance_run
 from tests.dolls.skirted import write_skirted

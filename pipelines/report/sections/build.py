@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from pipelines.figures import body_cameras, encode_jpeg, render_shaded
 from pipelines.report import CheckRow, KeyNumber, Picture, Report, Section, write_report
 from pipelines.report.builder import readable, readable_numbers
 from pipelines.report.sections.evaluation import (
@@ -64,6 +63,7 @@ from pipelines.stages.run_inputs import capture_of_build
 from smplxpp.body import load_body
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import jsonable
+from smplxpp.figures import body_cameras, encode_jpeg, render_shaded
 from smplxpp.template.template import Template
 from smplxpp.template.texture import texture_paint
 

@@ -10,8 +10,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from avatar.evaluation.input_protocol import InputProtocol, counted
-from pipelines.figures import encode_png, row
-from pipelines.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, error_colors, error_legend, read_tiles
 from pipelines.report import CheckRow, Comparison, Film, KeyNumber, Picture, Section, Table
 from pipelines.report.sections.fit import HEAD_HEIGHT, head_box
 from pipelines.runs.code import sha256_file
@@ -27,6 +25,8 @@ from pipelines.runs.layout import (
 )
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.files.paths import path_inside, read_bytes
+from smplxpp.figures import encode_png, row
+from smplxpp.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, error_colors, error_legend, read_tiles
 
 
 def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:

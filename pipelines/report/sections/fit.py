@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from avatar.training.engine.metrics_log import read_metrics
-from pipelines.figures import encode_png, row
-from pipelines.figures.comparison import ERROR_LIMIT, error_legend, read_strip
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import FIT_STAGE, TEMPLATE
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_numbers, shown
 from smplxpp.core.files.paths import path_inside
+from smplxpp.figures import encode_png, row
+from smplxpp.figures.comparison import ERROR_LIMIT, error_legend, read_strip
 
 HEAD_HEIGHT = 420
 """Pixels: crops of the head are enlarged by the whole number that brings them nearest to this."""

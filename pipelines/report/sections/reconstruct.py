@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy import ndimage
 
-from pipelines.figures import body_cameras, caption, encode_jpeg, render_heat, render_shaded, row
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.report.builder import readable, readable_numbers
 from pipelines.runs.artefacts import read_named
@@ -21,6 +20,7 @@ from smplxpp.build.reconstruct import open_photographs
 from smplxpp.core import InputError, TriangleMesh, spread
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.mesh_files.mesh_io import read_raw_mesh
+from smplxpp.figures import body_cameras, caption, encode_jpeg, render_heat, render_shaded, row
 from smplxpp.metrics.comparison import MM
 from smplxpp.raster import rasterize_mesh
 

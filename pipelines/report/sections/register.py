@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from pipelines.figures import body_cameras, caption, encode_jpeg, encode_png, render_overlay, render_shaded, row
-from pipelines.figures.body_drawings import body_on_photograph, draw_bones
-from pipelines.figures.sheets import heat_strip
 from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Section, Table, write_report
 from pipelines.report.builder import readable, readable_numbers
 from pipelines.runs.artefacts import load_located, load_stacked_params, read_named, values_of
@@ -26,6 +23,9 @@ from smplxpp.build.scan import read_scan
 from smplxpp.capture import Capture, find_scans
 from smplxpp.core import BodyParams, Camera, InputError, TriangleMesh, spread
 from smplxpp.core.files.json_file import as_list, as_object, as_text, read_json
+from smplxpp.figures import body_cameras, caption, encode_jpeg, encode_png, render_overlay, render_shaded, row
+from smplxpp.figures.body_drawings import body_on_photograph, draw_bones
+from smplxpp.figures.sheets import heat_strip
 
 HEIGHT = 560
 REFERENCE_VIEWS, WORST_FRAMES = 2, 3

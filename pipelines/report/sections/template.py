@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipelines.figures import body_cameras, encode_jpeg, render_heat, render_overlay, render_shaded, row
-from pipelines.figures.colors import blend_joint_colors
 from pipelines.report import CheckRow, Comparison, Histogram, Picture, Section, Table
 from pipelines.runs.artefacts import (
     load_arrays,
@@ -28,6 +26,8 @@ from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core import BodyParams, TriangleMesh, concatenate_meshes, spread
 from smplxpp.core.camera import Camera
 from smplxpp.core.files.json_file import as_list, as_text
+from smplxpp.figures import body_cameras, encode_jpeg, render_heat, render_overlay, render_shaded, row
+from smplxpp.figures.colors import blend_joint_colors
 from smplxpp.metrics.distance import MM, point_to_surface
 from smplxpp.segment import UNSURE
 from smplxpp.template.template import Template

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from avatar.training.engine.metrics_log import read_metrics
-from pipelines.figures import encode_png, row
-from pipelines.figures.comparison import ERROR_LIMIT, error_legend, read_strip, read_tiles
 from pipelines.report import CheckRow, Comparison, Curve, KeyNumber, Picture, Section, Table
 from pipelines.runs.layout import (
     BAKE_STAGE,
@@ -25,6 +23,8 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.files.paths import path_inside
 from smplxpp.core.spread import spread
+from smplxpp.figures import encode_png, row
+from smplxpp.figures.comparison import ERROR_LIMIT, error_legend, read_strip, read_tiles
 
 SHOWN_VIEWS = 4
 CURVE_POINTS = 300

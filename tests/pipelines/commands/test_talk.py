@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pipelines.commands.talk import Talk
-from pipelines.figures.film import write_film
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.sound_file import Sound
+from smplxpp.figures.film import write_film
 
 
 @pytest.mark.parametrize(

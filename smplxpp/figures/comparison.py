@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from pipelines.figures import body_cameras, caption, colormap, encode_png, heat_colors, render_heat, row
-from smplxpp.capture import Capture
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.core.files.image_file import open_image
 from smplxpp.core.mesh import TriangleMesh
+from smplxpp.figures.body_drawings import render_heat
+from smplxpp.figures.colors import colormap, heat_colors
+from smplxpp.figures.sheets import caption, encode_png, row
 from smplxpp.metrics import point_to_surface
+from smplxpp.raster import body_cameras
 
 ERROR_LIMIT = 64
 """Difference of the worst channel, of 255, that the error's colours end at."""
@@ -50,22 +52,6 @@ def read_strip(path: Path) -> tuple[Picture, Picture, Picture]:
 def enlarge(image: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray, "_ _ 3"]:
     """Draw every pixel as a square of `factor` pixels: nothing is smoothed away."""
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
-
-
-def preview_writer(capture: Capture, folder: Path) -> Callable[[Mapping[str, np.ndarray]], None]:
-    """Writes photograph, rendering and error of measured views to `folder/previews/CAM_FFFFFF.png`."""
-    # Here and not above: a report of a build draws with this module where torch is not installed.
-    from avatar.data.views import read_view
-
-    background = capture.recording.background or (0.0, 0.0, 0.0)
-
-    def write(images: Mapping[str, np.ndarray]) -> None:
-        for name, image in images.items():
-            camera, frame = name.rsplit(" ", 1)
-            real = read_view(capture, camera, int(frame)).photograph(background)
-            write_strip(folder / "previews" / f"{camera}_{int(frame):06d}.png", real, image)
-
-    return write
 
 
 SURFACE_HEIGHT = 480

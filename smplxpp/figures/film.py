@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from pipelines.figures import encode_png
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_folder, atomic_path, atomic_write_bytes
 from smplxpp.core.files.sound_file import Sound, wave_bytes
 from smplxpp.core.lazy import import_extra
+from smplxpp.figures.sheets import encode_png
 
 FRAME_FOLDER = ""  # the suffix of a folder of pictures
 SUFFIXES = (".mp4", ".gif", FRAME_FOLDER)

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from pipelines.figures.colors import colormap, heat_colors
 from smplxpp.core.errors import InputError
+from smplxpp.figures.colors import colormap, heat_colors
 
 INK = (38, 42, 51)
 WHITE = (255, 255, 255)

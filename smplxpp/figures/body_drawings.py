@@ -10,10 +10,10 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
-from pipelines.figures.colors import heat_colors
-from pipelines.figures.sheets import color_bar
 from smplxpp.core import Camera, InputError, TriangleMesh
 from smplxpp.core.colors import srgb8_from_linear
+from smplxpp.figures.colors import heat_colors
+from smplxpp.figures.sheets import color_bar
 from smplxpp.raster.shading import ShadeStyle, render_shaded, shade_layer
 
 LEFT, RIGHT, MIDDLE = (52, 130, 246), (232, 64, 52), (250, 205, 50)
