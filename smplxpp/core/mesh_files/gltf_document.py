@@ -14,6 +14,7 @@ import numpy as np
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import as_integer, as_list, as_object, as_text, parse_json, read_bytes
+from smplxpp.core.mesh_files.gltf_compression import MESHOPT, draco_primitive, meshopt_view
 from smplxpp.core.mesh_files.texture import TextureCache, file_beside
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -49,6 +50,9 @@ class GltfDocument:
             raise InputError(self.subject, expected="glTF 2.0", received=f"version {version or 'unknown'}")
         self._buffers: dict[int, bytes] = {}
         self._files: dict[Path, bytes] = {}
+        self._decoded: dict[int, np.ndarray] = {}  # values of accessors that Draco held, by their index
+        self._views: dict[int, tuple[memoryview, int]] = {}
+        self._unpacked: set[int] = set()  # views of Draco's primitives that are among the accessors
         self.pictures = TextureCache(self.subject)
 
     def _chunks(self, data: bytes) -> tuple[bytes, bytes | None]:
@@ -100,12 +104,17 @@ class GltfDocument:
         """Return the bytes of a buffer view, and its stride (0 for none).
 
         Raises:
-            InputError: a view outside its buffer, or a compressed one.
+            InputError: a view outside its buffer, or compressed data that are damaged.
+            MissingExtraError: a compressed one, without its codec.
         """
         view = self.entry("bufferViews", index)
-        for name in self.part(view, "extensions"):
-            if name in ("EXT_meshopt_compression", "KHR_meshopt_compression"):
-                raise compression_error(self.subject, name)
+        for name, value in self.part(view, "extensions").items():
+            if name in MESHOPT:
+                if index not in self._views:
+                    compressed = as_object(value, subject=f"{self.subject}: {name}")
+                    buffer = self._buffer(self.number(compressed, "buffer"))
+                    self._views[index] = meshopt_view(self.subject, compressed, buffer)
+                return self._views[index]
         data = self._buffer(self.number(view, "buffer"))
         start, length = self.number(view, "byteOffset", 0), self.number(view, "byteLength")
         if start + length > len(data):
@@ -135,6 +144,12 @@ class GltfDocument:
             )
         if "bufferView" in accessor:
             values = self._values(accessor, count, width, kind)
+        elif index in self._decoded:
+            values = self._decoded[index]
+            # The count is the codec's, which leaves faces without an area out.
+            if values.shape[1] != width:
+                received = f"{values.shape[1]} in the compressed data"
+                raise InputError(f"{self.subject}: accessor", expected=f"{width} components", received=received)
         elif "sparse" in accessor and count <= 1 << 20:  # zeros without bytes, which no small file may blow up
             values = np.zeros((count, width), kind)
         else:
@@ -146,6 +161,31 @@ class GltfDocument:
         if accessor.get("normalized") is True and values.dtype.kind in "iu":
             return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
         return values
+
+    def decompress(self, attributes: dict[str, Any], indices: Any, draco: dict[str, Any]) -> None:
+        """Decode a primitive that Draco holds, so that `accessor` returns its values.
+
+        Args:
+            attributes: accessor of each attribute of the primitive.
+            indices: accessor of its indices; None: it has none.
+            draco: the primitive's JSON object of the extension.
+
+        Raises:
+            InputError: damaged data.
+            MissingExtraError: the codec is not installed.
+        """
+        view = self.number(draco, "bufferView")
+        if view in self._unpacked:
+            return
+        self._unpacked.add(view)
+        found, faces = draco_primitive(self.subject, draco, self.view(view)[0])
+        for name, values in found.items():
+            if name in attributes:
+                accessor = self.entry("accessors", attributes[name])
+                kind = _COMPONENTS.get(self.number(accessor, "componentType"), values.dtype)
+                self._decoded[attributes[name]] = values.astype(kind)
+        if indices is not None and self.entry("accessors", indices):
+            self._decoded[indices] = faces.astype("<u4")[:, None]
 
     def _values(self, of: dict[str, Any], count: int, width: int, kind: str) -> np.ndarray:
         """Return a view of values in a buffer view, without a copy."""
@@ -227,13 +267,3 @@ class GltfDocument:
         if found not in self._files:
             self._files[found] = read_bytes(found, subject=f"{self.subject}: file")
         return self._files[found]
-
-
-def compression_error(subject: str, name: str) -> InputError:
-    """Return the error for a geometry compression that is not supported."""
-    return InputError(
-        subject,
-        expected="uncompressed geometry",
-        received=name,
-        remedy="export without compression, or decompress it (gltf-transform copy, Blender's import and export)",
-    )

@@ -16,7 +16,8 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_integer, as_object
 from smplxpp.core.mesh_files.gltf_colors import primitive_colors, primitive_texture
-from smplxpp.core.mesh_files.gltf_document import GltfDocument, compression_error
+from smplxpp.core.mesh_files.gltf_compression import DRACO
+from smplxpp.core.mesh_files.gltf_document import GltfDocument
 from smplxpp.core.mesh_files.gltf_skins import Binding, Bindings, Node, read_influences, world_nodes
 from smplxpp.core.mesh_files.raw_mesh import FacePictures, RawMesh, blended, require_indices, warn
 from smplxpp.core.mesh_files.texture import MISSING_GRAY
@@ -32,7 +33,8 @@ def read_gltf(path: Path) -> RawMesh:
     points are left out with a warning; morph targets and animations without one.
 
     Raises:
-        InputError: no glTF 2.0, Draco or meshopt compression, data outside the file, a node with two parents.
+        InputError: no glTF 2.0, data outside the file or damaged, a node with two parents.
+        MissingExtraError: Draco's or meshoptimizer's compression without the extra `gltf`.
     """
     document = GltfDocument(path)
     nodes = {node.index: node for node in world_nodes(document)}
@@ -96,11 +98,10 @@ class _Parts:
             self._left_out += 1
             return
         position = document.number(attributes, "POSITION")
-        draco = "KHR_draco_mesh_compression"
-        if draco in document.part(primitive, "extensions") and "bufferView" not in document.entry(
-            "accessors", position
-        ):
-            raise compression_error(subject, draco)
+        compressed = document.part(document.part(primitive, "extensions"), DRACO)
+        # A file may hold the same geometry without compression for readers that do not know the extension.
+        if compressed and "bufferView" not in document.entry("accessors", position):
+            document.decompress(attributes, primitive.get("indices"), compressed)
         if position not in shared:
             shared[position] = self._add_vertices(attributes, position, world, binding)
         # Indices into the part's vertices; without any, the vertices follow each other.
