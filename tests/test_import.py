@@ -19,8 +19,8 @@ from pipelines.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("smplxpp", "avatar", "pipelines")
-TOP = {"build", "people", "synth", "figures"}
-"""Rooms above the stages, which nothing below imports: stages in order, procedural people, their captures, pictures."""
+TOP = {"build", "people", "synth", "figures", "footage"}
+"""Rooms above the stages, which nothing below imports: stages in order, procedural people, captures, pictures."""
 SHARED = {"core", "native", "raster", "skinning", "body", "template", "cloth", "data"}
 STAGES = {
     "capture",
@@ -54,7 +54,6 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"runs"},
         {"stages"},
         {"report"},
-        {"captures"},
         {"ablation"},
         {"batch"},
         {"web"},
@@ -67,11 +66,10 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
 # Rooms that reach even less than what lies below them.
 NARROW = {
     "avatar.evaluation": {"training", "baselines"},
-    "pipelines.captures": {"stages"},
-    "pipelines.batch": {"stages", "report", "captures", "ablation"},
-    "pipelines.viewer": {"report", "captures", "ablation"},
-    "pipelines.chat": {"runs", "stages", "report", "captures", "ablation", "viewer"},
-    "pipelines.web": {"runs", "stages", "report", "captures", "ablation", "viewer"},
+    "pipelines.batch": {"stages", "report", "ablation"},
+    "pipelines.viewer": {"report", "ablation"},
+    "pipelines.chat": {"runs", "stages", "report", "ablation", "viewer"},
+    "pipelines.web": {"runs", "stages", "report", "ablation", "viewer"},
 }
 
 

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ROOMS = {
     "smplxpp": (
         "core body capture build segment clean transfer skinning template export metrics register reconstruct "
-        "cloth raster detect people synth figures"
+        "cloth raster detect people synth footage figures"
     ).split(),
     "avatar": (
         "data gaussians rendering losses models training evaluation metrics runtime driving speech export formats"

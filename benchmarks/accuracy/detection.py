@@ -28,7 +28,6 @@ from jaxtyping import Bool, Float64, UInt8
 from benchmarks.accuracy.registration import bare_and_under
 from benchmarks.support.people import captured, captured_names
 from benchmarks.support.results import store_results
-from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes
 from pipelines.commands.options import OptionalPath, OptionalText, selected_frames
 from pipelines.stages.build_config import RegisterInputs
 from smplxpp.body import BodyModel, load_body
@@ -39,6 +38,7 @@ from smplxpp.core import BodyParams, InputError
 from smplxpp.detect import load_detector
 from smplxpp.detect.mediapipe_detector import PersonSegmenter
 from smplxpp.detect.plates import PlateModel
+from smplxpp.footage.keypoints import detect_keypoints, detection_notes
 from smplxpp.metrics.pose_error import pose_error
 from smplxpp.people import PersonScan, people, variant
 from smplxpp.register import LandmarkModel, Observations, RegisterConfig, register, triangulate

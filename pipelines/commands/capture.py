@@ -57,8 +57,8 @@ class CaptureCheckCommand:
 
     def run(self) -> dict:
         """Check; exit status 1 if something has to be corrected."""
-        from pipelines.captures.check import check_as_dict, print_check, write_check_report
         from pipelines.commands.terminal import shared_progress
+        from pipelines.report.capture_check import check_as_dict, print_check, write_check_report
         from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.body import load_body
         from smplxpp.capture import open_capture

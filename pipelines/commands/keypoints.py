@@ -96,7 +96,6 @@ class KeypointsDetect:
 
     def run(self) -> dict:
         """Detect keypoints and return the number of frames for each camera."""
-        from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes, detection_sheet
         from pipelines.commands.terminal import shared_progress
         from pipelines.runs.folders import keep_out_of_capture
         from smplxpp.capture import open_capture
@@ -104,6 +103,7 @@ class KeypointsDetect:
         from smplxpp.core.files.paths import same_place
         from smplxpp.detect import load_detector
         from smplxpp.figures import encode_jpeg, encode_png
+        from smplxpp.footage.keypoints import detect_keypoints, detection_notes, detection_sheet
 
         # `keypoints` of the capture itself is allowed, any other place inside the capture is not.
         if not same_place(self.out, self.capture / "keypoints"):

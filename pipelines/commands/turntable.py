@@ -50,9 +50,9 @@ class CaptureTurntable:
 
     def run(self) -> dict:
         """Make the capture and return its figures."""
-        from pipelines.captures.turntable import TurntableCaptureConfig, make_turntable_capture
         from pipelines.commands.terminal import shared_progress
         from smplxpp.body import load_body
+        from smplxpp.footage.turntable import TurntableCaptureConfig, make_turntable_capture
 
         config = TurntableCaptureConfig(
             height=self.height,

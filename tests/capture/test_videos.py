@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.captures.turn_frames import sharpest_of_intervals
 from pipelines.commands.capture import CaptureConvertCommand
 from smplxpp.capture import open_capture
 from smplxpp.capture.video_files import Video, probe_video, video_frames
 from smplxpp.capture.video_sync import found_offsets, timeline
 from smplxpp.core import InputError
+from smplxpp.footage.turn_frames import sharpest_of_intervals
 from tests.capture.calibration_writers import pose2sim as write_calibration
 from tests.capture.test_calibrations import rig
 

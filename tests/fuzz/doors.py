@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipelines.captures.detect_keypoints import kept_rows
 from smplxpp.body import load_params
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.calibrations import read_calibration
@@ -25,6 +24,7 @@ from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.safe_pickle import dense_array, safe_load, safe_npz
 from smplxpp.core.mesh_files.mesh_io import read_mesh, read_raw_mesh, write_ply
 from smplxpp.detect.model_card import load_card
+from smplxpp.footage.keypoints import kept_rows
 from smplxpp.register import read_landmarks, write_landmarks
 from smplxpp.segment.corrections import BoxCorrection, Corrections, FaceCorrection, StrokeCorrection
 from smplxpp.segment.label_files import read_label_map, read_labels

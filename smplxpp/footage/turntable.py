@@ -10,11 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.captures.detect_keypoints import detect_keypoints
-from pipelines.captures.turn_frames import Lens, TurnFrame, last_number, lens_of, turn_frames, upright_image
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture, MattingModel, open_capture, write_mattes
-from smplxpp.capture.files import IMAGE_SUFFIXES
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.capture.views import read_alpha
@@ -23,7 +20,6 @@ from smplxpp.capture.writers.metadata import write_plain_cameras_json
 from smplxpp.core import (
     Camera,
     InputError,
-    Keypoints2D,
     ProgressCallback,
     ignore_progress,
     require_at_least,
@@ -31,6 +27,17 @@ from smplxpp.core import (
 )
 from smplxpp.core.files import atomic_folder, atomic_write_bytes, atomic_write_text, jsonable, read_bytes
 from smplxpp.detect import load_detector
+from smplxpp.footage.keypoints import detect_keypoints
+from smplxpp.footage.turn_frames import (
+    Lens,
+    TurnFrame,
+    files_of_frames,
+    is_turned,
+    keypoints_of_frames,
+    lens_of,
+    turn_frames,
+    upright_image,
+)
 from smplxpp.register import Observations
 from smplxpp.register.turntable import (
     LEAST_FRAMES,
@@ -187,8 +194,7 @@ def _write_images(
         jpeg = suffix in JPEG_SUFFIXES
         path = view_path(root, "image", CAMERA, row, suffix if jpeg or suffix == ".png" else ".png")
         # Files that need no rotation keep their bytes.
-        with_exif = jpeg and image.size != size
-        if (jpeg or suffix == ".png") and not with_exif and not _is_turned(frame.path):
+        if (jpeg or suffix == ".png") and not is_turned(frame.path):
             atomic_write_bytes(path, read_bytes(frame.path))
         elif jpeg:
             write_jpeg(path, np.asarray(image), quality=95)
@@ -211,13 +217,6 @@ def _write_images(
     return Camera(K, pose, width, height, name=CAMERA), lens
 
 
-def _is_turned(path: Path) -> bool:
-    """Return whether a photograph has to be rotated to be upright."""
-    from smplxpp.core.files.image_file import open_image
-
-    return int(open_image(path, subject="photograph").getexif().get(0x0112, 1)) != 1
-
-
 def _write_masks(
     root: Path,
     frames: list[TurnFrame],
@@ -227,7 +226,7 @@ def _write_masks(
 ) -> None:
     """Copy the masks that are given, or make them."""
     if config.masks is not None:
-        files = _by_frame(config.masks, frames, "masks")
+        files = files_of_frames(config.masks, frames, "masks")
         for row, path in files.items():
             write_gray_png(view_path(root, "mask", CAMERA, row, ".png"), np.asarray(read_alpha(path)))
         return
@@ -259,55 +258,17 @@ def _write_keypoints(
     """Copy the keypoints that are given, or detect them."""
     target = root / "keypoints" / f"{CAMERA}.npz"
     if config.keypoints is not None:
-        write_keypoints(target, _of_frames(read_keypoints(config.keypoints), frames, str(config.keypoints)))
+        write_keypoints(target, keypoints_of_frames(read_keypoints(config.keypoints), frames, str(config.keypoints)))
         return
     if given is not None:
         (camera,) = given.cameras
         found = given.keypoints(camera)
         if found is not None:
-            write_keypoints(target, _of_frames(found, frames, f"capture {given.name}"))
+            write_keypoints(target, keypoints_of_frames(found, frames, f"capture {given.name}"))
             return
     detect_keypoints(
         open_capture(root, cache_bytes=0), load_detector(config.detector), target.parent, progress=progress
     )
-
-
-def _of_frames(keypoints: Keypoints2D, frames: list[TurnFrame], source: str) -> Keypoints2D:
-    """Return keypoints with the frames numbered from 0, matched by the files' numbers, else by their order.
-
-    Raises:
-        InputError: keypoints of other frames.
-    """
-    have, wanted = keypoints.frames.tolist(), [frame.number for frame in frames]
-    if not set(wanted) <= set(have):
-        if len(have) != len(frames):
-            raise InputError(
-                f"keypoints {source}",
-                expected=f"those of {len(frames)} frames, with the numbers of their files",
-                received=f"{len(have)} frames, {have[0]} to {have[-1]}" if have else "none",
-            )
-        wanted = list(have)
-    rows = keypoints.select(keypoints.names, [int(number or 0) for number in wanted])
-    return Keypoints2D(rows.names, np.arange(len(frames)), rows.points, rows.confidence)
-
-
-def _by_frame(folder: Path, frames: list[TurnFrame], what: str) -> dict[int, Path]:
-    """Match the files of a folder to the frames by their numbers, else by their order.
-
-    Raises:
-        InputError: no such folder, or files of other frames.
-    """
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
-    by_number = {last_number(path): path for path in files}
-    if len(by_number) == len(files) and {frame.number for frame in frames} <= set(by_number):
-        return {row: by_number[frame.number] for row, frame in enumerate(frames)}
-    if len(files) != len(frames):
-        raise InputError(
-            f"{what} {folder}",
-            expected=f"images of the {len(frames)} frames, with the numbers of their files",
-            received=f"{len(files)} images",
-        )
-    return dict(enumerate(files))
 
 
 def _register(

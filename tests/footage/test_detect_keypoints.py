@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.captures.detect_keypoints import detect_keypoints, detection_notes
 from pipelines.cli import main
 from smplxpp.capture import open_capture
 from smplxpp.core.errors import InputError
 from smplxpp.detect import DetectedPerson
+from smplxpp.footage.keypoints import detect_keypoints, detection_notes
 from tests.capture.scene import LENS, make_scene
 from tests.capture.writers import write_simple
 from tests.detect.keypoint_models import write_card, write_model
@@ -89,7 +89,7 @@ def test_a_kill_loses_little(rig, tmp_path, monkeypatch):
                 raise KeyboardInterrupt
             return super().__call__(image, box)
 
-    monkeypatch.setattr("pipelines.captures.detect_keypoints._SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr("smplxpp.footage.keypoints._SAVE_EVERY_S", 0.0)
     with pytest.raises(KeyboardInterrupt):
         detect_keypoints(open_capture(rig), Killed(), tmp_path / "k")
     rest = Finder()

@@ -10,9 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.captures import turntable
-from pipelines.captures.turn_frames import lens_of, turn_frames, upright_image
-from pipelines.captures.turntable import TurntableCaptureConfig, held_out_frames, make_turntable_capture
 from smplxpp.body import load_body
 from smplxpp.build import register
 from smplxpp.build.config import RegisterInputs
@@ -24,6 +21,9 @@ from smplxpp.capture.writers.frame_files import write_keypoints
 from smplxpp.core import InputError, Keypoints2D
 from smplxpp.core.files.image_file import image_size
 from smplxpp.detect import DetectedPerson
+from smplxpp.footage import turntable
+from smplxpp.footage.turn_frames import lens_of, turn_frames, upright_image
+from smplxpp.footage.turntable import TurntableCaptureConfig, held_out_frames, make_turntable_capture
 from smplxpp.register import RegisterConfig
 from tests.register.turns import turned_person
 

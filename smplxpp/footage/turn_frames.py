@@ -19,7 +19,7 @@ from scipy.ndimage import laplace
 from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from smplxpp.capture.video_files import ffmpeg_program, probe_video
-from smplxpp.core import InputError, spread
+from smplxpp.core import InputError, Keypoints2D, spread
 from smplxpp.core.files.image_file import open_image
 
 _UNKNOWN_LENS, _STATED_LENS = 0.25, 0.03  # standard deviations of log f
@@ -170,6 +170,11 @@ def upright_image(path: Path) -> Image.Image:
     return ImageOps.exif_transpose(open_image(path, subject="photograph")).convert("RGB")
 
 
+def is_turned(path: Path) -> bool:
+    """Return whether a photograph has to be rotated to be upright."""
+    return int(open_image(path, subject="photograph").getexif().get(ExifTags.Base.Orientation, 1)) != 1
+
+
 def lens_of(path: Path, size: tuple[int, int], focal_mm: float | None) -> Lens:
     """Return what is known of a lens: the user's word, the photograph's Exif record, or that it is a phone's.
 
@@ -189,3 +194,41 @@ def lens_of(path: Path, size: tuple[int, int], focal_mm: float | None) -> Lens:
     # Main cameras of phones, filming: 24 to 30 mm.
     phone_mm = 27.0
     return Lens(phone_mm * pixels_a_mm, _UNKNOWN_LENS, f"not known, {phone_mm:g} mm expected of a phone")
+
+
+def keypoints_of_frames(keypoints: Keypoints2D, frames: list[TurnFrame], source: str) -> Keypoints2D:
+    """Return keypoints with the frames numbered from 0, matched by the files' numbers, else by their order.
+
+    Raises:
+        InputError: keypoints of other frames.
+    """
+    have, wanted = keypoints.frames.tolist(), [frame.number for frame in frames]
+    if not set(wanted) <= set(have):
+        if len(have) != len(frames):
+            raise InputError(
+                f"keypoints {source}",
+                expected=f"those of {len(frames)} frames, with the numbers of their files",
+                received=f"{len(have)} frames, {have[0]} to {have[-1]}" if have else "none",
+            )
+        wanted = list(have)
+    rows = keypoints.select(keypoints.names, [int(number or 0) for number in wanted])
+    return Keypoints2D(rows.names, np.arange(len(frames)), rows.points, rows.confidence)
+
+
+def files_of_frames(folder: Path, frames: list[TurnFrame], what: str) -> dict[int, Path]:
+    """Match the files of a folder to the frames by their numbers, else by their order.
+
+    Raises:
+        InputError: no such folder, or files of other frames.
+    """
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
+    by_number = {last_number(path): path for path in files}
+    if len(by_number) == len(files) and {frame.number for frame in frames} <= set(by_number):
+        return {row: by_number[frame.number] for row, frame in enumerate(frames)}
+    if len(files) != len(frames):
+        raise InputError(
+            f"{what} {folder}",
+            expected=f"images of the {len(frames)} frames, with the numbers of their files",
+            received=f"{len(files)} images",
+        )
+    return dict(enumerate(files))

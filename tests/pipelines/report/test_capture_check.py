@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.captures.check import write_check_report
 from pipelines.cli import main
 from pipelines.commands.capture import FormatName
+from pipelines.report.capture_check import write_check_report
 from smplxpp.body import load_body
 from smplxpp.capture import FORMATS, open_capture
 from smplxpp.capture.check import CheckConfig, check_capture
@@ -22,7 +22,7 @@ from smplxpp.capture.check.silhouettes import compare_silhouettes
 from smplxpp.core.rotations import matrix_from_rotvec
 from tests.capture.scene import make_scene
 from tests.capture.writers import write_actorshq, write_avatarrex, write_easymocap, write_neus2, write_simple
-from tests.captures.planted_faults import (
+from tests.pipelines.report.planted_faults import (
     CALIBRATION_FAULTS,
     FILE_FAULTS,
     PARAMETER_FAULTS,
@@ -37,7 +37,7 @@ from tests.captures.planted_faults import (
     truncate,
 )
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "capture_check.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "capture_check.md"
 
 
 @pytest.fixture(scope="module")

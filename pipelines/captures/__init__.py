@@ -1,1 +1,0 @@
-"""Write reports of a capture's check, and keypoints and masks of its images."""
