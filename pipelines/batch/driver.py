@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -118,12 +117,16 @@ def drive(
     pending = deque(Task.of(job, parts_of(job, splits=executor.splits)) for job in jobs)
     progress = Progress(total or len(jobs), Counter(done=(total or len(jobs)) - len(jobs), waiting=len(jobs)))
     tries: Counter[tuple[str, tuple[str, ...]]] = Counter()
+    withdrawn = False
     for job in jobs:
         executor.check(job)
     try:
         while pending or progress.running:
-            if not progress.halted:
-                progress.halted = _reason_to_halt(runs, held)
+            progress.halted = progress.halted or _reason_to_halt(runs, held)
+            if progress.halted and not withdrawn:
+                withdrawn = True
+                for task in executor.withdraw():
+                    progress.running.pop(task.job.subject, None)
             if progress.halted:
                 pending.clear()
             # The first that fits begins, so that a job that waits for a GPU lets others pass.
@@ -132,8 +135,6 @@ def drive(
                     pending.remove(task)
                     executor.submit(task)
                     progress.running[task.job.subject] = task.steps
-                elif not task.on_gpu:
-                    break
             for task, outcome in executor.ended(1.0):
                 progress.running.pop(task.job.subject, None)
                 again = _settle(runs, task, outcome, progress, tries, retries)
@@ -143,6 +144,8 @@ def drive(
     except BaseException:
         # Ctrl-C ends the running commands kindly, as `batch stop` does.
         request_stop(runs)
+        for task in executor.withdraw():
+            progress.running.pop(task.job.subject, None)
         while progress.running and (ended := executor.ended(60.0)):
             for task, _ in ended:
                 progress.running.pop(task.job.subject, None)
@@ -243,7 +246,8 @@ def _settle(
         if tries[key] <= retries:
             return task
     if meaning in ("disk", "code"):
-        progress.halted = progress.halted or f"{subject}: {_last_error(runs, subject)}"
+        words = outcome.get("message") or _last_error(runs, subject)
+        progress.halted = progress.halted or f"{subject}: {words}"
     progress.states["waiting"] -= 1
     progress.states[state] += 1
     return None
@@ -261,9 +265,6 @@ def _lost(
     subject, key = task.job.subject, (task.job.subject, task.steps)
     words = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
     log.warning("%s: %s", subject, words)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
-        progress.halted = progress.halted or f"{subject}: {words}"
-        return None
     tries[key] += 1
     if tries[key] <= retries and not isinstance(error, InputError):
         return task

@@ -91,17 +91,23 @@ def run_job(job: Job, folder: Path, resources: Resources) -> dict[str, Any]:
 
     Returns:
         `subject`, `state` of the chain, `meaning` of the last command's end, `ran` (names of the steps whose commands
-        were started) and `seconds`. The meanings `disk` and `code` ask the driver to begin nothing else, `again` and
-        `busy` to call once more.
+        were started), `seconds` and, where no record could be written, `message`. The meanings `disk` and `code` ask
+        the driver to begin nothing else, `again` and `busy` to call once more.
     """
-    begin, runs = time.perf_counter(), folder.parent
-    folder.mkdir(parents=True, exist_ok=True)
+    begin, runs = time.monotonic(), folder.parent
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         with _patient_hold(job, folder, resources) as hold:
-            chain = _Chain(job, folder, resources, stop=lambda: hold.lost or stop_requested(runs))
+            # The limit of a stay counts from here: a hold may have been waited for.
+            chain = _Chain(job, folder, resources, begin=begin, stop=lambda: hold.lost or stop_requested(runs))
             meaning = chain.run()
     except _BusyError as busy:
         return _result(job, "waiting", busy.meaning, [], begin)
+    except OSError as error:
+        # Ray and submitit hand an error on as text, in which the driver cannot see that a disk is full.
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+            raise
+        return {**_result(job, "waiting", "disk", [], begin), "message": str(error)}
     return _result(job, chain.record.state, meaning, chain.ran, begin)
 
 
@@ -129,18 +135,18 @@ def _patient_hold(job: Job, folder: Path, resources: Resources) -> Hold:
 
 
 def _result(job: Job, state: State, meaning: Meaning, ran: Sequence[str], begin: float) -> dict[str, Any]:
-    seconds = round(time.perf_counter() - begin, 3)
+    seconds = round(time.monotonic() - begin, 3)
     return {"subject": job.subject, "state": state, "meaning": meaning, "ran": list(ran), "seconds": seconds}
 
 
 class _Chain:
     """The steps of one call, in their order, and the record that they keep."""
 
-    def __init__(self, job: Job, folder: Path, resources: Resources, *, stop: Callable[[], bool]) -> None:
+    def __init__(self, job: Job, folder: Path, resources: Resources, *, begin: float, stop: Callable[[], bool]) -> None:
         self.job, self.folder, self.resources, self.stop = job, folder, resources, stop
         self.record = _joined(read_job(folder.parent, job.subject), job)
         self.ran: list[str] = []
-        self.begin = time.monotonic()
+        self.begin = begin
         self.store = Store(job, folder, resources.scratch)
 
     def run(self) -> Meaning:

@@ -18,9 +18,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
+from pipelines.batch.clusters import RayExecutor, SlurmExecutor, cancel_queued
 from pipelines.batch.driver import Progress as State
 from pipelines.batch.driver import begin_batch, drive, retry, take_batch
-from pipelines.batch.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor, gpus_here
+from pipelines.batch.executors import Executor, LocalExecutor, gpus_here
 from pipelines.batch.hold import BATCH_HOLD, at_work, request_stop
 from pipelines.batch.jobs import Job, JobFile, option_words, read_jobs
 from pipelines.batch.page import INDEX_FILE, STATE_STYLES, IndexWriter, cost_table, terminal_table
@@ -184,6 +185,7 @@ class BatchStop:
         """Ask all that work on the batch to end their commands, which they do within seconds."""
         batch = read_batch(self.runs)
         request_stop(self.runs)
+        cancel_queued(self.runs)
         if not self.json:
             Console().print(
                 f"asked to stop; `smplxpp batch {batch.job_file}` continues", soft_wrap=True, highlight=False
