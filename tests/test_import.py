@@ -46,7 +46,7 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"losses"},
         {"metrics", "models"},
         {"export", "driving"},
-        {"training"},
+        {"training", "conversation"},
         {"baselines"},
         {"evaluation"},
     ),
@@ -58,17 +58,15 @@ FLOORS: dict[str, tuple[set[str], ...]] = {
         {"batch"},
         {"web"},
         {"viewer"},
-        {"chat"},
         {"commands"},
         {"cli"},
     ),
 }
 # Rooms that reach even less than what lies below them.
 NARROW = {
-    "avatar.evaluation": {"training", "baselines"},
+    "avatar.evaluation": {"training", "conversation", "baselines"},
     "pipelines.batch": {"stages", "report", "ablation"},
     "pipelines.viewer": {"report", "ablation"},
-    "pipelines.chat": {"runs", "stages", "report", "ablation", "viewer"},
     "pipelines.web": {"runs", "stages", "report", "ablation", "viewer"},
 }
 

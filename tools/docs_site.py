@@ -27,7 +27,8 @@ ROOMS = {
         "cloth raster detect people synth footage figures"
     ).split(),
     "avatar": (
-        "data gaussians rendering losses models training evaluation metrics runtime driving speech export formats"
+        "data gaussians rendering losses models training evaluation metrics runtime driving speech conversation "
+        "export formats"
     ).split(),
 }
 """Packages and their rooms in the order of the reference; a room's public names are its `__all__`."""

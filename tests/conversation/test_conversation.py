@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipelines.chat.conversation import MOST_TYPED, Conversation
-from pipelines.chat.frame_queue import AHEAD, LEAD_TIME, FrameQueue, Line
+from avatar.conversation.conversation import MOST_TYPED, Conversation
+from avatar.conversation.frame_queue import AHEAD, LEAD_TIME, FrameQueue, Line
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.tensor_bytes import unpack_tensors
-from tests.chat.actors import A_CHARACTER, Dancer, Hum, Script, Words, cast, doll
-from tests.chat.test_listening import sound
+from tests.conversation.actors import A_CHARACTER, Dancer, Hum, Script, Words, cast, doll
+from tests.conversation.test_listening import sound
 from tests.dolls.dancing import dance
 
 FPS = 30
@@ -192,7 +192,7 @@ def test_words_that_do_not_match_their_sounds_are_said_and_not_answered(talk):
 
 
 def test_digits_are_not_spoken_for_longer_than_an_answer(talk, monkeypatch):
-    monkeypatch.setattr("pipelines.chat.conversation._MOST_SPOKEN", 10.0)
+    monkeypatch.setattr("avatar.conversation.conversation._MOST_SPOKEN", 10.0)
     it, page, _ = talk(partner=Script(["7" * 100 + ". "] * 9))
     it.typed("go on")
     until(lambda: "answered" in page.kinds())

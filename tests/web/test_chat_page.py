@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from smplxpp.core.files.sound_file import Sound, wave_bytes
-from tests.chat.actors import A_CHARACTER, Script, Words, cast, doll
-from tests.chat.test_deploy import NEEDS_NGINX, PROXIED, behind_nginx
-from tests.chat.test_listening import sound
+from tests.conversation.actors import A_CHARACTER, Script, Words, cast, doll
+from tests.conversation.test_listening import sound
 from tests.web.chromium import Page, find_chromium
 from tests.web.ear import LISTEN
 from tests.web.modules import NEEDS_BUILD, node
+from tests.web.test_deploy import NEEDS_NGINX, PROXIED, behind_nginx
 from tests.web.test_embed import SIZES, anybody_can_use, react_files, show
 from tests.web.test_lips import dolls_lips
 
 pytest.importorskip("websockets", reason="extra chat")
 
-from pipelines.chat.server import ChatServer
+from pipelines.web.chat_server import ChatServer
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="no Chromium here (apt-get install chromium)")
 STAGE = "window.conversation.stage"

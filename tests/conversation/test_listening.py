@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from pipelines.chat.hearing import RATE, ListenConfig, Listener, LoudnessActivity, UtterancePart, find_activity
+from avatar.conversation.hearing import RATE, ListenConfig, Listener, LoudnessActivity, UtterancePart, find_activity
 
 LEVEL = 8000
 

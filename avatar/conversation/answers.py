@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-from pipelines.chat.spoken_answer import ThoughtFilter
+from avatar.conversation.spoken_answer import ThoughtFilter
 from smplxpp.core import InputError, require_positive
 from smplxpp.core.files.json_file import as_list, as_object, parse_json
 
@@ -89,7 +89,7 @@ SYSTEM_PROMPT = (
     "without lists, markup or emoji."
 )
 # Tokens that an answer may take. Thoughts count too and are longer than answers; speech is bounded in characters
-# (`pipelines.chat.conversation`).
+# (`avatar.conversation.conversation`).
 _MOST_TOKENS = 2048
 _PATH = "/chat/completions"
 _MOST_LINE, _MOST_BYTES = 1 << 18, 4 << 20  # bounds of a line and of an answer in bytes, against endless streams

@@ -1,1 +1,0 @@
-"""Converse with an avatar in a page: hear or read a message, get an answer, speak it and move."""
