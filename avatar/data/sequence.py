@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Protocol
 
@@ -18,6 +18,7 @@ from avatar.data.cloth_motion import ClothMotions
 from avatar.data.views import View, read_view
 from avatar.rig.rig import Pose, Rig
 from smplxpp.capture import Capture
+from smplxpp.capture.cache import ArrayCache
 from smplxpp.core import BodyParams, Camera, InputError, require_at_least
 from smplxpp.core.spread import spread_inside
 from smplxpp.native import thread_count
@@ -122,6 +123,7 @@ class AvatarSequence:
         config: of reading.
         device: of all tensors.
         cloth: simulated clothes in frames that are not training frames; None: none.
+        cache_gib: bound of the photographs that are kept in memory; None: the capture's own, 1 GiB by default.
 
     Raises:
         InputError: no training camera or frame, or a training frame without parameters.
@@ -135,7 +137,10 @@ class AvatarSequence:
         *,
         device: str = "cpu",
         cloth: ClothMotions | None = None,
+        cache_gib: float | None = None,
     ) -> None:
+        if cache_gib is not None:
+            capture = replace(capture, cache=ArrayCache(round(cache_gib * 2**30)))
         # Images and, for a GPU, poses of the next steps are made while the current step computes.
         self.capture, self.config, self.device = capture, config or SequenceConfig(), device
         self.rig = Rig(template, device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -73,15 +73,16 @@ class Pose:
 
     def to(self, device: torch.device | str) -> Pose:
         """Return the same pose on another device; a GPU is not waited for where its memory is pinned."""
-        moved = {name: value.to(device, non_blocking=True) for name, value in self._tensors().items()}
-        return replace(self, **moved)
+        return self._with(lambda tensor: tensor.to(device, non_blocking=True))
 
     def pinned(self) -> Pose:
         """Return the same pose in memory that a GPU reads by itself."""
-        return replace(self, **{name: value.pin_memory() for name, value in self._tensors().items()})
+        return self._with(Tensor.pin_memory)
 
-    def _tensors(self) -> dict[str, Tensor]:
-        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+    def _with(self, change: Callable[[Tensor], Tensor]) -> Pose:
+        assert self.cloth is None, "a pose without simulated clothes"
+        changed: dict[str, Any] = {name: change(value) for name, value in vars(self).items() if torch.is_tensor(value)}
+        return replace(self, **changed)
 
     def without_cloth(self) -> Pose:
         """Return the same pose without simulated clothes, so that the model alone moves them."""
@@ -145,7 +146,7 @@ class Rig:
         rest[: self.template.body.vertex_count] = posed.rest_vertices[0]
         expression = np.zeros(self.expression_size)
         expression[: params.expression.shape[1]] = params.expression[0]
-        arrays = {
+        arrays: dict[str, np.ndarray] = {
             "body_pose": params.body_pose[0],
             "expression": expression,
             "jaw": params.jaw_pose[0],
@@ -153,7 +154,8 @@ class Rig:
             "world_from_rest": blended.reshape(-1, 3, 4),
             "root_from_world": np.linalg.inv(transforms[0]),
         }
-        return Pose(frame, **{name: self._tensor(array, device) for name, array in arrays.items()})
+        tensors: dict[str, Any] = {name: self._tensor(array, device) for name, array in arrays.items()}
+        return Pose(frame, **tensors)
 
     def pose_from_vertices(self, vertices: Float[np.ndarray, "V 3"]) -> Pose:
         """Return the pose whose skinned mesh equals `vertices`, metres, to the bit.

@@ -7,11 +7,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.training.engine.photometric_task import PhotometricConfig
+from avatar.training.engine.resources import Compiled
 from avatar.training.loose_clothes import ClothConfig
 from avatar.training.presets import TrainingPreset, training_preset, with_iterations, with_local_shapes
 from avatar.training.refinement.config import RefineConfig
@@ -51,6 +52,10 @@ class TrainConfig:
         force: repeat steps that are finished.
         tensorboard: log for TensorBoard too.
         checkpoint_minutes: between two checkpoints; None: half a minute, or longer for writing to take 2 %.
+        precision: of networks on a GPU: "tf32" (torch's convolutions), "float32", "bfloat16"; "preset": its `amp`.
+        compile: how the teacher's networks are compiled on a GPU, see `resources.compile_networks`.
+        readers: threads that decode photographs, see `SequenceConfig`.
+        cache_gib: see `AvatarSequence`.
 
     Raises:
         InputError: a number out of range, an unknown word, or options that exclude each other.
@@ -75,6 +80,10 @@ class TrainConfig:
     force: bool = False
     tensorboard: bool = False
     checkpoint_minutes: float | None = None
+    precision: Literal["preset", "tf32", "float32", "bfloat16"] = "preset"
+    compile: Compiled = "off"
+    readers: int | None = None
+    cache_gib: float | None = None
 
     def __post_init__(self) -> None:
         for name, value, least in (
@@ -83,6 +92,8 @@ class TrainConfig:
             ("seed", self.seed, 0),
             ("max-megabytes", self.max_megabytes, 0),
             ("refine-frames", self.refine_frames, 1),
+            ("readers", self.readers, 1),
+            ("cache-gib", self.cache_gib, 0),
             *((f"{step}-iterations", value, 1) for step, value in self.iterations.items()),
         ):
             if value is not None and not value >= least:
@@ -97,6 +108,8 @@ class TrainConfig:
             require_positive("option checkpoint-minutes", self.checkpoint_minutes)
         for step in self.iterations:
             require_choice("iterations of a step", step, ("fit", *_TRAININGS))
+        require_choice("option precision", self.precision, ("preset", "tf32", "float32", "bfloat16"))
+        require_choice("option compile", self.compile, get_args(Compiled))
 
     def recipe(
         self, preset: str | TrainingPreset = "cpu", *, cloth: Literal["auto", "none"] = "auto", turn_views: int = 0
@@ -121,6 +134,8 @@ class TrainConfig:
             chosen = with_batch(chosen, self.batch)
         if self.perceptual in ("lpips", "st-lpips"):
             chosen = with_perceptual(chosen)
+        if self.precision != "preset":
+            chosen = _with_changes(chosen, lambda config: {"amp": self.precision == "bfloat16"})
         return Recipe(
             preset=chosen,
             teacher=self.teacher and not turn_views,

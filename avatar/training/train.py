@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from avatar.data.one_frame import views_of_turn
-from avatar.data.sequence import AvatarSequence
+from avatar.data.sequence import AvatarSequence, SequenceConfig
 from avatar.gaussians.tensor_file import load_bound, save_bound
 from avatar.losses.perceptual import load_metric
 from avatar.models.model_file import load_avatar, save_avatar
@@ -26,7 +26,12 @@ from avatar.rig.rig import Rig
 from avatar.training.checks import check_training, note_missing_normals
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resources import choose_device, explain_resource_errors, keep_freed_memory
+from avatar.training.engine.resources import (
+    allow_tf32,
+    choose_device,
+    explain_resource_errors,
+    keep_freed_memory,
+)
 from avatar.training.engine.session import Session
 from avatar.training.fit.fit import fit_gaussians, fit_scene
 from avatar.training.loose_clothes import find_garments, with_simulated
@@ -190,6 +195,7 @@ class _Training:
         self._deadline = time.monotonic() + 60.0 * config.max_minutes
         self._worked = False
         keep_freed_memory()
+        allow_tf32(config.precision)
 
     @cached_property
     def _metric(self) -> Any:
@@ -204,7 +210,8 @@ class _Training:
             reference: parameters that pose the template as its scan; None: no clothes are simulated.
         """
         preset, template = self.recipe.preset, scene.template
-        sequence = AvatarSequence(scene.capture, template, device=self.device)
+        reading, kept = SequenceConfig(readers=self.config.readers), self.config.cache_gib
+        sequence = AvatarSequence(scene.capture, template, reading, device=self.device, cache_gib=kept)
         rig = sequence.rig
 
         # Gaussians on the template, coloured and placed by the photographs of one frame.
@@ -329,6 +336,7 @@ class _Training:
             tensorboard=self.config.tensorboard,
             checkpoint_seconds=self.config.checkpoint_seconds,
             report=lambda progress: self.report(step, progress),
+            compile=self.config.compile,
         )
         with explain_resource_errors(self.folder), atomic_folder(folder) as made:
             done = work(session, made)

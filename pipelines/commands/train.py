@@ -117,6 +117,15 @@ class Train:
     """Log for TensorBoard too, into the folders of the stages."""
     checkpoint_minutes: OptionalFloat = None
     """Minutes between checkpoints; by default half a minute, or longer for writing to take 2 % of the time."""
+    precision: Literal["preset", "tf32", "float32", "bfloat16"] = "preset"
+    """Of networks on a GPU. tf32, as all presets have: convolutions of inputs with 11 bits; bfloat16: networks of 8."""
+    compile: Literal["off", "graphs", "inductor"] = "off"
+    """On a GPU, record the teacher's networks as CUDA graphs, or compile them by torch, for minutes; what fails, or
+    gives other numbers, computes as before, which is said."""
+    readers: OptionalInt = None
+    """Threads that decode photographs; by default one, and beside a GPU as many as CPUs, at most eight."""
+    cache_gib: OptionalFloat = None
+    """GiB of memory for photographs that are kept; by default 1."""
     no_report: bool = False
     """Leave report.html as it is."""
     dry_run: bool = False
@@ -177,6 +186,10 @@ class Train:
                 tensorboard=self.tensorboard,
                 checkpoint_seconds=config.checkpoint_seconds,
                 bar=bar,
+                precision=config.precision,
+                compile=config.compile,
+                readers=config.readers,
+                cache_gib=config.cache_gib,
             )
             records = train(self.run_folder, inputs, scene, recipe, options, together, steps=steps)
             if not together.first:
@@ -270,6 +283,10 @@ class Train:
             force=self.force,
             tensorboard=self.tensorboard,
             checkpoint_minutes=self.checkpoint_minutes,
+            precision=self.precision,
+            compile=self.compile,
+            readers=self.readers,
+            cache_gib=self.cache_gib,
         )
 
     def _finish(self, records: dict[str, StageRecord]) -> dict[str, Any]:

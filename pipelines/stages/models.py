@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from avatar.baselines.build import outer_template
-from avatar.data.sequence import AvatarSequence
+from avatar.data.sequence import AvatarSequence, SequenceConfig
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.rig.rig import Rig
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import PhotometricConfig
 from avatar.training.engine.processes import Distributed
-from avatar.training.engine.resources import explain_resource_errors, keep_freed_memory
+from avatar.training.engine.resources import Compiled, allow_tf32, explain_resource_errors, keep_freed_memory
 from avatar.training.engine.session import Session
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.code import TRAINING
@@ -60,6 +60,10 @@ class TrainOptions:
         tensorboard: log for TensorBoard into the folders of the stages.
         checkpoint_seconds: between two checkpoints, see `LoopConfig`.
         bar: called with a stage's name and iterations; shows its progress.
+        precision: of networks on a GPU, see `TrainConfig`.
+        compile: how networks are compiled on a GPU.
+        readers: threads that decode photographs, see `SequenceConfig`.
+        cache_gib: see `AvatarSequence`.
     """
 
     max_seconds: float = float("inf")
@@ -67,6 +71,10 @@ class TrainOptions:
     tensorboard: bool = False
     checkpoint_seconds: float | None = None
     bar: Bar = field(default=lambda name, total: nullcontext(lambda progress: None))
+    precision: str = "preset"
+    compile: Compiled = "off"
+    readers: int | None = None
+    cache_gib: float | None = None
 
 
 class StageConfig(Protocol):
@@ -175,6 +183,7 @@ class Trainer:
         self._sequences: dict[str, AvatarSequence] = {}
         self._finished: dict[str, StageRecord] = {}
         keep_freed_memory()
+        allow_tf32(options.precision)
 
     @property
     def device(self) -> str:
@@ -193,7 +202,9 @@ class Trainer:
         """Return the capture with one of the templates of `GROUNDS`; all of them share its images."""
         if ground not in self._sequences:
             template = GROUNDS[ground](self.scene.template)
-            self._sequences[ground] = AvatarSequence(self.scene.capture, template, device=self.together.device)
+            reading, kept = SequenceConfig(readers=self.options.readers), self.options.cache_gib
+            made = AvatarSequence(self.scene.capture, template, reading, device=self.together.device, cache_gib=kept)
+            self._sequences[ground] = made
         return self._sequences[ground]
 
     def model(self, stage: ModelStage) -> Any:
@@ -349,6 +360,7 @@ class Trainer:
             tensorboard=self.options.tensorboard,
             checkpoint_seconds=self.options.checkpoint_seconds,
             preview=preview_writer(self.scene.capture, folder),
+            compile=self.options.compile,
         )
 
     def _seen(self, stage: ModelStage) -> dict[str, list[Any]]:

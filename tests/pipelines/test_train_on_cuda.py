@@ -109,8 +109,21 @@ def _kept(monkeypatch) -> list:
 
 
 def test_a_surface_is_followed_without_simulation_and_trainings_go_on(dance, tmp_path, capsys):
+    """And what the pretended device cannot have, networks as graphs, is said and left out."""
     run = write_dance_run(tmp_path / "run")
-    until = ("--preset", "demo", *FEW, "--until", "teacher")
+    until = (
+        "--preset",
+        "demo",
+        *FEW,
+        "--until",
+        "teacher",
+        "--compile",
+        "graphs",
+        "--readers",
+        "2",
+        "--cache-gib",
+        "0",
+    )
     on_cuda("train", run, dance, *until, "--max-minutes", "1e-9")
     assert not json.loads(capsys.readouterr().out)["finished"]
     on_cuda("train", run, dance, *until)

@@ -101,6 +101,15 @@ def test_the_bakes_student_has_no_blend_shapes(name):
     assert student.blend_shapes is None and student.field == training_preset(name).networks.field
 
 
+def test_the_precision_of_networks_is_an_option_of_any_preset():
+    presets = {name: TrainConfig(precision=name).recipe("gpu").preset for name in ("preset", "bfloat16", "float32")}
+    amp = {name: {preset.teacher.amp, preset.bake.amp, preset.compensate.amp} for name, preset in presets.items()}
+    assert amp == {"preset": {False}, "bfloat16": {True}, "float32": {False}}
+    for wrong in ({"precision": "half"}, {"compile": "jit"}, {"readers": 0}, {"cache_gib": -1.0}):
+        with pytest.raises(InputError, match="option"):
+            TrainConfig(**wrong)
+
+
 def test_an_unknown_name_is_refused():
     with pytest.raises(InputError, match="'paper' or 'gpu' or 'paper-small' or 'cpu' or 'demo'"):
         training_preset("tpu")

@@ -143,6 +143,10 @@ class Residuals:
         """Residuals of the quaternions, wxyz, added before normalisation."""
         return self.shape[..., 6:]
 
+    def float(self) -> Residuals:
+        """Return the residuals in float32, which rasteriser and losses need."""
+        return Residuals(self.shape.float(), self.colour.float(), self.position_scale)
+
     def sampled(self, sampler: MapSampler) -> Residuals:
         """Sample residual maps at the Gaussians of `sampler`."""
         return Residuals(sampler(self.shape), sampler(self.colour), self.position_scale)

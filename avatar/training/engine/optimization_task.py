@@ -82,7 +82,8 @@ class OptimizationTask(ABC, Generic[Batch]):
     def autocast(self) -> torch.autocast:
         """Return the autocast context of networks alone; rasteriser and losses need their outputs in float32."""
         enabled = self.optimiser_config.amp and self.device.type == "cuda"
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
+        # Every weight is used once a pass, so that a cache of rounded ones would gain nothing; graphs cannot have it.
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled, cache_enabled=False)
 
     def step(self, iteration: int) -> Mapping[str, Any]:
         """Take one step of Adam on the mean over the micro-batches.

@@ -6,10 +6,11 @@ import ctypes
 import errno
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, Literal
 
 try:
     import resource
@@ -17,6 +18,7 @@ except ModuleNotFoundError:  # Windows
     resource = None  # type: ignore[assignment]
 
 import torch
+from torch import Tensor, nn
 
 from smplxpp.core.errors import InputError
 
@@ -87,6 +89,117 @@ def explain_resource_errors(folder: Path) -> Iterator[None]:
 
 
 log = logging.getLogger(__name__)
+Compiled = Literal["off", "graphs", "inductor"]
+
+
+def allow_tf32(precision: str) -> None:
+    """Let convolutions of a GPU round their inputs to 11 bits, as torch does by default; not for "float32".
+
+    Products of matrices stay in float32 for all, because places in the world are among them.
+    """
+    torch.backends.cudnn.allow_tf32 = precision != "float32"
+
+
+def compile_networks(networks: Iterable[nn.Module], how: Compiled, *, tolerance: float = 0.02) -> None:
+    """Compile the forward passes of networks whose inputs keep their shapes, backward passes included.
+
+    The first call with gradients compiles a network and compares outputs and gradients with those of the plain one; a
+    network that fails, or differs, computes as before, and a warning says why. Calls without gradients, of other
+    shapes or of another precision are computed as before.
+
+    Args:
+        networks: on a GPU; others stay as they are.
+        how: "graphs": CUDA graphs, which take seconds and the memory of the activations once more; "inductor": torch's
+            compiler, which takes minutes and needs a C++ compiler; "off": not at all.
+        tolerance: largest difference that passes, as a share of the largest value: bfloat16 rounds to 1 / 256.
+    """
+    for network in networks:
+        if how != "off" and next(network.parameters()).is_cuda:
+            network.forward = _Compiled(network, how, tolerance)
+
+
+class _Compiled:
+    """The forward pass of a network, compiled for the inputs of its first call with gradients.
+
+    Args:
+        network: whose `forward` it takes the place of.
+        how: see `compile_networks`.
+        tolerance: see there.
+    """
+
+    def __init__(self, network: nn.Module, how: Compiled, tolerance: float) -> None:
+        self.network, self.plain, self.how, self.tolerance = network, network.forward, how, tolerance
+        self.compiled: Callable[..., Any] | None = None
+        self.kind: tuple[Any, ...] | None = None
+        self.failed = False
+
+    def __call__(self, *inputs: Tensor | None) -> Any:
+        """Return what the plain pass returns."""
+        given = tuple(one for one in inputs if one is not None)
+        kind = (
+            torch.is_autocast_enabled("cuda"),
+            *((None if one is None else (one.shape, one.dtype, one.requires_grad)) for one in inputs),
+        )
+        if self.failed or not torch.is_grad_enabled() or self.kind not in (None, kind):
+            return self.plain(*inputs)
+        if self.compiled is None:
+            self.kind = kind
+            places = [place for place, one in enumerate(inputs) if one is not None]
+            try:
+                self._compile(given, places, len(inputs))
+            except Exception as error:  # noqa: BLE001  whatever a compiler raises, the network itself computes
+                self.failed = True
+                log.warning("a network is not compiled and computes as before: %s", str(error).split("\n")[0][:300])
+                return self.plain(*inputs)
+        assert self.compiled is not None
+        return self.compiled(*given)
+
+    def _compile(self, given: tuple[Tensor, ...], places: Sequence[int], count: int) -> None:
+        """Compile the plain pass for some inputs, and compare it with itself."""
+
+        def plain(*tensors: Tensor) -> tuple[Tensor, ...]:
+            placed: list[Tensor | None] = [None] * count
+            for place, tensor in zip(places, tensors, strict=True):
+                placed[place] = tensor
+            return tuple(self.plain(*placed))
+
+        module = _Pass(self.network, plain)
+        truth = self._gradients(plain, given)
+        if self.how == "graphs":
+            samples = tuple(one.detach().clone().requires_grad_(one.requires_grad) for one in given)
+            made = torch.cuda.make_graphed_callables(module, samples, allow_unused_input=True)
+            # Graphs write gradients to the same memory in each call, which the next micro-batch would overwrite.
+            for parameter in self.network.parameters():
+                parameter.register_hook(torch.clone)
+        else:
+            made = torch.compile(module, dynamic=False)
+        for name, found, own in zip(("outputs", "gradients"), self._gradients(made, given), truth, strict=True):
+            for one, other in zip(found, own, strict=True):
+                apart = float((one - other).abs().max()) if one.numel() else 0.0
+                if not apart <= self.tolerance * max(float(other.abs().max()), 1e-6):
+                    raise RuntimeError(f"its {name} differ by {apart:.2g}")
+        self.compiled = made
+
+    def _gradients(self, run: Callable[..., Any], given: tuple[Tensor, ...]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return outputs, and the gradients of their mean square by the parameters, copied."""
+        outputs = list(run(*(one.detach() for one in given)))
+        loss = torch.stack([one.float().square().mean() for one in outputs]).sum()
+        parameters = list(self.network.parameters())
+        found = torch.autograd.grad(loss, parameters, allow_unused=True)
+        gradients = [torch.zeros_like(p) if g is None else g.clone() for g, p in zip(found, parameters, strict=True)]
+        return [one.detach().float().clone() for one in outputs], gradients
+
+
+class _Pass(nn.Module):
+    """A forward pass as a module, whose parameters are those of a network."""
+
+    def __init__(self, network: nn.Module, run: Callable[..., Any]) -> None:
+        super().__init__()
+        self.network, self._run = network, run
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """Return what the pass returns."""
+        return self._run(*inputs)
 
 
 def choose_device(name: str) -> str:

@@ -12,6 +12,7 @@ from avatar.training.engine.loop import LoopConfig, Progress, run_training
 from avatar.training.engine.optimization_task import OptimizationTask, PretrainConfig
 from avatar.training.engine.photometric_task import PhotometricConfig, Preview, TaskContext
 from avatar.training.engine.processes import Distributed
+from avatar.training.engine.resources import Compiled
 
 TRACK, PRETRAIN = "track", "pretrain"
 """Folders of the tracking and of the pretraining, which precede a training."""
@@ -33,6 +34,7 @@ class Session:
         checkpoint_seconds: see `LoopConfig`.
         report: called after logged steps and evaluations.
         preview: called at evaluations with rendered images.
+        compile: how networks are compiled on a GPU, see `compile_networks`.
     """
 
     folder: Path
@@ -44,6 +46,7 @@ class Session:
     checkpoint_seconds: float | None = None
     report: Callable[[Progress], None] = lambda progress: None
     preview: Preview = lambda images: None
+    compile: Compiled = "off"
 
     @property
     def context(self) -> TaskContext:

@@ -117,7 +117,12 @@ class BakeTask(PhotometricTask):
         # Targets and losses of a bake with a teacher.
         if teacher is not None:
             self.targets = DistillationTargets(
-                teacher, sequence, eps2d=config.eps2d, tau=config.tau, normals=bool(config.weights.normal)
+                teacher,
+                sequence,
+                eps2d=config.eps2d,
+                tau=config.tau,
+                normals=bool(config.weights.normal),
+                autocast=self.autocast,
             )
             teacher_config = teacher.config
             self.displacement_loss = DisplacementLoss(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -44,6 +45,7 @@ class DistillationTargets:
         tau: of the semantic labels, radians a metre.
         normals: whether targets have normals.
         max_bytes: bound of the cache.
+        autocast: precision of the teacher's networks.
     """
 
     def __init__(
@@ -55,9 +57,10 @@ class DistillationTargets:
         tau: float,
         normals: bool,
         max_bytes: int = 2 << 30,
+        autocast: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
         self.teacher, self.sequence = teacher.requires_grad_(False), sequence
-        self.eps2d, self.normals = eps2d, normals
+        self.eps2d, self.normals, self.autocast = eps2d, normals, autocast
         self.labels = semantic_labels(sequence.rig, teacher.gaussians(), tau=tau)
         self._cache = ByteCache(max_bytes)
 
@@ -67,7 +70,8 @@ class DistillationTargets:
         def make() -> tuple[Tensor, ...]:
             if self.teacher.track is not None:
                 return (self._maps.interpolate(self.teacher.track.displacements(frame)).half(),)
-            return (self.teacher.displacement_maps([self.sequence.pose(frame)])[0].half(),)
+            with self.autocast():
+                return (self.teacher.displacement_maps([self.sequence.pose(frame)])[0].half(),)
 
         return self._cache.get(("maps", frame), make)[0].float()
 
@@ -87,7 +91,10 @@ class DistillationTargets:
         if missing:
             with torch.no_grad():
                 camera_centers = camera_centers_of([views[k] for k in missing])
-                posed = self.teacher(self.sequence.pose(frame), camera_centers)
+                pose = self.sequence.pose(frame)
+                with self.autocast():
+                    maps = self.teacher.residual_maps(pose, camera_centers)
+                posed = self.teacher.posed(pose, camera_centers, maps.float())
                 for index, k in enumerate(missing):
                     draw = partial(self._draw, posed, index, views[k])
                     found[k] = self._cache.get(keys[k], draw)

@@ -20,7 +20,7 @@ from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import CACHE_BYTES, PretrainConfig, PretrainTask
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
-from avatar.training.engine.resources import fixed_seed
+from avatar.training.engine.resources import compile_networks, fixed_seed
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.surface_normals import with_surface_normals
@@ -168,8 +168,7 @@ class TeacherTask(PhotometricTask):
         jittered = camera_centers + away * torch.tensor(noise, dtype=camera_centers.dtype, device=camera_centers.device)
         # The networks alone run in half precision; rasteriser and losses need float32.
         with self.autocast():
-            maps = self.teacher.residual_maps(pose, jittered)
-        return Residuals(maps.shape.float(), maps.colour.float(), maps.position_scale)
+            return self.teacher.residual_maps(pose, jittered).float()
 
 
 def _millimetres(posed: PosedAvatar, teacher: TeacherAvatar) -> Tensor:
@@ -201,6 +200,7 @@ def fit_teacher(
     with fixed_seed(config.seed):
         teacher = TeacherAvatar(networks, sequence.rig, gaussians)
     teacher.centre(sequence.pose(frame) for frame in spread_inside(sequence.train_frames, centred_on))
+    compile_networks(teacher.networks.networks.values(), session.compile)
     # Track the surface.
     track = None
     if config.track is not None:
