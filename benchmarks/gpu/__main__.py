@@ -3,7 +3,7 @@
     python -m benchmarks gpu --minutes 15
 
 Each part runs in a process of its own with its share of the time that is left; what the others need less is shared
-out again. benchmarks/results/gpu.json is written again after each part. A part that fails, crashes or takes too long is
+out again. benchmarks/results/gpu_parts.json is written after each part. A part that fails, crashes or takes too long is
 stored with its error and what it had measured, and the next one begins. Without a CUDA device it says what it would run
 and ends with 2; with --dry-run every part runs on the CPU at toy size, and results go to the work folder.
 """
@@ -30,16 +30,18 @@ from benchmarks.support.results import RESULTS, store_results
 SHARES = {
     "mapping": 3.0,
     "template": 0.7,
-    "demo": 6.0,
-    "fit": 1.0,
-    "training": 3.0,
-    "paper_step": 2.0,
+    "steps": 5.0,
     "student": 1.3,
+    "gpu": 3.0,
+    "loader": 0.4,
     "nccl": 0.5,
-    "cpu": 5.0,
+    "demo": 2.5,
+    "cpu": 4.0,
 }
 """Shares of the time by part; gsplat compiles its kernels in the first."""
-NEEDS_TEMPLATE = ("demo", "fit", "training", "paper_step", "student", "cpu")
+LEAST = {"mapping": 150.0, "template": 60.0}
+"""Seconds that a part has whatever its share, because all others need it."""
+NEEDS_TEMPLATE = ("steps", "student", "gpu", "demo", "cpu")
 FAILED, NO_DEVICE = 1, 2
 LAST_WORDS = 2_000
 """Characters of a part's output that are kept when it fails."""
@@ -95,7 +97,9 @@ class GpuBenchmark:
     def _store(self, figures: dict[str, Any], work: Path) -> Path:
         parts = f" --parts {' '.join(self.parts)}" if self.parts else ""
         command = f"python -m benchmarks gpu --minutes {self.minutes:g}{parts}" + self.dry_run * " --dry-run"
-        return store_results("gpu", command, figures, folder=work if self.dry_run else RESULTS)
+        # The work folder may be all that comes back of a machine that is lent.
+        kept = store_results("gpu_parts", command, figures, folder=work)
+        return kept if self.dry_run else store_results("gpu_parts", command, figures, folder=RESULTS)
 
 
 def run_part(name: str, job: Job) -> dict[str, Any]:
@@ -144,7 +148,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 def _seconds(name: str, left: list[str], seconds: float) -> float:
     """The share of a part in the seconds that it and those after it have."""
-    return seconds * SHARES[name] / sum(SHARES[each] for each in left)
+    share = seconds * SHARES[name] / sum(SHARES[each] for each in left)
+    return min(seconds, max(share, LEAST.get(name, 0.0)))
 
 
 def _device(dry_run: bool) -> dict[str, object]:

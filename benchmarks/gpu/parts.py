@@ -9,6 +9,7 @@ part that is stopped leaves what it had.
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import shutil
@@ -27,7 +28,15 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.gpu.student import Deformer, Replayed, frames_a_second, largest_difference_mm
+from benchmarks.gpu.timing import (
+    Deformer,
+    EnoughError,
+    Probe,
+    Replayed,
+    frames_a_second,
+    largest_difference_mm,
+    probed,
+)
 from benchmarks.support.results import ROOT
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE
 from smplxpp.capture import open_capture
@@ -109,40 +118,95 @@ def cpu(job: Job, note: Note) -> None:
     _to_the_end(job, note, "cpu")
 
 
-def fit(job: Job, note: Note) -> None:
-    """The fit."""
-    size = ("--gaussians", 300, "--iterations", 2) if job.toy else ("--max-minutes", 0.6 * job.seconds / 60)
-    where = ("--capture", job.capture, "--device", job.device, "--force", "--no-report")
-    answer = command("fit", job.run, *where, *size)
-    note(**{key: answer[key] for key in answer if key != "run"}, **_memory(job))
+def steps(job: Job, note: Note) -> None:
+    """Warm steps of every stage of `gpu` and `paper` at 1500x2000, and how busy the GPU is; then faster ones."""
+    import avatar
+
+    size = (60, 80) if job.toy else (1500, 2000)
+    capture = open_capture(enlarge(job.capture, job.work / "large", size, frames=3, cameras=4))
+    rows: dict[str, Any] = {}
+    note(width=size[0], height=size[1], rows=rows)
+    # Every stage first; of what may be faster the teacher alone, whose networks it changes.
+    orders: list[tuple[str, str, str | None]]
+    orders = [(preset, "plain", None) for preset in ("gpu", "paper")]
+    orders += [(preset, way, "Teacher") for way in list(WAYS)[1:] for preset in ("gpu", "paper")]
+    if job.toy:
+        orders = [("gpu", "plain", None), ("paper", "plain", "Teacher"), ("gpu", "graphs", "Teacher")]
+    for preset, way, last in orders:
+        row = rows.setdefault(f"{preset}, {way}", {})
+        probe = Probe(job.device, 0.05 if job.toy else 2.0, last, told=lambda _: note(rows=rows), found=row)
+        config = avatar.TrainConfig(device=job.device, force=True, gaussians=300 if job.toy else None, **WAYS[way])
+        begin = time.perf_counter()
+        try:
+            with probed(probe):
+                chosen = _toy_preset(preset) if job.toy else preset
+                out = job.work / "steps" / preset
+                avatar.train(_template(job), capture, out, preset=chosen, refine="off", cloth="none", config=config)
+        except EnoughError:
+            pass
+        except Exception as error:  # noqa: BLE001  the others are still worth their minutes
+            row["error"] = f"{type(error).__name__}: {error}"[:500]
+        row["whole_seconds"] = time.perf_counter() - begin
+        note(rows=rows)
+    if failed := [name for name, row in rows.items() if "error" in row]:
+        raise RuntimeError(f"failed: {'; '.join(failed)}")
 
 
-def training(job: Job, note: Note) -> None:
-    """The preset `gpu` from the fit to the student: once for its steps' speed, then as long as the time allows."""
+WAYS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "bfloat16": {"precision": "bfloat16"},
+    "graphs": {"compile": "graphs"},
+    "graphs, bfloat16": {"compile": "graphs", "precision": "bfloat16"},
+    "inductor, bfloat16": {"compile": "inductor", "precision": "bfloat16"},
+}
+"""Options of a training whose steps may be faster."""
+
+
+def _toy_preset(name: str) -> Any:
+    """Return a preset with networks and counts of a toy, and the steps that it needs to be timed."""
+    from avatar.training.presets import training_preset
+
+    small, like = training_preset("demo"), training_preset(name)
+    teacher = replace(small.teacher, track=None if like.teacher.track is None else small.teacher.track)
+    short = replace(small, teacher=teacher).shortened(0.1)
+    return replace(short, fit=replace(short.fit, iterations=8))
+
+
+def gpu(job: Job, note: Note) -> None:
+    """The preset `gpu` on the embedded person, with as many of its steps as the time allows, and its evaluation."""
     preset, first = ("demo", 1e-9) if job.toy else ("gpu", 5e-4)
     begin = time.perf_counter()
-    short = _train(job, "training_short", preset, "--cloth", "none", "--iterations-share", first)
+    short = _train(job, "gpu_short", preset, "--cloth", "none", "--iterations-share", first)
     seconds = time.perf_counter() - begin
     note(preset=preset, short=_stages(short) | {"share": first, "seconds": seconds}, **_memory(job))
-    if job.toy:
-        return
     of_steps = sum(stage["seconds_of_steps"] for stage in short["stages"].values())
-    left = 0.7 * (job.seconds - seconds) - (seconds - of_steps)
-    share = min(1.0, first * left / of_steps)
+    left = 0.6 * (job.seconds - seconds) - (seconds - of_steps)
+    share = 0.01 if job.toy else min(1.0, first * left / of_steps)
     if share <= first:
         note(longer="no time left")
         return
-    longer = _train(job, "training", preset, "--cloth", "none", "--iterations-share", share)
+    longer = _train(job, "gpu", preset, "--cloth", "none", "--iterations-share", share)
     note(longer=_stages(longer) | {"share": share, "finished": longer["finished"]}, **_memory(job))
+    note(**_evaluated(job, "gpu"))
 
 
-def paper_step(job: Job, note: Note) -> None:
-    """One step of every stage of the preset `paper` on images of 1500x2000."""
-    size, preset = ((60, 80), "demo") if job.toy else ((1500, 2000), "paper")
-    capture = enlarge(job.capture, job.work / "large", size)
-    note(preset=preset, width=size[0], height=size[1])
-    answer = _train(replace(job, capture=capture), "paper", preset, "--cloth", "none", "--iterations-share", 1e-9)
-    note(**_stages(answer), **_memory(job))
+def loader(job: Job, note: Note) -> None:
+    """Photographs of 1500x2000 a second by number of reading threads, from the disk's cache."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from avatar.data.views import read_view
+
+    size, count = ((60, 80), 4) if job.toy else ((1500, 2000), 96)
+    root = enlarge(job.capture, job.work / "large", size, frames=3, cameras=4)
+    capture = open_capture(root, cache_bytes=0)
+    views = itertools.islice(itertools.cycle(capture.views()), count)
+    wanted, rates = list(views), {}
+    for readers in (1, 2) if job.toy else (1, 2, 4, 8, 12):
+        with ThreadPoolExecutor(readers) as pool:
+            begin = time.perf_counter()
+            list(pool.map(lambda view: read_view(capture, *view).cropped(12), wanted))
+            rates[str(readers)] = count / (time.perf_counter() - begin)
+        note(images_a_second=rates, cores=os.cpu_count())
 
 
 def student(job: Job, note: Note) -> None:
@@ -213,7 +277,7 @@ def nccl(job: Job, note: Note) -> None:
 
 
 PARTS: dict[str, Callable[[Job, Note], None]] = {
-    part.__name__: part for part in (mapping, template, demo, fit, training, paper_step, student, nccl, cpu)
+    part.__name__: part for part in (mapping, template, steps, student, gpu, loader, nccl, demo, cpu)
 }
 """Parts, the most important first."""
 
@@ -242,16 +306,20 @@ def _to_the_end(job: Job, note: Note, preset: str) -> None:
     size = ("--iterations-share", 0.01) if job.toy else ()
     answer = _train(job, preset, "demo" if job.toy else preset, "--cloth", "auto", *size)
     note(**_stages(answer), seconds=time.perf_counter() - begin, **_memory(job))
+    note(**_evaluated(job, preset))
+
+
+def _evaluated(job: Job, name: str) -> dict[str, Any]:
+    """Return figures of the student of a run in the work folder, on held-out views and poses."""
     begin = time.perf_counter()
     views = ("--every", 8, "--samples", 300) if job.toy else ()
-    run = ("evaluate", job.work / preset, "--capture", job.capture, "--device", job.device, "--no-report")
-    report = command(*run, *views)
-    student = report["models"]["student"]
-    note(
-        views={name: {key: mean[key] for key in ("psnr", "ssim")} for name, mean in student["mean"].items()},
-        counts=student["counts"],
-        seconds_of_evaluation=time.perf_counter() - begin,
-    )
+    run = ("evaluate", job.work / name, "--capture", job.capture, "--device", job.device, "--no-report")
+    student = command(*run, *views)["models"]["student"]
+    return {
+        "views": {name: {key: mean[key] for key in ("psnr", "ssim")} for name, mean in student["mean"].items()},
+        "counts": student["counts"],
+        "seconds_of_evaluation": time.perf_counter() - begin,
+    }
 
 
 def _train(job: Job, name: str, preset: str, *options: object) -> dict[str, Any]:

@@ -36,13 +36,15 @@ def found_by(name: str, job: Job) -> dict:
 def test_every_part_has_a_share_of_the_time():
     assert list(gpu.SHARES) == list(PARTS)
     assert set(gpu.NEEDS_TEMPLATE) <= set(PARTS)
-    left = list(PARTS)
-    assert sum(gpu._seconds(name, left, 600.0) for name in left) == pytest.approx(600.0)
-    assert gpu._seconds("nccl", ["nccl"], 42.0) == 42.0
-
-
-def test_the_fit_is_measured(job):
-    assert found_by("fit", job)["iterations_done"] == 2
+    assert set(gpu.LEAST) <= set(PARTS)
+    # Parts that others need have what they need, others share what is left.
+    left, seconds = list(PARTS), 600.0
+    for place, name in enumerate(left):
+        own = gpu._seconds(name, left[place:], seconds)
+        assert own >= min(gpu.LEAST.get(name, 5.0), seconds)
+        seconds -= own
+    assert seconds == pytest.approx(0.0, abs=1e-6)
+    assert gpu._seconds("nccl", ["nccl"], 42.0) == gpu._seconds("template", ["template", "nccl"], 42.0) == 42.0
 
 
 def test_the_demo_is_trained_and_measured(job):
@@ -51,14 +53,28 @@ def test_the_demo_is_trained_and_measured(job):
     assert found["counts"]["novel_view"]["images"] >= 1 and found["views"]["novel_pose"]["psnr"] > 0
 
 
-@pytest.mark.parametrize("part", ["training", "paper_step"])
-def test_all_stages_take_their_steps(job, part):
-    found = found_by(part, job)
-    stages = found["short"]["stages"] if part == "training" else found["stages"]
-    assert list(stages) == ["fit", "teacher", "bake", "compensate"]
-    assert all(stage["steps"] >= 1 and stage["steps_a_second"] > 0 for stage in stages.values())
-    if part == "paper_step":
-        assert (found["width"], found["height"]) == (60, 80)
+def test_the_preset_of_a_gpu_is_trained_and_measured(job):
+    found = found_by("gpu", job)
+    for stages in (found["short"]["stages"], found["longer"]["stages"]):
+        assert list(stages) == ["fit", "teacher", "bake", "compensate"]
+        assert all(stage["steps"] >= 1 and stage["steps_a_second"] > 0 for stage in stages.values())
+    assert found["views"]["novel_view"]["psnr"] > 0
+
+
+def test_warm_steps_of_all_stages_are_timed_and_profiled(job):
+    found = found_by("steps", job)
+    rows, both = found["rows"], ["PretrainField", "Bake", "Compensate"]
+    assert (found["width"], found["height"]) == (60, 80)
+    stages = [name for name in rows["gpu, plain"] if name != "whole_seconds"]
+    assert stages == ["Fit", "Track", "PretrainTeacher", "Teacher", *both]
+    assert [name for name in rows["paper, plain"] if name != "whole_seconds"] == ["Fit", "Teacher"]
+    assert list(rows["gpu, graphs"])[-2:] == ["Teacher", "whole_seconds"]
+    figures = [row for rows_of in rows.values() for row in rows_of.values() if isinstance(row, dict)]
+    assert all(one["steps_a_second"] > 0 and one["calls"] > 100 for one in figures)
+
+
+def test_photographs_a_second_are_counted_by_readers(job):
+    assert all(rate > 0 for rate in found_by("loader", job)["images_a_second"].values())
 
 
 def test_the_student_is_the_same_in_half_precision_and_without_checks(job):
@@ -103,17 +119,17 @@ def test_a_part_of_another_name_is_refused(capsys):
 def test_what_fails_is_stored_and_the_next_part_runs(job, tmp_path, capsys):
     work = tmp_path / "work"
     options = {"capture": job.capture, "run_folder": tmp_path / "none", "work": work, "dry_run": True}
-    assert GpuBenchmark(parts=("fit", "nccl"), minutes=15.0, **options).run() == 1
-    written = json.loads((work / "gpu.json").read_text())
-    assert written["command"] == "python -m benchmarks gpu --minutes 15 --parts fit nccl --dry-run"
+    assert GpuBenchmark(parts=("gpu", "nccl"), minutes=15.0, **options).run() == 1
+    written = json.loads((work / "gpu_parts.json").read_text())
+    assert written["command"] == "python -m benchmarks gpu --minutes 15 --parts gpu nccl --dry-run"
     stored = written["figures"]
-    assert stored["parts"]["fit"]["state"] == "failed" and "template" in stored["parts"]["fit"]["error"]
+    assert stored["parts"]["gpu"]["state"] == "failed" and "template" in stored["parts"]["gpu"]["error"]
     assert stored["parts"]["nccl"]["state"] == "done" and stored["parts"]["nccl"]["found"]["right"]
 
 
 def test_a_part_that_crashes_or_takes_too_long_leaves_its_words(job, tmp_path):
     lost = Job(tmp_path, job.run, tmp_path / "no capture", 900.0, "cpu")
-    result = run_part("fit", lost)
+    result = run_part("gpu", lost)
     assert result["state"] == "failed" and "no capture" in result["error"] and "Traceback" in result["log"]
     late = run_part("nccl", Job(tmp_path, job.run, job.capture, 0.05, "cpu"))
     assert late["state"] == "stopped" and "longer than" in late["error"]

@@ -1,4 +1,4 @@
-"""A student's frames a second: as it is, with networks in half precision, and with its deformation as a CUDA graph.
+"""Time warm steps of a training's stages, and a student's frames: plain, in half precision, as a CUDA graph.
 
 The parts of a frame that a graph can hold are written out here without what asks the GPU for an answer: checks of
 triangles without area, and the row of a frame's code. gsplat sorts into lists of unknown length, so that drawing stays
@@ -10,12 +10,17 @@ from __future__ import annotations
 import copy
 import itertools
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from statistics import median
+from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
 
 from avatar.gaussians.binding import world_from_frames_reference
 from avatar.gaussians.colors import view_colors
@@ -24,6 +29,8 @@ from avatar.gaussians.tensor_operations import quat_from_matrix
 from avatar.models.student import Student
 from avatar.rendering import rasterize
 from avatar.rig.rig import Pose
+from avatar.training.engine.loop import LoopConfig, Progress
+from avatar.training.tracking.track import TrackTask
 from smplxpp.core.camera import Camera
 
 MOVING = ("body_pose", "expression", "jaw", "rest", "world_from_rest", "root_from_world")
@@ -161,3 +168,89 @@ def frames_a_second(
 def largest_difference_mm(one: Drawable, other: Drawable) -> float:
     """Return the largest distance of a Gaussian between two frames."""
     return 1e3 * float((one.means - other.means).norm(dim=-1).max())
+
+
+class EnoughError(Exception):
+    """The last stage that was asked for has been timed."""
+
+
+@dataclass
+class Probe:
+    """Stands for `run_training`: times warm steps of each stage and hands its task on as if it had ended.
+
+    Attributes:
+        device: "cuda" or "cpu".
+        seconds: of timed steps a stage.
+        last: name of the last stage that is timed; None: all.
+        told: called after every stage.
+        found: figures by stage: warm steps a second, seconds of the first ones, GiB of the GPU at most, kernels a step
+            and the share of a step in which the GPU computes.
+    """
+
+    device: str
+    seconds: float
+    last: str | None = None
+    told: Callable[[dict[str, Any]], None] = lambda found: None
+    found: dict[str, Any] = field(default_factory=dict)
+
+    def __call__(self, task: Any, config: LoopConfig, folder: Path, **_: Any) -> Progress:
+        """Time the stage of a task."""
+        name, profiled = type(task).__name__.removesuffix("Task"), 2
+        # Frames are followed in whole numbers, because their first steps are of smaller images.
+        whole = task.track_config.steps if isinstance(task, TrackTask) else 1
+        first = min(max(whole, WARM_UP), max(config.iterations - profiled - 1, 1))
+        if self.device == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        begin = self._now()
+        for k in range(first):
+            task.step(k)
+        cold, begin, done = self._now() - begin, self._now(), 0
+        while first + done < config.iterations - profiled:
+            task.step(first + done)
+            done += 1
+            if done % whole == 0 and time.perf_counter() - begin > self.seconds:
+                break
+        took = self._now() - begin
+        each = took / max(done, 1)
+        row: dict[str, Any] = {"steps_a_second": 1.0 / each if done else None, "timed": done, "first_seconds": cold}
+        if self.device == "cuda":
+            row["gib"] = torch.cuda.max_memory_allocated() / 2**30
+        self.found[name] = row | self._profiled(task, range(first + done, first + done + profiled), each)
+        self.told(self.found)
+        if name == self.last:
+            raise EnoughError
+        return Progress(config.iterations, config.iterations, took, 1.0 / each if done else 0.0)
+
+    def _now(self) -> float:
+        if self.device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+    def _profiled(self, task: Any, steps: range, seconds: float) -> dict[str, Any]:
+        """Return what the GPU does in a step, of which `seconds` were timed without a profiler."""
+        kinds = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * (self.device == "cuda")
+        with profile(activities=kinds) as seen:
+            for k in steps:
+                task.step(k)
+            self._now()
+        # Rows of kernels have time of the device alone; those of calls repeat it.
+        rows = [one for one in seen.key_averages() if one.self_device_time_total and not one.self_cpu_time_total]
+        busy = sum(one.self_device_time_total for one in rows) / len(steps)
+        longest = sorted(rows, key=lambda one: -one.self_device_time_total)[:5]
+        calls = sum(one.count for one in seen.key_averages() if one.key.startswith("aten::"))
+        return {
+            "busy_share": 1e-6 * busy / seconds if seconds else None,
+            "kernels": sum(one.count for one in rows) / len(steps),
+            "calls": calls / len(steps),
+            "longest_us": {one.key[:60]: round(one.self_device_time_total / len(steps)) for one in longest},
+        }
+
+
+@contextmanager
+def probed(probe: Probe) -> Iterator[None]:
+    """Time the stages of trainings in the block instead of running them to their end."""
+    with (
+        mock.patch("avatar.training.engine.session.run_training", probe),
+        mock.patch("avatar.training.fit.fit.run_training", probe),
+    ):
+        yield
