@@ -171,6 +171,21 @@ def _hat(body: BodyModel, posed: PosedBody, crown: float, brim: float, forward: 
     return [piece @ turn.T for piece in (top, edge)]
 
 
+def _headphones(body: BodyModel, posed: PosedBody, side: float) -> list[np.ndarray]:
+    """A cup over either ear and a band over the top of the head between them, in the frame of the head."""
+    eyes, turn = _head(body, posed)
+    head = posed.vertices[0][body.weights[:, body.joint_names.index("head")] > 0.9] @ turn
+    eye = 0.5 * (eyes[0] + eyes[1]) @ turn
+    x, z = eye[0], 0.5 * float(head[:, 2].min() + head[:, 2].max())
+    y = float(eye[1]) - 0.02  # metres, the middle of the ears
+    top, half = float(head[:, 1].max()) - y + 0.012, float(np.abs(head[:, 0] - x).max())
+    cups = [_tube(0.037, (x + sign * (half - 0.02), y, z), (x + sign * (half + 0.02), y, z)) for sign in (1.0, -1.0)]
+    angle = np.linspace(0.0, np.pi, 13)
+    arc = np.stack([x + (half + 0.012) * np.cos(angle), y + top * np.sin(angle), np.full(13, z)], axis=1)
+    band = [_tube(0.009, tuple(start), tuple(end)) for start, end in pairwise(arc)]
+    return [piece @ turn.T for piece in (*cups, *band)]
+
+
 def _trunk(body: BodyModel, posed: PosedBody, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the place of a joint of the trunk, the axes right, up and front there, and the trunk's skin in them."""
     joint = body.joint_names.index(name)
@@ -255,6 +270,7 @@ WORN: dict[str, Callable[[BodyModel, PosedBody, float], list[np.ndarray]]] = {
     "brimmed hat": lambda body, posed, side: _hat(body, posed, 0.11, 0.19, 0.0),
     "top hat": lambda body, posed, side: _hat(body, posed, 0.18, 0.15, 0.0),
     "cap": lambda body, posed, side: _hat(body, posed, 0.09, 0.09, 0.09),
+    "headphones": _headphones,
     "shoulder bag": _shoulder_bag,
     "belt bag": _belt_bag,
     "backpack": _backpack,

@@ -12,7 +12,8 @@ The terms are found one after the other:
    nearest in position and normal.
 2. `by_body_colors`: a palette of the scan (k-means in OKLab), and a normal distribution of this person's skin colour
    from the face and the hands, whose log-likelihood ratio tells skin from other colours.
-3. `by_body_objects`: things in hands, by a cut of their own; they are left out of all other steps.
+3. `by_body_objects`, `by_body_headwear`: things in hands and on the head, by cuts of their own; all other steps leave
+   them out.
 4. `by_body_layers`: long hair, open coats and bibs, as connected faces whose colours are nearer to the layer's
    histogram than to all others; they are left out of the next step, which they would disturb.
 5. `by_body_outfit`: the outline of the clothes. The unknowns are the four borders between shoe, skin, lower, skin and
@@ -49,6 +50,7 @@ from smplxpp.raster import outer_visible_points
 from smplxpp.segment.by_body_chart import FOOT, LEG, TRUNK, BodyChart, chart_of_scan, in_arm, in_column, settled_body
 from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
+from smplxpp.segment.by_body_headwear import find_headwear
 from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_shoes, on_heels, roughness
 from smplxpp.segment.by_body_layers import Layers, find_layers, open_coat_by_shape
 from smplxpp.segment.by_body_objects import FoundObjects, find_objects
@@ -57,9 +59,17 @@ from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.by_body_rings import ARM_END, ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 from smplxpp.segment.by_body_shape import ShapeEvidence, outfit_by_shape
 from smplxpp.segment.by_body_waist import find_waist
-from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
+from smplxpp.segment.graph_cut import (
+    COST_SCALE,
+    PottsProblem,
+    SmoothingConfig,
+    absorb_islands,
+    edge_weights,
+    face_colors,
+    likeness,
+    minimize_potts,
+)
 from smplxpp.segment.segment import SegmentedScan
-from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors, likeness
 
 
 @dataclass(frozen=True)
@@ -105,7 +115,7 @@ class Evidence:
         outfit: outline of the clothes.
         skin: model of skin colour; None without colours.
         layers: layers over other clothes.
-        objects: things in hands.
+        objects: things in hands and on the head.
         misfit: robust standard deviation, in metres, of bare skin's distance to the body.
         costs: unary costs of all labels, nats.
     """
@@ -163,6 +173,8 @@ def label_by_body(
     share /= share.sum(axis=1, keepdims=True)
     rows = np.arange(len(cut))
     labels = absorb_islands(mesh, cut, share[rows, cut], pairs, ends, config.smoothing)
+    # Glasses are smaller than any garment, and no fragment of one.
+    labels = np.where(found.objects.faces & (cut == OBJECT.id), OBJECT.id, labels)
     # Confidence is bounded by the outline's and falls with the body's misfit. 5 mm is the tolerance of visibility: less
     # than the gap between layers of clothes, more than the scan's noise.
     bound = confidence_bound(found.chart, labels, found.outfit, found.layers, colored=lab is not None)
@@ -186,17 +198,22 @@ def weigh_evidence(
     config: ByBodyConfig,
 ) -> Evidence:
     """Return the unary costs of all labels at all faces with their ingredients; `lab` is (M, 3) colours in OKLab."""
-    # The misfit of the body is the robust spread (1.4826 MAD) of the distances of face and hands.
-    chart = chart_of_scan(mesh, body, params, posed=settled_body(mesh, body, params))
+    # What is worn on the head is found first: it would pull the body that is moved onto the scan, a hat by 15 mm.
     pairs, ends = face_adjacency(mesh.faces)
+    worn = find_headwear(mesh, body, params, pairs, ends, lab=lab)
+    rest = mesh.submesh(~worn.faces)[0] if worn.faces.any() else mesh
+    # The misfit of the body is the robust spread (1.4826 MAD) of the distances of face and hands.
+    chart = chart_of_scan(mesh, body, params, posed=settled_body(rest, body, params))
     # What the person holds says nothing about her clothes, so that it has no area in the steps that follow. A body that
     # is not even at the face, where nothing is held, would make a thing of her own arm. Where it is at the hands, a hat
     # or a mask stands off the face: what lies near it is the face.
-    face = chart.face_core
+    face = chart.face_core & ~worn.faces
     elsewhere = face.any() and _spread(chart.distance[face]) > BODY_ELSEWHERE
     if elsewhere and chart.hand_core.any() and _spread(chart.distance[chart.hand_core]) < 0.5 * BODY_ELSEWHERE:
         face, elsewhere = face & (np.abs(chart.distance) < 0.5 * BODY_ELSEWHERE), False
-    objects = FoundObjects.none(mesh.face_count) if elsewhere else find_objects(mesh, body, params, lab=lab)
+    objects = FoundObjects.none(mesh.face_count)
+    if not elsewhere:
+        objects = find_objects(mesh, body, params, lab=lab).joined(worn)
     area = np.where(objects.faces, 0.0, mesh.face_areas)
     bare = (face | chart.hand_core) & ~objects.faces
     misfit = _spread(chart.distance[bare if bare.any() else slice(None)])
@@ -243,8 +260,8 @@ def weigh_evidence(
             # In shoes the colour of skin is none.
             skin_like = np.where(np.isin(chart.region, (FOOT, LEG)) & (chart.height < outfit.shoe_top), 0.01, skin_like)
     # The border between upper and lower garment where the surface shows it.
-    worn = ~(layers.hair | layers.coat | objects.faces)
-    waist = find_waist(mesh, chart, outfit, pairs, ends, used=worn, smoothing=config.smoothing)
+    clothes = ~(layers.hair | layers.coat | objects.faces)
+    waist = find_waist(mesh, chart, outfit, pairs, ends, used=clothes, smoothing=config.smoothing)
     if waist is not None and layers.bib:
         # A front that ends over the trousers is a waistcoat's.
         layers = replace(layers, bib=False)
@@ -255,7 +272,9 @@ def weigh_evidence(
     if lab is None:
         upper = chart.height > outfit.upper_start
         upper = upper if waist is None else np.where(waist.faces, waist.upper, upper)
-        layers = replace(layers, coat=open_coat_by_shape(chart, area, outfit, column, shape.apart, upper=upper) & worn)
+        layers = replace(
+            layers, coat=open_coat_by_shape(chart, area, outfit, column, shape.apart, upper=upper) & clothes
+        )
     prior = place_prior(
         chart, outfit, layers, softness=config.softness, body_softness=config.body_softness, waist=waist
     )

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, InputError, TriangleMesh, row_lengths
 from smplxpp.core.topology import face_adjacency
-from smplxpp.segment.smoothing import SmoothingConfig, edge_weights
+from smplxpp.segment.graph_cut import SmoothingConfig, edge_weights
 
 HEAD, NECK, TRUNK, ARM, HAND, LEG, FOOT = range(7)
 REGION_NAMES = ("head", "neck", "trunk", "arm", "hand", "leg", "foot")

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from smplxpp.core.labels import HAIR, LABELS, SKIN
-from smplxpp.segment.smoothing import COLOR_STEP
+from smplxpp.segment.graph_cut import COLOR_STEP
 
 # Spread of one dye's colour in OKLab under changing light, noise and blur: nearer colours count as one. Lightness
 # varies most.

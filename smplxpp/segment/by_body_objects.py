@@ -29,8 +29,7 @@ from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.topology import component_labels, face_adjacency
 from smplxpp.segment.by_body_chart import ARM, HAND, HEAD, LEG, NECK, TRUNK, chart_of_body, chart_of_scan
 from smplxpp.segment.flat_patches import flat_share
-from smplxpp.segment.graph_cut import PottsProblem, minimize_potts
-from smplxpp.segment.smoothing import SmoothingConfig, edge_weights
+from smplxpp.segment.graph_cut import PottsProblem, SmoothingConfig, edge_weights, minimize_potts
 
 _CM2 = 1e4  # square centimetres in a square metre
 # Evidence of faces by their distance, in metres, from the nearest part of the body, interpolated. A fist, or fingers
@@ -54,7 +53,7 @@ _LENGTH_COST = 2.0  # square centimetres of evidence for one centimetre of a cut
 
 @dataclass(frozen=True, eq=False)
 class FoundObjects:
-    """Things in hands.
+    """Things that a person holds or wears.
 
     Attributes:
         faces: the faces of all of them.
@@ -68,6 +67,10 @@ class FoundObjects:
     def none(count: int) -> FoundObjects:
         """Return no things on a scan of `count` faces."""
         return FoundObjects(np.zeros(count, dtype=bool), ())
+
+    def joined(self, other: FoundObjects) -> FoundObjects:
+        """Return the things of both."""
+        return FoundObjects(self.faces | other.faces, (*self.notes, *other.notes))
 
 
 def find_objects(

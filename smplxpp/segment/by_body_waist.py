@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 from smplxpp.core import TriangleMesh
 from smplxpp.segment.by_body_chart import LEG, TRUNK, BodyChart
 from smplxpp.segment.by_body_outfit import Outfit
-from smplxpp.segment.graph_cut import PottsProblem, minimize_potts
-from smplxpp.segment.smoothing import SmoothingConfig, edge_weights
+from smplxpp.segment.graph_cut import PottsProblem, SmoothingConfig, edge_weights, minimize_potts
 
 _LOW, _HIGH, _BESIDE = 0.74, 1.06, 0.06
 """Heights between which hems of shirts and jackets lie, standard metres, and how far beside the outline's border."""

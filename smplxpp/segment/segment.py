@@ -11,8 +11,15 @@ from scipy.sparse import csr_matrix, identity
 from smplxpp.core import BACKGROUND, LABELS, OUTER, SKIN, UPPER, InputError, Labels, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import one_line
 from smplxpp.core.topology import face_adjacency
-from smplxpp.segment.graph_cut import COST_SCALE, PottsProblem, minimize_potts
-from smplxpp.segment.smoothing import SmoothingConfig, absorb_islands, edge_weights, face_colors
+from smplxpp.segment.graph_cut import (
+    COST_SCALE,
+    PottsProblem,
+    SmoothingConfig,
+    absorb_islands,
+    edge_weights,
+    face_colors,
+    minimize_potts,
+)
 
 _CERTAIN_PRIOR = 0.6  # confidence from which a prior's label counts as known
 

@@ -48,7 +48,7 @@ def rigid_weights(
     """
     source = as_mesh(source, subject="source")
     target = as_mesh(target, subject="target")
-    # Fingers count as the wrist that they belong to.
+    # Fingers count as the wrist that they belong to, eyes as the head: glasses lie nearest to them.
     names = list(joint_names)
     if joint is not None:
         require_choice("rigid joint", joint, names)
@@ -57,6 +57,8 @@ def rigid_weights(
         side = name.partition("_")[0]
         if any(finger in name for finger in _FINGERS) and f"{side}_wrist" in names:
             owner[k] = names.index(f"{side}_wrist")
+        if "eye" in name and "head" in names:
+            owner[k] = names.index("head")
     own = dense_weights(source_weights)
     folded = np.zeros((len(own), len(names)))
     np.add.at(folded.T, owner, own.T)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import igl
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from smplxpp.body import BodyModel, PosedBody, load_body
 from smplxpp.core import HAIR, OBJECT, SKIN, UPPER, BodyParams, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.topology import face_adjacency
+from smplxpp.people.cloth_mesh import outer_faces
 from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
 from smplxpp.people.things import THINGS, WORN, Thing, thing_mesh
-from smplxpp.segment import label_by_body
+from smplxpp.segment import by_body, label_by_body
 from smplxpp.segment.by_body_chart import chart_of_scan
 from smplxpp.segment.by_body_confidence import notes_on_worn_things
-from smplxpp.segment.by_body_objects import _enclosed, _Where, find_objects
+from smplxpp.segment.by_body_headwear import find_headwear
+from smplxpp.segment.by_body_objects import FoundObjects, _enclosed, _Where, find_objects
 from smplxpp.segment.flat_patches import flat_share
 from smplxpp.transfer import rigid_weights
 
@@ -229,22 +233,113 @@ def test_what_is_worn_is_where_it_is_worn(open_body, stance):
     assert np.abs(glasses[:, 1] - joints["left_eye_smplhf"][1]).max() < 0.04
 
 
-def test_under_a_hat_the_face_is_found_and_a_bag_on_a_strap_is_told(open_body, stance):
+@pytest.fixture(scope="module")
+def with_things(open_body, stance) -> Callable[..., tuple[TriangleMesh, np.ndarray, np.ndarray]]:
+    """The skin with things as fine as a scan, which of the faces are theirs, and which of these show."""
+    skin = open_body.mesh(stance[1].vertices[0])
+    tree = cKDTree(skin.vertices)
+
+    def made(*kinds: str) -> tuple[TriangleMesh, np.ndarray, np.ndarray]:
+        worn = [thing_mesh(Thing(kind), open_body, stance[1]) for kind in kinds]
+        fine = [TriangleMesh(*igl.upsample(one.vertices, one.faces, 3)) for one in worn]
+        mesh = concatenate_meshes([skin, *fine])
+        distance, at = tree.query(mesh.face_centers)
+        outside = np.einsum("ij,ij->i", mesh.face_centers - skin.vertices[at], skin.vertex_normals[at]) > 0.5 * distance
+        own = np.arange(mesh.face_count) >= skin.face_count
+        return mesh, own, own & outside & (distance > 0.01)
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def head(open_body, stance) -> TriangleMesh:
+    """Her head alone, without what lies within it."""
+    skin = open_body.mesh(stance[1].vertices[0])
+    kept = (skin.face_centers[:, 1] > stance[1].joints[0, open_body.joint_names.index("neck"), 1]) & outer_faces(
+        open_body
+    )
+    return skin.submesh(kept)[0]
+
+
+def scanned_head(head: TriangleMesh, *worn: TriangleMesh) -> tuple[TriangleMesh, np.ndarray]:
+    """A scan of a head with what it wears, and which of its faces show that."""
+    taken = simulate_scan(
+        concatenate_meshes([head, *worn]), [], ScanConfig(cell=0.006, views=12, resolution=128, faces=4000)
+    )
+    return taken.mesh, (taken.face >= head.face_count)[taken.mesh.faces].sum(axis=1) >= 2
+
+
+@pytest.mark.parametrize("kind", ["sunglasses", "goggles", "brimmed hat", "top hat", "cap", "headphones"])
+def test_what_is_worn_on_the_head_is_an_object_and_stiff_on_it(open_body, stance, head, kind):
+    """Glasses were skin, hats hair, and lenses that lie nearest to an eyeball turned with it."""
+    worn = thing_mesh(Thing(kind), open_body, stance[1])
+    mesh, truth = scanned_head(head, worn)
+    found = find_headwear(mesh, open_body, stance[0], *face_adjacency(mesh.faces))
+    area = mesh.face_areas
+    assert area[found.faces & truth].sum() > 0.85 * area[truth].sum()
+    assert area[found.faces & ~truth].sum() < 0.1 * area[truth].sum()
+    assert "on the head" in found.notes[0] and len(found.notes) == 1
+    skin = open_body.mesh(stance[1].vertices[0])
+    weights = rigid_weights(skin, open_body.weights, worn, joint_names=open_body.joint_names)
+    assert {open_body.joint_names[k] for k in weights.dense().argmax(axis=1)} == {"head"}
+
+
+def test_hair_hoods_and_bare_heads_wear_nothing(open_body, stance, head):
+    """A bun, a ponytail that stands out behind, two buns over the ears, long hair and a hood round the face."""
+    at = dict(zip(open_body.joint_names, stance[1].joints[0], strict=True))
+    middle = 0.5 * (at["left_eye_smplhf"] + at["right_eye_smplhf"]) + [0.0, 0.02, -0.08]
+    ball = TriangleMesh(*igl.upsample(*convex_ball(), 2))
+
+    def blob(size: tuple[float, float, float], place: tuple[float, float, float]) -> TriangleMesh:
+        return ball.with_vertices(ball.vertices * size + middle + place)
+
+    def around(size: tuple[float, float, float], front: float) -> TriangleMesh:
+        """All round the head but for the face, which comes out of it."""
+        whole = blob(size, (0.0, -0.02, 0.0))
+        return whole.with_vertices(np.minimum(whole.vertices, [np.inf, np.inf, middle[2] + front]))
+
+    for worn in (
+        [blob((0.045, 0.045, 0.045), (0.0, 0.1, -0.06)), blob((0.02, 0.02, 0.12), (0.0, 0.0, -0.2))],
+        [blob((0.04, 0.05, 0.04), (sign * 0.1, 0.05, -0.01)) for sign in (1.0, -1.0)],
+        [around((0.1, 0.16, 0.13), 0.03)],
+        [around((0.13, 0.19, 0.16), 0.06)],
+    ):
+        mesh, _ = scanned_head(head, *worn)
+        found = find_headwear(mesh, open_body, stance[0], *face_adjacency(mesh.faces))
+        assert not found.faces.any(), found.notes
+
+
+def convex_ball() -> tuple[np.ndarray, np.ndarray]:
+    """An octahedron's vertices and faces refined to a ball of radius 1."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    points, faces = igl.upsample(corners, faces, 3)
+    return points / np.linalg.norm(points, axis=1, keepdims=True), faces
+
+
+def test_glasses_outlive_the_removal_of_fragments_and_pull_no_body(open_body, stance, with_things):
+    """They are smaller than any garment; a hat pulled the body that is moved onto the scan 15 mm off the face."""
+    mesh, _, shown = with_things("glasses", "cap")
+    result = label_by_body(mesh, open_body, stance[0])
+    found = result.face_labels == OBJECT.id
+    assert mesh.face_areas[found & shown].sum() > 0.9 * mesh.face_areas[shown].sum()
+    assert sum("on the head" in note for note in result.notes) == 2
+    assert not any("misses face and hands" in note for note in result.notes)
+
+
+def test_under_a_hat_the_face_is_found_and_a_bag_on_a_strap_is_told(open_body, stance, with_things, monkeypatch):
     """A brim was taken for the face, so that no label was trusted; a bag was clothes in silence."""
-    skin, found = open_body.mesh(stance[1].vertices[0]), {}
-    for kind in ("brimmed hat", "shoulder bag"):
-        worn = thing_mesh(Thing(kind), open_body, stance[1])
-        mesh = concatenate_meshes([skin, TriangleMesh(*igl.upsample(worn.vertices, worn.faces, 4))])
-        found[kind] = mesh, chart_of_scan(mesh, open_body, stance[0])
-    mesh, chart = found["brimmed hat"]
+    monkeypatch.setattr(by_body, "find_headwear", lambda mesh, *_, **__: FoundObjects.none(mesh.face_count))
+    mesh, worn, _ = with_things("brimmed hat")
+    chart = chart_of_scan(mesh, open_body, stance[0])
     hat = label_by_body(mesh, open_body, stance[0])
     assert not any("no label can be trusted" in note for note in hat.notes)
-    assert (hat.face_labels[skin.face_count :] == HAIR.id).mean() > 0.7
+    assert (hat.face_labels[worn] == HAIR.id).mean() > 0.7
     # What of its brim hangs over the face was skin.
-    brim = (np.arange(mesh.face_count) >= skin.face_count) & (chart.distance > 0.04)
-    assert (hat.face_labels[brim] == HAIR.id).mean() > 0.995
+    assert (hat.face_labels[worn & (chart.distance > 0.04)] == HAIR.id).mean() > 0.995
+    mesh, *_ = with_things("shoulder bag")
+    chart = chart_of_scan(mesh, open_body, stance[0])
     # The bag as a shirt, as skin, and on both sides, as a coat would stand off.
-    mesh, chart = found["shoulder bag"]
     for label, words in ((UPPER, "off the left side alone"), (SKIN, "labelled skin stand more than 5 cm off")):
         labels = np.full(mesh.face_count, label.id)
         (note,) = notes_on_worn_things(chart, mesh.face_areas, labels, misfit=0.005)
