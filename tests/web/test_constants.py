@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import math
 import re
+import textwrap
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +19,9 @@ from avatar.speech.coarticulation import ARTICULATORS, Timing
 from avatar.speech.face import JAW_ANGLE, MAX_UNOBSERVED
 from avatar.speech.lips import PHONES, VERSION
 from pipelines.web.chat_server import REPLACED
-from smplxpp.cloth.driver import LONGEST_STEP, DriverConfig
+from smplxpp.cloth import garment_file, quality, solver, thread
+from smplxpp.cloth.driver import LONGEST_STEP, ClothDriver, DriverConfig
+from smplxpp.cloth.embedding import SkinnedRows
 from smplxpp.cloth.model import SolverConfig
 from smplxpp.core.params import DEFAULT_FPS
 
@@ -50,18 +55,36 @@ def evaluated(text: str, known: dict[str, float]) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
+def local(function: Callable[..., object], name: str) -> float:
+    """Return the number that a function of Python gives a name of its own."""
+    for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(function)))):
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == [name]:
+            number = evaluated(ast.unparse(node.value), {})
+            assert number is not None, f"{name} of {function.__qualname__} is no number"
+            return number
+    raise AssertionError(f"{function.__qualname__} gives no number the name {name}")
+
+
 DRIVER, SOLVER, TIMING = DriverConfig(), SolverConfig(), Timing()
 REPEATED = {
     "src/bundle/motion.ts": {"USUAL_RATE": DEFAULT_FPS},
     "src/chat/connection.ts": {"REPLACED": REPLACED},
     "src/chat/conversation.ts": {"MOST_TYPED": MOST_TYPED},
     "src/chat/microphone.ts": {"RATE": RATE},
-    "src/cloth/carried.ts": {"MOST_DRAWN": DRIVER.most_drawn},
+    "src/cloth/carried.ts": {
+        "MOST_DRAWN": DRIVER.most_drawn,
+        "LEAST": local(quality.drawn_bounds, "least"),
+        "BESIDE": local(quality.carried_edges, "beside"),
+        "LEAST_DETERMINANT": local(SkinnedRows.unposed, "least_determinant"),
+    },
     "src/cloth/driver.ts": {
         "LONGEST_STEP": LONGEST_STEP,
         "RAMP": DRIVER.ramp,
         "HOLD": DRIVER.hold,
         "TELEPORT": DRIVER.teleport,
+        "RAMP_STEP": local(ClothDriver._start, "ramp_step"),
+        "FAR": local(ClothDriver._advance, "far"),
+        "SAME": local(garment_file._garment, "same"),
     },
     "src/cloth/thread.ts": {
         "SUBSTEP": SOLVER.substep,
@@ -69,6 +92,8 @@ REPEATED = {
         "MOST_SPEED": SOLVER.most_speed,
         "MOST_STRETCH": DRIVER.most_stretch,
         "LONGEST_EDGE": SOLVER.most_stretch,
+        "GRAVITY": solver.GRAVITY,
+        "FINE_MARGIN": thread._FINE_MARGIN,
     },
     "src/lips/features.ts": {
         "RATE": audio_features.RATE,
