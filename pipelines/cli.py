@@ -139,7 +139,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "photographs or a video of a person who turns before one camera, to a capture with camera and poses",
     ),
     "capture masks": (
-        "pipelines.commands.masks",
+        "pipelines.commands.detect",
         "CaptureMasks",
         "masks of a capture's images by a matting model, empty plates or MediaPipe",
     ),
@@ -149,12 +149,12 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "a capture with exact inputs to one with a tracker's: noisy parameters, keypoints, estimated labels",
     ),
     "keypoints convert": (
-        "pipelines.commands.keypoints",
+        "pipelines.commands.detect",
         "KeypointsConvert",
         "keypoints of OpenPose, EasyMocap, mmpose, COCO or MediaPipe to ours",
     ),
     "keypoints detect": (
-        "pipelines.commands.keypoints",
+        "pipelines.commands.detect",
         "KeypointsDetect",
         "keypoints of a capture's images by MediaPipe or your own ONNX model",
     ),

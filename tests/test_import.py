@@ -358,7 +358,7 @@ READS: dict[str, set[str]] = {
         *("smplxpp/core/files/array_file.py", "smplxpp/core/files/safe_pickle.py", "smplxpp/core/files/image_file.py"),
         *("smplxpp/core/files/package_file.py", "smplxpp/core/files/atomic.py"),
         *("smplxpp/capture/readers/colmap.py", "smplxpp/capture/readers/neus2.py", "pipelines/runs/code.py"),
-        *("smplxpp/capture/writers/frame_files.py", "smplxpp/core/params.py", "avatar/formats/ply.py"),  # written
+        *("smplxpp/capture/writers.py", "smplxpp/core/params.py", "avatar/formats/ply.py"),  # written
         *("pipelines/batch/hold.py", "pipelines/batch/process.py"),  # a lock, logs
         *("avatar/training/engine/metrics_log.py", "pipelines/runs/folders.py", "pipelines/commands/terminal.py"),
     },
@@ -389,7 +389,6 @@ SMALL_WITH_A_REASON = {
     "avatar.export.posed": "needs torch, which formats does not",
     "avatar.models.networks.presets": "sizes of networks, apart from the trainings that use them",
     "smplxpp.capture.readers.thuman4": "one reader of a data set a file",
-    "smplxpp.detect.load": "the registry in which CONTRIBUTING asks to list a new detector",
     "smplxpp.export.by_suffix": "keeps the writers of formats out of the light room of templates",
 }
 SMALL_MODULE = 60

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32
 
 from pipelines.commands.options import OptionalPath
 from smplxpp.body import BodyModel, load_body
-from smplxpp.capture.writers.frame_files import save_compact
+from smplxpp.capture.writers import save_compact
 from smplxpp.core import BodyParams, TriangleMesh
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.people.fixture_person import (

@@ -21,7 +21,7 @@ from smplxpp.body.named_poses import STRESS_POSES, stress_poses
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.figures import blend_joint_colors, body_cameras, caption, encode_png, render_shaded, row
-from smplxpp.figures.comparison import read_tiles
+from smplxpp.figures.drawings import read_tiles
 from smplxpp.template.template import Template
 
 HEIGHT = 420

@@ -20,7 +20,7 @@ from pipelines.stages.evaluate_inputs import REPORT_FILE
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import atomic_write_bytes, path_inside
 from smplxpp.figures import caption, encode_jpeg, row
-from smplxpp.figures.comparison import enlarge, error_colors, read_tiles
+from smplxpp.figures.drawings import enlarge, error_colors, read_tiles
 
 HEIGHT = 480
 MARGIN = 8

@@ -26,8 +26,7 @@ from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Pose, PosedAvatar, Rig
-from avatar.training.engine.adam import ParameterGroup
-from avatar.training.engine.learning_rates import LearningRates
+from avatar.training.engine.adam import LearningRates, ParameterGroup
 
 OPACITY = 0.99
 

@@ -18,7 +18,7 @@ from avatar.data.cloth_motion import ClothMotions
 from avatar.data.views import View, read_view
 from avatar.rig.rig import Pose, Rig
 from smplxpp.capture import Capture
-from smplxpp.capture.cache import ArrayCache
+from smplxpp.capture.views import ArrayCache
 from smplxpp.core import BodyParams, Camera, InputError, require_at_least
 from smplxpp.core.spread import spread_inside
 from smplxpp.native import thread_count

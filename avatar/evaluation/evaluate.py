@@ -14,8 +14,18 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.data.views import View
-from avatar.evaluation.gallery import Gallery, ShownSurface, ShownView
-from avatar.evaluation.protocol import AsNew, ProtocolConfig, ViewSet, new_pose, truth_frames, view_sets, with_people
+from avatar.evaluation.protocol import (
+    AsNew,
+    Gallery,
+    ProtocolConfig,
+    ShownSurface,
+    ShownView,
+    ViewSet,
+    new_pose,
+    truth_frames,
+    view_sets,
+    with_people,
+)
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
 from avatar.evaluation.summary import SPREAD_CONVENTION
 from avatar.gaussians.sampling import head_faces

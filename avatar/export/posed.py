@@ -15,7 +15,7 @@ from avatar.formats.splats import Splats
 from avatar.gaussians.binding import THICKNESS, BoundGaussians, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.models.student import Student
-from avatar.rendering.picture import render
+from avatar.rendering.avatar_view import render
 from smplxpp.core import BodyParams, TriangleMesh, require_choice
 from smplxpp.core.mesh_files.raw_mesh import FacePictures
 from smplxpp.core.spherical_harmonics import C0, rotate_sh

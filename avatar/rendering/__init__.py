@@ -7,7 +7,7 @@ _EXPORTS = {
     "RasterSettings": "avatar.rendering.settings",
     "Rendering": "avatar.rendering.avatar_view",
     "rasterize": "avatar.rendering.api",
-    "render": "avatar.rendering.picture",
+    "render": "avatar.rendering.avatar_view",
     "render_view": "avatar.rendering.avatar_view",
 }
 __all__ = [*_EXPORTS]

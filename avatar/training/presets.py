@@ -10,12 +10,12 @@ from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.presets import NetworkPreset, network_preset
 from avatar.models.student import StudentConfig
-from avatar.training.engine.learning_rates import LearningRates
+from avatar.training.engine.adam import LearningRates
 from avatar.training.engine.optimization_task import PretrainConfig
-from avatar.training.fit.config import PRESETS, FitConfig
+from avatar.training.fit.fit import PRESETS, FitConfig
+from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
-from avatar.training.teacher.fit_teacher import FitTeacherConfig
 from avatar.training.tracking.config import Level, TrackConfig
 from smplxpp.core.errors import require_choice
 

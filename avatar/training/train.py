@@ -23,7 +23,6 @@ from avatar.models.open_student import TRAINING_FILES, open_student
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Rig
-from avatar.training.checks import check_training, note_missing_normals
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import (
@@ -34,15 +33,15 @@ from avatar.training.engine.resources import (
 )
 from avatar.training.engine.session import Session
 from avatar.training.fit.fit import fit_gaussians, fit_scene
+from avatar.training.fit_teacher import fit_teacher
 from avatar.training.loose_clothes import find_garments, with_simulated
 from avatar.training.presets import TrainingPreset
-from avatar.training.recipe import STEPS, Recipe, TrainConfig
+from avatar.training.recipe import STEPS, Recipe, TrainConfig, check_training, note_missing_normals
 from avatar.training.refinement.board import RefinementStoppedError
 from avatar.training.refinement.refine_capture import refine_capture, with_refined_poses
 from avatar.training.scene import TrainScene, hold_out_cameras, prepare_scene
 from avatar.training.student.bake import bake
 from avatar.training.student.compensate import compensate, write_student
-from avatar.training.teacher.fit_teacher import fit_teacher
 from smplxpp.capture import Capture
 from smplxpp.capture.declared import has_estimated_params
 from smplxpp.cloth.garment_file import load_garments, save_garments

@@ -23,11 +23,11 @@ from avatar.evaluation.report import EvalReport
 from avatar.gaussians.tensor_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.tracked_surface import TrackedAvatar
+from avatar.training.fit_teacher import PretrainTeacherTask, TeacherTask
 from avatar.training.presets import TrainingPreset, training_preset
 from avatar.training.student.bake import BakeTask
 from avatar.training.student.compensate import CompensateTask
 from avatar.training.student.pretrain import PretrainFieldTask
-from avatar.training.teacher.fit_teacher import PretrainTeacherTask, TeacherTask
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.track import TrackTask
 from benchmarks.support.results import store_results

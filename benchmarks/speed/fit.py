@@ -27,8 +27,7 @@ from avatar.gaussians.sampling import SamplingConfig
 from avatar.rig.rig import PosedAvatar
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
-from avatar.training.fit.config import PRESETS, FitConfig
-from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
+from avatar.training.fit.fit import PRESETS, FitConfig, FitScene, FitTask, fit_gaussians
 from benchmarks.support.results import store_results
 from pipelines.commands.build import Build
 from pipelines.runs import layout

@@ -21,8 +21,7 @@ from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import ABLATION
 from pipelines.runs.stage import MANIFEST, Stage, StageOutput, StageRecord, decide, run_stage
 from pipelines.stages.cloth import ClothStage, clothed_sequence
-from pipelines.stages.evaluate_inputs import surface_digest
-from pipelines.stages.evaluate_poses import of_held_out_poses, refined_digest, refined_poses
+from pipelines.stages.evaluate_inputs import of_held_out_poses, refined_digest, refined_poses, surface_digest
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.capture import Capture
 from smplxpp.core import ProgressCallback, ignore_progress

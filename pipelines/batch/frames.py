@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from pipelines.runs.artefacts import load_stacked_params
+from pipelines.runs.folders import read_record
 from pipelines.runs.layout import RECONSTRUCT_STAGE, RECONSTRUCTION, REGISTERED_PARAMS, reconstructed_scan
-from pipelines.runs.manifest import read_record
 from pipelines.runs.stage import MANIFEST
 from smplxpp.body import BodyModel
 from smplxpp.build.register import BODY_JOINTS, stacked_rows

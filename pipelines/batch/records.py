@@ -30,7 +30,7 @@ from typing import Any, Literal, cast, get_args
 from pipelines.batch.jobs import Job, JobFile
 from pipelines.batch.steps import STEPS
 from pipelines.runs.code import PACKAGES, TRAINING, code_of, sha256_file, versions
-from pipelines.runs.manifest import require_plain_fields
+from pipelines.runs.folders import require_plain_fields
 from smplxpp import __version__
 from smplxpp.core.errors import InputError, require_choice
 from smplxpp.core.files.atomic import atomic_write_text

@@ -12,8 +12,8 @@ from typing import Any
 
 from avatar.evaluation.input_protocol import NOT_KNOWN, InputProtocol
 from pipelines.batch.records import JOB_FILE, RUN_FOLDER, JobRecord, read_batch, read_job
+from pipelines.runs.folders import read_record
 from pipelines.runs.layout import BEST_FIRST, COMPACT_STUDENT, EVALUATE_STAGE, REPORT_FILE, STUDENT
-from pipelines.runs.manifest import read_record
 from pipelines.runs.stage import MANIFEST
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_object

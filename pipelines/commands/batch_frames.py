@@ -27,8 +27,8 @@ from pipelines.commands.batch import Machines, check_options, shown
 from pipelines.commands.metrics import frame_number, over_frames, pair_frames
 from pipelines.commands.options import OptionalPath, OptionalText, frame_numbers, selected_frames
 from pipelines.commands.terminal import print_checks, print_paths
+from pipelines.runs.folders import read_record
 from pipelines.runs.layout import REFINE_STAGE, REGISTERED_PARAMS
-from pipelines.runs.manifest import read_record
 from pipelines.runs.stage import MANIFEST
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture

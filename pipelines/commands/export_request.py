@@ -175,14 +175,14 @@ def series_name(number: int, format: str) -> str:
 
 
 # Module and function that return the writers of a format, by model; modules are imported when they are needed.
-_SPLATS = ("pipelines.commands.export_splats", "splat_writers")
-_TEMPLATE = ("pipelines.commands.export_template", "template_writers")
+_SPLATS = ("pipelines.commands.export_files", "splat_writers")
+_TEMPLATE = ("pipelines.commands.export_files", "template_writers")
 _BY_MODEL = {
     **{("student", name): _SPLATS for name in ("ply", "spz", "sog", "glb", "usd")},
     **{("template", name): _TEMPLATE for name in ("glb", "fbx", "vrm", "usd", "obj")},
 }
-_STEP = ("pipelines.commands.export_splats", "step_writers")
-_MOTION = ("pipelines.commands.export_template", "motion_writers")
+_STEP = ("pipelines.commands.export_files", "step_writers")
+_MOTION = ("pipelines.commands.export_files", "motion_writers")
 _FOR_ANY_MODEL = {"onnx": _STEP, "webavatar": _STEP, "bvh": _MOTION, "amass": _MOTION}
 Write = Callable[[Path], None]
 

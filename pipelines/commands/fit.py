@@ -21,7 +21,7 @@ from pipelines.runs.stage import StageRecord, how_to_continue
 from smplxpp.core.errors import require_at_least, require_positive
 
 if TYPE_CHECKING:
-    from avatar.training.fit.config import FitConfig
+    from avatar.training.fit.fit import FitConfig
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Fit:
         """
         from dataclasses import replace
 
-        from avatar.training.fit.config import PRESETS
+        from avatar.training.fit.fit import PRESETS
 
         config = PRESETS[self.preset]
         count = config.sampling.count if self.gaussians is None else self.gaussians

@@ -14,6 +14,7 @@ from rich.text import Text
 from pipelines.commands.file_kinds import print_kind, shown_bytes
 from pipelines.report.model import CheckRow, Step, count_statuses, worst_status
 from pipelines.report.words import next_steps
+from pipelines.runs.folders import read_record
 from pipelines.runs.layout import (
     ALL_STAGES,
     EVALUATE_STAGE,
@@ -25,7 +26,6 @@ from pipelines.runs.layout import (
     TEMPLATE_STAGES,
     TRAIN_STAGES,
 )
-from pipelines.runs.manifest import read_record
 from pipelines.runs.stage import MANIFEST, is_finished
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_list, as_object, read_json

@@ -18,8 +18,7 @@ from pipelines.report import CheckRow, Curve, KeyNumber, Picture, Report, Sectio
 from pipelines.runs.code import versions
 from smplxpp.capture.check.check import CaptureCheck
 from smplxpp.capture.check.findings import AREAS, Finding, grouped
-from smplxpp.capture.check.silhouettes import OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary, body_silhouette
-from smplxpp.capture.check.views import OPAQUE, ViewCheck
+from smplxpp.capture.check.views import OPAQUE, OUTSIDE_BAD, OUTSIDE_DOUBTFUL, FitSummary, ViewCheck, body_silhouette
 from smplxpp.capture.check.without_images import in_ranges
 from smplxpp.core import InputError, spread
 from smplxpp.core.files import atomic_write_bytes, atomic_write_text, jsonable

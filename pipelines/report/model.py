@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Num
 
-from pipelines.runs.manifest import STATUSES, require_check
+from pipelines.runs.folders import STATUSES, require_check
 from smplxpp.core import Check, InputError
 
 

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipelines.runs.code import GEOMETRY, code_of, sha256_file, versions
-from pipelines.runs.manifest import SCHEMA, read_record
+from pipelines.runs.folders import SCHEMA, read_record
 from smplxpp.core import InputError, StageOutput
 from smplxpp.core.files import atomic_folder, atomic_write_text, jsonable
 

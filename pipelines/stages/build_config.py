@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 from pipelines.runs.artefacts import values_of
 from pipelines.runs.code import sha256_file
+from pipelines.runs.folders import require_plain_fields
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, RECONSTRUCT_FILE, REGISTER_FILE
-from pipelines.runs.manifest import require_plain_fields
 from pipelines.runs.stage import read_manifest
 from smplxpp.assemble import FillHolesConfig
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs

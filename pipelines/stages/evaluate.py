@@ -17,7 +17,7 @@ from avatar.gaussians.tensor_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import AvatarModel, Rig
-from avatar.training.engine.learning_rates import pixel_size
+from avatar.training.engine.adam import pixel_size
 from pipelines.runs import gates
 from pipelines.runs.code import TRAINING, sha256_file
 from pipelines.runs.folders import own_run_folder
@@ -26,25 +26,22 @@ from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_inputs import (
     REPORT_FILE,
-    input_protocol,
-    surface_digest,
-)
-from pipelines.stages.evaluate_poses import (
     exact_params,
+    input_protocol,
     of_held_out_poses,
     pose_errors,
     refined_digest,
     refined_poses,
+    surface_digest,
 )
-from pipelines.stages.held_out import refuse_seen
-from pipelines.stages.scene import TrainInputs, open_scene
+from pipelines.stages.scene import TrainInputs, open_scene, refuse_seen
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
 from smplxpp.cloth.quality import ClothQuality, all_checks, merged
 from smplxpp.core import Check, InputError, ProgressCallback, ignore_progress, require_known
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.figures import encode_png
-from smplxpp.figures.comparison import surface_picture, write_tiles
+from smplxpp.figures.drawings import surface_picture, write_tiles
 from smplxpp.metrics.comparison import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
 from smplxpp.template.template import Template

@@ -1,23 +1,44 @@
-"""Collect the inputs of an evaluation: whether they are exact, tracked or estimated, and the true surfaces."""
+"""Collect the inputs of an evaluation: whether they are exact, tracked or estimated, true surfaces, poses."""
 
 from __future__ import annotations
 
 import hashlib
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
 from avatar.evaluation.protocol import ProtocolConfig, truth_frames, view_sets
 from avatar.training.scene import normal_maps
-from pipelines.runs.layout import REGISTERED_PARAMS, TRAIN_STAGES
+from pipelines.runs.code import sha256_file
+from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS, REGISTERED_PARAMS, TRAIN_STAGES
 from pipelines.runs.stage import MANIFEST, read_manifest
 from pipelines.stages.build_config import load_build
 from pipelines.stages.run_inputs import folder_of_maps, labels_of_build, parameters_in_run
-from smplxpp.capture import Capture
+from smplxpp.body import BodyModel
+from smplxpp.capture import Capture, open_capture
 from smplxpp.capture.declared import DeclaredInputs, path_of_params
+from smplxpp.capture.protocols import EXACT
+from smplxpp.capture.recording import ParamSource
+from smplxpp.capture.sources import StackedParams
+from smplxpp.core import BodyParams, InputError, spread
 from smplxpp.core.files.json_file import as_integer, as_text
+from smplxpp.metrics import PoseError, mean_pose_error, pose_error
+from smplxpp.raster import outer_visible_points
+from smplxpp.template.template import Template
 
 REPORT_FILE = "metrics.json"
+log = logging.getLogger(__name__)
+COMPARED = 100
+"""Largest number of frames of a kind (training, held-out) whose poses are compared; they are evenly spread."""
+BEHIND = 5e-4
+"""Depth in metres behind the outer surface from which a vertex counts as covered; parts keep 1 mm from the body."""
 
 
 def input_protocol(run: Path, capture: Capture) -> InputProtocol:
@@ -85,3 +106,110 @@ def surface_digest(capture: Capture, protocol: ProtocolConfig) -> str:
         assert mesh is not None  # `truth_frames` chose frames that have one
         digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
     return digest.hexdigest()
+
+
+def exact_params(capture: Capture, body: Path | None, model: BodyModel) -> ParamSource | None:
+    """Return the exact parameters of a capture with a protocol of that name; they serve measuring, never training."""
+    if EXACT not in capture.recording.protocols or capture.protocol == EXACT:
+        return None
+    try:
+        return open_capture(capture.root, body=None if body is None else model, protocol=EXACT).recording.params
+    except InputError as error:
+        log.warning("poses are not compared with the exact ones: %s", error)
+        return None
+
+
+def pose_errors(captures: Mapping[str, Capture], exact: ParamSource, template: Template) -> dict[str, PoseError]:
+    """Measure the errors of the poses in use, for training and for held-out frames.
+
+    The poses in use move the template's body, which has one shape; the exact body has a shape of its own.
+
+    Args:
+        captures: captures by a suffix of the kind's name. "" has the poses in use; of others only held-out poses count.
+        exact: the true parameters.
+        template: template of the run.
+    """
+    covered, known = covered_vertices(template), set(exact.frames().tolist())
+    found: dict[str, PoseError] = {}
+    for title, capture in captures.items():
+        splits = capture.splits
+        # Refinement of held-out poses leaves the training poses alone, so that those are compared once, under "".
+        kinds = {"training frames": () if title else splits.train_frames, "held-out frames": splits.novel_pose_frames}
+        for kind, frames in kinds.items():
+            # Compare only frames for which both sources have parameters.
+            there = [frame for frame in frames if frame in known and capture.params(frame) is not None]
+            errors = [
+                pose_error(
+                    _params(capture, frame).without_shape(),
+                    _from_template(exact.read(frame), template),
+                    template.body,
+                    covered,
+                )
+                for frame in spread(there, COMPARED)
+            ]
+            if errors:
+                found[f"{kind}{title}"] = mean_pose_error(errors)
+    return found
+
+
+def _from_template(params: BodyParams, template: Template) -> BodyParams:
+    """Return parameters for the template's body, whose mean shape is the template's."""
+    size = template.body.num_betas
+    betas = np.zeros((len(params), size))
+    # The template's mean shape already contains its own betas; subtract them from the exact ones.
+    betas[:, : params.betas.shape[1]] += params.betas[:, :size]
+    betas[:, : len(template.betas)] -= template.betas[:size]
+    return replace(params, betas=betas, v_shape=None)
+
+
+def covered_vertices(template: Template) -> Bool[np.ndarray, " V"]:
+    """Return which vertices of the body are hidden by parts in the T-pose, and visible from outside without parts."""
+    body = template.part_mesh(template.part_names[0])
+    # A vertex is covered if it is visible with the body alone and hidden with all parts.
+    seen = [outer_visible_points(mesh, body.vertices, tolerance=BEHIND) for mesh in (body, template.mesh)]
+    return seen[0] & ~seen[1]
+
+
+def refined_poses(run: Path, capture: Capture) -> Capture | None:
+    """Return the capture with held-out poses that the run refined on the training cameras; None without any."""
+    path = run / REFINED_HELD_OUT_PARAMS
+    own = capture.recording.params
+    if own is None or not path.is_file() or not capture.splits.novel_pose_frames:
+        return None
+    source = _HeldOutFrom(own, StackedParams(path), frozenset(capture.splits.novel_pose_frames))
+    return replace(capture, recording=replace(capture.recording, params=source))
+
+
+def refined_digest(run: Path, refined: Capture | None) -> dict[str, str]:
+    """Return the digest of the file behind `refined_poses`, as an input of a stage."""
+    return {} if refined is None else {REFINED_HELD_OUT_PARAMS: sha256_file(run / REFINED_HELD_OUT_PARAMS)}
+
+
+def of_held_out_poses(config: EvaluationConfig, capture: Capture) -> EvaluationConfig | None:
+    """Restrict an evaluation to the view sets of held-out poses, without speed and pictures; None without such sets."""
+    sets = tuple(name for name in view_sets(capture, config.protocol) if name.startswith("novel_pose"))
+    if not sets:
+        return None
+    return replace(config, protocol=replace(config.protocol, sets=sets), speed_pictures=0, shown=0)
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldOutFrom:
+    """Parameters whose held-out frames come from a second source, where that source has them."""
+
+    own: ParamSource
+    other: ParamSource
+    held_out: frozenset[int]
+
+    def frames(self) -> Int64[np.ndarray, " F"]:
+        return self.own.frames()
+
+    def read(self, frame: int) -> BodyParams:
+        other = frame in self.held_out and frame in self.other.frames()
+        return (self.other if other else self.own).read(frame)
+
+
+def _params(capture: Capture, frame: int) -> BodyParams:
+    params = capture.params(frame)
+    assert params is not None  # frames without were left out
+    return params

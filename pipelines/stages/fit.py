@@ -20,8 +20,7 @@ from avatar.rig.rig import Rig
 from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.session import Session
-from avatar.training.fit.config import FitConfig
-from avatar.training.fit.fit import FitResult, fit_gaussians, fit_scene
+from avatar.training.fit.fit import FitConfig, FitResult, fit_gaussians, fit_scene
 from avatar.training.scene import silhouette_overlap
 from pipelines.runs import gates
 from pipelines.runs.code import sha256_file
@@ -29,7 +28,7 @@ from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import GROUNDS, ModelStage, Trainer
 from smplxpp.core.spread import spread
-from smplxpp.figures.comparison import write_strip
+from smplxpp.figures.drawings import write_strip
 
 PREVIEWED_TRAINING_VIEWS = 3
 

@@ -33,8 +33,7 @@ from pipelines.runs.stage import (
     run_stage,
     standing,
 )
-from pipelines.stages.held_out import seen_of
-from pipelines.stages.scene import TrainScene, preview_writer
+from pipelines.stages.scene import TrainScene, preview_writer, seen_of
 from smplxpp.core.errors import InputError
 from smplxpp.template.template import Template
 

@@ -34,7 +34,7 @@ from pipelines.stages.scene import TrainInputs, of_protocol, open_scene, open_vi
 from smplxpp.capture.declared import has_estimated_params
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files import atomic_write_text, jsonable
-from smplxpp.figures.comparison import write_tiles
+from smplxpp.figures.drawings import write_tiles
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.training.engine.session import Session
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, fit_teacher
+from avatar.training.fit_teacher import FitTeacherConfig, fit_teacher
 from pipelines.runs.stage import StageOutput
 from pipelines.stages.models import ModelStage, Trainer
 from pipelines.stages.train_results import training_output, write_model

@@ -48,13 +48,12 @@ from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body import load_body, load_params
 from smplxpp.build.assemble import add_texture, assemble_parts
 from smplxpp.build.data import RestPart
-from smplxpp.build.locate import locate_in_scan
+from smplxpp.build.locate import LEAST_CONFIDENCE, locate_in_scan, require_found
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
 from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces, vertex_labels
 from smplxpp.build.validate import validate_template
-from smplxpp.build.verdict import LEAST_CONFIDENCE, require_found
 from smplxpp.core import BodyParams, StageOutput, write_ply
 from smplxpp.core.files.atomic import atomic_write_bytes
 from smplxpp.export import write_glb, write_obj

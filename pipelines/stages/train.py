@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from avatar.losses.perceptual import load_metric
-from avatar.training.checks import check_training, note_missing_normals
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
-from avatar.training.recipe import STEPS, Recipe
+from avatar.training.recipe import STEPS, Recipe, check_training, note_missing_normals
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.scene import TrainScene
 from pipelines.runs import layout
@@ -22,10 +21,9 @@ from pipelines.stages.bake import BakeStage
 from pipelines.stages.cloth import ClothStage
 from pipelines.stages.compensate import CompensateStage
 from pipelines.stages.fit import FitStage
-from pipelines.stages.held_out import refuse_seen
 from pipelines.stages.models import ModelStage, Trainer, TrainOptions
 from pipelines.stages.refine import help_refine, refine
-from pipelines.stages.scene import TrainInputs, open_scene
+from pipelines.stages.scene import TrainInputs, open_scene, refuse_seen
 from pipelines.stages.teacher import TeacherStage
 
 log = logging.getLogger(__name__)

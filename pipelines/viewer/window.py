@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pipelines.viewer.picking import first_hit, line_under, middle_of_limb
 from pipelines.viewer.run_scene import label_again
-from pipelines.viewer.scene import MODES, ScanScene, legend
+from pipelines.viewer.scene import MODES, ScanScene, first_hit, legend, line_under, middle_of_limb
 from pipelines.viewer.server import address_of, one_at_a_time, plain_markdown, start_server, stop_server
 from pipelines.viewer.session import CHOICE, LabelSession, UncertainRegion, lies_within, uncertain_regions
 from smplxpp.core.labels import UPPER, Labels

@@ -17,7 +17,7 @@ from smplxpp.build.assemble import add_texture, assemble_parts
 from smplxpp.build.config import BuildConfig, BuildInputs, ReconstructInputs, RegisterInputs
 from smplxpp.build.data import LocatedInScan, RestPart
 from smplxpp.build.inputs import check_inputs, given_motion, plan_build
-from smplxpp.build.locate import locate_in_scan
+from smplxpp.build.locate import locate_in_scan, require_found
 from smplxpp.build.observe import observe
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
 from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
@@ -37,7 +37,6 @@ from smplxpp.build.request import BuildRequest, opened, with_params
 from smplxpp.build.scan import ScanFile, read_scan
 from smplxpp.build.segment import label_faces
 from smplxpp.build.validate import validate_template
-from smplxpp.build.verdict import require_found
 from smplxpp.capture import Capture
 from smplxpp.clean.remesh import require_remesher
 from smplxpp.core import BodyParams, MeshLike, StageOutput, ignore_progress

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.keypoints import shown_keypoints
 from smplxpp.capture.recording import KINDS, Problem, Recording, Splits
-from smplxpp.capture.views import ViewReader
+from smplxpp.capture.views import ArrayCache, ViewReader
 from smplxpp.capture.window import Window
 from smplxpp.core import BodyParams, Camera, Keypoints2D, TriangleMesh, require_choice
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress

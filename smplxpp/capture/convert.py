@@ -17,11 +17,12 @@ from typing import Literal
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.convert_views import ViewOutcome, ViewWriter
 from smplxpp.capture.sources import PosedTopology
-from smplxpp.capture.writers.frame_files import save_params_by_row, write_keypoints
-from smplxpp.capture.writers.metadata import (
+from smplxpp.capture.writers import (
     RigCamera,
+    save_params_by_row,
     write_calibration_csv,
     write_description,
+    write_keypoints,
     write_plain_cameras_json,
 )
 from smplxpp.core import BodyParams, require_between, require_choice, require_positive, write_ply

@@ -14,8 +14,7 @@ from smplxpp.capture.capture import Capture
 from smplxpp.capture.convert import Conversion, claim_folder
 from smplxpp.capture.video_files import Video, probe_video, video_frames
 from smplxpp.capture.video_sync import Timeline, found_offsets, timeline
-from smplxpp.capture.writers.frame_files import write_keypoints
-from smplxpp.capture.writers.metadata import camera_entry, lens_entry
+from smplxpp.capture.writers import camera_entry, lens_entry, write_keypoints
 from smplxpp.core import Camera, Keypoints2D
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress, require_between, require_choice
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text

@@ -10,7 +10,7 @@ from jaxtyping import UInt8, UInt16
 
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.window import Window
-from smplxpp.capture.writers.frame_files import JPEG_SUFFIXES, encoded_image, normal_codes, view_path
+from smplxpp.capture.writers import JPEG_SUFFIXES, encoded_image, normal_codes, view_path
 from smplxpp.core.errors import InputError
 from smplxpp.core.files import atomic_write_bytes, read_bytes
 from smplxpp.core.files.image_file import image_mode

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from smplxpp.body import BodyModel
-from smplxpp.capture.cache import ArrayCache
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.files import require_folder, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
@@ -32,7 +31,7 @@ from smplxpp.capture.readers import (
 from smplxpp.capture.readers.common import ReaderOptions, RigOptions
 from smplxpp.capture.recording import Recording, Splits
 from smplxpp.capture.subject import SubjectKeypoints
-from smplxpp.capture.views import read_alpha
+from smplxpp.capture.views import ArrayCache, read_alpha
 from smplxpp.capture.window import Window
 from smplxpp.core import InputError, require_choice
 

@@ -5,13 +5,13 @@ Example:
     >>> Path("scan.png").write_bytes(encode_png(render_shaded(mesh, camera, vertex_colors=colors)))
 """
 
-from smplxpp.figures.body_drawings import body_on_photograph, draw_bones, draw_keypoints, render_heat
 from smplxpp.figures.colors import (
     blend_joint_colors,
     colormap,
     heat_colors,
     joint_palette,
 )
+from smplxpp.figures.drawings import body_on_photograph, draw_bones, draw_keypoints, render_heat
 from smplxpp.figures.film import write_film
 from smplxpp.figures.sheets import caption, color_bar, contact_sheet, encode_jpeg, encode_png, row
 from smplxpp.raster import (

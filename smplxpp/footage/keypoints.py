@@ -18,12 +18,12 @@ from jaxtyping import UInt8
 from smplxpp.capture import Capture
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color
-from smplxpp.capture.writers.frame_files import write_keypoints
+from smplxpp.capture.writers import write_keypoints
 from smplxpp.core import InputError, Keypoints2D, ProgressCallback, ignore_progress
 from smplxpp.core.files import read_arrays, read_bytes
 from smplxpp.detect import Box, DetectedPerson, Detector, mask_box
 from smplxpp.figures import contact_sheet
-from smplxpp.figures.body_drawings import draw_keypoints
+from smplxpp.figures.drawings import draw_keypoints
 
 _SAVE_EVERY_S = 20.0  # a file is written this often, so that a kill loses at most that much work
 

@@ -15,8 +15,14 @@ from smplxpp.capture import Capture, MattingModel, open_capture, write_mattes
 from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.capture.views import read_alpha
-from smplxpp.capture.writers.frame_files import JPEG_SUFFIXES, view_path, write_gray_png, write_jpeg, write_keypoints
-from smplxpp.capture.writers.metadata import write_plain_cameras_json
+from smplxpp.capture.writers import (
+    JPEG_SUFFIXES,
+    view_path,
+    write_gray_png,
+    write_jpeg,
+    write_keypoints,
+    write_plain_cameras_json,
+)
 from smplxpp.core import (
     Camera,
     InputError,

@@ -12,9 +12,8 @@ import numpy as np
 
 from smplxpp.body import BodyModel, load_body
 from smplxpp.capture import Capture, open_capture
-from smplxpp.capture.camera_rig import camera_rig
-from smplxpp.capture.writers.frame_files import save_params_by_row
-from smplxpp.capture.writers.metadata import write_cameras_json, write_description
+from smplxpp.capture.cameras import camera_rig
+from smplxpp.capture.writers import save_params_by_row, write_cameras_json, write_description
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_at_least
 from smplxpp.core.files import atomic_folder, atomic_write_text, read_json
 from smplxpp.synth.tracker import (

@@ -21,7 +21,7 @@ from smplxpp.capture import Capture
 from smplxpp.capture.files import FileSeries
 from smplxpp.capture.keypoints import moved_keypoints
 from smplxpp.capture.views import read_labels
-from smplxpp.capture.writers.frame_files import write_gray_png, write_keypoints
+from smplxpp.capture.writers import write_gray_png, write_keypoints
 from smplxpp.core import (
     BACKGROUND,
     BodyParams,

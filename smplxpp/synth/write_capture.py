@@ -13,16 +13,19 @@ from jaxtyping import Bool, UInt8
 
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
-from smplxpp.capture.camera_rig import camera_rig
-from smplxpp.capture.writers.frame_files import (
+from smplxpp.capture.cameras import camera_rig
+from smplxpp.capture.writers import (
+    RigCamera,
     rounded,
     save_compact,
     view_path,
+    write_actorshq_scene,
+    write_calibration_csv,
+    write_cameras_json,
     write_gray_png,
     write_jpeg,
     write_normal_png,
 )
-from smplxpp.capture.writers.metadata import RigCamera, write_actorshq_scene, write_calibration_csv, write_cameras_json
 from smplxpp.core import ProgressCallback, TriangleMesh, ignore_progress, write_ply
 from smplxpp.core.files import atomic_folder, atomic_write_text, read_json
 from smplxpp.people.fixture_person import PART_LABELS, PART_NAMES, Person, person_of, read_layers

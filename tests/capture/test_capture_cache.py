@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.capture import open_capture
-from smplxpp.capture.cache import ArrayCache
+from smplxpp.capture.views import ArrayCache
 from tests.capture.scene import make_scene
 from tests.capture.writers import write_simple
 

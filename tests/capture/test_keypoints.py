@@ -12,7 +12,7 @@ from pipelines.cli import main
 from smplxpp.body import load_body
 from smplxpp.capture import Problem, find_problems, open_capture
 from smplxpp.capture.distortion import Distortion
-from smplxpp.capture.writers.frame_files import write_keypoints
+from smplxpp.capture.writers import write_keypoints
 from smplxpp.core import InputError, Keypoints2D
 from tests.capture.scene import LENS, Scene, make_scene
 from tests.capture.writers import write_easymocap, write_simple

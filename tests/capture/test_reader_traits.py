@@ -12,7 +12,7 @@ import pytest
 from pipelines.cli import main
 from smplxpp.capture import find_problems, open_capture
 from smplxpp.capture.files import FileSeries
-from smplxpp.capture.writers.frame_files import save_params_by_row
+from smplxpp.capture.writers import save_params_by_row
 from smplxpp.core.errors import InputError
 from tests.capture.calibration_writers import pose2sim as write_calibration
 from tests.capture.scene import make_scene

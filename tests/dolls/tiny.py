@@ -9,11 +9,11 @@ from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.networks.presets import NetworkPreset
 from avatar.models.networks.teacher import TeacherConfig
 from avatar.training.engine.optimization_task import PretrainConfig
-from avatar.training.fit.config import FitConfig
+from avatar.training.fit.fit import FitConfig
+from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.presets import TrainingPreset
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
-from avatar.training.teacher.fit_teacher import FitTeacherConfig
 from avatar.training.tracking.config import Level, TrackConfig
 
 TINY_TEACHER = TeacherConfig(

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from avatar.evaluation.gallery import Gallery, ShownView
-from avatar.evaluation.protocol import ViewSet
+from avatar.evaluation.protocol import Gallery, ShownView, ViewSet
 
 PSNR = {0: 20.0, 1: 15.0, 2: 18.0, 3: 15.0, 4: 30.0}
 SETS = {name: ViewSet(name, tuple(("Cam", frame) for frame in PSNR)) for name in ("novel_pose", "novel_view")}

@@ -17,7 +17,7 @@ from smplxpp.build.inputs import plan_build
 from smplxpp.build.observe import observe
 from smplxpp.build.request import BuildRequest
 from smplxpp.capture import open_capture
-from smplxpp.capture.writers.frame_files import write_keypoints
+from smplxpp.capture.writers import write_keypoints
 from smplxpp.core import InputError, Keypoints2D
 from smplxpp.core.files.image_file import image_size
 from smplxpp.detect import DetectedPerson

@@ -37,7 +37,7 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs, save_build
 from pipelines.stages.evaluate_inputs import input_protocol
 from smplxpp.capture import open_capture
 from smplxpp.core import BodyParams, InputError
-from smplxpp.figures.comparison import read_tiles, surface_picture, write_tiles
+from smplxpp.figures.drawings import read_tiles, surface_picture, write_tiles
 from smplxpp.template.template import Template
 from tests.dolls.standing import FRAMES, HELD_OUT, doll, dressed, write_frames
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers

@@ -20,7 +20,7 @@ from pipelines.commands.inspect import summarise_run
 from pipelines.commands.terminal import training_progress
 from pipelines.runs.stage import SCHEMA, read_manifest
 from smplxpp.core.params import BodyParams
-from smplxpp.figures.comparison import read_strip
+from smplxpp.figures.drawings import read_strip
 from tests.dolls.standing import HELD_OUT, TRAIN, doll, write_capture, write_run
 
 SMALL = ("--gaussians", "1500", "--iterations", "12", "--device", "cpu", "--json")

@@ -28,7 +28,7 @@ from pipelines.stages.build_config import (
 )
 from smplxpp.core.errors import InputError
 from smplxpp.figures import colormap
-from smplxpp.figures.comparison import ERROR_LIMIT, enlarge, error_colors, error_legend, read_strip, write_strip
+from smplxpp.figures.drawings import ERROR_LIMIT, enlarge, error_colors, error_legend, read_strip, write_strip
 from tests.dolls.standing import HELD_OUT, TRAIN, write_capture, write_run
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
 

@@ -13,16 +13,14 @@ import pytest
 
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.report import EvalReport
-from avatar.training.checks import note_missing_normals
 from avatar.training.presets import training_preset
-from avatar.training.recipe import STEPS, Recipe
+from avatar.training.recipe import STEPS, Recipe, note_missing_normals
 from pipelines.cli import main
 from pipelines.commands.build import Build
 from pipelines.runs.code import sha256_file
 from pipelines.runs.stage import SCHEMA
 from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, save_build
-from pipelines.stages.evaluate_inputs import input_protocol
-from pipelines.stages.evaluate_poses import covered_vertices
+from pipelines.stages.evaluate_inputs import covered_vertices, input_protocol
 from pipelines.stages.run_inputs import chosen_protocol
 from pipelines.stages.scene import TrainInputs, open_frame, open_scene
 from smplxpp.capture import open_capture

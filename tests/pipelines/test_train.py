@@ -21,7 +21,7 @@ from pipelines.runs.stage import read_manifest
 from pipelines.stages import train as train_stage
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.core.errors import InputError
-from smplxpp.figures.comparison import read_strip
+from smplxpp.figures.drawings import read_strip
 from tests.cloth.persons import person
 from tests.dolls.dancing import HELD_OUT, template, write_dance_run
 from tests.dolls.skirted import write_skirted

@@ -15,8 +15,7 @@ from avatar.training import recipe
 from pipelines.commands import options
 from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages import scene as scene_module
-from pipelines.stages.held_out import refuse_seen
-from pipelines.stages.scene import TrainInputs, open_scene
+from pipelines.stages.scene import TrainInputs, open_scene, refuse_seen
 from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.template.template import Template
 from tests.dolls.dancing import FRAMES, HEIGHT, HELD_OUT, TRAIN, WIDTH, dance, template, write_dance, write_dance_run
@@ -237,7 +236,7 @@ def test_a_checkpoint_of_a_newer_version_is_refused_and_kept(run, original, caps
 
 @pytest.mark.parametrize("shortage", [MemoryError(), OSError(28, "No space left on device")])
 def test_what_runs_out_is_said_and_finished_stages_stay(run, original, capsys, monkeypatch, shortage):
-    from avatar.training.teacher.fit_teacher import TeacherTask
+    from avatar.training.fit_teacher import TeacherTask
 
     def broken(self, iteration):
         raise shortage

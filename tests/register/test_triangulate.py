@@ -10,7 +10,7 @@ import pytest
 
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
-from smplxpp.capture.camera_rig import camera_rig
+from smplxpp.capture.cameras import camera_rig
 from smplxpp.core import Camera, InputError, Keypoints2D, matrix_from_rotvec
 from smplxpp.people.fixture_person import PERSON_BETAS
 from smplxpp.register.keypoint_faults import mirror_index, number_ranges

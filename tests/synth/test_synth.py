@@ -13,10 +13,15 @@ from PIL import Image
 from pipelines.cli import main
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
-from smplxpp.capture.camera_rig import camera_rig
-from smplxpp.capture.cameras import read_cameras
-from smplxpp.capture.writers.frame_files import png16, save_compact, write_normal_png
-from smplxpp.capture.writers.metadata import FACE, write_calibration_csv, write_cameras_json
+from smplxpp.capture.cameras import camera_rig, read_cameras
+from smplxpp.capture.writers import (
+    FACE,
+    png16,
+    save_compact,
+    write_calibration_csv,
+    write_cameras_json,
+    write_normal_png,
+)
 from smplxpp.core import InputError, TriangleMesh
 from smplxpp.people.fixture_person import load_person
 from smplxpp.raster import rasterize_mesh

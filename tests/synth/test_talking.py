@@ -14,7 +14,7 @@ from pipelines.commands.synth import Synth
 from smplxpp.body import load_body
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.capture import open_capture
-from smplxpp.capture.camera_rig import camera_rig
+from smplxpp.capture.cameras import camera_rig
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.fixture_person import load_person, read_layers

@@ -17,9 +17,9 @@ from avatar.training.engine.loop import METRICS_FILE
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.optimization_task import OptimizationTask, PretrainConfig
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
+from avatar.training.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
 from avatar.training.student.bake import BakeConfig, bake
 from avatar.training.student.pretrain import PretrainFieldTask, _MapLookup
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
 from avatar.training.tracking.config import Level
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import gaussians, sequence, template, write_dance

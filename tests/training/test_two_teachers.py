@@ -15,7 +15,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.photometric_task import TaskContext
 from avatar.training.engine.processes import Distributed, join_processes
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, TeacherTask
+from avatar.training.fit_teacher import FitTeacherConfig, TeacherTask
 from tests.dolls.dancing import gaussians, sequence, write_dance
 from tests.dolls.tiny import TINY_TEACHER
 from tests.training.engine.test_photometric_tasks import STEPS

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipelines.viewer.picking import first_hit, hits, line_under, middle_of_limb
+from pipelines.viewer.scene import first_hit, hits, line_under, middle_of_limb
 from smplxpp.core.mesh import concatenate_meshes
 from smplxpp.segment.corrected_faces import ScanSurface
 from tests.segment.test_corrections import tube

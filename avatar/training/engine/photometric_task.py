@@ -21,8 +21,7 @@ from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_qualit
 from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.rendering.avatar_view import Rendering, render_view
 from avatar.rig.rig import AvatarModel, PosedAvatar
-from avatar.training.engine.adam import OptimiserConfig, ParameterGroup
-from avatar.training.engine.learning_rates import LearningRates, attribute_groups, pixel_size
+from avatar.training.engine.adam import LearningRates, OptimiserConfig, ParameterGroup, attribute_groups, pixel_size
 from avatar.training.engine.optimization_task import OptimizationTask
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.unseen import hold_unseen

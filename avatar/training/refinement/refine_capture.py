@@ -16,7 +16,7 @@ from avatar.training.refinement.refine import Refinement, refine_held_out, refin
 from avatar.training.scene import TrainScene, with_cameras
 from smplxpp.capture import Capture, read_cameras
 from smplxpp.capture.sources import find_params
-from smplxpp.capture.writers.metadata import write_plain_cameras_json
+from smplxpp.capture.writers import write_plain_cameras_json
 from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.array_file import write_arrays
 from smplxpp.register import BodyState

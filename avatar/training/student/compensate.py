@@ -21,8 +21,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.student import Student
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track
-from avatar.training.engine.adam import Adam, ParameterGroup
-from avatar.training.engine.learning_rates import pixel_size
+from avatar.training.engine.adam import Adam, ParameterGroup, pixel_size
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
 from avatar.training.engine.resources import fixed_seed

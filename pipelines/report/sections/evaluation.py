@@ -26,7 +26,7 @@ from pipelines.runs.layout import (
 from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.files.paths import path_inside, read_bytes
 from smplxpp.figures import encode_png, row
-from smplxpp.figures.comparison import ERROR_LIMIT, SURFACE_LIMIT_MM, error_colors, error_legend, read_tiles
+from smplxpp.figures.drawings import ERROR_LIMIT, SURFACE_LIMIT_MM, error_colors, error_legend, read_tiles
 
 
 def standing_evaluation(run: Path, template_digest: str) -> StageRecord | None:

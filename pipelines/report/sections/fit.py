@@ -16,7 +16,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_numbers, shown
 from smplxpp.core.files.paths import path_inside
 from smplxpp.figures import encode_png, row
-from smplxpp.figures.comparison import ERROR_LIMIT, error_legend, read_strip
+from smplxpp.figures.drawings import ERROR_LIMIT, error_legend, read_strip
 
 HEAD_HEIGHT = 420
 """Pixels: crops of the head are enlarged by the whole number that brings them nearest to this."""

@@ -24,7 +24,7 @@ from smplxpp.capture import Capture, find_scans
 from smplxpp.core import BodyParams, Camera, InputError, TriangleMesh, spread
 from smplxpp.core.files.json_file import as_list, as_object, as_text, read_json
 from smplxpp.figures import body_cameras, caption, encode_jpeg, encode_png, render_overlay, render_shaded, row
-from smplxpp.figures.body_drawings import body_on_photograph, draw_bones
+from smplxpp.figures.drawings import body_on_photograph, draw_bones
 from smplxpp.figures.sheets import heat_strip
 
 HEIGHT = 560

@@ -24,7 +24,7 @@ from pipelines.runs.stage import StageRecord, read_manifest
 from smplxpp.core.files.paths import path_inside
 from smplxpp.core.spread import spread
 from smplxpp.figures import encode_png, row
-from smplxpp.figures.comparison import ERROR_LIMIT, error_legend, read_strip, read_tiles
+from smplxpp.figures.drawings import ERROR_LIMIT, error_legend, read_strip, read_tiles
 
 SHOWN_VIEWS = 4
 CURVE_POINTS = 300

@@ -10,18 +10,18 @@ import numpy as np
 
 from smplxpp.capture.check.findings import Finding
 from smplxpp.capture.check.mistakes import COMBINED, SINGLE, Mistake, Sample, shifts
-from smplxpp.capture.check.silhouettes import (
+from smplxpp.capture.check.views import (
     IOU_BAD,
     MIN_SHARE,
     OUTSIDE_BAD,
     OUTSIDE_DOUBTFUL,
     FitSummary,
     SilhouetteFit,
+    ViewCheck,
     body_silhouette,
     compare_silhouettes,
     summary,
 )
-from smplxpp.capture.check.views import ViewCheck
 from smplxpp.core import Camera, spread
 
 # A correction explains the misfit if the body is then this far inside the masks, and the overlap this much larger.

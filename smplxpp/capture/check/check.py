@@ -19,8 +19,7 @@ from smplxpp.capture import Capture
 from smplxpp.capture.check.calibration import blind_cameras, by_camera, by_frame, calibration_findings
 from smplxpp.capture.check.findings import Finding
 from smplxpp.capture.check.mistakes import Sample
-from smplxpp.capture.check.silhouettes import FitSummary
-from smplxpp.capture.check.views import OPAQUE, ViewCheck, check_view
+from smplxpp.capture.check.views import OPAQUE, FitSummary, ViewCheck, check_view
 from smplxpp.capture.check.without_images import missing_findings, parameter_findings, read_parameters, split_findings
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, matrix_from_rotvec, spread
 from smplxpp.core.errors import one_line

@@ -18,7 +18,7 @@ from smplxpp.body import load_body
 from smplxpp.capture import FORMATS, open_capture
 from smplxpp.capture.check import CheckConfig, check_capture
 from smplxpp.capture.check.findings import KINDS
-from smplxpp.capture.check.silhouettes import compare_silhouettes
+from smplxpp.capture.check.views import compare_silhouettes
 from smplxpp.core.rotations import matrix_from_rotvec
 from tests.capture.scene import make_scene
 from tests.capture.writers import write_actorshq, write_avatarrex, write_easymocap, write_neus2, write_simple

@@ -13,7 +13,7 @@ from pipelines.report.sections.register import register_section, worst_frames
 from pipelines.stages.build_config import RegisterInputs
 from pipelines.stages.register_capture import register_capture
 from smplxpp.capture import open_capture
-from smplxpp.figures.body_drawings import JOINT, body_on_photograph, draw_bones
+from smplxpp.figures.drawings import JOINT, body_on_photograph, draw_bones
 from smplxpp.figures.sheets import heat_strip
 from tests.pipelines.registrations import FIXTURE, exact, posed_joints, use_keypoints, use_solver
 

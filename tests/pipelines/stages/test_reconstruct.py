@@ -12,9 +12,9 @@ from pipelines.commands.reconstruct import ReconstructCommand
 from pipelines.runs.layout import RECONSTRUCT_STAGE, reconstructed_scan
 from pipelines.stages import reconstruct as stage_module
 from pipelines.stages.build_config import ReconstructInputs, load_reconstruct
-from pipelines.stages.held_out import seen_of
 from pipelines.stages.neural_surface import neural_method
 from pipelines.stages.reconstruct import reconstruct_capture
+from pipelines.stages.scene import seen_of
 from smplxpp.build.reconstruct import open_photographs, unit_cube_of, usable_cameras, usable_frames
 from smplxpp.capture import open_capture
 from smplxpp.core import InputError, TriangleMesh

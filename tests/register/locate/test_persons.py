@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 
 from smplxpp.body import load_body
 from smplxpp.body.named_poses import standing_poses
-from smplxpp.build.verdict import LEAST_CONFIDENCE
+from smplxpp.build.locate import LEAST_CONFIDENCE
 from smplxpp.core import TriangleMesh, ignore_progress, matrix_from_rotvec
 from smplxpp.core.surface_points import SurfacePoints
 from smplxpp.people.things import _ball, _box, _joined, _tube

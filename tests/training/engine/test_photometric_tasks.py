@@ -17,16 +17,16 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import ControlCage, Track, TrackedAvatar
-from avatar.training.engine.learning_rates import pixel_size
+from avatar.training.engine.adam import pixel_size
 from avatar.training.engine.loop import LoopConfig, run_training
 from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.engine.photometric_task import TaskContext
 from avatar.training.engine.session import Session
+from avatar.training.fit_teacher import FitTeacherConfig, PretrainTeacherTask, TeacherTask, fit_teacher
 from avatar.training.student.bake import BakeConfig, BakeTask, bake
 from avatar.training.student.compensate import CompensateConfig, CompensateTask, compensate
 from avatar.training.student.distillation import DistillationTargets
 from avatar.training.student.pretrain import PretrainFieldTask
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, PretrainTeacherTask, TeacherTask, fit_teacher
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.track import TrackTask
 from smplxpp.core.errors import InputError

@@ -14,12 +14,11 @@ from avatar.export.posed import posed_splats
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.metrics.view_quality import head_box
 from avatar.rig.rig import Rig
-from avatar.training.engine.learning_rates import LearningRates
+from avatar.training.engine.adam import LearningRates
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.optimization_task import DivergedError
 from avatar.training.engine.resources import choose_device
-from avatar.training.fit.config import FitConfig
-from avatar.training.fit.fit import FitScene, FitTask, fit_gaussians
+from avatar.training.fit.fit import FitConfig, FitScene, FitTask, fit_gaussians
 from avatar.training.fit.initial_gaussians import initial_gaussians
 from avatar.training.presets import TRAINING_PRESETS
 from smplxpp.core import Camera, InputError, matrix_from_rotvec

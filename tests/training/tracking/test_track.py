@@ -17,7 +17,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.engine.session import Session
-from avatar.training.teacher.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
+from avatar.training.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
 from avatar.training.tracking import track as tracking
 from avatar.training.tracking.cloth_prediction import SimulatedControls
 from avatar.training.tracking.config import Level, TrackConfig

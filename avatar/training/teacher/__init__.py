@@ -1,1 +1,0 @@
-"""Training of the teacher: tracking, pretraining, then photographs."""

@@ -1,1 +1,0 @@
-"""Write the files of a capture: description, cameras, images, arrays."""
