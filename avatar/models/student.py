@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -21,7 +23,9 @@ from avatar.models.networks.deformation_field import DeformationField, FieldConf
 from avatar.models.networks.pose_dependence import PoseGate, PoseRegression, seen_joints
 from avatar.rig.rig import Pose, PosedAvatar, Rig
 from smplxpp.cloth.garment import Garment
-from smplxpp.core import BodyParams, InputError, require_at_least
+from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, require_at_least
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -124,8 +128,8 @@ class Student(nn.Module):
         # code.
         frame = pose.frame if pose.frame in self.codes.row else None
         if frame is None and self.regression is not None:
-            return self.field.spread(self.regression(pose.body_pose[None]))[0]
-        return self.field(pose.body_pose[None], self.codes([frame]))[0]
+            return self.field.spread(self.regression(pose.body_pose[None].to(self.regression.level.dtype)))[0]
+        return self.field(pose.body_pose[None].to(self.codes.codes.dtype), self.codes([frame]))[0]
 
     def compensated(self, pose: Pose) -> BoundGaussians:
         """Return the Gaussians with their blend shapes of a pose added."""
@@ -133,8 +137,9 @@ class Student(nn.Module):
         if self.blend_shapes is None:
             return bound
         # Coefficients z (1, n) of this pose: the first `head_shapes` belong to the head, the rest to the body.
-        jaw = pose.jaw[None] if self.blend_shapes.config.jaw else None
-        z = self.blend_shapes.coefficients(pose.expression[None], pose.body_pose[None], jaw)
+        shapes = self.blend_shapes.U.dtype
+        expression, theta, jaw = (one[None].to(shapes) for one in (pose.expression, pose.body_pose, pose.jaw))
+        z = self.blend_shapes.coefficients(expression, theta, jaw if self.blend_shapes.config.jaw else None)
         # Body shapes fade in unseen poses and under simulated clothes; head shapes do not.
         head = self.blend_shapes.config.head_shapes
         of_head, of_body = z.clone(), self._pose_weight(pose) * z
@@ -146,7 +151,7 @@ class Student(nn.Module):
             du, dc = (
                 a + still * b for a, b in zip(self.blend_shapes(of_head), self.blend_shapes(of_body), strict=True)
             )
-        return replace(bound, offset=bound.offset + du[0], dc=bound.dc + dc[0])
+        return replace(bound, offset=bound.offset + du[0].to(bound.offset), dc=bound.dc + dc[0].to(bound.dc))
 
     def _pose_weight(self, pose: Pose) -> float | Tensor:
         """Return the weight of a pose as one of the training's, in [0, 1]; body shapes fade with it."""
@@ -218,6 +223,106 @@ class Student(nn.Module):
         import avatar  # the writers lie above this room; the front door knows where
 
         return avatar.export_student(self, path, **options)
+
+    def compiled(self, *, dtype: torch.dtype = torch.float32, graph: bool = True) -> CompiledStudent:
+        """Return the student as it is for films and streams of new poses on a GPU, see `CompiledStudent`."""
+        return CompiledStudent(self, dtype=dtype, graph=graph)
+
+
+class CompiledStudent:
+    """A student in new poses as one CUDA graph: parameters in, the avatar as one camera sees it out.
+
+    Pose, field, blend shapes, skinning and colours are computed on the student's device from one small copy a frame.
+    On a GPU they are recorded once and replayed; where that fails, which is logged, and on a CPU, they run as they are.
+    Loose clothes are not simulated: they follow the student's field.
+
+    Args:
+        student: whose parameters must not change any more.
+        dtype: of field and blend shapes; geometry and colours stay in float32.
+        graph: record a CUDA graph on a GPU.
+
+    Example:
+        >>> fast = student.compiled(dtype=torch.float16)
+        >>> picture = avatar.render_view(fast(params.frame(0), camera.position), 0, camera, background)
+    """
+
+    def __init__(self, student: Student, *, dtype: torch.dtype = torch.float32, graph: bool = True) -> None:
+        self.rig, self.student = student.rig, copy.copy(student)
+        # Copies of what computes in another precision; the rest is shared.
+        self.student._modules = dict(student._modules)
+        for name in ("field", "codes", "regression", "blend_shapes"):
+            part = getattr(student, name)
+            if part is not None and dtype != torch.float32:
+                self.student._modules[name] = copy.deepcopy(part).to(dtype)
+        self._graph = graph and self.rig.device.type == "cuda"
+        self._replay: Callable[[], object] | None = None
+        self._widths: dict[str, int] = {}
+        self._flat = False
+
+    @property
+    def recorded(self) -> bool:
+        """Whether poses are replayed as a CUDA graph; known after the first one."""
+        return self._replay is not None
+
+    @torch.no_grad()
+    def __call__(self, params: BodyParams, camera_center: Float[np.ndarray, " 3"]) -> PosedAvatar:
+        """Return the avatar in a pose; on a GPU in memory that the next pose overwrites.
+
+        Args:
+            params: one frame; its shape coefficients are ignored.
+            camera_center: centre of projection in the world, metres.
+
+        Raises:
+            InputError: several frames, parameters of another body, or of other widths than those of the first call.
+        """
+        if len(params) != 1:
+            raise InputError("parameters of a pose", expected="one frame", received=f"{len(params)} frames")
+        given = {name: getattr(params, name)[0] for name in ARRAY_NAMES if name != "betas"}
+        missing = max(0, self.rig.expression_size - len(given["expression"]))
+        given["expression"] = np.pad(given["expression"], (0, missing))
+        widths = {name: len(value) for name, value in given.items()}
+        if self._widths and (widths, params.flat_hand_mean) != (self._widths, self._flat):
+            raise InputError("parameters of a pose", expected=f"{self._widths}, as before", received=str(widths))
+        packed = torch.tensor(np.concatenate([*given.values(), camera_center]), dtype=torch.float32)
+        if not self._widths:
+            self._widths, self._flat = widths, params.flat_hand_mean
+            self._input = packed.to(self.rig.device)
+            self._record()
+        self._input.copy_(packed)
+        if self._replay is None:
+            return self._posed()
+        self._replay()
+        return self._output
+
+    def _posed(self) -> PosedAvatar:
+        """Compute the pose of the input, without copies from the CPU and without waiting for the device."""
+        *values, center = self._input.split([*self._widths.values(), 3])
+        tensors = {name: value[None] for name, value in zip(self._widths, values, strict=True)}
+        pose = self.rig.pose_on_device(tensors, flat_hand_mean=self._flat)
+        moved = self.student.displacements(pose)
+        moved = None if moved is None else moved.float()
+        vertices = self.rig.skin(pose, moved)
+        frames = triangle_frames(vertices, self.rig.faces)
+        bound = self.student.compensated(pose)
+        world = world_from_frames(bound, frames)
+        return PosedAvatar(vertices, world, view_colors(bound, frames, world.means, center[None]), bound, moved)
+
+    def _record(self) -> None:
+        if not self._graph:
+            return
+        try:
+            aside = torch.cuda.Stream()
+            aside.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(aside):  # what is set up by first calls must not be part of the graph
+                for _ in range(3):
+                    self._posed()
+            torch.cuda.current_stream().wait_stream(aside)
+            recorded = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(recorded):
+                self._output = self._posed()
+            self._replay = recorded.replay
+        except Exception as error:  # noqa: BLE001  whatever a driver raises, the student itself computes
+            log.warning("the student is not recorded as a CUDA graph: %s", str(error).split("\n")[0][:300])
 
 
 def _make_field(config: FieldConfig, student: StudentConfig, rig: Rig) -> DeformationField:

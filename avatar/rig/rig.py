@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -116,6 +116,8 @@ class Rig:
         self.semantic_colors = self._tensor(template.semantic_colors / 255.0)
         """(V, 3) in [0, 1]."""
         self._weights = template.weights.dense().astype(np.float32)
+        self._device_weights: Tensor | None = None
+        self._last = torch.tensor([3], device=device)
 
     @property
     def expression_size(self) -> int:
@@ -156,6 +158,34 @@ class Rig:
         }
         tensors: dict[str, Any] = {name: self._tensor(array, device) for name, array in arrays.items()}
         return Pose(frame, **tensors)
+
+    def pose_on_device(self, params: Mapping[str, Float[Tensor, "1 _"]], *, flat_hand_mean: bool = False) -> Pose:
+        """Return the pose of parameters that lie on the rig's device, computed there without waiting for it.
+
+        It equals `pose` within the rounding of float32, and gradients reach the parameters.
+
+        Args:
+            params: tensors of one frame by the names of `BodyParams`, without the shape.
+            flat_hand_mean: see `BodyParams`.
+        """
+        if self._device_weights is None:
+            self._device_weights = self._tensor(self._weights)
+        posed = self.template.body.forward(params, flat_hand_mean=flat_hand_mean)
+        transforms, joints = posed.posed_from_rest[0], len(posed.posed_from_rest[0])
+        blended = self._device_weights @ transforms[:, :3].reshape(joints, 12)
+        # The inverse of a rigid transform, (R, t) -> (R^T, -R^T t).
+        turn = transforms[0, :3, :3].T
+        upper = torch.cat([turn, -turn @ transforms[0, :3, 3:]], dim=1)
+        body = posed.rest_vertices[0]
+        return Pose(
+            None,
+            body_pose=params["body_pose"][0],
+            expression=params["expression"][0],
+            jaw=params["jaw_pose"][0],
+            rest=torch.cat([body, self.vertices[len(body) :]]),
+            world_from_rest=blended.unflatten(1, (3, 4)),
+            root_from_world=torch.cat([upper, torch.zeros_like(upper[:1]).index_fill(1, self._last, 1.0)]),
+        )
 
     def pose_from_vertices(self, vertices: Float[np.ndarray, "V 3"]) -> Pose:
         """Return the pose whose skinned mesh equals `vertices`, metres, to the bit.

@@ -28,15 +28,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.gpu.timing import (
-    Deformer,
-    EnoughError,
-    Probe,
-    Replayed,
-    frames_a_second,
-    largest_difference_mm,
-    probed,
-)
+from benchmarks.gpu.timing import EnoughError, Probe, frames_a_second, largest_difference_mm, probed
 from benchmarks.support.results import ROOT
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE
 from smplxpp.capture import open_capture
@@ -210,7 +202,7 @@ def loader(job: Job, note: Note) -> None:
 
 
 def student(job: Job, note: Note) -> None:
-    """Frames a second of a student with the paper's sizes: float32 and half, with and without a CUDA graph."""
+    """Frames a second of a student with the paper's sizes, pose included: float32, half, with and without graph."""
     import avatar
     from avatar.models.networks.blend_shapes import BlendShapeConfig
     from avatar.models.student import StudentConfig
@@ -224,29 +216,22 @@ def student(job: Job, note: Note) -> None:
     _shake(model)
     capture = open_capture(job.capture)
     params = [found for frame in capture.frames[:16] if (found := capture.params(frame)) is not None]
-    poses = [rig.pose(each, frame=0) for each in params]
     camera = next(iter(capture.cameras.values()))
     center = torch.tensor(camera.position[None], dtype=torch.float32, device=job.device)
+    with torch.no_grad():
+        truth = model(rig.pose(params[-1]), center)
     note(gaussians=count, vertices=len(rig.vertices), trained=False, rows={})
     rows: dict[str, Any] = {}
     for name, dtype in (("float32", torch.float32), ("half", torch.float16)):
-        # Half precision must not move Gaussians visibly: the largest distance from float32, in millimetres.
-        deform = Deformer(model, dtype)
-        with torch.no_grad():
-            truth = model(poses[-1], center).gaussians
-        rows[name] = {"difference_mm": largest_difference_mm(deform(poses[-1], center), truth)}
-        note(rows=rows)
-        variants: dict[str, Callable] = {"eager": deform}
-        if not job.toy:
-            try:
-                variants["graph"] = Replayed(deform, poses[0], center)
-                rows[name]["graph_difference_mm"] = largest_difference_mm(variants["graph"](poses[-1], center), truth)
-            except RuntimeError as error:
-                rows[name]["graph_error"] = str(error)[:500]
-        for variant, work in variants.items():
+        for way, graph in (("eager", False), ("graph", True)):
+            fast = model.compiled(dtype=dtype, graph=graph)
+            # Half precision must not move Gaussians visibly: the largest distance from the plain student, millimetres.
+            row = {"difference_mm": largest_difference_mm(fast(params[-1], camera.position), truth)}
+            row["recorded"] = fast.recorded
+            rows[f"{name}, {way}"] = row
             for width, height in sizes:
                 seen = fitted(camera, width, height)
-                rows[name][f"{variant} {width}x{height}"] = frames_a_second(work, poses, seen, pictures=pictures)
+                row[f"{width}x{height}"] = frames_a_second(fast, params, seen, pictures=pictures)
                 note(rows=rows)
     note(rows=rows, **_memory(job))
 

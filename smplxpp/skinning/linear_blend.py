@@ -5,8 +5,10 @@ The type of the result is the type of the arguments; in torch everything is diff
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -39,9 +41,10 @@ def forward_kinematics(
     """
     # Offsets from each joint's parent; the root starts at its own place and the translation.
     xp = array_namespace(rotations)
-    parents = np.asarray(parents)
-    levels, places, back = _levels(tuple(parents.tolist()))
-    offsets = rest_joints - rest_joints[..., np.maximum(parents, 0), :]
+    above = tuple(np.asarray(parents).tolist())
+    device = None if xp is np else rotations.device
+    (own, *places), levels, back = _levels(above, device)
+    offsets = rest_joints - rest_joints[..., own, :]
     root = levels[0]
     root_position = rest_joints[..., root, :]
     if transl is not None:
@@ -95,9 +98,15 @@ def skin(
 
 
 @lru_cache(maxsize=64)
-def _levels(parents: tuple[int, ...]) -> tuple[list[list[int]], list[list[int]], np.ndarray]:
-    """Return the joints grouped by their depth in the tree, the place of each joint's parent in the group above (from
-    the second group on), and the order that puts the groups' joints back."""
+def _levels(parents: tuple[int, ...], device: Any) -> tuple[list[Any], list[Any], Any]:
+    """Return indices for a tree of joints: arrays, or tensors on a device, which a GPU need not wait for.
+
+    Returns:
+        places: each joint's parent (the root's is a joint of no effect); then, from the second group on, the place of
+            each joint's parent in the group above.
+        levels: joints grouped by their depth in the tree.
+        back: the order that puts the groups' joints back.
+    """
     above = np.array(parents)
     levels = [[int(j) for j in np.flatnonzero(above < 0)]]
     while sum(map(len, levels)) < len(parents):
@@ -105,4 +114,11 @@ def _levels(parents: tuple[int, ...]) -> tuple[list[list[int]], list[list[int]],
         assert level, "the joints do not form a tree"
         levels.append(level)
     places = [[upper.index(parents[j]) for j in level] for upper, level in pairwise(levels)]
-    return levels, places, np.argsort([j for level in levels for j in level])
+    back = np.argsort([j for level in levels for j in level])
+    if device is None:
+        return [np.maximum(above, 0), *places], levels, back
+    # Indices that are made in inference mode could not take part in autograd later.
+    torch = sys.modules["torch"]
+    with torch.inference_mode(False):
+        moved = [torch.tensor(one, device=device) for one in (np.maximum(above, 0), *places, *levels, back)]
+    return moved[: len(levels)], moved[len(levels) : -1], moved[-1]

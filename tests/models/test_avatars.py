@@ -11,12 +11,14 @@ from avatar.gaussians.binding import world_from_local
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.networks.blend_shapes import BlendShapeConfig
+from avatar.models.networks.pose_dependence import PoseRegression
 from avatar.models.student import Student, StudentConfig
 from avatar.models.teacher_avatar import HALF_EXTENT, TeacherAvatar, map_frame
 from avatar.rig.rig import Rig
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import dance, gaussians, template, varied
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
+from tests.pretended_cuda import CountedWaits, pretended_cuda
 
 EYES = torch.tensor([[0.0, 0.8, 2.0], [1.5, 0.2, -1.0]])
 SHAPES = BlendShapeConfig(expression_size=2, head_shapes=2, body_shapes=3, width=8, jaw=True)
@@ -42,7 +44,7 @@ def disturb(module) -> None:
     random = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for value in module.parameters():
-            value.add_(0.05 * torch.randn(value.shape, generator=random))
+            value.add_(0.05 * torch.randn(value.shape, generator=random).to(value.device))
 
 
 def test_a_teacher_without_residuals_is_skinning(rig, pose):
@@ -279,6 +281,69 @@ def test_a_still_body_follows_its_joints_alone(rig, pose):
     alone = Student(StudentConfig(field=TINY_FIELD, still_body=True), naked, bound, (0,))
     disturb(alone)
     assert alone.displacements(naked.pose(dance().frame(3))).abs().max() > 0
+
+
+def whole_student(rig) -> Student:
+    """A student with everything that moves it in new poses: regression, gate, gated blend shapes."""
+    random = torch.Generator().manual_seed(2)
+    made = student(rig, blend_shapes=replace(SHAPES, gated=True))
+    points = len(made.field.points)
+    tensors = [0.01 * torch.randn(shape, generator=random) for shape in PoseRegression.shapes(points, 2).values()]
+    tensors[4:] = tensors[4] - 1.0, tensors[5] + 1.0
+    known = torch.stack([rig.pose(dance().frame(k)).body_pose for k in range(3)])
+    shapes = made.blend_shapes
+    made = Student(
+        made.config, rig, varied(gaussians()), (0, 1), blend_shapes=shapes, known_poses=known,
+        regression=PoseRegression(*(one.to(rig.device) for one in tensors)),
+    )  # fmt: skip
+    disturb(made.blend_shapes)
+    return made.eval()
+
+
+@pytest.mark.parametrize("regression", [True, False])
+def test_a_compiled_student_is_the_student_with_its_pose_computed_in_torch(rig, regression):
+    made = whole_student(rig)
+    if not regression:
+        made.regression = None
+        disturb(made.field)
+    fast = made.compiled()
+    for k in (4, 1):
+        params = dance().frame(k)
+        with torch.no_grad():
+            truth = made(rig.pose(params), EYES[:1])
+        found = fast(params, EYES[0].numpy())
+        torch.testing.assert_close(found.gaussians.means, truth.gaussians.means, rtol=0, atol=2e-6)
+        torch.testing.assert_close(found.colors, truth.colors, rtol=0, atol=2e-5)
+    assert not fast.recorded
+
+
+def test_half_precision_moves_a_compiled_student_by_less_than_a_tenth_of_a_millimetre(rig):
+    made, params = whole_student(rig), dance().frame(4)
+    whole, half = (made.compiled(dtype=dtype)(params, EYES[0].numpy()) for dtype in (torch.float32, torch.float16))
+    apart = (whole.gaussians.means - half.gaussians.means).norm(dim=1).max()
+    assert 0.0 < apart < 1e-4 and (whole.colors - half.colors).abs().max() < 2e-3
+    assert made.blend_shapes.U.dtype == torch.float32 and half.gaussians.means.dtype == torch.float32
+
+
+def test_a_compiled_student_on_a_gpu_waits_for_nothing_and_says_when_it_has_no_graph(caplog):
+    with pretended_cuda():
+        rig = Rig(template(), "cuda")
+        fast = whole_student(rig).compiled()
+        first = fast(dance().frame(0), EYES[0].numpy()).gaussians.means.cpu()
+        with CountedWaits() as counted:
+            second = fast(dance().frame(4), EYES[0].numpy())
+        assert (second.gaussians.means.cpu() - first).abs().max() > 1e-3
+    assert (counted.count, counted.sent) == (0, 1)  # the parameters
+    assert caplog.text.count("not recorded as a CUDA graph") == 1 and not fast.recorded
+
+
+def test_a_compiled_student_refuses_other_parameters(rig):
+    fast = whole_student(rig).compiled()
+    with pytest.raises(InputError, match="one frame"):
+        fast(dance(), EYES[0].numpy())
+    fast(dance().frame(0), EYES[0].numpy())
+    with pytest.raises(InputError, match="as before"):
+        fast(replace(dance().frame(0), left_hand_pose=[[0.0] * 6]), EYES[0].numpy())
 
 
 def test_gaussians_of_another_mesh_are_refused(rig):
