@@ -226,7 +226,7 @@ def student(job: Job, note: Note) -> None:
         for way, graph in (("eager", False), ("graph", True)):
             fast = model.compiled(dtype=dtype, graph=graph)
             # Half precision must not move Gaussians visibly: the largest distance from the plain student, millimetres.
-            row = {"difference_mm": largest_difference_mm(fast(params[-1], camera.position), truth)}
+            row: dict[str, Any] = {"difference_mm": largest_difference_mm(fast(params[-1], camera.position), truth)}
             row["recorded"] = fast.recorded
             rows[f"{name}, {way}"] = row
             for width, height in sizes:
@@ -352,23 +352,6 @@ def _memory(job: Job) -> dict[str, float]:
     return {} if job.toy else {"gpu_memory_gib": torch.cuda.max_memory_allocated() / 2**30}
 
 
-def main() -> int:
-    """Run one part; its error ends the process."""
-    name, job = sys.argv[1], Job.load(Path(sys.argv[2]))
-    found: dict[str, Any] = {}
-
-    def note(**figures: Any) -> None:
-        found.update(figures)
-        atomic_write_text(job.work / f"{name}.json", json.dumps(jsonable(found)))
-
-    PARTS[name](job, note)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 def enlarge(source: Path, folder: Path, size: tuple[int, int], *, frames: int = 2, cameras: int = 3) -> Path:
     """A few views of a capture, cut to the shape of `size` (width, height) and enlarged to it, in our own layout.
 
@@ -415,3 +398,20 @@ def cut(camera: Camera, size: tuple[int, int]) -> tuple[tuple[int, int, int, int
 def fitted(camera: Camera, width: int, height: int) -> Camera:
     """The camera with the largest part of its image that has the shape of another size."""
     return cut(camera, (width, height))[1]
+
+
+def main() -> int:
+    """Run one part; its error ends the process."""
+    name, job = sys.argv[1], Job.load(Path(sys.argv[2]))
+    found: dict[str, Any] = {}
+
+    def note(**figures: Any) -> None:
+        found.update(figures)
+        atomic_write_text(job.work / f"{name}.json", json.dumps(jsonable(found)))
+
+    PARTS[name](job, note)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

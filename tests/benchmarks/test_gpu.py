@@ -128,6 +128,13 @@ def test_what_fails_is_stored_and_the_next_part_runs(job, tmp_path, capsys):
     assert stored["parts"]["nccl"]["state"] == "done" and stored["parts"]["nccl"]["found"]["right"]
 
 
+def test_a_part_in_a_process_of_its_own_finds_all_that_it_calls(job, tmp_path):
+    """Parts called what their module had not yet defined when it ran as a program; in a test's process it was there."""
+    result = run_part("loader", Job(tmp_path, job.run, job.capture, 900.0, "cpu"))
+    assert result["state"] == "done", result
+    assert set(result["found"]["images_a_second"]) == {"1", "2"}
+
+
 def test_a_part_that_crashes_or_takes_too_long_leaves_its_words(job, tmp_path):
     lost = Job(tmp_path, job.run, tmp_path / "no capture", 900.0, "cpu")
     result = run_part("gpu", lost)
