@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.accuracy.registration import bare_and_under
 from benchmarks.accuracy.training import evaluation_conditions, evaluation_figures
-from benchmarks.support.capture_truth import find_captures
+from benchmarks.support.people import find_captures
 from benchmarks.support.results import RESULTS, store_results
 from pipelines.commands.build import Build
 from pipelines.commands.options import OptionalPath

@@ -23,7 +23,7 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from benchmarks.peers.transfer_speed import load_peer, run_peer
-from benchmarks.support.capture_truth import CaptureTruth, TruePart, find_captures, read_capture_truth
+from benchmarks.support.people import CaptureTruth, TruePart, find_captures, read_capture_truth
 from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from smplxpp.body.named_poses import STRESS_POSES, stress_poses

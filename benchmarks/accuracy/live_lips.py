@@ -27,8 +27,7 @@ from avatar.speech.audio_features import FRAME, RATE
 from avatar.speech.lips import PHONES, WEIGHTS, LipNetwork, LipPrediction, recognise_phonemes, smooth_mouth
 from avatar.speech.phonemes import BILABIALS, VOWELS
 from avatar.speech.voice import PiperVoice
-from benchmarks.accuracy.talking import CLOSED, SENTENCES, VISEMES
-from benchmarks.support.other_voices import ESPEAK, FLITE, Espeak, by_flite
+from benchmarks.accuracy.talking import CLOSED, ESPEAK, FLITE, SENTENCES, VISEMES, Espeak, by_flite
 from benchmarks.support.results import store_results
 from smplxpp.core.files.sound_file import Sound
 

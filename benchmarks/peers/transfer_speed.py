@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.support.capture_truth import CaptureTruth, find_captures, read_capture_truth
+from benchmarks.support.people import CaptureTruth, find_captures, read_capture_truth
 from benchmarks.support.results import store_results
 from smplxpp.core import SkinWeights, TriangleMesh, concatenate_meshes
 from smplxpp.transfer import TransferConfig, transfer_weights

@@ -1,1 +1,1 @@
-"""Share the store of results, captures with a known truth, voices and the page of results."""
+"""Share the store of results, captures with a known truth and the page of results."""

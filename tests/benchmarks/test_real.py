@@ -12,10 +12,19 @@ import trimesh
 from PIL import Image
 
 from benchmarks.accuracy import real as real_module
-from benchmarks.accuracy.real import Real, line, stored_rows, summary, with_assessment
+from benchmarks.accuracy.real import (
+    Ran,
+    Real,
+    last_words,
+    line,
+    outcome,
+    run_command,
+    stored_rows,
+    summary,
+    with_assessment,
+)
 from benchmarks.support import real_sources
 from benchmarks.support.page import PAGES, page
-from benchmarks.support.real_runs import Ran, last_words, outcome, run_command
 from benchmarks.support.real_sources import KINDS, SOURCES, Source, Truth, chosen_sources
 from benchmarks.support.real_truth import distances
 from benchmarks.support.results import RESULTS, ROOT

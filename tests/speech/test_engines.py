@@ -15,8 +15,7 @@ from avatar.speech.forced_alignment import NotEnglishError, align, force_align, 
 from avatar.speech.phonemes import BILABIALS, SILENCE, VOWELS
 from avatar.speech.pronunciation import pronounce
 from avatar.speech.voice import PiperVoice, _symbols
-from benchmarks.accuracy.talking import starts_apart
-from benchmarks.support.other_voices import Espeak
+from benchmarks.accuracy.talking import Espeak, starts_apart
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.sound_file import Sound, read_wave, wave_bytes
 from tests.speech.conftest import TEXT

@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 from benchmarks.accuracy.driving import judge
-from benchmarks.support.capture_truth import read_capture_truth
+from benchmarks.support.people import read_capture_truth
 from smplxpp.core.errors import GeometryWarning
 from smplxpp.transfer import TransferConfig, transfer_weights
 
