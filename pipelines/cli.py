@@ -134,7 +134,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "any capture that can be opened, to our layout or ActorsHQ's",
     ),
     "capture turntable": (
-        "pipelines.commands.turntable",
+        "pipelines.commands.synth",
         "CaptureTurntable",
         "photographs or a video of a person who turns before one camera, to a capture with camera and poses",
     ),

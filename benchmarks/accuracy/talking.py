@@ -4,8 +4,8 @@
 
 A Piper voice (extra `[talk]`) says sentences and tells how long each of its phonemes was: the truth here. The aligner
 hears the sound, once with the words and once without. Measured are starts of phonemes that both name, and the pictures
-in which the lips are closed, at 30 a second, against the middle of each bilabial. flite and espeak-ng, voices that nothing
-here was trained on, stand below with phonemes in time by their own account; other benchmarks hear them.
+in which the lips are closed, at 30 a second, against the middle of each bilabial. flite and espeak-ng, voices that
+nothing here was trained on, stand below with phonemes in time by their own account; other benchmarks hear them.
 """
 
 from __future__ import annotations

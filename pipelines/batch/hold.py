@@ -27,10 +27,10 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.batch.records import now
-from smplxpp.core.claims import age_of, process_runs
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_text, try_lock
 from smplxpp.core.files.json_file import as_object, parse_json
+from smplxpp.core.files.paths import age_of, process_runs
 
 BATCH_HOLD, JOB_HOLD, STOP_FILE = ".batch.lock", ".job.lock", "stop.json"
 

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from smplxpp.core import claims
+from smplxpp.core.files import paths as claims
 
 
 def test_a_process_runs_until_it_has_ended(monkeypatch):

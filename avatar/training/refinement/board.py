@@ -17,11 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from smplxpp.core.claims import age_of, process_runs
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.core.files.atomic import atomic_write_text
-from smplxpp.core.files.paths import read_bytes
+from smplxpp.core.files.paths import age_of, process_runs, read_bytes
 
 Arrays = Mapping[str, np.ndarray]
 

@@ -27,8 +27,7 @@ from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, Ph
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import PRETRAIN, Session
-from avatar.training.student.distillation import DistillationTargets
-from avatar.training.student.pretrain import PretrainFieldTask
+from avatar.training.student.pretrain import DistillationTargets, PretrainFieldTask
 from avatar.training.student.regress_poses import regress_poses
 from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core.errors import require_at_least, require_between, require_choice

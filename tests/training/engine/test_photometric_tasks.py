@@ -25,8 +25,7 @@ from avatar.training.engine.session import Session
 from avatar.training.fit_teacher import FitTeacherConfig, PretrainTeacherTask, TeacherTask, fit_teacher
 from avatar.training.student.bake import BakeConfig, BakeTask, bake
 from avatar.training.student.compensate import CompensateConfig, CompensateTask, compensate
-from avatar.training.student.distillation import DistillationTargets
-from avatar.training.student.pretrain import PretrainFieldTask
+from avatar.training.student.pretrain import DistillationTargets, PretrainFieldTask
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.track import TrackTask
 from smplxpp.core.errors import InputError

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from avatar.data.sequence import camera_centers_of
-from avatar.training.student.distillation import DistillationTargets
+from avatar.training.student.pretrain import DistillationTargets
 from tests.dolls.dancing import sequence, write_dance
 from tests.training.engine.test_photometric_tasks import taught
 
