@@ -135,7 +135,15 @@ def summary(rows: list[dict[str, float | str | bool | list[str]]]) -> dict[str, 
     body, joints, facing = (np.array([row[k] for row in kept]) for k in ("body_mm", "joints_mm", "facing_degrees"))
     if not kept:
         return {"scans": float(len(rows)), "refused": float(len(rows))}
+    # A thing is found where what is labelled object covers it by half, intersection over union.
+    found = {
+        what: [float(row["thing_iou"]) >= 0.5 for row in kept if "thing_iou" in row and _kind(row) in kinds]
+        for what, kinds in (("held", THINGS), ("worn", WORN))
+    }
+    things = {what: one for what, one in found.items() if one}
     return {
+        **{f"{what}_things": float(len(one)) for what, one in things.items()},
+        **{f"{what}_things_found": float(sum(one)) for what, one in things.items()},
         "scans": float(len(rows)),
         "refused": float(len(rows) - len(kept)),
         "body_mm_median": float(np.median(body)),
@@ -147,6 +155,11 @@ def summary(rows: list[dict[str, float | str | bool | list[str]]]) -> dict[str, 
         "wrong_facing": float((facing > 90.0).sum()),
         "wrong_frame": float(sum(not row["frame_found"] for row in kept)),
     }
+
+
+def _kind(row: dict[str, float | str | bool | list[str]]) -> str:
+    """The kind of the thing that the person of a row holds or wears."""
+    return str(row["scan"]).split(" | ")[0].rpartition(": ")[2]
 
 
 def line(row: dict[str, float | str | bool | list[str]]) -> str:

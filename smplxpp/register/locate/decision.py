@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.core.surface_points import SurfacePoints
@@ -125,7 +126,7 @@ def findings_of(
         out.append(f"{len(apart)} pieces of a person's size beside each other ({pieces}): two people, or furniture")
     seen = heads(surface, float(mesh.face_areas.sum()))
     low, high = np.quantile(surface.points[:, 1], (0.0, 1.0))
-    upper = seen[seen[:, 1] > 0.5 * (low + high)]
+    upper, pads = without_pads(seen[seen[:, 1] > 0.5 * (low + high)], posed, best.facing)
     if len(upper) > 1:
         trust = min(trust, 0.3)
         heights = " and ".join(f"{head[1] - low:.2f}" for head in upper[:3])
@@ -165,14 +166,43 @@ def findings_of(
         return tuple(out), trust
     # Something large that is no part of a body.
     piece = largest_piece(surface, best.misfit.unexplained)
+    if pads:
+        out.append(
+            f"{pads} round places as large as heads, alike on both sides of one head: armour or pads, which stand too "
+            "far off for a body to be found in them; cut them away"
+        )
     if piece is not None and piece.share > 0.1 and not carried:
         what = "furniture, another person, something held or a wide garment"
+        what = "armour, something held or a wide garment" if pads else what
         out.append(f"{piece.share:.0%} of the surface, in one piece of {piece}, is no part of the body found: {what}")
     if float(high - low) < 1.2:
         out.append(
             f"only {high - low:.2f} m from the lowest to the highest point: a small child, or a part of a person"
         )
     return tuple(out), trust
+
+
+def without_pads(
+    found: Float64[np.ndarray, "K 3"], posed: TriangleMesh, facing: Float64[np.ndarray, " 2"]
+) -> tuple[Float64[np.ndarray, "_ 3"], int]:
+    """Return the heads that are no pads on both shoulders, and the number of those that are.
+
+    Pads are pairs that mirror each other at the body's middle, within 10 cm, below a head in that middle. Two people
+    have none between them that is higher.
+
+    Args:
+        found: places of round surface as large as heads.
+        posed: the body that was found.
+        facing: the direction that it faces, x and z.
+    """
+    close, beside = 0.05, 0.1  # metres
+    across = np.array([facing[1], 0.0, -facing[0]])
+    off = (found - posed.vertices.mean(axis=0)) @ across
+    top = found[np.abs(off) < close, 1].max(initial=-np.inf)
+    mirrored = found - 2.0 * off[:, None] * across
+    near = np.linalg.norm(mirrored[:, None] - found[None], axis=2) < 2.0 * close
+    pad = (near & (np.abs(off) > beside)[None]).any(axis=1) & (np.abs(off) > beside) & (found[:, 1] < top)
+    return found[~pad], int(pad.sum())
 
 
 def limb_elsewhere(surface: SurfacePoints, found: Found) -> str:

@@ -14,7 +14,7 @@ from smplxpp.core.surface_points import SurfacePoints
 from smplxpp.people.things import _ball, _box, _joined, _tube
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.landmarks import visible_vertices
-from smplxpp.register.locate.decision import confidence_of, findings_of
+from smplxpp.register.locate.decision import confidence_of, findings_of, without_pads
 from smplxpp.register.locate.persons import convex_share, feet_of, heads, largest_piece, people_apart, unlike_person
 from smplxpp.register.locate.search import LocateConfig, Search
 
@@ -96,6 +96,19 @@ def test_the_largest_piece_that_no_body_explains_has_the_size_of_what_is_held(pe
     assert piece is not None and np.abs(np.array(piece.size) - size).max() < 0.03
     assert abs(piece.share - 600 / 4600) < 0.001
     assert largest_piece(surface, np.zeros(4000, dtype=bool)) is None
+
+
+def test_pads_on_both_shoulders_are_no_heads_and_a_second_person_is(person):
+    """A soldier in armour was refused as two people, for five heads."""
+    (head,) = _heads(person)
+    front = np.array([0.0, 1.0])
+    pads = head + [[0.25, -0.2, 0.05], [-0.24, -0.22, 0.04]]
+    kept, count = without_pads(np.stack([*pads, head]), person, front)
+    assert count == 2 and np.allclose(kept, head)
+    # One on one side alone, a pair as high as the head, and a pair without one between them are people.
+    for others in (pads[:1], pads + [0.0, 0.3, 0.0]):
+        assert without_pads(np.stack([*others, head]), person, front)[1] == 0
+    assert without_pads(pads, person, front)[1] == 0
 
 
 def _judged(mesh: TriangleMesh, **turns: tuple[float, float, float]) -> tuple[float, str]:
