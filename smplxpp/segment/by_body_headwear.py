@@ -105,8 +105,9 @@ def find_headwear(
     faces, notes = nothing.faces.copy(), []
     for kind, least, core in kinds:
         own = cut & np.isin(piece, piece[cut & core]) & ~faces
-        area = float(head.area[own].sum())
-        if area > least:
+        area, left = float(head.area[own].sum()), float(head.area[own & (head.place[:, 0] > 0.0)].sum())
+        # All of them are on both sides of the head.
+        if area > least and min(left, area - left) > 0.25 * area:
             faces |= own
             notes.append(f"{kind} of {area:.0f} cm2 on the head: labelled object, stiff on it")
     return FoundObjects(faces, tuple(notes))

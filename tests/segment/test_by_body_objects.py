@@ -285,7 +285,7 @@ def test_what_is_worn_on_the_head_is_an_object_and_stiff_on_it(open_body, stance
 
 
 def test_hair_hoods_and_bare_heads_wear_nothing(open_body, stance, head):
-    """A bun, a ponytail that stands out behind, two buns over the ears, long hair and a hood round the face."""
+    """A bun, a ponytail behind, two buns over the ears, one beside a bulge, long hair and a hood round the face."""
     at = dict(zip(open_body.joint_names, stance[1].joints[0], strict=True))
     middle = 0.5 * (at["left_eye_smplhf"] + at["right_eye_smplhf"]) + [0.0, 0.02, -0.08]
     ball = TriangleMesh(*igl.upsample(*convex_ball(), 2))
@@ -301,6 +301,7 @@ def test_hair_hoods_and_bare_heads_wear_nothing(open_body, stance, head):
     for worn in (
         [blob((0.045, 0.045, 0.045), (0.0, 0.1, -0.06)), blob((0.02, 0.02, 0.12), (0.0, 0.0, -0.2))],
         [blob((0.04, 0.05, 0.04), (sign * 0.1, 0.05, -0.01)) for sign in (1.0, -1.0)],
+        [blob((0.03, 0.035, 0.035), (0.1, -0.02, 0.0)), blob((0.06, 0.13, 0.13), (-0.06, -0.02, 0.0))],
         [around((0.1, 0.16, 0.13), 0.03)],
         [around((0.13, 0.19, 0.16), 0.06)],
     ):
