@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +13,14 @@ import tyro
 from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText
 from pipelines.commands.terminal import stage_progress
 from pipelines.runs.folders import keep_out_of_capture
-from pipelines.runs.layout import BUILD_STAGES, CORRECTIONS_FILE, LANDMARKS_FILE, REGISTER_STAGE, reconstructed_scan
+from pipelines.runs.layout import (
+    ASSEMBLE_STAGE,
+    BUILD_STAGES,
+    CORRECTIONS_FILE,
+    LANDMARKS_FILE,
+    REGISTER_STAGE,
+    reconstructed_scan,
+)
 from pipelines.runs.stage import read_manifest
 from pipelines.stages.build_config import load_reconstruct, load_register
 from smplxpp.body import Whose
@@ -128,8 +136,12 @@ class Build:
     json: bool = False
     """Print the summary as JSON."""
 
-    def run(self) -> dict:
-        """Build, write metrics.json and the report, print the summary; the exit status is 1 where checks fail."""
+    def run(self, assembled: Callable[[], None] = lambda: None) -> dict:
+        """Build, write metrics.json and the report, print the summary; the exit status is 1 where checks fail.
+
+        Args:
+            assembled: called when the template stands, before it is validated and shown.
+        """
         from pipelines.commands.inspect import Inspect
         from pipelines.report.sections.build import update_build_report
         from pipelines.stages.build import build
@@ -144,6 +156,12 @@ class Build:
         count = sum(name in plan.inputs.steps for name in names)
         whole = self.until_stage == BUILD_STAGES[-1] and not self.no_report
         with stage_progress(count + whole, enabled=not self.json) as step:
+
+            def told(name: str, done: bool) -> None:
+                step(name, done)
+                if done and name == ASSEMBLE_STAGE:
+                    assembled()
+
             build(
                 self.run_folder,
                 plan.inputs,
@@ -153,7 +171,7 @@ class Build:
                 by_hand={LANDMARKS_FILE: self.landmarks, CORRECTIONS_FILE: self.corrections},
                 first=self.from_stage,
                 last=self.until_stage,
-                progress=step,
+                progress=told,
                 report=None if self.no_report else update_build_report,
             )
         # Print the same summary as `smplxpp inspect`.

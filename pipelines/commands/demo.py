@@ -32,6 +32,8 @@ _LOG = logging.getLogger(__name__)
 # Below what the small scan has, so that simplification has something to do.
 BUDGETS = {"upper": 8_000, "lower": 8_000}
 NAME, LICENCE = "The embedded person", "CC0-1.0"
+# Two processes share the chunks of the refinement, which have few frames, so that both end at about the same time.
+CHUNKS = {"refine_frames": 2}
 SPEECH = (
     "Hello! I was made from one scan and a few photographs. Nobody has ever filmed me talking: "
     "my voice, my mouth and my hands all come from this text. Type one of your own, and I will say it."
@@ -65,11 +67,38 @@ def evaluate_beside(run: Path, capture: Path, stop: Event) -> None:
     Raises:
         InputError: the evaluation has failed; its log is kept in the run folder.
     """
-    log, answer = run / "evaluate.log", run / "evaluate.json"
+    failed = _beside(("evaluate", str(run.resolve()), "--no-report"), run, capture, "evaluate", stop)
+    if failed is not None:
+        log = run / "evaluate.log"
+        raise InputError("the evaluation of the demo", expected="its figures", received=failed, remedy=f"see {log}")
+
+
+def help_refine_beside(run: Path, capture: Path, stop: Event) -> None:
+    """Compute chunks of the refinement as a process of its own, until none is left or `stop` is set.
+
+    Two processes of one thread take half the time of one with two threads, which wait for each other's Python.
+    """
+    words = (
+        "train",
+        str(run.resolve()),
+        "--stage",
+        "refine",
+        "--refine-help",
+        "--refine-frames",
+        str(CHUNKS["refine_frames"]),
+    )
+    failed = _beside(words, run, capture, "refine_help", stop)
+    if failed is not None and not stop.is_set():
+        _LOG.warning("a process that was to help with the poses has ended: %s; see refine_help.log", failed)
+
+
+def _beside(words: tuple[str, ...], run: Path, capture: Path, name: str, stop: Event) -> str | None:
+    """Run a command on a capture beside this process; return what was wrong, None where it has done its work."""
+    log, answer = run / f"{name}.log", run / f"{name}.json"
     program, variables = own_program()
     half = str(max(1, (os.cpu_count() or 1) // 2))
     ended = run_process(
-        (*program, "evaluate", str(run.resolve()), "--capture", str(capture.resolve()), "--no-report", "--json"),
+        (*program, *words, "--capture", str(capture.resolve()), "--json"),
         log=log,
         answer=answer,
         environment={**variables, "OMP_NUM_THREADS": half},
@@ -78,11 +107,11 @@ def evaluate_beside(run: Path, capture: Path, stop: Event) -> None:
         began=lambda pid: None,
     )
     meaning, error = meaning_of(ended, log=log, answer=answer, judged=False)
-    if meaning != "done":
-        words = str((error or {}).get("message") or f"exit status {ended.exit_status}").rstrip(".")
-        raise InputError("the evaluation of the demo", expected="its figures", received=words, remedy=f"see {log}")
+    if meaning not in ("done", "stopped"):
+        return str((error or {}).get("message") or f"exit status {ended.exit_status}").rstrip(".")
     log.unlink()
     answer.unlink()
+    return None
 
 
 @dataclass(frozen=True)
@@ -108,17 +137,29 @@ class Demo:
             InputError: the embedded person is not there and no capture is given.
         """
         require_avatar("training the student of the demo")
+        from avatar.training.engine.resources import half_of_the_threads
+
         console = Console(stderr=True)
         out, capture = self.run_folder, self.capture or embedded_capture()
-        started = perf_counter()
-        built = Build(run_folder=out, capture=capture, protocol=TRACKED, budgets=BUDGETS).run()
-        _LOG.info(
-            "demo: the template stands after %.0f s: open %s while the student is trained (a few minutes more)",
-            perf_counter() - started,
-            (out / "report.html").resolve(),
-        )
-        # The report is written when all of its parts are there, because writing it takes nine seconds.
-        Train(run_folder=out, capture=capture, preset="demo", no_report=True).run()
+        started, helped = perf_counter(), Event()
+        # Poses need the template, not its validation nor its report: another process begins with them meanwhile.
+        with ThreadPoolExecutor(1) as beside:
+            try:
+                built = Build(run_folder=out, capture=capture, protocol=TRACKED, budgets=BUDGETS).run(
+                    assembled=lambda: beside.submit(help_refine_beside, out, capture, helped)
+                )
+                _LOG.info(
+                    "demo: the template stands after %.0f s: open %s while the student is trained (minutes more)",
+                    perf_counter() - started,
+                    (out / "report.html").resolve(),
+                )
+                # The report is written when all of its parts are there, because writing it takes nine seconds.
+                chosen = {"run_folder": out, "capture": capture, "no_report": True, **CHUNKS}
+                with half_of_the_threads():
+                    Train(**chosen, stage="refine", json=True).run()
+            finally:
+                helped.set()
+        Train(**chosen, preset="demo").run()
         # The evaluation reads nothing of the film and the pages, and none of them keeps two cores busy: side by side
         # they take half the time. Film, page and speech play one bundle.
         stop = Event()

@@ -253,11 +253,43 @@ class BodyModel:
     def _shaped(self, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
         betas, expression = arrays["betas"], arrays["expression"]
         vertices = self._constant("v_template", betas) + self._blend("shapedirs", betas, "betas")
+        # Joints are linear in the vertices, and so in the coefficients: no pose reads the regressor.
+        joints = self._constant("_joints", betas) + self._blend("_joints_by_shape", betas, "betas")
         if self.num_expressions:
-            vertices = vertices + self._blend("exprdirs", expression, "expression")
+            vertices = self._with_expression(vertices, expression)
+            joints = joints + self._blend("_joints_by_expression", expression, "expression")
         if "v_shape" in arrays:
-            vertices = vertices + self._checked_offsets(arrays["v_shape"])
-        return vertices, self._constant("joint_regressor", vertices) @ vertices
+            offsets = self._checked_offsets(arrays["v_shape"])
+            vertices, joints = vertices + offsets, joints + self._constant("joint_regressor", offsets) @ offsets
+        return vertices, joints
+
+    def _with_expression(self, vertices: Array, expression: Array) -> Array:
+        """Return vertices moved by an expression; with numpy only those of the face are touched."""
+        rows, directions = self._expressive
+        if not isinstance(expression, np.ndarray) or 2 * len(rows) > self.vertex_count:
+            return vertices + self._blend("exprdirs", expression, "expression")
+        moved = self._product(directions, expression, "expression")
+        out = np.repeat(vertices, len(moved), axis=0) if len(vertices) < len(moved) else vertices.copy()
+        out[:, rows] += moved
+        return out
+
+    @cached_property
+    def _expressive(self) -> tuple[Int64[np.ndarray, " E"], Float64[np.ndarray, "E 3 n"]]:
+        """The vertices that expressions move, and their directions."""
+        rows = np.flatnonzero(self.exprdirs.any(axis=(1, 2)))
+        return rows, self.exprdirs[rows]
+
+    @cached_property
+    def _joints(self) -> Float64[np.ndarray, "J 3"]:
+        return self.joint_regressor @ self.v_template
+
+    @cached_property
+    def _joints_by_shape(self) -> Float64[np.ndarray, "J 3 n"]:
+        return np.einsum("jv,vcn->jcn", self.joint_regressor, self.shapedirs, optimize=True)
+
+    @cached_property
+    def _joints_by_expression(self) -> Float64[np.ndarray, "J 3 n"]:
+        return np.einsum("jv,vcn->jcn", self.joint_regressor, self.exprdirs, optimize=True)
 
     def _checked_offsets(self, offsets: Array) -> Array:
         if offsets.shape[1] != self.vertex_count:
@@ -271,7 +303,9 @@ class BodyModel:
 
     def _blend(self, basis_name: str, coefficients: Array, subject: str) -> Array:
         """Return offsets (T, V, 3) of the first n directions for (T, n) coefficients."""
-        basis = self._constant(basis_name, coefficients)
+        return self._product(self._constant(basis_name, coefficients), coefficients, subject)
+
+    def _product(self, basis: Array, coefficients: Array, subject: str) -> Array:
         used, known = coefficients.shape[-1], basis.shape[-1]
         if used > known:
             raise InputError(
@@ -282,8 +316,8 @@ class BodyModel:
                 "(smplxpp params convert --betas, load_params(max_betas=))",
             )
         # One matrix product over all vertices and axes; fewer coefficients than directions use the first of these.
-        flat = basis.reshape(3 * self.vertex_count, known)[:, :used]
-        return (coefficients @ flat.T).reshape(-1, self.vertex_count, 3)
+        flat = basis.reshape(3 * len(basis), known)[:, :used]
+        return (coefficients @ flat.T).reshape(-1, len(basis), 3)
 
     def _pose_offsets(self, rotations: Array) -> Array | None:
         if self.posedirs is None:

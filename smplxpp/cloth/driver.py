@@ -165,13 +165,17 @@ class ClothDriver:
         if params is None:
             self.notes.append(f"no pose after {self._time:.2f} s: the clothes stay as they are")
             return self._shape
+        return self._shaped(self._stepped(params, seconds, posed))
+
+    def _stepped(self, params: BodyParams, seconds: float, posed: PosedBody | None = None) -> PosedBody:
+        """Step the particles to the next pose; return the body in it."""
         if len(params) != 1:
             raise InputError("pose of a step", expected="one frame", received=f"{len(params)} frames")
         posed = self.template.posed_body(params) if posed is None else posed
         # The very first pose has no state to continue from.
         if self._last is None:
             self._start(params, posed)
-            return self._shaped(posed)
+            return posed
         require_positive("seconds of a step", seconds)
         self._time += seconds
         if seconds > LONGEST_STEP:
@@ -182,7 +186,7 @@ class ClothDriver:
             self.notes.append(f"a leap at {self._time:.2f} s: the clothes restart")
             self._start(params, posed)
         self._last = params
-        return self._shaped(posed)
+        return posed
 
     def _start(self, params: BodyParams, posed: PosedBody) -> None:
         """Come to a first pose from the reference pose, where the cloth hangs as it was scanned."""
@@ -250,9 +254,11 @@ class ClothDriver:
             drawn: one frame; None: the last of the poses.
             posed: the drawn body, where it is there already.
         """
-        for pose in poses:
-            shape = self.step(pose, seconds / len(poses))
-        return shape if drawn is None else self.over(drawn, posed=posed)
+        for pose in poses[:-1]:
+            self.step(pose, seconds / len(poses))
+        last = self._stepped(poses[-1], seconds / len(poses))
+        # The cloth is carried and measured once where it is drawn, for the body of the last pose or for another one.
+        return self._shaped(last) if drawn is None else self.over(drawn, posed=posed)
 
     def over(self, params: BodyParams, *, posed: PosedBody | None = None) -> ClothShape:
         """Return the cloth where it hangs now, for a body that is drawn in another pose than the last step's.

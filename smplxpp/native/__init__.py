@@ -84,6 +84,9 @@ def _check_status(status: int, function: Any, _: tuple) -> None:
 def thread_count(asked: int | None = None) -> int:
     """Return the number of threads for a kernel: `asked`, at most `MOST_THREADS`; None: a thread a CPU, at most 8.
 
+    `OMP_NUM_THREADS` bounds the second, as it bounds the threads of torch and OpenMP: several processes of one thread
+    each would else wait for each other's at every kernel.
+
     In a process that was forked after the library was loaded it is 1, because OpenMP's workers do not exist there and a
     parallel loop would wait for them for ever.
 
@@ -92,6 +95,9 @@ def thread_count(asked: int | None = None) -> int:
     """
     if asked is None:
         asked = min(8, os.cpu_count() or 1)
+        first, _, _ = os.environ.get("OMP_NUM_THREADS", "").partition(",")  # a list: one number a level of loops
+        if first.strip().isdecimal() and int(first):
+            asked = min(asked, int(first))
     if not isinstance(asked, numbers.Integral) or isinstance(asked, bool) or asked < 1:
         from smplxpp.core.errors import InputError
 

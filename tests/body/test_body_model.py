@@ -208,3 +208,14 @@ def test_a_skeleton_that_is_no_tree_in_order_is_refused(open_body, wrong):
     parents[joint] = parent
     with pytest.raises(InputError, match="parents"):
         replace(open_body, parents=parents)
+
+
+def test_joints_are_those_that_the_regressor_finds_on_the_shaped_vertices(open_body):
+    """They are computed from the coefficients; the vertices' own columns say what they have to be."""
+    rng = np.random.default_rng(0)
+    params = {"betas": rng.normal(size=(2, 5)), "expression": rng.normal(size=(2, open_body.num_expressions))}
+    shaped = open_body.v_template + np.einsum("vcn,tn->tvc", open_body.shapedirs[..., :5], params["betas"])
+    shaped += np.einsum("vcn,tn->tvc", open_body.exprdirs, params["expression"])
+    posed = open_body.forward(params)
+    np.testing.assert_allclose(posed.rest_vertices, shaped, atol=1e-12)
+    np.testing.assert_allclose(posed.rest_joints, open_body.joint_regressor @ shaped, atol=1e-12)

@@ -250,3 +250,14 @@ def test_what_is_not_asked_for_rightly_is_refused():
     for name, value in (("ramp", -0.1), ("hold", float("nan")), ("teleport", 0.0), ("most_stretch", -1.0)):
         with pytest.raises(InputError, match=name):
             DriverConfig(**{name: value})
+
+
+def test_cloth_that_is_drawn_over_another_pose_is_measured_once_there():
+    """Each frame was carried and measured for the pose that leads there, and then again for the one that is drawn."""
+    path, drawn = [swaying(t) for t in (0.3, 0.35)], swaying(0.36)
+    one, other = followed(30.0, 0.3), followed(30.0, 0.3)
+    shape, before = one.follow(path, 1 / 30, drawn), other.quality[0].frames
+    for pose in path:
+        other.step(pose, 1 / 60)
+    np.testing.assert_array_equal(shape.displacements, other.over(drawn).displacements)
+    assert one.quality[0].frames == before + 2 < other.quality[0].frames

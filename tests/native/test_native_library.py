@@ -42,6 +42,14 @@ def test_any_number_of_threads_gives_the_same_picture(triangle, camera):
     assert native.thread_count(2**40) == native.MOST_THREADS
 
 
+@pytest.mark.parametrize(("said", "threads"), [("1", 1), ("3,2", 3), ("64", 4), ("0", 4), ("many", 4), ("", 4)])
+def test_a_process_that_has_few_threads_by_its_environment_does_not_take_one_a_cpu(monkeypatch, said, threads):
+    monkeypatch.setattr(native.os, "cpu_count", lambda: 4)
+    monkeypatch.setenv("OMP_NUM_THREADS", said)
+    assert native.thread_count() == threads
+    assert native.thread_count(4) == 4  # a caller that says how many
+
+
 def test_arrays_that_a_kernel_would_misread_are_refused(triangle, camera):
     vertices, faces = triangle.vertices, triangle.faces
     for bad in ([[0, 1, 3]], [[-1, 1, 2]], [[0, 1, 2**32]], [[0, 1]], [[0.0, 1.0, 2.0]]):

@@ -180,10 +180,15 @@ def _copy_in_layout(content: Tensor, parameter: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _finite(values: Iterable[Tensor]) -> bool:
-    """Return whether all values are finite: the largest magnitude is NaN or infinite when any of them is."""
-    # One call for all tensors, which is a few launches on a GPU, and one transfer of the answer.
-    largest = torch._foreach_norm(list(values), ord=torch.inf)
-    return bool(torch.isfinite(torch.stack(largest)).all())
+    """Return whether all values are finite: a sum or a largest magnitude is NaN or infinite when any value is."""
+    values = list(values)
+    if values[0].device.type == "cpu":
+        # The largest magnitude takes ten times as long there, an eighth of a step of the compensation.
+        figures = [value.sum() for value in values]
+    else:
+        # One call for all tensors, which is a few launches on a GPU, and one transfer of the answer.
+        figures = list(torch._foreach_norm(values, ord=torch.inf))
+    return bool(torch.isfinite(torch.stack(figures)).all())
 
 
 def _diverged(iteration: int, item: str) -> DivergedError:

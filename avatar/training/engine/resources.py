@@ -55,6 +55,17 @@ def keep_freed_memory() -> bool:
 
 
 @contextmanager
+def half_of_the_threads() -> Iterator[None]:
+    """Compute with half of torch's threads in the block, because another process has the other cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(max(1, threads // 2))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
 def explain_resource_errors(folder: Path) -> Iterator[None]:
     """Turn errors of memory and disk within the block into an `InputError`; all others pass.
 

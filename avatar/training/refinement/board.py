@@ -58,6 +58,7 @@ class Board:
             OvertakenError: the pass is over.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
+        pause = shortest = 0.01  # seconds; a chunk of a small capture takes a tenth of one
         files = [self.folder / f"{name}_{k:04d}.npz" for k in range(count)]
         while True:
             left = [k for k, file in enumerate(files) if not file.is_file()]
@@ -67,8 +68,10 @@ class Board:
                 raise OvertakenError
             begun = next((k for k in left if self._claim(files[k])), None)
             if begun is None:
-                time.sleep(0.2)
+                time.sleep(pause)
+                pause = min(1.5 * pause, 0.2)
             else:
+                pause = shortest
                 write_arrays(files[begun], compute(begun))
                 with suppress(OSError):
                     files[begun].with_suffix(".claim").unlink()
