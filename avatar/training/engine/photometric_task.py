@@ -144,8 +144,8 @@ class PhotometricConfig:
 
     @property
     def evaluate_every(self) -> int:
-        """Number of steps between two evaluations."""
-        return max(1, self.iterations // self.evaluations)
+        """Number of steps between two evaluations, rounded up: the last one is that of the end."""
+        return -(-self.iterations // self.evaluations)
 
 
 class PhotometricTask(OptimizationTask[Item]):

@@ -433,3 +433,9 @@ def test_a_normal_loss_with_normal_maps_tells_nothing(frames, caplog, monkeypatc
     monkeypatch.setattr(type(frames), "view", with_normals)
     assert steps(make("compensate", frames), 1)[0]["normal"] > 0
     assert not caplog.records
+
+
+def test_a_training_is_not_measured_twice_at_its_end():
+    """500 steps were measured after 498 and after 500, because a sixth of them was rounded down."""
+    every = BakeConfig(iterations=500, evaluations=6).evaluate_every
+    assert [step for step in range(1, 501) if step % every == 0 or step == 500] == [84, 168, 252, 336, 420, 500]
