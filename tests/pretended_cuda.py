@@ -261,6 +261,7 @@ def pretended_cuda() -> Iterator[None]:
             "synchronize": lambda device=None: None,
             "max_memory_allocated": lambda device=None: 1,
             "reset_peak_memory_stats": lambda device=None: None,
+            "mem_get_info": lambda device=None: (64 << 30, 80 << 30),
             "get_device_name": lambda device=None: "pretended",
         }.items():
             stack.enter_context(mock.patch.object(torch.cuda, name, value))

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.training.engine.photometric_task import PhotometricConfig
-from avatar.training.engine.resources import Compiled
+from avatar.training.engine.resources import Compiled, StageMemory, foretell_memory
 from avatar.training.loose_clothes import ClothConfig, loose_names, why_none
 from avatar.training.presets import TrainingPreset, training_preset, with_iterations, with_local_shapes
 from avatar.training.refinement.config import RefineConfig
@@ -294,6 +294,15 @@ def check_training(scene: TrainScene, recipe: Recipe, steps: Sequence[str], *, p
         why = why_none(scene.template, recipe.cloth, pose_known=pose_known, followed=True, fps=scene.capture.fps)
         if why is not None:
             log.warning("loose clothes: %s", why)
+
+
+def memory_on(capture: Capture, recipe: Recipe, steps: Sequence[str]) -> dict[str, StageMemory]:
+    """Return what some steps need on a capture, see `foretell_memory`."""
+    cameras = [capture.cameras[name] for name in capture.splits.train_cameras]
+    pixels = max(camera.width * camera.height for camera in cameras)
+    images = len(cameras) * len(capture.splits.train_frames)
+    found = foretell_memory(recipe, megapixels=1e-6 * pixels, images=images)
+    return {step: memory for step, memory in found.items() if step in steps}
 
 
 def note_missing_normals(capture: Capture, recipe: Recipe, steps: Sequence[str]) -> None:

@@ -27,6 +27,7 @@ from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import (
     allow_tf32,
+    check_memory,
     choose_device,
     explain_resource_errors,
     keep_freed_memory,
@@ -36,7 +37,7 @@ from avatar.training.fit.fit import fit_gaussians, fit_scene
 from avatar.training.fit_teacher import fit_teacher
 from avatar.training.loose_clothes import find_garments, with_simulated
 from avatar.training.presets import TrainingPreset
-from avatar.training.recipe import STEPS, Recipe, TrainConfig, check_training, note_missing_normals
+from avatar.training.recipe import STEPS, Recipe, TrainConfig, check_training, memory_on, note_missing_normals
 from avatar.training.refinement.board import RefinementStoppedError
 from avatar.training.refinement.refine_capture import refine_capture, with_refined_poses
 from avatar.training.scene import TrainScene, hold_out_cameras, prepare_scene
@@ -126,6 +127,8 @@ def train(
     # Checks that need the template, the capture and the recipe together; after them only work is left.
     steps = [step for step in STEPS if step not in ({"cloth"} if recipe.cloth is None else ())]
     check_training(scene, recipe, steps, pose_known=reference is not None)
+    if training.device.startswith("cuda"):
+        check_memory(memory_on(scene.capture, recipe, steps), training.device)
     how = config.refinement(wanted=refine == "on" or (refine == "auto" and has_estimated_params(capture)))
     if how is not None:
         settings = {"refinement": how, "reference": scene.frame}

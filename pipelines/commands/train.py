@@ -129,7 +129,7 @@ class Train:
     no_report: bool = False
     """Leave report.html as it is."""
     dry_run: bool = False
-    """Print hours, gigabytes and disk of each stage, and train nothing; see docs/batch.md."""
+    """Print hours, gigabytes, memory and disk of each stage, and train nothing; see docs/batch.md."""
     rates: OptionalPath = None
     """With --dry-run: JSON with rates of this machine, as `smplxpp batch --rates` takes it."""
     json: bool = False
@@ -198,7 +198,8 @@ class Train:
 
     def _plan(self, gpu: bool, steps: tuple[str, ...], *, refines: bool) -> dict[str, Any]:
         """Foretell what the stages take, as `smplxpp batch --dry-run` does for a fleet."""
-        from pipelines.batch.amounts import facts_of
+        from avatar.training.engine.resources import foretell_memory
+        from pipelines.batch.amounts import facts_of, recipe_of
         from pipelines.batch.page import cost_table
         from pipelines.batch.plan import read_rates, training_costs
 
@@ -214,12 +215,21 @@ class Train:
             next(f for f in (self.run_folder, *self.run_folder.absolute().parents) if f.exists())
         ).free
         kept = sum(cost.written_gb for cost in costs.values())
+        recipe = recipe_of(options, tracked=refines)
+        cached = 1.0 if self.cache_gib is None else self.cache_gib
+        memory = foretell_memory(recipe, megapixels=facts.megapixels, images=facts.images, cache_gib=cached)
+        memory = {step: one for step, one in memory.items() if step in steps}
         if not self.json:
             Console().print(cost_table(costs, "stage"))
+            where = "GiB of the GPU" if gpu else "GiB more for steps"
+            told = ", ".join(f"{step} {one.host:.1f} + {one.device:.1f}" for step, one in memory.items())
+            Console().print(f"GiB of memory + {where}: {told}", highlight=False)
             words = f"{facts.frames} frames of {facts.cameras} cameras, {facts.megapixels:.2f} megapixels"
             Console().print(f"{words}; {kept:.2f} GB are kept, {free / 1e9:.1f} GB are free", highlight=False)
         plan = {step: vars(cost) for step, cost in costs.items()}
-        return {"run": str(self.run_folder), "facts": vars(facts), "plan": plan, "free_gb": free / 1e9}
+        needs = {step: vars(one) for step, one in memory.items()}
+        answer = {"run": str(self.run_folder), "facts": vars(facts), "plan": plan, "memory_gib": needs}
+        return {**answer, "free_gb": free / 1e9}
 
     def _help(self, inputs: TrainInputs, scene: TrainScene, config: RefineConfig | None) -> dict[str, Any]:
         """Compute chunks of the refinement; nothing where poses are not refined, or are already."""

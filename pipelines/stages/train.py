@@ -10,7 +10,8 @@ from pathlib import Path
 from avatar.losses.perceptual import load_metric
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
-from avatar.training.recipe import STEPS, Recipe, check_training, note_missing_normals
+from avatar.training.engine.resources import check_memory
+from avatar.training.recipe import STEPS, Recipe, check_training, memory_on, note_missing_normals
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.scene import TrainScene
 from pipelines.runs import layout
@@ -98,6 +99,8 @@ def train(
     """
     # Refuse a training that cannot succeed before anything is written.
     check_training(scene, config, steps, pose_known=(run / PARAMS).is_file())
+    if together.device.startswith("cuda"):
+        check_memory(memory_on(scene.capture, config, steps), together.device)
     if "cloth" in steps and config.cloth is not None and config.cloth.parts:
         load_params_of_run(run)  # parts that the user named are simulated, so their pose has to be readable
     records: dict[str, StageRecord] = {}

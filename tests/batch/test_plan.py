@@ -144,6 +144,9 @@ def test_a_training_tells_its_cost_before_it_begins(tmp_path, capsys):
     facts = facts_of(capture)
     alone = training_costs(facts, Rates(), {"preset": "demo", "refine_poses": "on"}, gpu=False)
     assert answer["plan"] == {step: vars(cost) for step, cost in alone.items()} and answer["free_gb"] > 0
+    assert list(answer["memory_gib"]) == ["fit", "teacher", "bake", "compensate"]
+    assert all(0.0 < one["device"] < 2.0 and one["host"] > 1.0 for one in answer["memory_gib"].values())
     assert main([*words, "--until", "fit"]) == 0
-    assert list(json.loads(capsys.readouterr().out)["plan"]) == ["fit"]
+    answer = json.loads(capsys.readouterr().out)
+    assert list(answer["plan"]) == list(answer["memory_gib"]) == ["fit"]
     assert not (run / "70_fit").exists()

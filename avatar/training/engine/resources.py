@@ -6,8 +6,9 @@ import ctypes
 import errno
 import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,7 @@ except ModuleNotFoundError:  # Windows
 import torch
 from torch import Tensor, nn
 
+from avatar.models.networks.teacher import Teacher, TeacherConfig
 from smplxpp.core.errors import InputError
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "not enough memory")
@@ -97,6 +99,106 @@ def explain_resource_errors(folder: Path) -> Iterator[None]:
             received=error.strerror or str(error),
             remedy="free some space and give the same command, which continues from the last checkpoint",
         ) from error
+
+
+@dataclass(frozen=True)
+class StageMemory:
+    """What a stage of a training needs at most, GiB, as it is foretold.
+
+    Attributes:
+        host: of the machine's memory.
+        device: of what tensors of the step take, on a GPU or, without one, of the machine's memory.
+    """
+
+    host: float
+    device: float
+
+
+def foretell_memory(recipe: Any, *, megapixels: float, images: int, cache_gib: float = 1.0) -> dict[str, StageMemory]:
+    """Return what the stages of a training need, by the name of their step; within a third of what was measured.
+
+    Parameters take 16 bytes, with gradients and Adam's moments. What the teacher's networks keep for their backward
+    pass is counted by passing shapes through them. A picture takes bytes a pixel of the person, who fills two fifths,
+    and bytes a Gaussian; all views of a pose are kept until their backward pass.
+
+    Args:
+        recipe: a `Recipe`.
+        megapixels: of an image.
+        images: of all training frames.
+        cache_gib: bound of the photographs in memory.
+    """
+    preset, gib = recipe.preset, 2.0**30
+    count = preset.fit.sampling.count
+    # Bytes a pixel: of images, losses and SSIM, and of features of the perceptual networks at full size.
+    a_pixel = 700.0 + {"st-lpips": 1200.0, "lpips": 250.0}.get(recipe.perceptual, 0.0)
+    a_view = 0.4e6 * megapixels * a_pixel + 500.0 * count
+    attributes = 16.0 * 25.0 * count
+    learned, kept = _network_bytes(preset.networks.teacher, preset.teacher.views) if recipe.teacher else (0.0, 0.0)
+    shapes = recipe.shapes
+    basis = 2.0 * 3.0 * count * (shapes.head_shapes + shapes.body_shapes)
+    # Known displacements of the frames; and gradients of activations beside them, measured 1.15 of what is kept.
+    known = min(1.0 * gib, 16.0 * count * images)
+    device = {
+        "fit": attributes + a_view,
+        "teacher": 16.0 * learned + 1.15 * kept + attributes + preset.teacher.views * a_view + known,
+        "bake": 4.0 * learned + attributes + preset.bake.views * a_view + known,
+        "compensate": 16.0 * basis + attributes + preset.compensate.views * a_view,
+    }
+    if preset.bake.images == "teacher":
+        device["bake"] += 0.3 * kept + 2.0 * gib
+    # Imports and template, photographs, poses; a checkpoint is copied, and put together as bytes.
+    photographs = min(cache_gib * gib, 4e6 * megapixels * images)
+    written = {"teacher": 24.0 * learned, "compensate": 24.0 * basis}
+    host = {step: 1.3 * gib + photographs + written.get(step, 0.0) for step in device}
+    return {
+        step: StageMemory(host[step] / gib, own / gib)
+        for step, own in device.items()
+        if step != "teacher" or recipe.teacher
+    }
+
+
+def _network_bytes(config: TeacherConfig, views: int) -> tuple[float, float]:
+    """Return the number of parameters of a teacher, and the bytes that a pass of one pose keeps for its gradients."""
+    kept: dict[int, int] = {}
+    held: list[Tensor] = []
+
+    def keep(tensor: Tensor) -> Tensor:
+        held.append(tensor)  # so that no other takes its place
+        storage = tensor.untyped_storage()
+        kept[storage._cdata] = storage.nbytes()
+        return tensor
+
+    # Tensors without numbers: shapes alone.
+    with torch.device("meta"), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        networks = Teacher(config)
+        side = config.in_size
+        maps = torch.zeros(1, 2, side, side, 3)
+        networks(maps, maps, torch.zeros(views, 2, side, side) if config.sees_view else None)
+    parameters = list(networks.parameters())
+    own = {one.untyped_storage()._cdata for one in parameters}
+    return sum(one.numel() for one in parameters), sum(size for place, size in kept.items() if place not in own)
+
+
+def check_memory(foretold: Mapping[str, StageMemory], device: str) -> None:
+    """Compare what the stages need with the memory of the GPU, before any work.
+
+    Raises:
+        InputError: a stage that needs half more than the GPU has. Less than that is a warning.
+    """
+    if not device.startswith("cuda"):
+        return
+    step, need = max(((step, one.device) for step, one in foretold.items()), key=lambda pair: pair[1])
+    there = torch.cuda.mem_get_info()[1] / 2**30
+    remedy = "take smaller images (--scale 0.5 needs a quarter of a picture's), fewer --gaussians, or a smaller preset"
+    if need > 1.5 * there:
+        raise InputError(
+            "memory of the GPU",
+            expected=f"about {need:.1f} GiB for the stage {step}",
+            received=f"{there:.1f} GiB",
+            remedy=remedy,
+        )
+    if need > 0.9 * there:
+        log.warning("the stage %s needs about %.1f GiB of the GPU's %.1f: if it ends, %s", step, need, there, remedy)
 
 
 log = logging.getLogger(__name__)

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
 from avatar.models.networks.teacher import Teacher
-from avatar.training.engine.resources import _Compiled, compile_networks
+from avatar.training.engine.resources import (
+    StageMemory,
+    _Compiled,
+    check_memory,
+    compile_networks,
+    foretell_memory,
+)
+from avatar.training.recipe import TrainConfig
+from smplxpp.core.errors import InputError
 from tests.dolls.tiny import TINY_TEACHER
 from tests.pretended_cuda import pretended_cuda
 
+ROOT = Path(__file__).resolve().parents[3]
 CHILD = """
 import resource
 import torch
@@ -46,6 +57,44 @@ def test_freed_memory_is_kept_for_the_next_step():
     done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, check=True, timeout=900)
     usual, kept = map(int, done.stdout.split())
     assert kept < 1000 < usual
+
+
+def stored(name: str) -> dict:
+    return json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text())["figures"]
+
+
+def test_memory_is_foretold_within_a_third_of_what_was_measured():
+    found = foretell_memory(TrainConfig().recipe("paper"), megapixels=3.0, images=4)
+    measured = stored("gpu")["parts"]["paper_step"]["found"]["gpu_memory_gib"]
+    assert max(one.device for one in found.values()) == pytest.approx(measured, rel=1 / 3)
+    # On a CPU all of it is the machine's.
+    sizes = {"training_woman_casual_cpu_tracked": ("cpu", 0.384 * 0.64, 48 * 12)}
+    for name, (preset, megapixels, images) in sizes.items():
+        found = foretell_memory(TrainConfig().recipe(preset), megapixels=megapixels, images=images)["compensate"]
+        measured = stored(name)["stages"]["90_compensate"]["peak_memory_gib"]
+        assert found.host + found.device == pytest.approx(measured, rel=1 / 3)
+
+
+def test_more_gaussians_pixels_and_views_need_more_memory():
+    def most(megapixels=1.0, **options):
+        found = foretell_memory(TrainConfig(**options).recipe("gpu"), megapixels=megapixels, images=100)
+        return {step: one.device for step, one in found.items()}
+
+    usual = most()
+    assert all(more > usual[step] for step, more in most(megapixels=4.0).items())
+    assert all(more > usual[step] for step, more in most(gaussians=540_000).items())
+    assert list(most(teacher=False)) == ["fit", "bake", "compensate"]
+
+
+def test_a_gpu_with_too_little_memory_is_told_before_work(caplog):
+    with pretended_cuda():
+        check_memory({"fit": StageMemory(1.0, 60.0)}, "cuda")
+        assert not caplog.text
+        check_memory({"fit": StageMemory(1.0, 2.0), "teacher": StageMemory(1.0, 75.0)}, "cuda")
+        assert "stage teacher needs about 75.0 GiB of the GPU's 80.0" in caplog.text
+        with pytest.raises(InputError, match=r"130.0 GiB for the stage bake, received 80.0 GiB.*--scale 0.5"):
+            check_memory({"bake": StageMemory(1.0, 130.0)}, "cuda")
+    check_memory({"bake": StageMemory(1.0, 1e6)}, "cpu")
 
 
 class Doubled(nn.Module):
