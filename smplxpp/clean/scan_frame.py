@@ -227,7 +227,7 @@ def _no_size(received: str, size: float) -> InputError:
         expected=f"a person {_LOW} to {_HIGH} m high in {', '.join(METRES_PER_UNIT)}",
         received=received,
         remedy=f"{sizes_by_unit(size)}: state which it is with --units, or the person's stature in metres with "
-        "--height 1.75; check for stray geometry and half a person",
+        "--height 1.75; check for stray geometry, half a person, an animal",
     )
 
 
