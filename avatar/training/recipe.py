@@ -56,6 +56,8 @@ class TrainConfig:
         checkpoint_minutes: between two checkpoints; None: half a minute, or longer for writing to take 2 %.
         precision: of networks on a GPU: "tf32" (torch's convolutions), "float32", "bfloat16"; "preset": its `amp`.
         compile: how the teacher's networks are compiled on a GPU, see `resources.compile_networks`.
+        surface_normals: normals of the followed clothes where a capture has no maps, see `PhotometricConfig`; None: as
+            the preset has it.
         readers: threads that decode photographs, see `SequenceConfig`.
         cache_gib: see `AvatarSequence`.
 
@@ -84,6 +86,7 @@ class TrainConfig:
     checkpoint_minutes: float | None = None
     precision: Literal["preset", "tf32", "float32", "bfloat16"] = "preset"
     compile: Compiled = "off"
+    surface_normals: bool | None = None
     readers: int | None = None
     cache_gib: float | None = None
 
@@ -136,6 +139,8 @@ class TrainConfig:
             chosen = with_batch(chosen, self.batch)
         if self.perceptual in ("lpips", "st-lpips"):
             chosen = with_perceptual(chosen)
+        if self.surface_normals is not None:
+            chosen = _with_changes(chosen, lambda config: {"surface_normals": self.surface_normals})
         if self.precision != "preset":
             chosen = _with_changes(chosen, lambda config: {"amp": self.precision == "bfloat16"})
         return Recipe(

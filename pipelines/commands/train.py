@@ -117,6 +117,8 @@ class Train:
     """Log for TensorBoard too, into the folders of the stages."""
     checkpoint_minutes: OptionalFloat = None
     """Minutes between checkpoints; by default half a minute, or longer for writing to take 2 % of the time."""
+    surface_normals: Literal["preset", "on", "off"] = "preset"
+    """Compare normals with those of the followed clothes where the capture has no normal maps."""
     precision: Literal["preset", "tf32", "float32", "bfloat16"] = "preset"
     """Of networks on a GPU. tf32, as all presets have: convolutions of inputs with 11 bits; bfloat16: networks of 8."""
     compile: Literal["off", "graphs", "inductor"] = "off"
@@ -295,6 +297,7 @@ class Train:
             checkpoint_minutes=self.checkpoint_minutes,
             precision=self.precision,
             compile=self.compile,
+            surface_normals={"preset": None, "on": True, "off": False}[self.surface_normals],
             readers=self.readers,
             cache_gib=self.cache_gib,
         )

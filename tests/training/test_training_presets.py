@@ -110,6 +110,13 @@ def test_the_precision_of_networks_is_an_option_of_any_preset():
             TrainConfig(**wrong)
 
 
+def test_normals_of_followed_clothes_are_an_option_of_any_preset():
+    for name, usual in (("cpu", False), ("demo", True), ("paper", False)):
+        for asked, found in ((None, usual), (True, True), (False, False)):
+            preset = TrainConfig(surface_normals=asked).recipe(name).preset
+            assert {preset.teacher.surface_normals, preset.bake.surface_normals} == {found}
+
+
 def test_an_unknown_name_is_refused():
     with pytest.raises(InputError, match="'paper' or 'gpu' or 'paper-small' or 'cpu' or 'demo'"):
         training_preset("tpu")
