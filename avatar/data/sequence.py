@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -153,8 +153,10 @@ class AvatarSequence:
         self._expected_poses: dict[int, Future[Pose]] = {}
         self._of_gpu = self.rig.device.type == "cuda"
         readers = self.config.readers or (thread_count(None) if self._of_gpu else 1)
-        self._reader = ThreadPoolExecutor(readers, thread_name_prefix="views")
-        self._poser = ThreadPoolExecutor(1, thread_name_prefix="poses")
+        # Memory is pinned for the current GPU of a thread, which is the first of a machine unless it is told.
+        begin = None if self.rig.device.index is None else partial(torch.cuda.set_device, self.rig.device)
+        self._reader = ThreadPoolExecutor(readers, thread_name_prefix="views", initializer=begin)
+        self._poser = ThreadPoolExecutor(1, thread_name_prefix="poses", initializer=begin)
 
     def with_cloth(self, cloth: ClothMotions) -> AvatarSequence:
         """Return the sequence with simulated clothes; both share the images."""

@@ -126,7 +126,9 @@ def test_beside_a_gpu_other_threads_make_poses_and_views_ahead(root, made, monke
 
     monkeypatch.setattr(Rig, "pose", noted)
     with pretended_cuda():
-        other = sequence(root, device="cuda", readers=3)
+        told: list[str] = []  # the GPU of each thread: memory would be pinned for the first of a machine
+        monkeypatch.setattr(torch.cuda, "set_device", lambda device: told.append(current_thread().name.split("_")[0]))
+        other = sequence(root, device="cuda:0", readers=3)
         items = other.items(0, count=3, views=2, seed=0)
         other.expect(items)
         for item in items:
@@ -136,6 +138,7 @@ def test_beside_a_gpu_other_threads_make_poses_and_views_ahead(root, made, monke
             for camera in item.cameras:
                 assert torch.equal(other.view(camera, item.frame).alpha.cpu(), made.view(camera, item.frame).alpha)
     assert threads[: len(items)].count("poses") == len(items)
+    assert set(told) == {"poses", "views"}
 
 
 @pytest.mark.parametrize("margin", [0, 5, 12])
