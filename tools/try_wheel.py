@@ -43,6 +43,8 @@ class TryWheel:
     """Wheel to try."""
     demo: bool = False
     """Install the extras and run the demo: minutes more."""
+    runs: Path | None = None
+    """Folder that keeps the demo's run; by default it is deleted with the environment."""
 
     def run(self) -> None:
         """Install and run.
@@ -85,7 +87,8 @@ class TryWheel:
                 _print(f"installed: {_megabytes(folder / 'venv'):.0f} MB")
                 for order in ("torch-first", "torch-last"):
                     call(f"one OpenMP runtime, {order}", bin_folder / "python", "-c", ONE_RUNTIME, order)
-                call("smplxpp demo", bin_folder / "smplxpp", "demo", "runs/demo")
+                run = Path("runs") if self.runs is None else self.runs.absolute()
+                call("smplxpp demo", bin_folder / "smplxpp", "demo", run / "demo")
 
 
 def _print(line: str) -> None:
