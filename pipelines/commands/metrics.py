@@ -10,6 +10,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -189,7 +190,7 @@ def pair_frames(a: Path, b: Path) -> tuple[list[tuple[str, Path, Path]], list[di
     # Equal stems are the safest match; otherwise the frame numbers at the names' ends decide.
     files = [_frames(a), _frames(b)]
     stems = [{f.stem for f in found} for found in files]
-    key = _stem if stems[0] & stems[1] else frame_number
+    key = attrgetter("stem") if stems[0] & stems[1] else frame_number
     keyed = [_by_key(found, key, folder) for found, folder in zip(files, (a, b), strict=True)]
     common = sorted(keyed[0].keys() & keyed[1].keys())
     pairs = [(keyed[0][k].stem, keyed[0][k], keyed[1][k]) for k in common]
@@ -226,10 +227,6 @@ def flat_row(frame: dict[str, Any]) -> dict[str, Any]:
             for key, value in (result[direction] or {}).items():
                 row[f"{prefix}{direction}.{key}"] = value
     return row
-
-
-def _stem(path: Path) -> str:
-    return path.stem
 
 
 def _frames(folder: Path) -> list[Path]:

@@ -62,7 +62,7 @@ _PURPOSES = (
 def uses_of(checks: Sequence[CheckRow]) -> tuple[Use, ...]:
     """Group the checks of a run by what they decide, and word each group.
 
-    A student that no evaluation has measured is never said to be good, because training holds it against floors alone,
+    A student that no evaluation has measured is never called good, because training holds it against floors alone,
     which tell a broken training from a working one.
 
     Example:
@@ -109,7 +109,7 @@ def verdict_of(kind: str, checks: Sequence[CheckRow], uses: Sequence[Use]) -> st
     """
     if not checks and not uses:
         return "No checks were made"
-    # Without uses (a report of another kind than a run's) the counts are all that can be said.
+    # Without uses (a report of another kind than a run's) the counts are all that is known.
     counts = count_statuses(checks)
     if not uses:
         plain = {"pass": "Every check passes", "warn": "Usable, with warnings", "fail": "Some checks fail"}

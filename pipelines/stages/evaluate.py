@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,21 +12,19 @@ from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_mo
 from avatar.evaluation.protocol import SETS, measured_splits, view_sets, with_people
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, ModelFigures, view_key
 from avatar.evaluation.summary import evaluation_tables, garments, summary_figures
-from avatar.gaussians.tensor_file import load_bound
-from avatar.models.model_file import load_avatar
-from avatar.models.student import Student, StudentConfig
-from avatar.rig.rig import AvatarModel, Rig
 from avatar.training.engine.adam import pixel_size
 from pipelines.runs import gates
 from pipelines.runs.code import TRAINING, sha256_file
 from pipelines.runs.folders import own_run_folder
-from pipelines.runs.layout import BEST_FIRST, EVALUATE_STAGE, GARMENTS, MEASURED, MODEL_FILES
+from pipelines.runs.layout import BEST_FIRST, EVALUATE_STAGE, GARMENTS
 from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_inputs import (
     REPORT_FILE,
     exact_params,
     input_protocol,
+    load_model,
+    model_files,
     of_held_out_poses,
     pose_errors,
     refined_digest,
@@ -38,7 +35,7 @@ from pipelines.stages.scene import TrainInputs, open_scene, refuse_seen
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
 from smplxpp.cloth.quality import ClothQuality, all_checks, merged
-from smplxpp.core import Check, InputError, ProgressCallback, ignore_progress, require_known
+from smplxpp.core import Check, InputError, ProgressCallback, ignore_progress
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.figures import encode_png
 from smplxpp.figures.drawings import surface_picture, write_tiles
@@ -185,46 +182,6 @@ class _Clothes:
                 config=ClothMotionConfig(mode="skin" if self.mode == "skin" else "simulate"),
             )
         return AvatarSequence(capture, self.template, device=device, cloth=motions)
-
-
-def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
-    """Find the files of the models of a run, in the order of `MODEL_FILES`.
-
-    Args:
-        names: those to find; none: `MEASURED`, as far as there are files, with the newest student there is.
-
-    Raises:
-        InputError: an unknown name, a model that is asked for and not trained, no teacher and no student.
-    """
-    # Look for every known model file, then compare with the names that the user asked for.
-    there = {name: run / file for name, file in MODEL_FILES.items() if (run / file).is_file()}
-    asked = list(names)
-    require_known("models", asked, MODEL_FILES)
-    missing = [name for name in asked if name not in there]
-    untrained = not asked and not there.keys() & set(BEST_FIRST)
-    if missing or untrained:
-        fit_alone = missing == ["fit"]
-        raise InputError(
-            f"run {run}",
-            expected=", ".join(MODEL_FILES[name] for name in missing) if missing else "a trained teacher or student",
-            received=f"only {', '.join(there)}" if there else "no model",
-            remedy=f"`smplxpp {'fit' if fit_alone else 'train'}` makes it; a training in progress is measured "
-            "when its stage is finished",
-        )
-    # Without a student, the baked one (before its blend shapes) is the newest.
-    wanted = asked or (*MEASURED, *(() if "student" in there else ("baked",)))
-    return {name: there[name] for name in MODEL_FILES if name in wanted and name in there}
-
-
-def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
-    """Load a model of a run; the fit is a student without field and blend shapes.
-
-    Raises:
-        InputError: a damaged file, one of another template or of a newer version.
-    """
-    if name != "fit":
-        return load_avatar(path, rig)
-    return Student(StudentConfig(field=None), rig, load_bound(path, faces=rig.template.faces), ())
 
 
 def _write(folder: Path, found: Evaluation, *, overlap: float, pixel: float) -> StageOutput:

@@ -1,10 +1,10 @@
-"""Collect the inputs of an evaluation: whether they are exact, tracked or estimated, true surfaces, poses."""
+"""Collect the inputs of an evaluation: models, whether inputs are exact, tracked or estimated, true surfaces, poses."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -15,9 +15,20 @@ from jaxtyping import Bool, Int64
 from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
 from avatar.evaluation.protocol import ProtocolConfig, truth_frames, view_sets
+from avatar.gaussians.tensor_file import load_bound
+from avatar.models.model_file import load_avatar
+from avatar.models.student import Student, StudentConfig
+from avatar.rig.rig import AvatarModel, Rig
 from avatar.training.scene import normal_maps
 from pipelines.runs.code import sha256_file
-from pipelines.runs.layout import REFINED_HELD_OUT_PARAMS, REGISTERED_PARAMS, TRAIN_STAGES
+from pipelines.runs.layout import (
+    BEST_FIRST,
+    MEASURED,
+    MODEL_FILES,
+    REFINED_HELD_OUT_PARAMS,
+    REGISTERED_PARAMS,
+    TRAIN_STAGES,
+)
 from pipelines.runs.stage import MANIFEST, read_manifest
 from pipelines.stages.build_config import load_build
 from pipelines.stages.run_inputs import folder_of_maps, labels_of_build, parameters_in_run
@@ -27,7 +38,7 @@ from smplxpp.capture.declared import DeclaredInputs, path_of_params
 from smplxpp.capture.protocols import EXACT
 from smplxpp.capture.recording import ParamSource
 from smplxpp.capture.sources import StackedParams
-from smplxpp.core import BodyParams, InputError, spread
+from smplxpp.core import BodyParams, InputError, require_known, spread
 from smplxpp.core.files.json_file import as_integer, as_text
 from smplxpp.metrics import PoseError, mean_pose_error, pose_error
 from smplxpp.raster import outer_visible_points
@@ -39,6 +50,46 @@ COMPARED = 100
 """Largest number of frames of a kind (training, held-out) whose poses are compared; they are evenly spread."""
 BEHIND = 5e-4
 """Depth in metres behind the outer surface from which a vertex counts as covered; parts keep 1 mm from the body."""
+
+
+def model_files(run: Path, names: Iterable[str] = ()) -> dict[str, Path]:
+    """Find the files of the models of a run, in the order of `MODEL_FILES`.
+
+    Args:
+        names: those to find; none: `MEASURED`, as far as there are files, with the newest student there is.
+
+    Raises:
+        InputError: an unknown name, a model that is asked for and not trained, no teacher and no student.
+    """
+    # Look for every known model file, then compare with the names that the user asked for.
+    there = {name: run / file for name, file in MODEL_FILES.items() if (run / file).is_file()}
+    asked = list(names)
+    require_known("models", asked, MODEL_FILES)
+    missing = [name for name in asked if name not in there]
+    untrained = not asked and not there.keys() & set(BEST_FIRST)
+    if missing or untrained:
+        fit_alone = missing == ["fit"]
+        raise InputError(
+            f"run {run}",
+            expected=", ".join(MODEL_FILES[name] for name in missing) if missing else "a trained teacher or student",
+            received=f"only {', '.join(there)}" if there else "no model",
+            remedy=f"`smplxpp {'fit' if fit_alone else 'train'}` makes it; a training in progress is measured "
+            "when its stage is finished",
+        )
+    # Without a student, the baked one (before its blend shapes) is the newest.
+    wanted = asked or (*MEASURED, *(() if "student" in there else ("baked",)))
+    return {name: there[name] for name in MODEL_FILES if name in wanted and name in there}
+
+
+def load_model(name: str, path: Path, rig: Rig) -> AvatarModel:
+    """Load a model of a run; the fit is a student without field and blend shapes.
+
+    Raises:
+        InputError: a damaged file, one of another template or of a newer version.
+    """
+    if name != "fit":
+        return load_avatar(path, rig)
+    return Student(StudentConfig(field=None), rig, load_bound(path, faces=rig.template.faces), ())
 
 
 def input_protocol(run: Path, capture: Capture) -> InputProtocol:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
-from smplxpp.assemble.feet import feet_in_shoes
+from smplxpp.assemble.body_inside import feet_in_shoes
 from smplxpp.assemble.layers import (
     Obstacle,
     Penetration,

@@ -173,11 +173,6 @@ def _depth(points: Float[np.ndarray, "n 3"], spacing: float) -> int:
     return int(np.clip(np.rint(np.log2(cells)), _SHALLOWEST, _DEEPEST))
 
 
-def point_spacing(points: Float[np.ndarray, "N 3"]) -> float:
-    """Return the median distance of a point to its nearest neighbour, metres."""
-    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
-
-
 def estimate_normals(points: PointsLike) -> Float64[np.ndarray, "N 3"]:
     """Estimate outward unit normals of a point cloud of a body's surface.
 

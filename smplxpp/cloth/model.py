@@ -106,10 +106,6 @@ class ClothModel:
     tether: Float32[np.ndarray, " n"]
     spring: Float32[np.ndarray, " n"] | None = None
 
-    @property
-    def particle_count(self) -> int:
-        return len(self.inverse_mass)
-
 
 def build_model(
     rest: TriangleMesh,

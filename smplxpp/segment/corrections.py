@@ -119,10 +119,6 @@ class Corrections:
     def __len__(self) -> int:
         return len(self.items)
 
-    def with_added(self, correction: Correction) -> Corrections:
-        """Return these corrections with one more at the end."""
-        return Corrections((*self.items, correction), self.labels)
-
     @staticmethod
     def load(path: str | Path, *, labels: Labels = LABELS) -> Corrections:
         """Read and check the corrections in `labels_corrections.json` (docs/corrections.md).

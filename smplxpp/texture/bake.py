@@ -20,7 +20,7 @@ from smplxpp.texture.painted_scan import LabelledSurface, PaintedScan
 from smplxpp.texture.photographs import Painter
 
 # Metres. A template lies within 1 mm of its scan except where holes were filled and layers pushed apart, its body
-# within 15 mm where skin shows (`smplxpp.assemble.body_colors` draws the same line).
+# within 15 mm where skin shows (`smplxpp.assemble.body_inside` draws the same line).
 _FAR = 0.015
 # Rounds in which the colours that were carried under clothes become smooth, a vertex's with those of its neighbours.
 _ROUNDS = 40

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smplxpp.assemble.feet import feet_in_shoes
+from smplxpp.assemble.body_inside import feet_in_shoes
 from smplxpp.body import load_body
 from smplxpp.core import SkinWeights, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.clean.poisson import estimate_normals, point_spacing
+from smplxpp.clean.poisson import estimate_normals
 from smplxpp.core import BodyParams, TriangleMesh, matrix_from_rotvec
 from smplxpp.core.topology import face_components
 from smplxpp.metrics import sample_surface
@@ -56,8 +56,3 @@ def test_normals_move_with_the_points_and_their_order():
     assert (np.einsum("ij,ij->i", moved, normals @ TURN.T) > 0.99).mean() > 0.97
     order = np.random.default_rng(0).permutation(len(normals))
     np.testing.assert_allclose(estimate_normals(samples.points[order]), normals[order], atol=1e-9)
-
-
-def test_spacing_is_the_median_distance_of_nearest_points():
-    grid = np.stack(np.meshgrid(np.arange(5), np.arange(4), [0.0]), axis=-1).reshape(-1, 3) * 0.25
-    assert point_spacing(grid) == pytest.approx(0.25)

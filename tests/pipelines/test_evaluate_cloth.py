@@ -14,7 +14,7 @@ from avatar.evaluation.evaluate import evaluate_models
 from avatar.evaluation.protocol import AsNew
 from pipelines.runs.layout import GARMENTS, MODEL_FILES, REFINED_HELD_OUT_PARAMS
 from pipelines.runs.stage import read_manifest
-from pipelines.stages.evaluate import load_model
+from pipelines.stages.evaluate_inputs import load_model
 from smplxpp.body import load_params
 from smplxpp.capture import open_capture
 from smplxpp.cloth.garment_file import load_garments, save_garments

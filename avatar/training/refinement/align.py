@@ -150,7 +150,7 @@ class Alignment:
             stop: whether to end after a pass.
 
         Raises:
-            RefinementStoppedError: `stop` said so before the last pass.
+            RefinementStoppedError: `stop` returned True before the last pass.
         """
         passes = sum(level.steps + 1 for level in levels)
         done, carried = self._restore(file) if file is not None and file.is_file() else (0, None)

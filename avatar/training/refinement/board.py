@@ -1,6 +1,6 @@
 """Share the work of a refinement among any number of processes that see one folder.
 
-A pass over the frames is a sum over chunks of frames. Whoever is free computes a chunk that nobody has begun and writes
+A pass over the frames is a sum over chunks of frames. Whoever is free computes a chunk that is not begun and writes
 its sums; when all are there, every process adds them in one order and takes the same step, to the same bits. No process
 leads: one that is killed loses the chunk that it was at, and one that comes later continues where the others are.
 """
@@ -54,7 +54,7 @@ class Board:
             compute: returns the arrays of a chunk; calls nothing that waits for others.
 
         Raises:
-            RefinementStoppedError: `stop` said so; what is computed stays.
+            RefinementStoppedError: `stop` returned True; what is computed stays.
             OvertakenError: the pass is over.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -114,7 +114,7 @@ class Board:
         """Begin a chunk unless another process has begun it; one that is silent for ten minutes counts as lost."""
         lost_after = 600.0  # seconds
         claim = file.with_suffix(".claim")
-        with suppress(FileNotFoundError):  # nobody has begun it, or it is over
+        with suppress(FileNotFoundError):  # not begun, or over
             if age_of(claim) > lost_after or _is_dead(_who_of(claim)):
                 claim.unlink()
         if not self.first(claim.name):

@@ -85,7 +85,7 @@ def refine_poses(
 
     Raises:
         InputError: frames that are not training frames, or a frame without parameters or photographs.
-        RefinementStoppedError: `stop` said so; the same call continues.
+        RefinementStoppedError: `stop` returned True; the same call continues.
     """
     config = config or RefineConfig()
     chosen = tuple(sorted(sequence.train_frames if frames is None else frames))

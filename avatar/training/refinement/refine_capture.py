@@ -76,7 +76,7 @@ def refine_capture(
 
     Raises:
         InputError: a frame without parameters or photographs.
-        RefinementStoppedError: `stop` said so; the same call continues.
+        RefinementStoppedError: `stop` returned True; the same call continues.
     """
     sequence = AvatarSequence(scene.capture, scene.template, SequenceConfig(normals=False))
     if work is not None:

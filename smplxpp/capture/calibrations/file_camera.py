@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -151,8 +150,3 @@ def entry(mapping: Any, key: str, *, source: str) -> Any:
 def scaled_intrinsics(K: Float64[np.ndarray, "3 3"], factors: tuple[float, float]) -> Float64[np.ndarray, "3 3"]:
     """Return the intrinsics of a resized image, pixel centres at +0.5 in both."""
     return np.diag([factors[0], factors[1], 1.0]) @ K
-
-
-def camera_name_of(path: Path) -> str:
-    """Return the name of a camera whose file has no name of its own: that of the file."""
-    return path.stem
