@@ -19,7 +19,7 @@ from smplxpp.assemble import (
     part_legs,
 )
 from smplxpp.assemble.build import AssemblyConfig, CanonicalPart, assemble_template
-from smplxpp.assemble.drape import drape_patches
+from smplxpp.assemble.patch import drape_patches
 from smplxpp.body import BodyModel
 from smplxpp.build.completeness import photograph_views
 from smplxpp.build.config import BuildConfig, BuildInputs

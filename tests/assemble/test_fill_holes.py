@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from smplxpp.assemble import CanonicalPart, FillHolesConfig, cut_holes, cut_slits, fill_holes, part_legs
-from smplxpp.assemble.drape import drape_patches
+from smplxpp.assemble.patch import drape_patches
 from smplxpp.core import UPPER, InputError, SkinWeights, TriangleMesh
 from smplxpp.core.topology import border_loops, edge_groups
 
