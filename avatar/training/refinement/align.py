@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import threading
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
-from avatar.data.views import View
 from avatar.gaussians.binding import BoundGaussians
-from avatar.training.refinement.board import Arrays, Board, OvertakenError, RefinementStoppedError
+from avatar.training.refinement.board import Arrays, Board, OvertakenError, RefinementStoppedError, in_threads
 from avatar.training.refinement.config import Level, RefineConfig
-from avatar.training.refinement.nuisance import AppearanceUpdate, CameraCorrections
+from avatar.training.refinement.nuisance import AppearanceUpdate, CameraCorrections, Photographs, Views
 from avatar.training.refinement.photometric import Linearization, PhotometricLoss
 from avatar.training.refinement.posing import PosedTemplate
 from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_prior
@@ -26,10 +23,6 @@ from avatar.training.refinement.variables import CentreJacobian, Variables
 from smplxpp.core.files.array_file import read_arrays, write_arrays
 from smplxpp.core.spread import split_frames
 from smplxpp.register import BodyState
-
-Views = Callable[[int], Sequence[View]]
-"""Returns the photographs of a frame at full size."""
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -126,9 +119,8 @@ class Alignment:
         self.history: list[PassReport] = []
         body = scene.posed.body
         self.variables = Variables.of_body(body.joint_count, body.num_expressions, scene.config)
+        self._photographs = Photographs(lambda row: views(frames[row]), scene.cameras)
         # Groups of the depths: one a label.
-        self._views, self._cached, self._bytes = views, dict[tuple[int, int], list[View]](), 0
-        self._reading = threading.Lock()
         labels = scene.posed.template.vertex_labels[scene.posed.template.faces[:, 0]]
         self._groups = torch.tensor(labels, dtype=torch.int64)[gaussians.face_index]
         self._jacobian = CentreJacobian(scene.posed, gaussians, self.variables)
@@ -188,10 +180,12 @@ class Alignment:
 
         def loss(row: int) -> float:
             vertices = self.scene.posed.place(state, row).vertices.detach()
-            return self.scene.photometric.rigid_loss(self.gaussians, vertices, rigid, self._photographs(row, halvings))
+            return self.scene.photometric.rigid_loss(
+                self.gaussians, vertices, rigid, self._photographs.of(row, halvings)
+            )
 
         def compute(rows: Sequence[int]) -> dict[str, np.ndarray]:
-            return {"loss": np.array(list(self._of_frames(loss, rows, on_frame)))}
+            return {"loss": np.array(list(in_threads(loss, rows, self._counted(on_frame))))}
 
         return np.concatenate([part["loss"] for part in self._gather(f"{self._name}_{name}", compute, on_frame)])
 
@@ -237,7 +231,8 @@ class Alignment:
         if cameras is not None:
             cameras.clear()
         losses, gradients, curvatures = [], [], []
-        for linear, gradient, curvature in self._of_frames(lambda row: self._linearize(row, halvings), rows, on_frame):
+        count = self._counted(on_frame)
+        for linear, gradient, curvature in in_threads(lambda row: self._linearize(row, halvings), rows, count):
             appearance.add(linear)
             if cameras is not None:
                 cameras.add(linear, self._jacobian.rigidity)
@@ -265,6 +260,16 @@ class Alignment:
                 on_frame()
         return found
 
+    def _counted(self, on_frame: Callable[[], None]) -> Callable[[], None]:
+        """Return what is called after each frame: its chunk's claim on the board is renewed, too."""
+
+        def after() -> None:
+            on_frame()
+            if self._board is not None:
+                self._board.touch()
+
+        return after
+
     def _keep(self, file: Path, number: int, carried: _Carried) -> None:
         """Save the state after a pass, by one of the processes that share it."""
         name = f"{self._name}_{number:02d}"
@@ -273,29 +278,6 @@ class Alignment:
         elif self._board.first(f"{name}.saved"):
             self._save(file, number, carried)
             self._board.end(name)
-
-    def _of_frames(self, work: Callable[[int], _T], rows: Sequence[int], on_frame: Callable[[], None]) -> Iterator[_T]:
-        """Yield what `work` returns for each row, in order; as many frames at a time as torch has threads.
-
-        Pictures of a few hundred pixels keep several threads waiting for each other, so that each frame has one thread.
-        """
-        threads = torch.get_num_threads()
-        results: Iterator[_T] = map(work, rows)
-        pool = None
-        if min(threads, len(rows)) > 1:
-            pool = ThreadPoolExecutor(threads, "frame", initializer=torch.set_num_threads, initargs=(1,))
-            results = pool.map(work, rows)
-        try:
-            for result in results:
-                on_frame()
-                if self._board is not None:
-                    self._board.touch()
-                yield result
-        finally:
-            if pool is not None:
-                pool.shutdown(cancel_futures=True)
-                # A thread sets its own number, and that of threads that start later.
-                torch.set_num_threads(threads)
 
     def _save(self, file: Path, number: int, carried: _Carried) -> None:
         """Write everything that the passes after this number depend on, whole or not at all."""
@@ -339,31 +321,13 @@ class Alignment:
         linear = self.scene.photometric.linearize(
             self.gaussians,
             placed.vertices,
-            self._photographs(row, halvings),
+            self._photographs.of(row, halvings),
             halvings=halvings,
             each_camera=cameras is not None,
         )
         # The chain rule takes the gradient of the vertices to the steps; the Gauss-Newton matrix is J^T M J.
         gradient = self.variables.packed(*posed.gradient(placed, linear.vertex_gradient))
         return linear, gradient, self._jacobian.curvature(placed, linear)
-
-    def _photographs(self, row: int, halvings: int) -> list[View]:
-        """Return the views of a frame at a level's size, with the current corrections of the cameras."""
-        cached_bytes = 1 << 30  # bound of the cached photographs
-        key = (row, halvings)
-        with self._reading:
-            views = self._cached.get(key, [])
-            if key not in self._cached:
-                # Halved photographs are kept until the bound, then all are dropped: passes read the frames in one
-                # order, so that dropping the oldest alone would save nothing.
-                views = list(halved(self._views(self.frames[row]), halvings))
-                self._bytes += sum(view.foreground.numel() + view.alpha.numel() for view in views)
-                if self._bytes > cached_bytes:
-                    self._cached, self._bytes = {}, 0
-                self._cached[key] = views
-        # Corrections change after each pass, so the cache holds views without them.
-        corrections = self.scene.cameras
-        return views if corrections is None else [corrections.corrected(view) for view in views]
 
     def _stepped(self, normal: Normal, damping: Float64[np.ndarray, " F"]) -> BodyState:
         """Return the state after one Levenberg-Marquardt step of all frames."""
@@ -372,13 +336,6 @@ class Alignment:
         smooth = smoothness(self.variables, self.state, self.frames, self.scene.config, self.scene.fps)
         with_start = with_prior(normal, change, self.variables.sigma)
         return self.variables.stepped(self.state, solve(with_start, smooth, damping))
-
-
-def halved(views: Sequence[View], times: int) -> Sequence[View]:
-    """Return views at half their size, `times` times over."""
-    for _ in range(times):
-        views = [view.halved() for view in views]
-    return views
 
 
 def _mixed(old: BodyState, new: BodyState, keep: Bool[np.ndarray, " F"]) -> BodyState:

@@ -10,12 +10,15 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+import torch
 
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.array_file import read_arrays, write_arrays
@@ -23,6 +26,7 @@ from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.paths import age_of, process_runs, read_bytes
 
 Arrays = Mapping[str, np.ndarray]
+_T = TypeVar("_T")
 
 
 class RefinementStoppedError(RuntimeError):
@@ -134,3 +138,30 @@ def _is_dead(who: str) -> bool:
     """Return whether a claim is of a process of this machine that has ended."""
     node, _, process = who.rpartition(" ")
     return node == platform.node() and process.isdigit() and not process_runs(int(process))
+
+
+def in_threads(work: Callable[[int], _T], rows: Sequence[int], after: Callable[[], None]) -> Iterator[_T]:
+    """Yield what `work` returns for each frame, in order; as many frames at a time as torch has threads.
+
+    Pictures of a few hundred pixels keep several threads waiting for each other, so that each frame has one thread.
+
+    Args:
+        work: takes the row of a frame.
+        rows: of the frames.
+        after: called after each frame.
+    """
+    threads = torch.get_num_threads()
+    results: Iterator[_T] = map(work, rows)
+    pool = None
+    if min(threads, len(rows)) > 1:
+        pool = ThreadPoolExecutor(threads, "frame", initializer=torch.set_num_threads, initargs=(1,))
+        results = pool.map(work, rows)
+    try:
+        for result in results:
+            after()
+            yield result
+    finally:
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+            # A thread sets its own number, and that of threads that start later.
+            torch.set_num_threads(threads)

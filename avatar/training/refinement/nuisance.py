@@ -1,11 +1,13 @@
 """Nuisance variables: colours and depths of the Gaussians, and small corrections of the training cameras' poses.
 
-Each is summed over all views of a pass and takes one Gauss-Newton step of its own: block coordinate descent.
+Photographs are handed out with these corrections. Each variable is summed over all views of a pass and takes one
+Gauss-Newton step of its own: block coordinate descent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +20,9 @@ from avatar.gaussians.binding import BoundGaussians
 from avatar.training.refinement.config import RefineConfig
 from avatar.training.refinement.photometric import Linearization
 from smplxpp.core.rotations import matrix_from_rotvec
+
+Views = Callable[[int], Sequence[View]]
+"""Returns the photographs of a frame at full size."""
 
 
 class AppearanceUpdate:
@@ -167,3 +172,36 @@ class CameraCorrections:
     def poses(self, cam_from_world: Mapping[str, Float64[np.ndarray, "4 4"]]) -> dict[str, Float64[np.ndarray, "4 4"]]:
         """Return the corrected `cam_from_world` of all cameras by name."""
         return {name: cam_from_world[name] @ self.matrix(name) for name in self.names}
+
+
+class Photographs:
+    """Photographs of frames at the sizes of the levels, with the current corrections of the cameras.
+
+    Args:
+        views: returns those of a frame at full size.
+        corrections: of the cameras; None: they are taken as exact.
+        most: bytes of photographs that are kept.
+    """
+
+    def __init__(self, views: Views, corrections: CameraCorrections | None, *, most: int = 1 << 30) -> None:
+        self._views, self._corrections, self._most = views, corrections, most
+        self._kept, self._bytes = dict[tuple[int, int], list[View]](), 0
+        self._reading = threading.Lock()
+
+    def of(self, frame: int, halvings: int) -> list[View]:
+        """Return the views of a frame, halved so often."""
+        key = frame, halvings
+        with self._reading:
+            views = self._kept.get(key, [])
+            if key not in self._kept:
+                views = list(self._views(frame))
+                for _ in range(halvings):
+                    views = [view.halved() for view in views]
+                # Kept until the bound, then all are dropped: passes read the frames in one order, so that dropping
+                # the oldest alone would save nothing.
+                self._bytes += sum(view.foreground.numel() + view.alpha.numel() for view in views)
+                if self._bytes > self._most:
+                    self._kept, self._bytes = {}, 0
+                self._kept[key] = views
+        # Corrections change after each pass, so that what is kept has none.
+        return views if self._corrections is None else [self._corrections.corrected(view) for view in views]
