@@ -2,10 +2,12 @@
 
 The stages of a training take of one core a constant, and rates of the work that they do:
 
-    seconds = start + looks (a + b megapixels + c Gaussians) + poses x (rig and networks of the preset)
+    seconds = start + vertices x opening + looks (a + b megapixels + c Gaussians) + poses x (rig and networks)
 
 A look draws a view of one pose, compares it and differentiates; one without derivatives counts as `drawn` of it. The
-work follows from the preset and from frames, cameras and pixels of a capture; rates are of a single core.
+work follows from the preset, from frames, cameras and pixels of a capture, and from the template's vertices and loose
+parts. Which of these a simulation has to move is known when the surface has been followed: till then the search for
+clothes takes a range. Rates are of a single core.
 """
 
 from __future__ import annotations
@@ -17,11 +19,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.batch.jobs import is_address
+from pipelines.runs.layout import TEMPLATE
 from smplxpp.capture import open_capture
 from smplxpp.capture.declared import has_estimated_params
 from smplxpp.capture.reference import find_scans
 from smplxpp.core import spread
 from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.template.template import Template
 
 if TYPE_CHECKING:
     from avatar.training.recipe import Recipe
@@ -41,6 +45,8 @@ class Facts:
         held_out_frames: frames that are measured.
         scan_mb: of the reference frame's scan; 0 where there is none.
         tracked: whether its parameters are estimates, which a training refines.
+        vertices: of the template; those of a usual one before it is built.
+        loose: parts of the template that may hang freely; those of a usual one before it is built.
     """
 
     frames: int
@@ -51,6 +57,8 @@ class Facts:
     held_out_frames: int = 0
     scan_mb: float = 0.0
     tracked: bool = False
+    vertices: int = 20_000
+    loose: int = 2
 
     @property
     def images(self) -> int:
@@ -64,17 +72,24 @@ class TrainingRates:
 
     Attributes:
         start_s: of each stage: opening, what it takes over, its files and figures.
+        start_s_kv: the same, a thousand vertices of the template.
         look_s: a look, beside its pixels and Gaussians.
         look_s_mp: a megapixel of the whole image, of which a person fills a part.
         look_s_kg: a thousand Gaussians.
         drawn: share of a look that drawing alone takes.
         pose_s: networks and rig of a pose in a step, by stage; of the field a thousand control points.
-        frame_s: of a frame beside its looks: following it, finding clothes in it, relating its pose to the surface.
+        frame_s: of a frame beside its looks: following it, relating its pose to the surface, and of each loose part.
+        simulated_s: of a frame of clothes whose simulation is fitted to it, ten times over.
     """
 
     start_s: Mapping[str, float] = field(
         default_factory=lambda: {
-            **{"refine": 3.0, "fit": 2.3, "teacher": 6.8, "cloth": 11.2, "bake": 3.8, "compensate": 6.8}
+            **{"refine": 1.0, "fit": 0.5, "teacher": 3.0, "cloth": 1.2, "bake": 1.0, "compensate": 2.0}
+        }
+    )
+    start_s_kv: Mapping[str, float] = field(
+        default_factory=lambda: {
+            **{"refine": 0.07, "fit": 0.06, "teacher": 0.13, "cloth": 0.05, "bake": 0.1, "compensate": 0.16}
         }
     )
     look_s: float = 0.001
@@ -87,20 +102,26 @@ class TrainingRates:
         }
     )
     frame_s: Mapping[str, float] = field(
-        default_factory=lambda: {"teacher": 0.15, "cloth": 0.15, "bake": 0.08, "compensate": 0.05}
+        default_factory=lambda: {"teacher": 0.15, "cloth": 0.05, "bake": 0.08, "compensate": 0.05}
     )
+    simulated_s: float = 0.5
 
 
 @dataclass
 class Work:
-    """Looks of a stage, the images that they read, and their megapixels; what the rest of it takes, seconds."""
+    """Looks of a stage, the images that they read, and their megapixels; what the rest of it takes, seconds.
+
+    `unsure` seconds more or fewer are taken by what only the stage itself finds out.
+    """
 
     stage: str
+    vertices: int
     gaussians: int = 0
     looks: float = 0.0
     reads: float = 0.0
     megapixels: float = 0.0
     seconds: float = 0.0
+    unsure: float = 0.0
 
     def look(self, count: float, megapixels: float, halvings: int = 0, *, reads: float | None = None) -> None:
         """Add looks at photographs that are halved; each reads its image, unless `reads` of them are kept."""
@@ -111,7 +132,8 @@ class Work:
     def takes(self, rates: TrainingRates) -> float:
         """Return the seconds of one core."""
         each = rates.look_s + rates.look_s_kg * 1e-3 * self.gaussians
-        return rates.start_s[self.stage] + self.looks * each + self.megapixels * rates.look_s_mp + self.seconds
+        start = rates.start_s[self.stage] + rates.start_s_kv[self.stage] * 1e-3 * self.vertices
+        return start + self.looks * each + self.megapixels * rates.look_s_mp + self.seconds
 
 
 def recipe_of(options: Mapping[str, Any], *, tracked: bool = True) -> Recipe:
@@ -136,6 +158,7 @@ def recipe_of(options: Mapping[str, Any], *, tracked: bool = True) -> Recipe:
         batch=_number(options.get("batch")),
         gaussians=_number(options.get("gaussians")),
         refine_frames=int(options.get("refine_frames", 200)),
+        loose_parts=tuple(options.get("loose_parts") or ()),
         teacher=not options.get("no_teacher", False),
         perceptual="none",
     )
@@ -162,14 +185,14 @@ def training_works(recipe: Recipe, facts: Facts, rates: TrainingRates) -> dict[s
     if recipe.refine is not None:
         works["refine"] = _refinement(recipe.refine, facts)
     measured = min(2, facts.frames) * max(facts.held_out_cameras, 1) + 2.0 * min(2, facts.held_out_frames)
-    fit = Work("fit", count)
+    fit = Work("fit", facts.vertices, count)
     fit.look(preset.fit.iterations, size)
     fit.look(rates.drawn * preset.fit.evaluations * max(facts.held_out_cameras, 1), size)
     works["fit"] = fit
     for step in ("teacher", "bake", "compensate"):
         if step == "teacher" and not recipe.teacher:
             continue
-        config, work = getattr(preset, step), Work(step, count)
+        config, work = getattr(preset, step), Work(step, facts.vertices, count)
         poses = config.iterations * config.poses_per_step
         work.look(poses * config.views, size)
         work.look(rates.drawn * config.evaluations * measured, size)
@@ -192,13 +215,26 @@ def training_works(recipe: Recipe, facts: Facts, rates: TrainingRates) -> dict[s
         for step in ("teacher", "bake", "compensate"):
             works[step].seconds += rates.frame_s[step] * frames
         if recipe.cloth is not None:
-            works["cloth"] = Work("cloth", seconds=rates.frame_s["cloth"] * frames)
+            works["cloth"] = _search_for_clothes(recipe.cloth.parts, facts, rates, frames)
     return works
+
+
+def _search_for_clothes(named: tuple[str, ...] | None, facts: Facts, rates: TrainingRates, frames: int) -> Work:
+    """Return what clothes take: each loose part is compared with skinning, and simulated where it departs from it."""
+    parts = facts.loose if named is None else len(named)
+    work = Work("cloth", facts.vertices, seconds=rates.frame_s["cloth"] * frames * parts)
+    simulated = rates.simulated_s * frames
+    if named is not None:
+        work.seconds += simulated * parts
+    elif parts:
+        # None of them, or one: trousers and a shirt do not depart, a skirt does.
+        work.seconds, work.unsure = work.seconds + simulated / 2.0, simulated / 2.0
+    return work
 
 
 def _refinement(config: RefineConfig, facts: Facts) -> Work:
     """Return the looks of a refinement: passes over all frames, then start and result drawn once more."""
-    work, cameras = Work("refine", config.sampling.count), facts.cameras - facts.held_out_cameras
+    work, cameras = Work("refine", facts.vertices, config.sampling.count), facts.cameras - facts.held_out_cameras
     for level in config.levels:
         work.look(facts.frames * cameras * (level.steps + 1), facts.megapixels, level.halvings)
     work.look(0.8 * facts.frames * cameras, facts.megapixels, config.levels[-1].halvings)
@@ -207,13 +243,16 @@ def _refinement(config: RefineConfig, facts: Facts) -> Work:
     return work
 
 
-def facts_of(place: str | Path, *, protocol: str | None = None, params: Path | None = None) -> Facts | None:
+def facts_of(
+    place: str | Path, *, protocol: str | None = None, params: Path | None = None, run: Path | None = None
+) -> Facts | None:
     """Return what a capture's files say about its cost; None where it is elsewhere, or cannot be opened.
 
     Args:
         place: its folder, or an address.
         protocol: of the capture.
         params: parameters to read in the place of its own.
+        run: folder of a run, whose template counts where there is one.
     """
     if is_address(str(place)) or not Path(place).is_dir():
         return None
@@ -227,7 +266,7 @@ def facts_of(place: str | Path, *, protocol: str | None = None, params: Path | N
     views = [(name, frame) for name in capture.cameras for frame in frames][:64]
     files = [capture.file(*view, kind) for view in views for kind in ("image", "mask")]
     sizes = [file.stat().st_size for file in files if file is not None]
-    return Facts(
+    facts = Facts(
         frames=len(capture.frames),
         cameras=len(cameras),
         megapixels=sum(camera.width * camera.height for camera in cameras) / max(len(cameras), 1) / 1e6,
@@ -237,6 +276,10 @@ def facts_of(place: str | Path, *, protocol: str | None = None, params: Path | N
         scan_mb=scan_mb(place),
         tracked=has_estimated_params(capture),
     )
+    if run is None or not (run / TEMPLATE).is_file():
+        return facts
+    template = Template.load(run / TEMPLATE)
+    return replace(facts, vertices=len(template.vertices), loose=len(template.loose_parts))
 
 
 def scan_mb(capture: str | Path) -> float:

@@ -172,8 +172,11 @@ class SlurmExecutor:
             time.sleep(min(seconds, 0.25))
         out: list[tuple[Task, Outcome]] = []
         for task, job in [pair for pair in self._running if pair[1].job_id in done]:
-            outcome = done[job.job_id] or job.exception()
-            out.append((task, job.result() if outcome is None else outcome))
+            error = done[job.job_id] or job.exception()
+            # Of an error on the node the last line of its trace says what it was.
+            words = "" if error is None else (str(error).split("-" * 22)[-2:-1] or [str(error)])[0].strip()
+            lost = RuntimeError(f"{words.splitlines()[-1]}; see {job.paths.stderr}") if words else error
+            out.append((task, job.result() if error is None else lost))
         self._running = [pair for pair in self._running if pair[1].job_id not in done]
         return out
 
@@ -215,7 +218,7 @@ class SlurmExecutor:
         for _, job in self._running:
             if job.job_id in absent & self._absent:
                 words = f"job {job.job_id} left Slurm's queue without an answer: cancelled, or its machine lost"
-                done[job.job_id] = RuntimeError(f"{words}; its output is in {job.paths.stderr}")
+                done[job.job_id] = RuntimeError(words)
         self._absent = absent
         return done
 

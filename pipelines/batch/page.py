@@ -181,6 +181,7 @@ def cost_table(costs: Mapping[str, Cost], head: str) -> Table:
     for name in ("core hours", "GPU hours", "GB read", "GB kept", "files"):
         table.add_column(name, justify="right")
     for step, cost in [*costs.items(), ("sum", sum(costs.values(), Cost()))]:
-        numbers = (cost.core_hours, cost.gpu_hours, cost.read_gb, cost.written_gb)
-        table.add_row(step, *(f"{number:,.3f}" for number in numbers), f"{cost.files:,.0f}")
+        hours, *numbers = (f"{n:,.3f}" for n in (cost.core_hours, cost.gpu_hours, cost.read_gb, cost.written_gb))
+        hours += f" ± {cost.unsure_hours:,.3f}" if cost.unsure_hours else ""
+        table.add_row(step, hours, *numbers, f"{cost.files:,.0f}")
     return table

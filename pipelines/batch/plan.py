@@ -9,62 +9,20 @@ of the user's own rates replaces them, and the records of subjects that are done
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pipelines.batch.amounts import Facts, TrainingRates, Work, facts_of, recipe_of, training_works
+from pipelines.batch.amounts import Facts, Work, facts_of, recipe_of, training_works
 from pipelines.batch.jobs import Job
-from smplxpp.core.errors import InputError, require_known
-from smplxpp.core.files.json_file import as_list, as_number, as_object, read_json
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Rates of the steps: seconds of one core, hours of one GPU, bytes.
-
-    Attributes:
-        convert_s_mp: decoding, undistortion and writing, a megapixel written of photographs four times as large
-            (capture_loader.json: 2.2 images of 3 megapixels a second).
-        convert_mb_mp: least and most of a JPEG of quality 95 and its mask, MB a megapixel: a person on black, a room.
-        check_s: `capture check`, an image and a megapixel of it, of at most `check_images` images.
-        check_images: images that a check opens by default.
-        start_s: a command's imports and first files.
-        build_s: a template, and a MB of its scan: of PLY, a fifth for text.
-        register_s: registration by keypoints, masks, labels and scans, a frame and camera (registration_*.json).
-        reconstruct_s_mp: surface of a frame, a megapixel of all its cameras (reconstruction_*.json: 6 to 11).
-        training: rates of the stages of a training on a CPU.
-        train_gpu_hours: training on one H200 by preset (gpu*.json); `gpu` and `paper` are their iterations over steps
-            that were timed of `paper` and of an earlier `gpu`; neither was run to its end.
-        evaluate_s_mp: rendering and comparison, a megapixel of a measured image and model, on a core.
-        evaluate_gpu_s: the same on a GPU, an image and model.
-        models: models that are measured.
-        export_s: bundle and page.
-        run_mb: MB of a run without its surfaces: template, models, pictures, reports.
-        scan_mb: of a reconstructed surface.
-        factors: by step, what measured costs of a site are of those foretold.
-    """
-
-    convert_s_mp: float = 0.154
-    convert_mb_mp: tuple[float, float] = (0.12, 0.35)
-    check_s: tuple[float, float] = (0.014, 0.014)
-    check_images: int = 2000
-    start_s: float = 2.0
-    build_s: tuple[float, float] = (12.0, 9.4)
-    register_s: float = 0.12
-    reconstruct_s_mp: float = 8.0
-    training: TrainingRates = field(default_factory=TrainingRates)
-    train_gpu_hours: Mapping[str, float] = field(
-        default_factory=lambda: {"demo": 0.03, "cpu": 0.07, "paper-small": 0.1, "gpu": 4.0, "paper": 94.0}
-    )
-    evaluate_s_mp: float = 1.5
-    evaluate_gpu_s: float = 0.1
-    models: int = 3
-    export_s: float = 0.5
-    run_mb: float = 150.0
-    scan_mb: float = 8.0
-    factors: Mapping[str, float] = field(default_factory=dict)
+from pipelines.batch.rates import Rates, Site
+from pipelines.batch.records import RUN_FOLDER, read_batch, read_job
+from pipelines.runs.folders import read_record
+from pipelines.runs.layout import MODEL_STAGES, REFINE_STAGE
+from pipelines.runs.stage import MANIFEST
+from smplxpp.core.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -78,6 +36,8 @@ class Cost:
         written_gb: written there, and kept.
         files: opened or made there.
         made: files made there, and kept.
+        unsure_hours: core hours, or of a GPU where it has one, that it may take more or fewer: what only the work
+            itself finds out.
     """
 
     core_hours: float = 0.0
@@ -86,6 +46,7 @@ class Cost:
     written_gb: float = 0.0
     files: float = 0.0
     made: float = 0.0
+    unsure_hours: float = 0.0
 
     def __add__(self, other: Cost) -> Cost:
         return Cost(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(Cost)))
@@ -93,27 +54,6 @@ class Cost:
     def times(self, share: float) -> Cost:
         """Return the cost times a number."""
         return Cost(*(getattr(self, one.name) * share for one in fields(Cost)))
-
-
-@dataclass(frozen=True)
-class Site:
-    """What a cluster has for the batch.
-
-    Attributes:
-        cores: that run at the same time.
-        gpus: likewise.
-        disk_tb: free on the shared disk.
-        disk_mb_s: read or written by all machines together.
-        files_s: opened or made by all machines together; a metadata server of NFS does some thousands.
-        files: inodes that are free.
-    """
-
-    cores: int = 2
-    gpus: int = 0
-    disk_tb: float = 1.0
-    disk_mb_s: float = 500.0
-    files_s: float = 2000.0
-    files: float = 1e9
 
 
 def cost_of(
@@ -190,6 +130,7 @@ def training_costs(facts: Facts, rates: Rates, options: Mapping[str, Any], *, gp
         MissingExtraError: torch is not installed.
     """
     name, tracked = str(options.get("preset", "cpu")), facts.tracked or options.get("refine_poses") == "on"
+    factor = rates.factors.get("train", 1.0)
 
     def seconds_of(chosen: Mapping[str, Any]) -> tuple[dict[str, Work], dict[str, float]]:
         works = training_works(recipe_of(chosen, tracked=tracked), facts, rates.training)
@@ -200,30 +141,34 @@ def training_costs(facts: Facts, rates: Rates, options: Mapping[str, Any], *, gp
     if gpu and name not in rates.train_gpu_hours:
         known = ", ".join(rates.train_gpu_hours)
         raise InputError(f"preset {name}", expected=f"one with a rate on a GPU: {known}", received=name)
-    image_mb, factor, out = facts.megapixels * rates.convert_mb_mp[1], rates.factors.get("train", 1.0), {}
+    image_mb, out = facts.megapixels * rates.convert_mb_mp[1], {}
     for step, work in works.items():
         # A GPU's training keeps a core busy with reading. Each look reads an image and its mask.
-        hours = seconds[step] / 3600.0
-        hours = rates.train_gpu_hours[name] * seconds[step] / whole if gpu else hours
+        scale = (rates.train_gpu_hours[name] / whole if gpu else 1.0 / 3600.0) * rates.factors.get(step, factor)
+        hours, unsure = scale * seconds[step], scale * work.unsure
         kept = 1e-3 * rates.run_mb / 2.0 / len(works)
-        cost = Cost(factor * hours, factor * hours * gpu, 1e-3 * image_mb * work.reads, kept, 2.0 * work.reads, 3.0)
-        out[step] = cost
+        out[step] = Cost(hours, hours * gpu, 1e-3 * image_mb * work.reads, kept, 2.0 * work.reads, 3.0, unsure)
     return out
 
 
-def plan_jobs(jobs: Sequence[Job], rates: Rates, site: Site) -> tuple[dict[str, Cost], list[str]]:
+def plan_jobs(
+    jobs: Sequence[Job], rates: Rates, site: Site, *, runs: Path | None = None
+) -> tuple[dict[str, Cost], list[str]]:
     """Return what each step costs over all jobs, and the subjects whose captures cannot be looked at from here.
 
     Args:
         jobs: of a batch.
         rates: of the site.
         site: whether it has GPUs decides what trains.
+        runs: RUNS, whose templates count where they are built.
     """
     costs: dict[str, Cost] = {}
-    unknown = []
+    unknown: list[str] = []
     for job in jobs:
         train = job.options.get("train", {})
-        facts = facts_of(job.capture, protocol=train.get("protocol")) if job.capture else Facts(1, 0, 0.0, 0.0, 0)
+        run = None if runs is None else runs / job.subject / RUN_FOLDER
+        place, protocol = job.capture, train.get("protocol")
+        facts = facts_of(place, protocol=protocol, run=run) if place else Facts(1, 0, 0.0, 0.0, 0)
         if facts is None:
             unknown.append(job.subject)
             continue
@@ -275,56 +220,68 @@ def breaks_first(costs: Mapping[str, Cost], site: Site) -> str:
     return f"{what}: busy for {busy[what]:,.1f} hours, most of all with {step}"
 
 
-def read_rates(path: Path | None) -> tuple[Rates, Site]:
-    """Read a JSON file with entries of `Rates` and, under "site", of `Site`; the defaults for None.
+@dataclass(frozen=True)
+class Spent:
+    """What a step, or a stage of a training, was foretold to take and has taken of one subject.
 
-    Raises:
-        InputError: a name that is none of theirs, or a value of another kind.
+    Attributes:
+        subject: its name.
+        what: name of the step or the stage.
+        foretold: seconds of a core, or of a GPU where it had one.
+        unsure: seconds more or fewer that were foretold.
+        measured: seconds that it took.
     """
-    if path is None:
-        return Rates(), Site()
-    content = as_object(read_json(path, subject="rates"), subject=f"rates {path}")
-    site = as_object(content.pop("site", {}), subject=f"rates {path}: site")
-    for given, cls in ((content, Rates), (site, Site)):
-        require_known(f"rates {path}", given, [one.name for one in fields(cls)])
-    for name, value in {**content, **site}.items():
-        for one in _leaves(value):
-            as_number(one, subject=f"rates {path}: {name}", least=0.0)
-    for name in {"convert_mb_mp", "check_s", "build_s"} & content.keys():
-        first, second = as_list(content[name], subject=f"rates {path}: {name}")
-        content[name] = (first, second)
-    # What a file does not name keeps its rate.
-    if "train_gpu_hours" in content:
-        content["train_gpu_hours"] = {**Rates().train_gpu_hours, **content["train_gpu_hours"]}
-    if "training" in content:
-        own, given = TrainingRates(), as_object(content["training"], subject=f"rates {path}: training")
-        require_known(f"rates {path}: training", given, [one.name for one in fields(TrainingRates)])
-        merged: dict[str, Any] = dict(given)
-        for name, usual in ((name, getattr(own, name)) for name in given):
-            if isinstance(usual, dict):
-                merged[name] = {**usual, **as_object(given[name], subject=f"rates {path}: training: {name}")}
-            else:
-                merged[name] = as_number(given[name], subject=f"rates {path}: training: {name}", least=0.0)
-        content["training"] = replace(own, **merged)
-    return Rates(**content), Site(**site)
+
+    subject: str
+    what: str
+    foretold: float
+    unsure: float
+    measured: float
 
 
-def _leaves(value: Any) -> list[Any]:
-    """Return the values in nested lists and objects."""
-    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
-    return [value] if inside is None else [leaf for one in inside for leaf in _leaves(one)]
+def spent_in(runs: Path, rates: Rates) -> list[Spent]:
+    """Return what the finished steps of a batch took, trainings by the stages whose manifests say so.
+
+    Steps that needed more than one attempt, and stages that were continued, say too little and are left out.
+    """
+    out: list[Spent] = []
+    stages = {stage.partition("_")[2]: stage for stage in (REFINE_STAGE, *MODEL_STAGES)}
+    for job in read_batch(runs).jobs:
+        record, folder = read_job(runs, job["subject"]), runs / job["subject"] / RUN_FOLDER
+        facts = facts_of(job["capture"], run=folder) if record and job["capture"] else None
+        if record is None or facts is None:
+            continue
+        for step in [step for step in record.steps if step.state == "done" and step.attempts == 1]:
+            words = dict(zip(step.command, [*step.command[1:], ""], strict=True))
+            options = {word[2:].replace("-", "_"): value for word, value in words.items() if word.startswith("--")}
+            gpu, clock = bool(step.gpu), step.seconds if step.gpu else step.cpu_seconds
+            try:
+                rows = {step.step: (cost_of(step.step, facts, rates, options=options, gpu=gpu), clock)}
+                costs = training_costs(facts, rates, options, gpu=gpu) if step.step in ("refine", "train") else {}
+            except InputError:  # options of another version
+                continue
+            for name, cost in costs.items():
+                with suppress(InputError, KeyError):  # a stage that was not asked for
+                    manifest = read_record(folder / stages[name] / MANIFEST)
+                    rows[name] = cost, manifest["seconds" if gpu else "core_seconds"]
+            for what, (cost, measured) in rows.items():
+                hours = cost.gpu_hours if gpu else cost.core_hours
+                out.append(Spent(record.subject, what, 3600.0 * hours, 3600.0 * cost.unsure_hours, measured))
+    return out
 
 
-def learned(rates: Rates, spent: Mapping[str, Iterable[tuple[float, float]]]) -> Rates:
-    """Return rates with the factors that finished steps show.
+def learned(rates: Rates, spent: Iterable[Spent]) -> Rates:
+    """Return rates with the factors that finished steps and stages show: the median of measured over foretold.
 
     Args:
         rates: that foretold.
-        spent: by step, foretold and measured core-hours of each subject.
+        spent: by finished subjects.
     """
-    ratios: dict[str, Any] = {}
-    for step, pairs in spent.items():
-        found = [measured / foretold for foretold, measured in pairs if foretold > 0 and measured > 0]
-        if found:
-            ratios[step] = rates.factors.get(step, 1.0) * median(found)
-    return replace(rates, factors={**rates.factors, **ratios})
+    ratios: dict[str, list[float]] = {}
+    for one in spent:
+        # Inside of a range nothing was foretold wrongly, and its nearer end counts else.
+        nearest = min(max(one.measured, one.foretold - one.unsure), one.foretold + one.unsure)
+        if one.measured > 0.0 and nearest > 0.0:
+            ratios.setdefault(one.what, []).append(one.measured / nearest)
+    found = {name: rates.factors.get(name, 1.0) * median(values) for name, values in ratios.items()}
+    return replace(rates, factors={**rates.factors, **found})

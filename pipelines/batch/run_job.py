@@ -225,6 +225,7 @@ class _Chain:
             step.pid = pid
             self._save()
 
+        begin = time.monotonic()
         try:
             ended = run_process(
                 [*words, *step.command, *self._limit(step)],
@@ -236,7 +237,7 @@ class _Chain:
                 began=began,
             )
         except (KeyboardInterrupt, SystemExit):  # Slurm takes the machine back: no failure of the step
-            step.state = "waiting"
+            step.state, step.seconds = "waiting", round(step.seconds + time.monotonic() - begin, 3)
             self._save()
             raise
         _add(step, ended)

@@ -25,8 +25,9 @@ from pipelines.batch.executors import Executor, LocalExecutor, gpus_here
 from pipelines.batch.hold import BATCH_HOLD, at_work, request_stop
 from pipelines.batch.jobs import Job, JobFile, option_words, read_jobs
 from pipelines.batch.page import INDEX_FILE, STATE_STYLES, IndexWriter, cost_table, terminal_table
-from pipelines.batch.plan import Cost, Site, breaks_first, demands, plan_jobs, read_rates
-from pipelines.batch.records import Batch, read_batch
+from pipelines.batch.plan import Cost, breaks_first, demands, learned, plan_jobs, spent_in
+from pipelines.batch.rates import Site, read_rates
+from pipelines.batch.records import BATCH_FILE, Batch, read_batch
 from pipelines.batch.run_job import Resources
 from pipelines.batch.steps import STEPS
 from pipelines.batch.table import Row, count_states
@@ -145,7 +146,10 @@ class RunBatch:
                 for line in lines:
                     console.print(f"  smplxpp {line}", soft_wrap=True, highlight=False, markup=False)
         rates, site = read_rates(self.rates)
-        costs, unknown = plan_jobs(file.jobs, rates, site)
+        # What this batch has finished tells how its machines and people differ from those of the rates.
+        if (file.out / BATCH_FILE).exists():
+            rates = learned(rates, spent_in(file.out, rates))
+        costs, unknown = plan_jobs(file.jobs, rates, site, runs=file.out)
         if not self.json and costs:
             print_plan(costs, site, unknown, Console())
         plan = {step: vars(cost) for step, cost in costs.items()}

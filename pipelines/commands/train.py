@@ -203,9 +203,10 @@ class Train:
         from avatar.training.engine.resources import foretell_memory
         from pipelines.batch.amounts import facts_of, recipe_of
         from pipelines.batch.page import cost_table
-        from pipelines.batch.plan import read_rates, training_costs
+        from pipelines.batch.plan import training_costs
+        from pipelines.batch.rates import read_rates
 
-        facts = facts_of(self.capture, protocol=self.protocol, params=self.params)
+        facts = facts_of(self.capture, protocol=self.protocol, params=self.params, run=self.run_folder)
         if facts is None:
             raise InputError("capture", expected="one that can be opened", received=str(self.capture))
         held_out = len(self.hold_out) or facts.held_out_cameras

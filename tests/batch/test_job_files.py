@@ -118,7 +118,7 @@ out: runs
 defaults:
   steps: [check, build]
   check: {{frames: "0"}}
-  build: {{no_report: true, texture_size: 0, samples: 500}}
+  build: {{no_report: true, texture_size: 0, samples: 1000}}
 jobs:
   - {{subject: anna, capture: {person}}}
   - {{subject: ben, capture: half}}

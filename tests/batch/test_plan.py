@@ -11,18 +11,19 @@ from pipelines.batch.amounts import Facts, TrainingRates, facts_of, recipe_of, t
 from pipelines.batch.jobs import Job, Needs
 from pipelines.batch.plan import (
     Cost,
-    Rates,
-    Site,
+    Spent,
     breaks_first,
     cost_of,
     demands,
     learned,
     plan_jobs,
-    read_rates,
+    spent_in,
     training_costs,
 )
+from pipelines.batch.rates import Rates, Site, read_rates
 from pipelines.cli import main
 from smplxpp.core import InputError
+from tests.batch.made import write_manifest
 from tests.capture.scene import make_scene
 from tests.capture.writers import WRITERS
 
@@ -83,10 +84,77 @@ def test_rates_of_a_file_replace_ours(tmp_path):
 
 
 def test_factors_are_learned_from_what_is_done():
-    rates = learned(Rates(factors={"build": 2.0}), {"build": [(10.0, 15.0), (20.0, 30.0), (1.0, 9.0)], "web": []})
-    assert rates.factors == {"build": 3.0}
+    built = [
+        Spent(name, "build", 10.0 * k, 0.0, m) for k, (name, m) in enumerate(zip("abc", (15, 30, 90), strict=True), 1)
+    ]
+    # Within a range nothing was foretold wrongly; beyond it the nearer end counts.
+    cloth = [
+        Spent("a", "cloth", 6.0, 4.0, 2.5),
+        Spent("b", "cloth", 6.0, 4.0, 9.0),
+        Spent("c", "cloth", 6.0, 4.0, 20.0),
+    ]
+    rates = learned(Rates(factors={"build": 2.0}), [*built, *cloth, Spent("a", "web", 0.0, 0.0, 1.0)])
+    assert rates.factors == {"build": 3.0, "cloth": 1.0}
     facts = Facts(1, 1, 0.1, 0.1)
     assert cost_of("build", facts, rates).core_hours == pytest.approx(3.0 * cost_of("build", facts, Rates()).core_hours)
+    # A stage's own factor goes before that of the whole training.
+    facts, options = Facts(10, 4, 0.1, 0.1), {"preset": "demo"}
+    base = training_costs(facts, Rates(), options, gpu=False)
+    found = training_costs(facts, Rates(factors={"train": 2.0, "bake": 0.5}), options, gpu=False)
+    assert found["bake"].core_hours == pytest.approx(0.5 * base["bake"].core_hours)
+    assert found["fit"].core_hours == pytest.approx(2.0 * base["fit"].core_hours)
+
+
+def test_loose_clothes_cost_a_range_until_they_are_found():
+    """A man in trousers was foretold 4.3 times what his search for clothes took, because no part of his was loose."""
+    facts, rates = Facts(40, 6, 0.2, 0.1, held_out_frames=8), Rates()
+    frames, training = 32, rates.training
+
+    def cloth(facts: Facts, **options) -> tuple[float, float]:
+        cost = training_costs(facts, rates, {"preset": "demo", **options}, gpu=False)["cloth"]
+        return 3600.0 * (cost.core_hours - cost.unsure_hours), 3600.0 * (cost.core_hours + cost.unsure_hours)
+
+    start = training.start_s["cloth"] + training.start_s_kv["cloth"] * 1e-3 * facts.vertices
+    assert cloth(replace(facts, loose=0)) == pytest.approx((start, start))
+    looked_at = start + 2 * frames * training.frame_s["cloth"]
+    assert cloth(facts) == pytest.approx((looked_at, looked_at + frames * training.simulated_s))
+    # A part that is named is simulated without a question.
+    least, most = cloth(facts, loose_parts=("lower",))
+    assert least == most == pytest.approx(start + frames * (training.frame_s["cloth"] + training.simulated_s))
+    assert "cloth" not in training_costs(facts, rates, {"preset": "demo", "cloth": "none"}, gpu=False)
+    # What opens a template takes longer for a larger one.
+    small, large = (training_costs(replace(facts, vertices=n), rates, {}, gpu=False) for n in (1_000, 40_000))
+    assert all(small[stage].core_hours < large[stage].core_hours for stage in small)
+
+
+def test_a_batch_corrects_its_plan_by_what_its_stages_took(tmp_path):
+    _, write, lens = WRITERS["simple"]
+    root = write(make_scene(lens=lens, names=("A", "B", "C")), tmp_path / "capture")
+    runs, words = tmp_path / "runs", ["train", "RUN", "--capture", str(root), "--preset", "demo", "--json"]
+    options = {"preset": "demo"}
+    stages = training_costs(facts_of(root), Rates(), options, gpu=False)
+    for name in ("anna", "ben"):
+        step = {
+            "step": "train",
+            "command": words,
+            "state": "done",
+            "attempts": 1 + (name == "ben"),
+            "cpu_seconds": 50.0,
+        }
+        (runs / name).mkdir(parents=True)
+        record = {"subject": name, "capture": str(root), "steps": [step], "state": "done", "note": ""}
+        (runs / name / "job.json").write_text(json.dumps(record))
+        for stage in ("70_fit", "80_teacher", "85_bake", "90_compensate"):
+            took = 3 * 3600 * stages[stage[3:]].core_hours
+            write_manifest(runs / name / "run", stage, core_seconds=took)
+    jobs = [{"subject": name, "capture": str(root), "steps": ["train"]} for name in ("anna", "ben")]
+    batch = {"format": "smplxpp batch", "format_version": 1, "name": "b", "version": "1", "code_key": "k", "jobs": jobs}
+    (runs / "batch.json").write_text(json.dumps({**batch, "started": "2026-01-31T12:00:00Z", "job_file": "jobs.yaml"}))
+    spent = spent_in(runs, Rates())
+    # The second subject's training was attempted twice, and says too little.
+    assert {one.subject for one in spent} == {"anna"}
+    factors = learned(Rates(), spent).factors
+    assert {name: factors[name] for name in ("fit", "teacher")} == pytest.approx({"fit": 3.0, "teacher": 3.0})
 
 
 def test_jobs_are_planned_by_their_captures(tmp_path):
@@ -108,8 +176,9 @@ def test_jobs_are_planned_by_their_captures(tmp_path):
 
 
 def test_the_work_of_a_training_follows_from_frames_cameras_pixels_and_options():
-    nothing = {name: dict.fromkeys(getattr(TrainingRates(), name), 0.0) for name in ("start_s", "pose_s", "frame_s")}
-    rates = TrainingRates(look_s=0.0, look_s_mp=1.0, look_s_kg=0.0, **nothing)
+    kinds = ("start_s", "start_s_kv", "pose_s", "frame_s")
+    nothing = {name: dict.fromkeys(getattr(TrainingRates(), name), 0.0) for name in kinds}
+    rates = TrainingRates(look_s=0.0, look_s_mp=1.0, look_s_kg=0.0, simulated_s=0.0, **nothing)
     facts = Facts(50, 7, 0.5, 1.0, held_out_cameras=1, held_out_frames=10, tracked=True)
     options = {"preset": "demo", "teacher_iterations": 250}
 
@@ -141,7 +210,7 @@ def test_a_training_tells_its_cost_before_it_begins(tmp_path, capsys):
     words = ["train", str(run), "--capture", str(capture), "--preset", "demo", "--device", "cpu", "--dry-run", "--json"]
     assert main([*words, "--refine-poses", "on"]) == 0
     answer = json.loads(capsys.readouterr().out)
-    facts = facts_of(capture)
+    facts = facts_of(capture, run=run)
     alone = training_costs(facts, Rates(), {"preset": "demo", "refine_poses": "on"}, gpu=False)
     assert answer["plan"] == {step: vars(cost) for step, cost in alone.items()} and answer["free_gb"] > 0
     assert list(answer["memory_gib"]) == ["fit", "teacher", "bake", "compensate"]
