@@ -84,12 +84,12 @@ class TrainingRates:
 
     start_s: Mapping[str, float] = field(
         default_factory=lambda: {
-            **{"refine": 1.0, "fit": 0.5, "teacher": 3.0, "cloth": 1.2, "bake": 1.0, "compensate": 2.0}
+            **{"refine": 1.0, "fit": 0.5, "teacher": 2.0, "cloth": 0.8, "bake": 0.4, "compensate": 0.8}
         }
     )
     start_s_kv: Mapping[str, float] = field(
         default_factory=lambda: {
-            **{"refine": 0.07, "fit": 0.06, "teacher": 0.13, "cloth": 0.05, "bake": 0.1, "compensate": 0.16}
+            **{"refine": 0.07, "fit": 0.06, "teacher": 0.09, "cloth": 0.04, "bake": 0.04, "compensate": 0.07}
         }
     )
     look_s: float = 0.001

@@ -105,6 +105,7 @@ def cost_of(
         looks = _measured(facts)
         work = rates.models * looks
         gpu_hours = rates.evaluate_gpu_s * work / 3600.0 if gpu else 0.0
+        seconds += rates.evaluate_s
         seconds += 3600.0 * gpu_hours if gpu else rates.evaluate_s_mp * facts.megapixels * work
         read, files = image_mb * looks, 2.0 * looks
     else:

@@ -29,6 +29,7 @@ class Rates:
         training: rates of the stages of a training on a CPU.
         train_gpu_hours: training on one H200 by preset (gpu*.json); `gpu` and `paper` are their iterations over steps
             that were timed of `paper` and of an earlier `gpu`; neither was run to its end.
+        evaluate_s: opening of an evaluation's models, and its figures.
         evaluate_s_mp: rendering and comparison, a megapixel of a measured image and model, on a core.
         evaluate_gpu_s: the same on a GPU, an image and model.
         models: models that are measured.
@@ -50,6 +51,7 @@ class Rates:
     train_gpu_hours: Mapping[str, float] = field(
         default_factory=lambda: {"demo": 0.03, "cpu": 0.07, "paper-small": 0.1, "gpu": 4.0, "paper": 94.0}
     )
+    evaluate_s: float = 10.0
     evaluate_s_mp: float = 1.5
     evaluate_gpu_s: float = 0.1
     models: int = 3

@@ -36,7 +36,7 @@ def test_a_conversion_costs_its_megapixels_and_files():
     assert (cost.read_gb, cost.made) == (pytest.approx(1152.0), 576_000)
     # Held-out cameras see all frames; two training cameras see held-out frames and every fourth training frame.
     looks = 4 * 6000 + 2 * 600 + 2 * 5400 / 4
-    on_cores = cost_of("evaluate", facts, Rates(start_s=0.0))
+    on_cores = cost_of("evaluate", facts, Rates(start_s=0.0, evaluate_s=0.0))
     assert on_cores.core_hours == pytest.approx(3 * looks * 3.0 * 1.5 / 3600) and on_cores.gpu_hours == 0.0
     assert cost_of("evaluate", facts, Rates(), gpu=True).gpu_hours == pytest.approx(3 * looks * 0.1 / 3600)
     # A template costs a constant and its scan's bytes.
