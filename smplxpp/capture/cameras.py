@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,22 @@ from jaxtyping import Float
 
 from smplxpp.capture.distortion import OPENCV, Distortion
 from smplxpp.capture.readers.common import inverted, pinhole, required
-from smplxpp.capture.writers import BODY, FACE, RigCamera
 from smplxpp.core import Camera, InputError, matrix_from_rotvec
 from smplxpp.core.files import as_integer, as_list, as_numbers, as_text, read_json, read_text, regular_file
 from smplxpp.core.files.paths import ascii_numbers
 from smplxpp.core.spread import spread_inside
 
 _CSV_FIELDS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
+BODY, FACE = "body", "face"
+
+
+@dataclass(frozen=True)
+class RigCamera:
+    """A camera of a rig; its kind is body or face, and `novel` cameras are held out."""
+
+    camera: Camera
+    kind: str
+    novel: bool
 
 
 def read_cameras(path: str | Path) -> list[Camera]:

@@ -14,11 +14,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from smplxpp.capture.cameras import RigCamera
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.convert_views import ViewOutcome, ViewWriter
 from smplxpp.capture.sources import PosedTopology
 from smplxpp.capture.writers import (
-    RigCamera,
     save_params_by_row,
     write_calibration_csv,
     write_description,

@@ -9,13 +9,13 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from PIL import Image
 
+from smplxpp.capture.cameras import RigCamera
 from smplxpp.capture.distortion import (
     FISHEYE,
     FOV,
@@ -224,18 +224,6 @@ def write_actorshq_scene(folder: Path, boxes: Float[np.ndarray, "T 2 3"], fps: f
     rows += [",".join([str(frame), *(f"{value:.6g}" for value in box.ravel())]) for frame, box in enumerate(boxes)]
     atomic_write_text(folder / "aabbs.csv", "\n".join(rows) + "\n")
     atomic_write_text(folder / "scene.json", json.dumps({"num_frames": len(boxes), "fps": fps}, indent=1) + "\n")
-
-
-BODY, FACE = "body", "face"
-
-
-@dataclass(frozen=True)
-class RigCamera:
-    """A camera of a rig; its kind is body or face, and `novel` cameras are held out."""
-
-    camera: Camera
-    kind: str
-    novel: bool
 
 
 def write_description(path: Path, recording: Recording, splits: Splits, frames: Sequence[int]) -> None:

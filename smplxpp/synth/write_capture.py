@@ -13,9 +13,8 @@ from jaxtyping import Bool, UInt8
 
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
-from smplxpp.capture.cameras import camera_rig
+from smplxpp.capture.cameras import RigCamera, camera_rig
 from smplxpp.capture.writers import (
-    RigCamera,
     rounded,
     save_compact,
     view_path,

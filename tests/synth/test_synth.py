@@ -13,9 +13,8 @@ from PIL import Image
 from pipelines.cli import main
 from smplxpp.body import load_body
 from smplxpp.capture import open_capture
-from smplxpp.capture.cameras import camera_rig, read_cameras
+from smplxpp.capture.cameras import FACE, camera_rig, read_cameras
 from smplxpp.capture.writers import (
-    FACE,
     png16,
     save_compact,
     write_calibration_csv,
