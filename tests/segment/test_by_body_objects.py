@@ -15,7 +15,7 @@ from smplxpp.core import HAIR, OBJECT, SKIN, UPPER, BodyParams, InputError, Tria
 from smplxpp.core.topology import face_adjacency
 from smplxpp.people.cloth_mesh import outer_faces
 from smplxpp.people.scan_simulation import ScanConfig, simulate_scan
-from smplxpp.people.things import THINGS, WORN, Thing, thing_mesh
+from smplxpp.people.things import THINGS, WORN, Thing, _joined, _tube, thing_mesh
 from smplxpp.segment import by_body, label_by_body
 from smplxpp.segment.by_body_chart import chart_of_scan
 from smplxpp.segment.by_body_confidence import notes_on_worn_things
@@ -282,6 +282,19 @@ def test_what_is_worn_on_the_head_is_an_object_and_stiff_on_it(open_body, stance
     skin = open_body.mesh(stance[1].vertices[0])
     weights = rigid_weights(skin, open_body.weights, worn, joint_names=open_body.joint_names)
     assert {open_body.joint_names[k] for k in weights.dense().argmax(axis=1)} == {"head"}
+
+
+def test_frames_without_lenses_are_glasses(open_body, stance, head):
+    """Two characters with clear glasses wore none: a frame covers a sixth of the surface about an eye."""
+    at = dict(zip(open_body.joint_names, stance[1].joints[0], strict=True))
+    bars = []
+    for eye in (at["left_eye_smplhf"], at["right_eye_smplhf"]):
+        low, high = eye + [-0.026, -0.019, 0.026], eye + [0.026, 0.019, 0.026]
+        corners = [low, [high[0], *low[1:]], high, [low[0], *high[1:]]]
+        bars += [_tube(0.005, tuple(a), tuple(b)) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)]
+    mesh, truth = scanned_head(head, _joined(bars))
+    found = find_headwear(mesh, open_body, stance[0], *face_adjacency(mesh.faces))
+    assert mesh.face_areas[found.faces & truth].sum() > 0.5 * mesh.face_areas[truth].sum()
 
 
 def test_hair_hoods_and_bare_heads_wear_nothing(open_body, stance, head):
