@@ -20,6 +20,7 @@ from smplxpp.capture.keypoint_files import read_keypoints
 from smplxpp.capture.views import read_alpha, read_color
 from smplxpp.capture.writers import write_keypoints
 from smplxpp.core import InputError, Keypoints2D, ProgressCallback, ignore_progress
+from smplxpp.core.errors import one_line
 from smplxpp.core.files import read_arrays, read_bytes
 from smplxpp.detect import Box, DetectedPerson, Detector, mask_box
 from smplxpp.figures import contact_sheet
@@ -41,6 +42,8 @@ class DetectedCamera:
     keypoints: Keypoints2D
     people: np.ndarray
     detected: int
+
+    __repr__ = one_line
 
     def frames_with(self, count: Callable[[np.ndarray], np.ndarray]) -> list[int]:
         """Return the numbers of the frames whose count of people meets a condition."""

@@ -16,6 +16,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.core import BodyParams, matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.errors import one_line
 from smplxpp.core.params import POSE_BLOCKS
 
 # Axis-angle rotation of each joint in degrees, in the T-pose's world axes (x to the subject's left, y up, z to the
@@ -174,6 +175,8 @@ class SeededMotion:
     seconds: float
     seed: int = 0
 
+    __repr__ = one_line
+
     def instants(self, times: Float[np.ndarray, " T"]) -> Float64[np.ndarray, " T"]:
         """Return times cut to the duration, seconds."""
         return np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, self.seconds)
@@ -184,6 +187,8 @@ class Performance(SeededMotion):
     """A performance of gestures, speech and a turn, as a function of time."""
 
     feet_stay: ClassVar[bool] = False
+
+    __repr__ = one_line
 
     def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
         """Return the parameters at `times` in seconds; transl is zero, `fps` is stored as it is given."""
@@ -303,6 +308,8 @@ class Turntable(SeededMotion):
     """
 
     feet_stay: ClassVar[bool] = False
+
+    __repr__ = one_line
 
     def at(self, times: Float[np.ndarray, " T"], *, fps: float | None = None) -> BodyParams:
         """Return the parameters at `times` in seconds; `fps` is stored as it is given."""

@@ -19,6 +19,7 @@ from scipy.interpolate import PchipInterpolator
 from smplxpp.body.layout import SMPLX_JOINTS
 from smplxpp.body.named_poses import ARM_JOINTS, ARM_POSES, MIRROR, ArmPose
 from smplxpp.core import BodyParams, require_positive
+from smplxpp.core.errors import one_line
 from smplxpp.synth.motion import JAW_DEGREES, SeededMotion, relaxed_pose, wander
 
 # Mouth shapes, and looks of the rest of the face, as weights of expressions.
@@ -91,6 +92,8 @@ class Talking(SeededMotion):
     """
 
     feet_stay: ClassVar[bool] = True
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         require_positive("seconds of talking", self.seconds)
