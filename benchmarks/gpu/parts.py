@@ -126,7 +126,8 @@ def steps(job: Job, note: Note) -> None:
         orders = [("gpu", "plain", None), ("paper", "plain", "Teacher"), ("gpu", "graphs", "Teacher")]
     for preset, way, last in orders:
         row = rows.setdefault(f"{preset}, {way}", {})
-        probe = Probe(job.device, 0.05 if job.toy else 2.0, last, told=lambda _: note(rows=rows), found=row)
+        seconds, profiled = (0.05, 1) if job.toy else (2.0, 2)
+        probe = Probe(job.device, seconds, last, profiled, lambda _: note(rows=rows), row)
         config = avatar.TrainConfig(device=job.device, force=True, gaussians=300 if job.toy else None, **WAYS[way])
         begin = time.perf_counter()
         try:

@@ -73,6 +73,7 @@ class Probe:
         device: "cuda" or "cpu".
         seconds: of timed steps a stage.
         last: name of the last stage that is timed; None: all.
+        profiled: steps that are profiled, after the timed ones.
         told: called after every stage.
         found: figures by stage: warm steps a second, seconds of the first ones, GiB of the GPU at most, kernels a step
             and the share of a step in which the GPU computes.
@@ -81,12 +82,13 @@ class Probe:
     device: str
     seconds: float
     last: str | None = None
+    profiled: int = 2
     told: Callable[[dict[str, Any]], None] = lambda found: None
     found: dict[str, Any] = field(default_factory=dict)
 
     def __call__(self, task: Any, config: LoopConfig, folder: Path, **_: Any) -> Progress:
         """Time the stage of a task."""
-        name, profiled = type(task).__name__.removesuffix("Task"), 2
+        name, profiled = type(task).__name__.removesuffix("Task"), self.profiled
         # Frames are followed in whole numbers, because their first steps are of smaller images.
         whole = task.track_config.steps if isinstance(task, TrackTask) else 1
         first = min(max(whole, WARM_UP), max(config.iterations - profiled - 1, 1))
@@ -125,10 +127,11 @@ class Probe:
                 task.step(k)
             self._now()
         # Rows of kernels have time of the device alone; those of calls repeat it.
-        rows = [one for one in seen.key_averages() if one.self_device_time_total and not one.self_cpu_time_total]
+        averages = seen.key_averages()
+        rows = [one for one in averages if one.self_device_time_total and not one.self_cpu_time_total]
         busy = sum(one.self_device_time_total for one in rows) / len(steps)
         longest = sorted(rows, key=lambda one: -one.self_device_time_total)[:5]
-        calls = sum(one.count for one in seen.key_averages() if one.key.startswith("aten::"))
+        calls = sum(one.count for one in averages if one.key.startswith("aten::"))
         return {
             "busy_share": 1e-6 * busy / seconds if seconds else None,
             "kernels": sum(one.count for one in rows) / len(steps),
