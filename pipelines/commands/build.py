@@ -136,7 +136,7 @@ class Build:
     json: bool = False
     """Print the summary as JSON."""
 
-    def run(self, assembled: Callable[[], None] = lambda: None) -> dict:
+    def run(self, assembled: Callable[[], object] = lambda: None) -> dict:
         """Build, write metrics.json and the report, print the summary; the exit status is 1 where checks fail.
 
         Args:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -154,7 +154,7 @@ class Demo:
                     (out / "report.html").resolve(),
                 )
                 # The report is written when all of its parts are there, because writing it takes nine seconds.
-                chosen = {"run_folder": out, "capture": capture, "no_report": True, **CHUNKS}
+                chosen: dict[str, Any] = {"run_folder": out, "capture": capture, "no_report": True, **CHUNKS}
                 with half_of_the_threads():
                     Train(**chosen, stage="refine", json=True).run()
             finally:
