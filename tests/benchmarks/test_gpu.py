@@ -61,6 +61,7 @@ def test_the_preset_of_a_gpu_is_trained_and_measured(job):
     assert found["views"]["novel_view"]["psnr"] > 0
 
 
+@pytest.mark.slow  # the profiles of twelve stages take ten seconds to sum
 def test_warm_steps_of_all_stages_are_timed_and_profiled(job):
     found = found_by("steps", job)
     rows, both = found["rows"], ["PretrainField", "Bake", "Compensate"]
