@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ from smplxpp.core.mesh import TriangleMesh, cross_rows, normalize_rows
 _SOLIDS: dict[bytes, tuple[igl.FastWindingNumberBVH, np.ndarray]] = {}
 """The solids asked of last with their outer faces, because garments, layers and checks ask one after the other of the
 same body, of which both take a tenth of a second."""
+# What is alive when the interpreter ends, libigl's bindings report as a leak, in eleven lines below a command's answer.
+atexit.register(_SOLIDS.clear)
 _REMEMBERED = 5
 """Number of solids that are kept, 10 MB each of a body: as many as the poses that a check goes through, and one."""
 

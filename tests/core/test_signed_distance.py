@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import subprocess
+import sys
+import textwrap
 
 import igl
 import numpy as np
@@ -131,3 +134,21 @@ def test_bad_input():
     with pytest.raises(InputError, match="query points"):
         SignedDistanceField(mesh, solid=True).query(np.full((1, 3), np.nan))
     assert len(SignedDistanceField(mesh, solid=True).query(np.zeros((0, 3))).distance) == 0
+
+
+def test_a_process_that_asked_of_a_solid_ends_without_a_word():
+    """Bindings that outlive the interpreter are reported as leaks, below the answer of a command."""
+    script = """
+        import ctypes, trimesh
+        from smplxpp.core import TriangleMesh
+        from smplxpp.core import signed_distance
+        from smplxpp.core.signed_distance import SignedDistanceField
+        made = trimesh.creation.icosphere(subdivisions=1)
+        mesh = TriangleMesh(made.vertices, made.faces)
+        assert SignedDistanceField(mesh, solid=True).query([[2.0, 0.0, 0.0]]).distance[0] > 0.9
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(signed_distance._SOLIDS))  # as a library may that never lets go
+    """
+    ran = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=900, check=True
+    )
+    assert ran.stdout + ran.stderr == ""
