@@ -19,7 +19,7 @@ from smplxpp.template.template import Template
 
 @dataclass(frozen=True, eq=False)
 class TrainScene:
-    """A template and a capture that it can be trained on; pickles.
+    """A template and a capture that it can be trained on.
 
     Attributes:
         template: the clothed body.

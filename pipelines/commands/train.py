@@ -161,10 +161,12 @@ class Train:
             refines = wants_refinement(self.run_folder, inputs, self.refine_poses)
             return self._plan(choose_device(self.device) == "cuda", steps, refines=refines)
         with join_processes(choose_device(self.device)) as together:
-            # Rank 0 decides and opens the scene, so that all ranks train with the same steps on the same data.
+            # Rank 0 decides and all open the scene, whose digests say that they train on the same data.
             first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
             refines = first and "refine" in steps
-            scene = together.run_on_rank0(lambda: open_scene(self.run_folder, inputs, refined=not refines))
+            scene = together.run_on_all(
+                lambda: open_scene(self.run_folder, inputs, refined=not refines), lambda opened: opened.digests
+            )
             recipe = config.recipe(self.preset, cloth=self.cloth, turn_views=views_of_turn(scene.capture))
             # Every process needs a pose of each step.
             preset = with_batch(recipe.preset, least=together.world_size)

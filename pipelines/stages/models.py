@@ -301,7 +301,7 @@ class Trainer:
             self._finished.pop(stage.name, None)
         # Only rank 0 trains; the other processes wait for its record.
         if stage.alone:
-            return self.together.run_on_rank0(lambda: self._make(stage, force=force))
+            return self.together.run_on_rank0(lambda: self._make(stage, force=force), kinds=(StageRecord,))
         return self._make(stage, force=force)
 
     def _make(self, stage: ModelStage, *, force: bool) -> StageRecord:
@@ -312,33 +312,34 @@ class Trainer:
         # Every collective call below has its partner in `_first`, in the same order. An unequal number of calls would
         # block all processes.
         if not together.first:
-            identity, runs = together.run_on_rank0(_nothing)
+            work, key, runs = together.run_on_rank0(_nothing)
             if runs:
-                stage.work(self, self._session(stage, identity), self.run / stage.name)
-            record = together.run_on_rank0(_nothing)
+                stage.work(self, self._session(stage, work, key), self.run / stage.name)
+            record = together.run_on_rank0(_nothing, kinds=(StageRecord,))
         else:
             # Only rank 0 holds the lock and writes.
             with own_run_folder((self.run / stage.name).parent, (Path(stage.name).name, "report")):
                 record = self._first(stage, shared=shared, force=force)
-            record = together.run_on_rank0(lambda: record) if shared else record
+            record = together.run_on_rank0(lambda: record, kinds=(StageRecord,)) if shared else record
         if record.finished:
             self._finished[stage.name] = record
         return record
 
     def _first(self, stage: ModelStage, *, shared: bool, force: bool) -> StageRecord:
         """Decide on rank 0 whether to train, broadcast the decision, train and write."""
-        together = self.together
+        identity: Stage
 
-        def decided() -> tuple[Stage, bool]:
+        def decided() -> tuple[str, str, bool]:
+            nonlocal identity
             identity = self.identity(stage)
-            return identity, decide(self.run, identity, force=force) != "skip"
+            return identity.work_name, identity.key, decide(self.run, identity, force=force) != "skip"
 
         # The other ranks learn from this call whether there is anything to train.
-        identity, _ = together.run_on_rank0(decided) if shared else decided()
+        name, key, _ = self.together.run_on_rank0(decided) if shared else decided()
 
         def work(folder: Path) -> StageOutput:
             with explain_resource_errors(self.run), self.options.bar(stage.name, stage.iterations) as report:
-                output = stage.work(self, replace(self._session(stage, identity), report=report), folder)
+                output = stage.work(self, replace(self._session(stage, name, key), report=report), folder)
             # Recorded for later commands, which refuse to call a seen view novel.
             output.numbers["seen"] = self._seen(stage)
             output.numbers["protocol"] = self.scene.capture.protocol
@@ -346,13 +347,13 @@ class Trainer:
 
         return run_stage(self.run, identity, work, force=force)
 
-    def _session(self, stage: ModelStage, identity: Stage) -> Session:
-        folder = self.run / identity.work_name
+    def _session(self, stage: ModelStage, work: str, key: str) -> Session:
+        folder = self.run / work
         # A stage trained by rank 0 alone must not call a collective.
         left = self._deadline - time.monotonic() if stage.alone else self.seconds_left()
         return Session(
             folder,
-            identity.key,
+            key,
             self.perceptual,
             self.together,
             max(left, ONE_STEP),

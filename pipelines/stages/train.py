@@ -112,7 +112,7 @@ def train(
         records["refine"] = _refined(run, inputs, start, how, options, together)
         if not records["refine"].finished:
             return records
-        scene = together.run_on_rank0(lambda: open_scene(run, inputs, before=start))
+        scene = together.run_on_all(lambda: open_scene(run, inputs, before=start), lambda opened: opened.digests)
         left = options.max_seconds - (time.monotonic() - begin)
         options = replace(options, max_seconds=together.run_on_rank0(lambda: max(0.0, left)))
     # Models of one run share the trainer: its scene, metric and deadline.
@@ -121,7 +121,7 @@ def train(
     trainer = Trainer(run, scene, options, together, scale=inputs.scale, perceptual=metric)
     stages = model_stages(config)
     # A fit made by `smplxpp fit` has another key than the preset's, but takes its place.
-    by_hand = together.run_on_rank0(lambda: _fit_by_hand(run, scene, stages["fit"]))
+    by_hand = together.run_on_rank0(lambda: _fit_by_hand(run, scene, stages["fit"]), kinds=(StageRecord,))
     if by_hand is not None:
         trainer.take(stages["fit"], by_hand)
     for step in steps:
@@ -164,7 +164,7 @@ def _refined(
         together.share_out(
             range(together.world_size), lambda _: help_refine(run, inputs, config, scene=scene, stop=stop)
         )
-    return together.run_on_rank0(whole)
+    return together.run_on_rank0(whole, kinds=(StageRecord,))
 
 
 def _fit_by_hand(run: Path, scene: TrainScene, fit: ModelStage) -> StageRecord | None:

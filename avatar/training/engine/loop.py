@@ -261,6 +261,6 @@ def _begin(task: Task, state: Path, metrics: Path, key: str) -> Checkpoint:
         )
 
     # All processes restore the same tensors, also at a new start, so that they begin with equal bits.
-    checkpoint = task.distributed.run_on_rank0(start)
+    checkpoint = task.distributed.run_on_rank0(start, kinds=(Checkpoint,))
     task.restore(checkpoint.tensors)
     return checkpoint

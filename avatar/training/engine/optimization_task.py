@@ -167,8 +167,7 @@ class OptimizationTask(ABC, Generic[Batch]):
         gradients = (value.grad for value in self.learned.values() if value.grad is not None)
         if not _finite((loss, *gradients)):
             return None
-        # Messages between processes do not carry tensors of a GPU.
-        return figures if self.distributed.world_size == 1 else {name: one.cpu() for name, one in figures.items()}
+        return figures
 
 
 def _copy_in_layout(content: Tensor, parameter: Tensor) -> Tensor:

@@ -76,7 +76,7 @@ class Session:
     ) -> Progress:
         """Run a training on the first process while the others wait; a checkpoint of its end is kept."""
         processes = self.distributed or Distributed()
-        return processes.run_on_rank0(lambda: self.run(make, config, keep_end=True))
+        return processes.run_on_rank0(lambda: self.run(make, config, keep_end=True), kinds=(Progress,))
 
     def within(self, name: str) -> Session:
         """Return the session in a folder inside this one, without previews."""

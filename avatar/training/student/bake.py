@@ -250,6 +250,5 @@ def bake(
 
 def _regressed(student: Student, sequence: AvatarSequence, together: Distributed) -> PoseRegression:
     """Return the regression that the first process fits, on each process's own device."""
-    # Tensors of a GPU would arrive on the first process's in all of them.
-    found = together.run_on_rank0(lambda: regress_poses(student, sequence).to("cpu"))
-    return found.to(student.rig.device)
+    found = together.run_on_rank0(lambda: dict(regress_poses(student, sequence).named_buffers()))
+    return PoseRegression(**found).to(student.rig.device)

@@ -359,5 +359,6 @@ def follow_surface(
 def _share(task: TrackTask, session: Session) -> None:
     """Send the first process's results to all processes."""
     processes = session.distributed or Distributed()
-    for own in task.found().values():
-        own.copy_(processes.run_on_rank0(own.cpu))
+    first = processes.run_on_rank0(task.found)
+    for name, own in task.found().items():
+        own.copy_(first[name])

@@ -94,6 +94,21 @@ def test_all_processes_stop_with_the_same_words(both, what, words):
     assert words in messages[0]
 
 
+def test_messages_arrive_as_they_were_sent_without_pickles(both):
+    one, two = (json.loads((both / f"report_{rank}.json").read_text())["messages"] for rank in (0, 1))
+    assert one["sent"] and two["sent"] and one["shared"] and two["shared"]
+    assert one["unknown"] == "TypeError: processes do not send each other a set" and "a set" in two["unknown"]
+
+
+def test_what_all_processes_open_is_equal_or_refused_by_all(both):
+    one, two = (json.loads((both / f"report_{rank}.json").read_text())["messages"] for rank in (0, 1))
+    assert (one["own"], two["own"]) == (0, 1)
+    assert (one["warned"], two["warned"]) == (1, 0)  # a warning comes once
+    assert one["apart"] == two["apart"] and "other contents on rank 1" in one["apart"]
+    assert one["broken"].startswith("InputError: process 1: ") and "OSError: [Errno 5]" in one["broken"]
+    assert two["broken"].startswith("OSError")
+
+
 def test_a_disk_that_is_full_for_the_first_process_stops_the_second(both):
     messages = [json.loads((both / f"report_{rank}.json").read_text())["disk"] for rank in (0, 1)]
     assert "free some space" in messages[0].lower()
