@@ -330,7 +330,7 @@ DOORS: dict[str, set[str]] = {
     },
     "safe_open": {"avatar/gaussians/tensor_file.py"},
     "load_file": set(),  # of safetensors
-    "torch.load": {"avatar/losses/perceptual.py"},  # weights of a metric, tensors alone
+    "torch.load": {"avatar/losses/perceptual_weights.py"},  # weights of a metric, tensors alone
 }
 
 

@@ -29,7 +29,8 @@ from avatar.evaluation.protocol import (
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, Surfaces, view_key
 from avatar.evaluation.summary import SPREAD_CONVENTION
 from avatar.gaussians.sampling import head_faces
-from avatar.losses.perceptual import PerceptualDistance, load_metric
+from avatar.losses.perceptual import PerceptualDistance
+from avatar.losses.perceptual_weights import load_metric
 from avatar.metrics import speed, surface_quality, view_quality
 from avatar.metrics.surface_quality import SAMPLES, SurfaceQuality, mean_surface
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, head_box, head_shown, head_vertices
@@ -46,7 +47,8 @@ class EvaluationConfig:
 
     Attributes:
         protocol: choice of the views.
-        metric: perceptual distance: "st-lpips", "lpips" or "none".
+        metric: perceptual distance: "st-lpips", "lpips", "both" or "none".
+        lpips_weights: files of LPIPS, see `load_lpips`.
         samples: points sampled on each surface; 0: no surface is measured.
         seed: of the samples.
         speed_size: width and height of the pictures that are timed.
@@ -57,6 +59,7 @@ class EvaluationConfig:
 
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     metric: str = "st-lpips"
+    lpips_weights: tuple[Path, ...] = ()
     samples: int = SAMPLES
     seed: int = 0
     speed_size: tuple[int, int] = (512, 512)
@@ -112,7 +115,7 @@ def evaluate_models(
     # Decide everything before any model runs: bad files and empty sets end an evaluation at once, not after hours.
     sets = with_people(sequence.capture, view_sets(sequence.capture, config.protocol))
     truths = truth_frames(sequence.capture, config.protocol, sets) if config.samples else {}
-    run = _Run(models, sequence, config, sets, truths, load_metric(config.metric, device=sequence.device))
+    run = _Run(models, sequence, config, sets, truths)
     # One pass over all frames, because a pose and its surface serve every set that has the frame.
     frames = sorted({frame for one in sets.values() for frame in one.frames} | set(chain(*truths.values())))
     for done, frame in enumerate(frames):
@@ -132,10 +135,13 @@ class _Run:
         config: EvaluationConfig,
         sets: Mapping[str, ViewSet],
         truths: Mapping[str, tuple[int, ...]],
-        metric: PerceptualDistance | None,
     ) -> None:
         self.models, self.sequence, self.config = models, sequence, config
-        self.sets, self.truths, self.metric = sets, truths, metric
+        self.sets, self.truths = sets, truths
+        # With both distances LPIPS has columns of its own, beside those of ST-LPIPS.
+        both = config.metric == "both"
+        self.metric = self._metric("st-lpips" if both else config.metric)
+        self.lpips = self._metric("lpips") if both else None
         self.views: dict[str, dict[str, dict[str, ViewQuality]]] = {name: {s: {} for s in sets} for name in models}
         self.surfaces: dict[str, dict[int, SurfaceQuality]] = {name: {} for name in models}
         self.skinning_alone: dict[int, SurfaceQuality] = {}
@@ -145,6 +151,9 @@ class _Run:
         self._middle = {frames[len(frames) // 2]: name for name, frames in truths.items()}
         self._head = torch.tensor(head_vertices(sequence.rig.template), device=sequence.device)
         self._head_faces: dict[int, Bool[np.ndarray, " F"] | None] = {}
+
+    def _metric(self, name: str) -> PerceptualDistance | None:
+        return load_metric(name, device=self.sequence.device, weights=self.config.lpips_weights)
 
     def measure(self, frame: int) -> None:
         """Measure all sets' views and the surface of one frame."""
@@ -202,16 +211,17 @@ class _Run:
             )
             for name, model in self.models.items()
         }
-        metric = None if self.metric is None else self.metric.name
+        metric, lpips = (None if one is None else one.name for one in (self.metric, self.lpips))
         # A report states in words what each of its figures means.
         conventions = {
             "images": view_quality.CONVENTION,
             "spread": SPREAD_CONVENTION,
-            **({} if metric is None else {metric: view_quality.PERCEPTUAL_CONVENTION}),
+            **{name: view_quality.PERCEPTUAL_CONVENTION for name in (metric, lpips) if name is not None},
             **({"surface": surface_quality.CONVENTION} if self.truths else {}),
             **({"speed": speed.CONVENTION} if self.config.speed_pictures else {}),
         }
-        report = EvalReport(self.sequence.capture.name, metric, models, self._by_set(self.skinning_alone), conventions)
+        alone = self._by_set(self.skinning_alone)
+        report = EvalReport(self.sequence.capture.name, metric, models, alone, conventions, lpips=lpips)
         return Evaluation(report, self.gallery.views(), tuple(self.meshes[name] for name in self.truths))
 
     def _head_shown(self, skinned: Float[Tensor, "V 3"], view: View) -> Bool[Tensor, "H W"] | None:
@@ -239,7 +249,14 @@ class _Run:
         background = self.sequence.background
         drawn = render_view(posed, index, view, background, eps2d=self.config.eps2d)
         quality = view_quality.view_quality(
-            view, drawn.image, drawn.alpha, background, head=head[0], head_pixels=head[1], metric=self.metric
+            view,
+            drawn.image,
+            drawn.alpha,
+            background,
+            head=head[0],
+            head_pixels=head[1],
+            metric=self.metric,
+            lpips=self.lpips,
         )
         for part in self._sets_of(view, frame):
             self.views[name][part][view_key(view.name, frame)] = quality

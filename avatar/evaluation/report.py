@@ -95,6 +95,7 @@ class EvalReport:
     Attributes:
         capture: name of the capture.
         metric: name of the perceptual distance; None without one.
+        lpips: name of LPIPS and its backbone, where it was measured beside `metric`; None without it.
         models: figures by name, in the order of tables.
         skinning_alone: distances of the skinned template, as `ModelFigures.surfaces`.
         conventions: definitions of the figures, in words.
@@ -112,6 +113,7 @@ class EvalReport:
     inputs: InputProtocol = field(default_factory=InputProtocol)
     refined_poses: dict[str, ModelFigures] = field(default_factory=dict)
     poses: dict[str, PoseError] = field(default_factory=dict)
+    lpips: str | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the JSON, with counts, means and spreads; infinite figures become null."""
@@ -152,6 +154,7 @@ class EvalReport:
                 inputs=InputProtocol.from_dict(values.get("inputs", {})),
                 refined_poses={name: _model(model) for name, model in values.get("refined_poses", {}).items()},
                 poses={name: _pose(error) for name, error in values.get("poses", {}).items()},
+                lpips=None if values.get("lpips") is None else as_text(values["lpips"], subject=f"{_SUBJECT}: lpips"),
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):

@@ -70,7 +70,7 @@ def garments(report: EvalReport) -> tuple[str, ...]:
 
 def summary_table(report: EvalReport) -> FigureTable:
     """Make the summary table, a row a model: novel views, novel poses, surface, cost."""
-    metric = report.metric or ""
+    metric, lpips = report.metric or "", report.lpips or ""
     # Groups of columns: two sets of views, two parts of surfaces, and the cost. Those without figures vanish.
     columns = []
     for name in ("novel_view", "novel_pose"):
@@ -79,6 +79,7 @@ def summary_table(report: EvalReport) -> FigureTable:
             Column(f"{name}.psnr{SPREAD}", SPREAD_TITLE, SETS[name], 2),
             Column(f"{name}.ssim", "SSIM", SETS[name], 4, "higher"),
             Column(f"{name}.perceptual", metric, SETS[name], 4, "lower"),
+            Column(f"{name}.lpips", lpips, SETS[name], 4, "lower"),
             Column(f"{name}.psnr_head", "head", SETS[name], 2, "higher"),
             Column(f"{name}.images", "images", SETS[name], 0),
         ]
@@ -97,7 +98,7 @@ def image_table(report: EvalReport, name: str, *, refined: bool = False) -> Figu
     """Make the table of the image figures of one set of views, with refined poses if `refined`."""
     models = report.refined_poses if refined else report.models
     title = f"{SETS[name]}{REFINED_POSES}" if refined else SETS[name]
-    metric = report.metric or ""
+    metric, lpips = report.metric or "", report.lpips or ""
     # The person's PSNR comes first, since the plain background inflates the figures of whole images.
     columns = (
         Column("images", "images", "", 0),
@@ -109,11 +110,14 @@ def image_table(report: EvalReport, name: str, *, refined: bool = False) -> Figu
         Column(f"ssim{SPREAD}", SPREAD_TITLE, "whole image", 4),
         Column("perceptual", metric, "whole image", 4, "lower"),
         Column(f"perceptual{SPREAD}", SPREAD_TITLE, "whole image", 4),
+        Column("lpips", lpips, "whole image", 4, "lower"),
+        Column(f"lpips{SPREAD}", SPREAD_TITLE, "whole image", 4),
         Column("psnr_head", "PSNR", "head", 2, "higher"),
         Column(f"psnr_head{SPREAD}", SPREAD_TITLE, "head", 2),
         Column("psnr_head_alone", "alone", "head", 2, "higher"),
         Column("ssim_head", "SSIM", "head", 4, "higher"),
         Column("perceptual_head", metric, "head", 4, "lower"),
+        Column("lpips_head", lpips, "head", 4, "lower"),
     )
     # All models are measured on the same views, so that the counts of any of them hold for the caption.
     rows = {model: _of_set(figures, name) for model, figures in models.items() if name in figures.views}

@@ -6,7 +6,7 @@ _EXPORTS = {
     "PerceptualDistance": "avatar.losses.perceptual",
     "ReconstructionWeights": "avatar.losses.reconstruction",
     "Target": "avatar.losses.reconstruction",
-    "load_metric": "avatar.losses.perceptual",
+    "load_metric": "avatar.losses.perceptual_weights",
     "reconstruction_loss": "avatar.losses.reconstruction",
     "ssim_map": "avatar.losses.image_similarity",
 }

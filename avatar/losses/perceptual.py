@@ -1,28 +1,23 @@
-"""Measure perceptual distances between images: ST-LPIPS, and LPIPS if its package is installed.
+"""Measure perceptual distances between images: ST-LPIPS and LPIPS; `perceptual_weights` loads them.
 
 Their values are not comparable, so each metric carries its name, which is printed with its values.
 """
 
 from __future__ import annotations
 
-import importlib.util
-import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Literal, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from smplxpp.core import InputError, MissingExtraError, require_choice
-from smplxpp.core.files.paths import regular_file
+from smplxpp.core.errors import InputError
 
-log = logging.getLogger(__name__)
-
-MetricName = Literal["st-lpips", "lpips", "none"]
+Stored = Mapping[str, Tensor]
+"""Tensors of a file by their names there."""
 
 MIN_SIZE = 32
 """Smallest side of an image, pixels; the coarsest features of a smaller one vanish."""
@@ -30,14 +25,6 @@ MIN_SIZE = 32
 CHANNELS = (64, 192, 384, 256, 256)
 KERNELS = (11, 5, 3, 3, 3)
 STORED_CONVS = ("net.slice1.0", "net.slice2.5", "net.slice3.9", "net.slice4.11", "net.slice5.13")
-WEIGHT_FILE = Path("weights", "vST0.0", "alex_shift_tolerant.pth")
-
-
-class MissingPackageError(MissingExtraError):
-    """An error for a missing package that no extra of this project installs."""
-
-    def __init__(self, package: str, *, command: str, purpose: str) -> None:
-        ImportError.__init__(self, f"{purpose} needs {package}, which is not installed: {command}")
 
 
 class PerceptualDistance(nn.Module, ABC):
@@ -74,64 +61,27 @@ class PerceptualDistance(nn.Module, ABC):
         """Return the distance of each pair of images in [-1, 1]."""
 
 
-class ShiftTolerantLPIPS(PerceptualDistance):
-    """ST-LPIPS (Ghildyal and Liu 2022): LPIPS on an AlexNet with a low-pass filter before every reduction.
+class FeatureDistance(PerceptualDistance):
+    """`sum over 5 layers of mean over pixels of w . (f/|f| - g/|g|)^2`.
 
-    `sum over 5 layers of mean over pixels of w . (f/|f| - g/|g|)^2`, f and g the layer's features of the two images and
-    w its learnt weights. A shift of the image by one pixel hardly changes the distance.
+    f and g are a layer's features of the two images, w its learnt weights (Zhang et al. 2018).
+
+    Args:
+        convs: of the network that gives the features.
+        channels: of each of the layers.
     """
 
-    name = "ST-LPIPS"
     shift: Tensor
     scale: Tensor
-    binomial: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, convs: Iterable[nn.Conv2d], channels: Sequence[int]) -> None:
         super().__init__()
-        inputs = (3, *CHANNELS[:-1])
-        # The stem keeps AlexNet's padding of 2 at a stride of 1; the reduction is left to the filter.
-        paddings = (2, 2, 1, 1, 1)
-        self.convs = nn.ModuleList(
-            nn.Conv2d(i, o, kernel, padding=padding)
-            for i, o, kernel, padding in zip(inputs, CHANNELS, KERNELS, paddings, strict=True)
-        )
-        self.layer_weights = nn.ParameterList(torch.rand(channels) for channels in CHANNELS)
+        self.convs = nn.ModuleList(convs)
+        self.layer_weights = nn.ParameterList(torch.rand(count) for count in channels)
         # Mean and standard deviation of ImageNet for images in [-1, 1], rounded as LPIPS has them.
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188])[:, None, None])
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450])[:, None, None])
-        taps = torch.tensor([0.25, 0.5, 0.25])
-        self.register_buffer("binomial", torch.outer(taps, taps)[None, None], persistent=False)
         self.requires_grad_(False)
-
-    @staticmethod
-    def from_weights(stored: Mapping[str, Tensor]) -> ShiftTolerantLPIPS:
-        """Make the metric with the weights of the authors' file.
-
-        Raises:
-            InputError: weights of another network.
-        """
-        # Collect the authors' tensors under our names, then copy them only if the sizes agree; a layer's weights are
-        # stored as a 1 x 1 convolution, hence the reshape.
-        metric = ShiftTolerantLPIPS()
-        state = {"shift": stored.get("scaling_layer.shift"), "scale": stored.get("scaling_layer.scale")}
-        for k, conv in enumerate(STORED_CONVS):
-            state[f"convs.{k}.weight"], state[f"convs.{k}.bias"] = (
-                stored.get(f"{conv}.weight"),
-                stored.get(f"{conv}.bias"),
-            )
-            state[f"layer_weights.{k}"] = stored.get(f"lin{k}.model.1.weight")
-        for name, value in metric.state_dict().items():
-            # The reshape drops axes of length 1 alone, so that equal numbers of entries are enough to check.
-            given = state[name]
-            if given is None or given.numel() != value.numel():
-                raise InputError(
-                    "ST-LPIPS weights",
-                    expected=f"{name} of shape {tuple(value.shape)}",
-                    received="none" if given is None else f"shape {tuple(given.shape)}",
-                    remedy="use the weight file of stlpips-pytorch 0.0.2",
-                )
-            value.copy_(given.reshape(value.shape))
-        return metric
 
     def distance(self, x: Float[Tensor, "B 3 H W"], y: Float[Tensor, "B 3 H W"]) -> Float[Tensor, " B"]:
         """Return the distance of each pair of images in [-1, 1]."""
@@ -141,6 +91,62 @@ class ShiftTolerantLPIPS(PerceptualDistance):
             difference = (_unit(f) - _unit(g)).square()
             total = total + torch.einsum("c,bchw->b", weight, difference) / (f.shape[2] * f.shape[3])
         return total
+
+    @abstractmethod
+    def features(self, x: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Return the activations of the five layers for images in [-1, 1]."""
+
+    def _take(self, stored: Stored, convs: Sequence[str], named: Mapping[str, str], remedy: str) -> None:
+        """Copy the weights of a file, which names convolutions and some of our tensors in these ways.
+
+        Raises:
+            InputError: weights of another network.
+        """
+        # A layer's weights are stored as a 1 x 1 convolution, hence the reshape. It drops axes of length 1 alone, so
+        # that equal numbers of entries are enough to check.
+        names = {f"layer_weights.{k}": f"lin{k}.model.1.weight" for k in range(len(self.layer_weights))} | {**named}
+        for k, conv in enumerate(convs):
+            names |= {f"convs.{k}.weight": f"{conv}.weight", f"convs.{k}.bias": f"{conv}.bias"}
+        own = self.state_dict()
+        for name, source in names.items():
+            given, value = stored.get(source), own[name]
+            if given is None or given.numel() != value.numel():
+                raise InputError(
+                    f"{self.name} weights",
+                    expected=f"{source}, {name} of shape {tuple(value.shape)}",
+                    received="none" if given is None else f"shape {tuple(given.shape)}",
+                    remedy=remedy,
+                )
+            value.copy_(given.reshape(value.shape))
+
+
+class ShiftTolerantLPIPS(FeatureDistance):
+    """ST-LPIPS (Ghildyal and Liu 2022): LPIPS on an AlexNet with a low-pass filter before every reduction.
+
+    A shift of the image by one pixel hardly changes the distance.
+    """
+
+    name = "ST-LPIPS"
+    binomial: Tensor
+
+    def __init__(self) -> None:
+        # The stem keeps AlexNet's padding of 2 at a stride of 1; the reduction is left to the filter.
+        layers = zip((3, *CHANNELS[:-1]), CHANNELS, KERNELS, (2, 2, 1, 1, 1), strict=True)
+        super().__init__((nn.Conv2d(i, o, kernel, padding=pad) for i, o, kernel, pad in layers), CHANNELS)
+        taps = torch.tensor([0.25, 0.5, 0.25])
+        self.register_buffer("binomial", torch.outer(taps, taps)[None, None], persistent=False)
+
+    @staticmethod
+    def from_weights(stored: Stored) -> ShiftTolerantLPIPS:
+        """Make the metric with the weights of the authors' file.
+
+        Raises:
+            InputError: weights of another network.
+        """
+        metric = ShiftTolerantLPIPS()
+        scaling = {"shift": "scaling_layer.shift", "scale": "scaling_layer.scale"}
+        metric._take(stored, STORED_CONVS, scaling, "use the weight file of stlpips-pytorch 0.0.2")
+        return metric
 
     def features(self, x: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
         """Return the activations of the five layers for images in [-1, 1]."""
@@ -161,84 +167,82 @@ class ShiftTolerantLPIPS(PerceptualDistance):
         return F.conv2d(padded, self.binomial.expand(channels, -1, -1, -1), stride=2, groups=channels)
 
 
-class PackagedLPIPS(PerceptualDistance):
-    """LPIPS (Zhang et al. 2018), computed by the installed `lpips` package."""
+@dataclass(frozen=True)
+class Backbone:
+    """A network of torchvision whose features LPIPS compares.
 
-    def __init__(self, network: nn.Module, backbone: str) -> None:
-        super().__init__()
+    Attributes:
+        file: of its weights, as torchvision downloads it.
+        layers: numbers of the convolutions of each layer in the network's `features`.
+        channels: of each layer.
+        kernels: of each layer's convolutions, pixels.
+        pooling: width of the maximum before a layer, pixels; 0: none.
+    """
+
+    file: str
+    layers: tuple[tuple[int, ...], ...]
+    channels: tuple[int, ...]
+    kernels: tuple[int, ...]
+    pooling: tuple[int, ...]
+
+
+BACKBONES: Mapping[str, Backbone] = {
+    "alex": Backbone(
+        "alexnet-owt-7be5be79.pth", ((0,), (3,), (6,), (8,), (10,)), CHANNELS, KERNELS, pooling=(0, 3, 3, 0, 0)
+    ),
+    "vgg": Backbone(
+        "vgg16-397923af.pth",
+        ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)),
+        (64, 128, 256, 512, 512),
+        (3, 3, 3, 3, 3),
+        pooling=(0, 2, 2, 2, 2),
+    ),
+}
+
+
+class LPIPS(FeatureDistance):
+    """LPIPS (Zhang et al. 2018), version 0.1, on AlexNet ("alex") or VGG16 ("vgg")."""
+
+    def __init__(self, backbone: str = "alex") -> None:
+        self.layout = BACKBONES[backbone]
+        convs, inputs = [], 3
+        for numbers, outputs, kernel in zip(self.layout.layers, self.layout.channels, self.layout.kernels, strict=True):
+            for _ in numbers:
+                # AlexNet's first convolution takes every fourth pixel; all others keep the size of the image.
+                stride, padding = (4, 2) if kernel > 5 else (1, kernel // 2)
+                convs.append(nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=padding))
+                inputs = outputs
+        super().__init__(convs, self.layout.channels)
         self.name = f"LPIPS ({backbone})"
-        self.network = network.requires_grad_(False).eval()
 
-    def distance(self, x: Float[Tensor, "B 3 H W"], y: Float[Tensor, "B 3 H W"]) -> Float[Tensor, " B"]:
-        """Return the distance of each pair of images in [-1, 1]."""
-        return self.network(x, y).flatten()
+    def features(self, x: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Return the activations of the five layers for images in [-1, 1]."""
+        x, convs, found = (x - self.shift) / self.scale, iter(self.convs), []
+        for numbers, width in zip(self.layout.layers, self.layout.pooling, strict=True):
+            x = F.max_pool2d(x, width, stride=2) if width else x
+            for _ in numbers:
+                x = F.relu(next(convs)(x))
+            found.append(x)
+        return found
+
+    @staticmethod
+    def from_weights(stored: Stored, backbone: str) -> LPIPS:
+        """Make the metric from a state of the package `lpips`, or from torchvision's weights and the package's own.
+
+        Raises:
+            InputError: weights of another network.
+        """
+        metric = LPIPS(backbone)
+        of_package = any(name.startswith("net.") for name in stored)
+        names = [
+            f"net.slice{layer}.{number}" if of_package else f"features.{number}"
+            for layer, numbers in enumerate(metric.layout.layers, start=1)
+            for number in numbers
+        ]
+        metric._take(stored, names, {}, f"give {metric.layout.file} of torchvision and weights/v0.1 of package lpips")
+        return metric
 
 
 def _unit(features: Tensor) -> Tensor:
     # Both small terms keep the quotient, and the slope of the square root, finite where all features are 0.
     return features / (features.square().sum(1, keepdim=True).clamp_min(1e-20).sqrt() + 1e-10)
-
-
-def load_st_lpips(weights: Path | None = None) -> ShiftTolerantLPIPS:
-    """Make ST-LPIPS with the authors' AlexNet weights.
-
-    Args:
-        weights: their file; None: that of the installed package `stlpips-pytorch`, without running its code.
-
-    Raises:
-        MissingPackageError: no file given and the package is not installed.
-        InputError: another kind of file.
-    """
-    if weights is None:
-        # Find the folder without importing the package, so that what it depends on need not be installed.
-        found = importlib.util.find_spec("stlpips_pytorch")
-        if found is None or not found.submodule_search_locations:
-            raise MissingPackageError(
-                "stlpips-pytorch", command="pip install --no-deps stlpips-pytorch", purpose="ST-LPIPS"
-            )
-        weights = Path(found.submodule_search_locations[0]) / WEIGHT_FILE
-    weights = regular_file(weights)
-    try:
-        # `weights_only` refuses pickled code.
-        stored = torch.load(weights, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise InputError(
-            f"file {weights.name}", expected="weights saved by torch", received=f"{type(error).__name__}"
-        ) from error
-    if not isinstance(stored, Mapping):
-        raise InputError(f"file {weights.name}", expected="tensors by name", received=type(stored).__name__)
-    return ShiftTolerantLPIPS.from_weights(stored)
-
-
-def load_lpips(backbone: str = "alex") -> PackagedLPIPS:
-    """Make LPIPS by the `lpips` package, with the backbone "alex" or "vgg", which the package finds or downloads.
-
-    Raises:
-        MissingPackageError: `lpips`, or torchvision which it needs, is not installed.
-        InputError: another backbone.
-    """
-    require_choice("backbone of LPIPS", backbone, ("alex", "vgg"))
-    try:
-        import lpips
-    except ModuleNotFoundError as error:
-        if error.name not in ("lpips", "torchvision"):  # a broken package says itself what it lacks
-            raise
-        raise MissingPackageError("lpips", command="pip install lpips torchvision", purpose="LPIPS") from error
-    return PackagedLPIPS(lpips.LPIPS(net=backbone, verbose=False), backbone)
-
-
-def load_metric(name: str, *, device: str = "cpu") -> PerceptualDistance | None:
-    """Make a metric by name; None for "none", and, with a log line, if its package is not installed.
-
-    Raises:
-        InputError: another name.
-    """
-    require_choice("perceptual metric", name, get_args(MetricName))
-    if name == "none":
-        return None
-    try:
-        metric = load_st_lpips() if name == "st-lpips" else load_lpips()
-    except MissingExtraError as error:
-        log.warning("no perceptual distance is measured: %s", error)
-        return None
-    return metric.to(device)

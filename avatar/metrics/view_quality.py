@@ -45,6 +45,8 @@ class ViewQuality:
         perceptual: distance of the whole composited images; None without a metric.
         perceptual_head: of the box alone; None too where it is under 32 pixels a side.
         psnr_head_alone: as `psnr`, over the pixels that show the head; None where none does.
+        lpips: LPIPS beside another perceptual distance, of the same images; None without.
+        lpips_head: as `perceptual_head`.
     """
 
     psnr: float
@@ -55,6 +57,8 @@ class ViewQuality:
     perceptual: float | None = None
     perceptual_head: float | None = None
     psnr_head_alone: float | None = None
+    lpips: float | None = None
+    lpips_head: float | None = None
 
 
 def view_quality(
@@ -66,6 +70,7 @@ def view_quality(
     head: Box | None,
     head_pixels: Bool[Tensor, "H W"] | None = None,
     metric: PerceptualDistance | None = None,
+    lpips: PerceptualDistance | None = None,
 ) -> ViewQuality:
     """Compare a rendered image with the view's.
 
@@ -77,6 +82,7 @@ def view_quality(
         head: box x0, y0, x1, y1 of the head, pixels; None: the head is not in the image.
         head_pixels: mask of the pixels that show the head, see `head_shown`.
         metric: perceptual distance; None: not measured.
+        lpips: a second one.
     """
     # Both images lie on the same background, so that its pixels differ only where the silhouettes do.
     real = view.composited(background)
@@ -84,14 +90,14 @@ def view_quality(
     error = (image - real).square()
     # The person's pixels are the union of both silhouettes: a missing or a surplus limb counts as error.
     person = (view.opacity() > OPACITY_THRESHOLD) | (alpha > OPACITY_THRESHOLD)
-    psnr_head = ssim_head = perceptual_head = psnr_head_alone = None
+    psnr_head = ssim_head = perceptual_head = lpips_head = psnr_head_alone = None
     # The head's figures come from its box: PSNR over the person's pixels, SSIM and perception over the whole crop.
     if head is not None:
         part = (slice(head[1], head[3]), slice(head[0], head[2]))
         if bool(person[part].any()):
             psnr_head = psnr_from_mse(float(error[part][person[part]].mean()))
             ssim_head = float(ssim(image[part].contiguous(), real[part].contiguous()))
-            perceptual_head = _distance(metric, image[part], real[part])
+            perceptual_head, lpips_head = (_distance(one, image[part], real[part]) for one in (metric, lpips))
     # The stricter figure leaves out hands and shoulders that enter the box.
     if head_pixels is not None and bool((alone := person & head_pixels).any()):
         psnr_head_alone = psnr_from_mse(float(error[alone].mean()))
@@ -104,6 +110,8 @@ def view_quality(
         perceptual=_distance(metric, image, real),
         perceptual_head=perceptual_head,
         psnr_head_alone=psnr_head_alone,
+        lpips=_distance(lpips, image, real),
+        lpips_head=lpips_head,
     )
 
 

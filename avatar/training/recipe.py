@@ -255,7 +255,7 @@ def choose_perceptual(name: str, preset: TrainingPreset) -> str:
     if name != "auto":
         # Load the metric now: a missing package is an error before hours of training.
         if name != "none":
-            from avatar.losses.perceptual import load_lpips, load_st_lpips
+            from avatar.losses.perceptual_weights import load_lpips, load_st_lpips
 
             (load_lpips if name == "lpips" else load_st_lpips)()
         return name

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from avatar.data.one_frame import views_of_turn
 from avatar.data.sequence import AvatarSequence, SequenceConfig
 from avatar.gaussians.tensor_file import load_bound, save_bound
-from avatar.losses.perceptual import load_metric
+from avatar.losses.perceptual_weights import load_metric
 from avatar.models.model_file import load_avatar, save_avatar
 from avatar.models.open_student import TRAINING_FILES, open_student
 from avatar.models.student import Student

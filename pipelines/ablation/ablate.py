@@ -15,7 +15,7 @@ import numpy as np
 
 from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.tables import FigureTable
-from avatar.losses.perceptual import load_metric
+from avatar.losses.perceptual_weights import load_metric
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
 from avatar.training.presets import TrainingPreset
@@ -99,7 +99,10 @@ def ablate(
     scene = open_scene(run, inputs)
     config = _measured(config, scene.capture)
     weights = (preset.teacher.weights, preset.bake.weights, preset.compensate.weights)
-    perceptual = load_metric(config.metric, device=how.device) if any(w.perceptual for w in weights) else None
+    learned = (
+        ("st-lpips" if config.metric == "both" else config.metric) if any(w.perceptual for w in weights) else "none"
+    )
+    perceptual = load_metric(learned, device=how.device, weights=config.lpips_weights)
     options = TrainOptions(max_seconds=how.max_seconds, bar=_bar(how))
     trainer = Trainer(run, scene, options, Distributed(device=how.device), scale=inputs.scale, perceptual=perceptual)
     stages = ablation_stages(preset, training_frames=len(trainer.sequence(CLOTHED).train_frames))

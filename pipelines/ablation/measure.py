@@ -21,7 +21,7 @@ from pipelines.runs.folders import own_run_folder
 from pipelines.runs.layout import ABLATION
 from pipelines.runs.stage import MANIFEST, Stage, StageOutput, StageRecord, decide, run_stage
 from pipelines.stages.cloth import ClothStage, clothed_sequence
-from pipelines.stages.evaluate_inputs import of_held_out_poses, refined_digest, refined_poses, surface_digest
+from pipelines.stages.evaluate_inputs import measuring_digests, of_held_out_poses, refined_digest, refined_poses
 from pipelines.stages.models import CLOTHED, ModelStage, Trainer
 from smplxpp.capture import Capture
 from smplxpp.core import ProgressCallback, ignore_progress
@@ -78,7 +78,7 @@ def row_stage(
         inputs={
             **trainer.scene.digests,
             "model": record.manifest["files"][model.file],
-            "capture/surfaces": surface_digest(trainer.scene.capture, config.protocol),
+            **measuring_digests(trainer.scene.capture, config),
             **refined_digest(trainer.run, refined),
         },
         code=(__name__, type(model).__module__),
@@ -192,13 +192,16 @@ class AblationResult:
         conventions = {name: text for report in reports for name, text in report.conventions.items()}
         refined = {title: model for report in reports for title, model in report.refined_poses.items()}
         first = reports[0]
-        return EvalReport(first.capture, first.metric, models, alone, conventions, first.inputs, refined)
+        return EvalReport(
+            first.capture, first.metric, models, alone, conventions, first.inputs, refined, lpips=first.lpips
+        )
 
 
 def ablation_table(result: AblationResult) -> FigureTable:
     """Return a table of a line a row: novel views, novel poses, distances to the true surface, bytes, training time."""
     # Columns only for the image sets that some row has; the order is that of the paper's tables.
     metric, capture = (result.report.metric or "", result.report.capture) if result.rows else ("", "")
+    lpips = (result.report.lpips if result.rows else None) or ""
     shown = [
         name
         for name in SETS
@@ -211,6 +214,7 @@ def ablation_table(result: AblationResult) -> FigureTable:
             Column(f"{name}.psnr", "PSNR", SETS[name], 2, "higher"),
             Column(f"{name}.ssim", "SSIM", SETS[name], 4, "higher"),
             Column(f"{name}.perceptual", metric, SETS[name], 4, "lower"),
+            Column(f"{name}.lpips", lpips, SETS[name], 4, "lower"),
         ]
     if any(r.report.refined_poses for r in result.rows.values()):
         group = f"{SETS[NOVEL_POSE]}{REFINED_POSES}"

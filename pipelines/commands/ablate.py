@@ -48,6 +48,8 @@ class Ablate:
     """Measure every n-th of the held-out frames."""
     metric: Literal["st-lpips", "lpips", "none"] = "st-lpips"
     """Perceptual distance to measure, and to train with where the preset does."""
+    lpips_weights: tuple[Path, ...] = ()
+    """Weights of LPIPS, as of `smplxpp evaluate`; it is measured beside ST-LPIPS then."""
     samples: int = 100_000
     """Points of a mesh for its distance to the true surface; 0 leaves the surface out."""
     hold_out: tuple[str, ...] = ()
@@ -89,7 +91,11 @@ class Ablate:
         # Every row is measured by the same protocol; rendering speed is not part of the table.
         rows, preset = ablation_rows(self.rows), self.training()
         config = EvaluationConfig(
-            protocol=ProtocolConfig(every=self.every), metric=self.metric, samples=self.samples, speed_pictures=0
+            protocol=ProtocolConfig(every=self.every),
+            metric="both" if self.lpips_weights and self.metric == "st-lpips" else self.metric,
+            lpips_weights=self.lpips_weights,
+            samples=self.samples,
+            speed_pictures=0,
         )
         with _progress(enabled=not self.json) as (training, measuring):
             outcome = ablate(

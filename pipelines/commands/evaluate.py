@@ -55,8 +55,11 @@ class Evaluate:
     """SMPL-X-layout body file that the parameters are for; the open body by default."""
     scale: float = 1.0
     """Size of the images to compare, 1 for every pixel."""
-    metric: Literal["auto", "st-lpips", "lpips", "none"] = "auto"
-    """Perceptual distance; auto: ST-LPIPS where stlpips-pytorch is installed."""
+    metric: Literal["auto", "st-lpips", "lpips", "both", "none"] = "auto"
+    """Perceptual distance; auto: ST-LPIPS where stlpips-pytorch is installed, and LPIPS where its weights are at hand:
+    --lpips-weights, or package lpips and the AlexNet that torchvision downloaded."""
+    lpips_weights: tuple[Path, ...] = ()
+    """Weights of LPIPS: a state of the package lpips, or torchvision's AlexNet or VGG16 and the package's own."""
     samples: int = 100_000
     """Points of a mesh for its distance to the truth; 0 leaves the surface out."""
     speed_size: tuple[int, int] = (512, 512)
@@ -104,7 +107,8 @@ class Evaluate:
             raise InputError("option speed-size", expected="two numbers above 0", received=str(self.speed_size))
         config = EvaluationConfig(
             protocol=protocol,
-            metric=_metric(self.metric),
+            metric=_metric(self.metric, self.lpips_weights),
+            lpips_weights=self.lpips_weights,
             samples=self.samples,
             seed=self.seed,
             speed_size=self.speed_size,
@@ -167,11 +171,18 @@ class Evaluate:
         return out
 
 
-def _metric(name: str) -> str:
-    """Return the name of the metric; "auto" is ST-LPIPS where it is installed."""
+def _metric(name: str, weights: tuple[Path, ...] = ()) -> str:
+    """Return the name of the metric; "auto" is ST-LPIPS where it is installed, LPIPS where it is at hand, or both."""
+    if weights and name in ("st-lpips", "none"):
+        raise InputError("option lpips-weights", expected="metric auto, both or lpips", received=f"metric {name}")
     if name != "auto":
         return name
-    if find_spec("stlpips_pytorch") is not None:
-        return "st-lpips"
+    from avatar.losses.perceptual_weights import load_lpips, lpips_at_hand
+
+    if weights:
+        load_lpips(weights)  # files of other weights are refused before anything is measured
+    shift_tolerant, plain = find_spec("stlpips_pytorch") is not None, bool(weights) or lpips_at_hand()
+    if shift_tolerant or plain:
+        return "both" if shift_tolerant and plain else "st-lpips" if shift_tolerant else "lpips"
     log.info("no perceptual distance is measured: stlpips-pytorch is not installed (pip install --no-deps)")
     return "none"

@@ -38,7 +38,7 @@ EXPERT_OPTIONS = frozenset(
         *("accept-failures", "no-report", "no-browser", "port", "host", "verbose", "tensorboard", "batch", "method"),
         *("iterations-share", "fit-iterations", "teacher-iterations", "bake-iterations", "compensate-iterations"),
         *("no-teacher", "keep-bridges", "keep-holes", "dissent", "cell", "hull-only", "outside", "codes", "all"),
-        *("checkpoint-minutes", "surface-normals", "precision", "compile", "readers", "cache-gib"),
+        *("checkpoint-minutes", "surface-normals", "precision", "compile", "readers", "cache-gib", "lpips-weights"),
         *("speed-size", "speed-pictures", "perceptual", "key-variable", "truth-step", "normals-step", "sync", "offset"),
     )
 )

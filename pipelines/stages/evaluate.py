@@ -24,12 +24,12 @@ from pipelines.stages.evaluate_inputs import (
     exact_params,
     input_protocol,
     load_model,
+    measuring_digests,
     model_files,
     of_held_out_poses,
     pose_errors,
     refined_digest,
     refined_poses,
-    surface_digest,
 )
 from pipelines.stages.scene import TrainInputs, open_scene, refuse_seen
 from smplxpp.body import load_body
@@ -104,7 +104,7 @@ def evaluate(
         inputs={
             **scene.digests,
             **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
-            "capture/surfaces": surface_digest(scene.capture, config.protocol),
+            **measuring_digests(scene.capture, config),
             **clothes.digests,
             **refined_digest(run, again),
             **({} if exact is None else {"capture/exact parameters": params_digest(exact)}),

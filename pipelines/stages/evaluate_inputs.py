@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int64
 
 from avatar.evaluation.evaluate import EvaluationConfig
 from avatar.evaluation.input_protocol import MIXED, NOT_KNOWN, InputProtocol
-from avatar.evaluation.protocol import ProtocolConfig, truth_frames, view_sets
+from avatar.evaluation.protocol import truth_frames, view_sets
 from avatar.gaussians.tensor_file import load_bound
 from avatar.models.model_file import load_avatar
 from avatar.models.student import Student, StudentConfig
@@ -149,14 +149,15 @@ def _trained(run: Path) -> tuple[str | None, int | None, int | None]:
     return None, None, None
 
 
-def surface_digest(capture: Capture, protocol: ProtocolConfig) -> str:
-    """Return the SHA-256 of the true surfaces that are measured."""
-    digest = hashlib.sha256()
+def measuring_digests(capture: Capture, config: EvaluationConfig) -> dict[str, str]:
+    """Return the SHA-256 of the true surfaces that are measured, and of the weights of LPIPS, as inputs of a stage."""
+    digest, protocol = hashlib.sha256(), config.protocol
     for frame in chain(*truth_frames(capture, protocol, view_sets(capture, protocol)).values()):
         mesh = capture.truth_mesh(frame)
         assert mesh is not None  # `truth_frames` chose frames that have one
         digest.update(f"{frame}".encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
-    return digest.hexdigest()
+    weights = {f"weights of LPIPS, file {k}": sha256_file(path) for k, path in enumerate(config.lpips_weights)}
+    return {"capture/surfaces": digest.hexdigest(), **weights}
 
 
 def exact_params(capture: Capture, body: Path | None, model: BodyModel) -> ParamSource | None:

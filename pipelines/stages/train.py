@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from avatar.losses.perceptual import load_metric
+from avatar.losses.perceptual_weights import load_metric
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import check_memory

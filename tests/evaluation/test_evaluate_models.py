@@ -18,12 +18,14 @@ from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.protocol import SETS, ProtocolConfig
 from avatar.evaluation.report import SKINNING_ALONE, EvalReport, ModelFigures, ViewCounts, view_key
 from avatar.evaluation.summary import evaluation_tables, summary_figures
-from avatar.losses import perceptual as metric_names
-from avatar.losses.perceptual import MissingPackageError, load_metric
+from avatar.losses import perceptual_weights as metric_names
+from avatar.losses.perceptual import ShiftTolerantLPIPS
+from avatar.losses.perceptual_weights import MissingPackageError, load_metric
 from avatar.metrics.speed import bytes_on_disk, fitted, measure_speed, parameter_counts
 from avatar.metrics.view_quality import ViewQuality
 from avatar.rig.rig import Rig, at_rest
 from smplxpp.core import BodyParams, Camera, InputError
+from tests.dolls.lpips import lpips_weights
 from tests.dolls.standing import OUT, Grown, doll, opened, still
 
 CONFIG = EvaluationConfig(
@@ -246,7 +248,7 @@ def test_a_model_trains_on_as_before():
 
 
 def test_a_metric_that_is_not_installed_is_logged_once(monkeypatch, caplog):
-    def missing():
+    def missing(weights):
         raise MissingPackageError("lpips", command="pip install lpips", purpose="LPIPS")
 
     monkeypatch.setattr(metric_names, "load_lpips", missing)
@@ -265,6 +267,25 @@ def test_perceptual_distance_goes_by_its_own_name(sequence):
     assert report.metric == "ST-LPIPS" and "ST-LPIPS" in report.conventions
     assert report.models["still"].mean("novel_pose")["perceptual"] > 0
     assert "ST-LPIPS" in evaluation_tables(report)["novel_pose"].text()
+
+
+def test_lpips_has_columns_of_its_own_beside_another_distance(sequence, tmp_path, monkeypatch):
+    of_torchvision, own = lpips_weights("alex")
+    torch.save({**of_torchvision, **own}, tmp_path / "weights.pth")
+    torch.manual_seed(1)
+    monkeypatch.setattr(metric_names, "load_st_lpips", ShiftTolerantLPIPS)
+    protocol = ProtocolConfig(sets=("novel_pose",), every=4)
+    config = EvaluationConfig(protocol=protocol, samples=0, speed_pictures=0, lpips_weights=(tmp_path / "weights.pth",))
+    models = {"still": still(sequence.rig)}
+    both, alone = (evaluate_models(models, sequence, replace(config, metric=name)).report for name in ("both", "lpips"))
+    assert (both.metric, both.lpips, alone.metric, alone.lpips) == ("ST-LPIPS", "LPIPS (alex)", "LPIPS (alex)", None)
+    found, wanted = both.models["still"].mean("novel_pose"), alone.models["still"].mean("novel_pose")
+    assert found["lpips"] == wanted["perceptual"] > 0 and found["perceptual"] != found["lpips"]
+    text = evaluation_tables(both)["novel_pose"].text()
+    assert "ST-LPIPS" in text and "LPIPS (alex)" in text and f"{found['lpips']:.4f}" in text
+    assert {"ST-LPIPS", "LPIPS (alex)"} <= both.conventions.keys()
+    both.save(tmp_path / "report.json")
+    assert EvalReport.load(tmp_path / "report.json") == both
 
 
 @pytest.mark.parametrize("size", [(64, 80), (128, 160), (100, 80), (64, 200)])

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import importlib.util
+import pickle
+from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import nn
 
-from avatar.losses.perceptual import (
-    STORED_CONVS,
+from avatar.losses.perceptual import BACKBONES, LPIPS, STORED_CONVS, ShiftTolerantLPIPS
+from avatar.losses.perceptual_weights import (
     WEIGHT_FILE,
-    PackagedLPIPS,
-    ShiftTolerantLPIPS,
     load_lpips,
+    load_metric,
     load_st_lpips,
+    lpips_at_hand,
 )
 from smplxpp.core.errors import InputError, MissingExtraError
+from tests.dolls.lpips import NETWORKS, lpips_weights
 
 
 @pytest.fixture
@@ -104,21 +110,132 @@ def test_missing_packages_name_the_command(monkeypatch):
     with pytest.raises(MissingExtraError, match="pip install lpips"):
         load_lpips()
     with pytest.raises(InputError, match="backbone"):
-        load_lpips("squeeze")
+        load_lpips(backbone="squeeze")
 
 
-def test_packaged_lpips_gets_images_in_its_range(images):
-    class Recorder(nn.Module):
-        def forward(self, x, y):
-            self.seen = x
-            return (x - y).square().mean((1, 2, 3), keepdim=True)
+def windows(x: np.ndarray, width: int, step: int) -> np.ndarray:
+    """Windows of an image (C, H, W): (C, h, w, width, width)."""
+    return np.lib.stride_tricks.sliding_window_view(x, (width, width), axis=(1, 2))[:, ::step, ::step]
 
-    network = Recorder()
-    metric = PackagedLPIPS(network, "vgg")
-    image, noise = images
-    assert metric.name == "LPIPS (vgg)"
-    assert metric(image, image + noise).shape == (2,)
-    torch.testing.assert_close(network.seen, 2 * image.permute(0, 3, 1, 2) - 1)
+
+def slow_lpips(backbone: str, weights: dict[str, torch.Tensor], images: list[np.ndarray]) -> float:
+    """LPIPS of two images (H, W, 3) in [0, 1], in float64."""
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    features = []
+    for image in images:
+        x, found = ((2.0 * image - 1.0 - shift) / scale).transpose(2, 0, 1), []
+        for layer in NETWORKS[backbone]:
+            if layer == "out":
+                found.append(x / np.sqrt((x**2).sum(axis=0)))
+            elif layer[0] == "max":
+                x = windows(x, layer[1], 2).max(axis=(3, 4))
+            else:
+                number, _, _, width, step, pad = layer
+                kernel, bias = (weights[f"features.{number}.{name}"].double().numpy() for name in ("weight", "bias"))
+                seen = windows(np.pad(x, ((0, 0), (pad, pad), (pad, pad))), width, step)
+                x = np.maximum(np.tensordot(kernel, seen, ((1, 2, 3), (0, 3, 4))) + bias[:, None, None], 0.0)
+        features.append(found)
+    return sum(
+        float((weights[f"lin{k}.model.1.weight"].double().numpy().reshape(-1, 1, 1) * (f - g) ** 2).sum(axis=0).mean())
+        for k, (f, g) in enumerate(zip(*features, strict=True))
+    )
+
+
+@pytest.fixture(scope="module", params=["alex", "vgg"])
+def lpips_case(request, tmp_path_factory):
+    """A backbone, its weights in two files as they are published, two pairs of images, and their true distances."""
+    folder = tmp_path_factory.mktemp(request.param)
+    of_torchvision, own = lpips_weights(request.param)
+    torch.save(of_torchvision, folder / BACKBONES[request.param].file)
+    torch.save(own, folder / f"{request.param}.pth")
+    pictures = np.random.default_rng(0).random((3, 40, 36, 3))
+    stored = {**of_torchvision, **own}
+    true = [slow_lpips(request.param, stored, [pictures[k], pictures[2]]) for k in (0, 1)]
+    return SimpleNamespace(name=request.param, folder=folder, weights=stored, pictures=pictures, true=true)
+
+
+def measured(metric: LPIPS, case: SimpleNamespace) -> torch.Tensor:
+    images = torch.tensor(case.pictures, dtype=torch.float32)
+    return metric(images[:2], images[2:].expand(2, -1, -1, -1))
+
+
+def test_lpips_is_that_of_a_slow_reference(lpips_case):
+    files = (lpips_case.folder / BACKBONES[lpips_case.name].file, lpips_case.folder / f"{lpips_case.name}.pth")
+    metric = load_lpips(files)
+    assert metric.name == f"LPIPS ({lpips_case.name})"
+    found = measured(metric, lpips_case)
+    np.testing.assert_allclose(found.numpy(), lpips_case.true, rtol=2e-5)
+    image = torch.tensor(lpips_case.pictures[:1], dtype=torch.float32)
+    assert metric(image, image).tolist() == [0.0]
+
+
+def test_lpips_reads_a_state_of_the_package(lpips_case, tmp_path):
+    state = {name: value for name, value in lpips_case.weights.items() if name.startswith("lin")}
+    for layer, own in enumerate(BACKBONES[lpips_case.name].layers, start=1):
+        for number in own:
+            for kind in ("weight", "bias"):
+                state[f"net.slice{layer}.{number}.{kind}"] = lpips_case.weights[f"features.{number}.{kind}"]
+    save_file(state, tmp_path / "all.safetensors")
+    np.testing.assert_allclose(
+        measured(load_lpips([tmp_path / "all.safetensors"]), lpips_case).numpy(), lpips_case.true, rtol=2e-5
+    )
+
+
+def test_lpips_needs_no_torchvision_where_its_weights_lie(lpips_case, tmp_path, monkeypatch):
+    """The package's own weights are read beside the backbone in torch's folder of downloads; neither's code runs."""
+    package, cache = tmp_path / "lpips" / "weights" / "v0.1", tmp_path / "hub" / "checkpoints"
+    package.mkdir(parents=True)
+    cache.mkdir(parents=True)
+    there = SimpleNamespace(submodule_search_locations=[str(tmp_path / "lpips")])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: there if name == "lpips" else None)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    monkeypatch.setitem(__import__("sys").modules, "lpips", None)
+    assert not lpips_at_hand(lpips_case.name)
+    file = BACKBONES[lpips_case.name].file
+    (cache / file).write_bytes((lpips_case.folder / file).read_bytes())
+    (package / f"{lpips_case.name}.pth").write_bytes((lpips_case.folder / f"{lpips_case.name}.pth").read_bytes())
+    assert lpips_at_hand(lpips_case.name)
+    np.testing.assert_allclose(
+        measured(load_lpips(backbone=lpips_case.name), lpips_case).numpy(), lpips_case.true, rtol=2e-5
+    )
+
+
+def test_files_of_other_weights_are_refused(lpips_case, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    backbone = lpips_case.folder / BACKBONES[lpips_case.name].file
+    with pytest.raises(InputError, match=r"lin0\.model\.1\.weight.*received none"):
+        load_lpips([backbone])
+    other = tmp_path / "other.pth"
+    torch.save({"lin0.model.1.weight": torch.rand(1, 7, 1, 1)}, other)
+    with pytest.raises(InputError, match=r"shape \(7|shape \(1, 7"):
+        load_metric("lpips", weights=(backbone, other))
+
+
+class Calls:
+    """Calls a function where it is unpickled."""
+
+    def __reduce__(self):
+        return (Path.touch, (Path("called"),))
+
+
+def test_no_code_of_a_file_of_weights_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for write in (lambda file: torch.save({"features.0.weight": Calls()}, file), pickled):
+        write(tmp_path / "evil.pth")
+        with pytest.raises(InputError, match=r"evil\.pth"):
+            load_lpips([tmp_path / "evil.pth"])
+        assert not (tmp_path / "called").exists()
+
+
+def pickled(path: Path) -> None:
+    path.write_bytes(pickle.dumps(Calls()))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("lpips") is None, reason="lpips is not installed")
+def test_the_packages_own_weights_fit(lpips_case, tmp_path):
+    """Those of version 0.1 have the channels of our layers and are not negative, as their authors trained them."""
+    metric = load_lpips([lpips_case.folder / BACKBONES[lpips_case.name].file])
+    assert all((weights >= 0).all() and weights.any() for weights in metric.layer_weights)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("stlpips_pytorch") is None, reason="stlpips-pytorch is not installed")

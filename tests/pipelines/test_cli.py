@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import tyro
 
-from avatar.losses.perceptual import load_lpips
+from avatar.losses.perceptual_weights import load_lpips
 from pipelines.cli import COMMANDS, main
 from pipelines.commands.help import EXPERT_OPTIONS, INPUT_OPTIONS, NEED, NEEDED_OPTIONS, known_options, options_of
 from pipelines.runs.folders import own_run_folder

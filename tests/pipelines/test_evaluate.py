@@ -17,6 +17,7 @@ from avatar.evaluation.protocol import ProtocolConfig
 from avatar.evaluation.report import EvalReport
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.gaussians.tensor_file import save_bound
+from avatar.losses import perceptual_weights
 from avatar.models.model_file import save_avatar
 from avatar.models.networks.deformation_field import FieldConfig
 from avatar.models.student import Student, StudentConfig
@@ -39,6 +40,7 @@ from smplxpp.capture import open_capture
 from smplxpp.core import BodyParams, InputError
 from smplxpp.figures.drawings import read_tiles, surface_picture, write_tiles
 from smplxpp.template.template import Template
+from tests.dolls.lpips import lpips_weights
 from tests.dolls.standing import FRAMES, HELD_OUT, doll, dressed, write_frames
 from tests.pipelines.foreign_numbers import sections_of, with_foreign_numbers
 from tools.overview import held_out_view
@@ -391,5 +393,35 @@ def test_a_perceptual_distance_that_nobody_asked_for_is_no_warning(monkeypatch, 
     monkeypatch.setattr(command, "find_spec", lambda name: None)
     assert command._metric("auto") == "none" and "stlpips-pytorch" in caplog.text
     assert [record.levelname for record in caplog.records] == ["INFO"]
+    monkeypatch.setattr(perceptual_weights, "lpips_at_hand", lambda: True)
+    assert command._metric("auto") == "lpips"
     monkeypatch.setattr(command, "find_spec", lambda name: object())
-    assert command._metric("auto") == "st-lpips" and command._metric("lpips") == "lpips"
+    assert command._metric("auto") == "both" and command._metric("lpips") == "lpips"
+    monkeypatch.setattr(perceptual_weights, "lpips_at_hand", lambda: False)
+    assert command._metric("auto") == "st-lpips"
+
+
+def test_weights_of_lpips_are_read_before_anything_is_measured(trained, capture, tmp_path, capsys):
+    (tmp_path / "mine.pth").write_bytes(b"none")
+    options = ("--metric", "auto", "--lpips-weights", str(tmp_path / "mine.pth"))
+    assert evaluate(trained, capture, *options) == 2
+    assert "mine.pth" in capsys.readouterr().err
+    assert evaluate(trained, capture, *options, "--metric", "st-lpips") == 2
+    assert "metric auto, both or lpips" in capsys.readouterr().err
+    assert not (trained / "95_evaluate_work").exists()
+
+
+def test_other_weights_of_lpips_are_measured_with(trained, capture, tmp_path, capsys):
+    run, file = shutil.copytree(trained, tmp_path / "run"), tmp_path / "mine.pth"
+    options = ("--sets", "novel_view", "--samples", "0", "--metric", "lpips", "--lpips-weights", str(file))
+    of_torchvision, own = lpips_weights("alex")
+    ran, distances = [], []
+    for share in (1.0, 1.0, 2.0):
+        torch.save(of_torchvision | {name: share * value for name, value in own.items()}, file)
+        capsys.readouterr()
+        assert evaluate(run, capture, *options) == 0
+        answer = json.loads(capsys.readouterr().out)
+        ran.append(answer["ran"])
+        distances.append(answer["models"]["student"]["mean"]["novel_view"]["perceptual"])
+    assert answer["metric"] == "LPIPS (alex)" and ran == [True, False, True]
+    assert distances[1] == distances[0] and distances[2] == pytest.approx(2.0 * distances[0], rel=1e-5)

@@ -197,7 +197,7 @@ def test_a_missing_extra_is_named(run, original, capsys, monkeypatch):
 
 def test_a_perceptual_metric_that_is_not_installed(run, original, capsys, monkeypatch):
     """Asked for by name it is an error before work starts; `auto` warns and goes without."""
-    import avatar.losses.perceptual as perceptual
+    import avatar.losses.perceptual_weights as perceptual
 
     def missing(*args):
         raise perceptual.MissingPackageError("lpips", command="pip install lpips", purpose="LPIPS")
