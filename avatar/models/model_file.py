@@ -79,8 +79,9 @@ class StoredModel:
         """
         for name, make in makers.items():
             with torch.device("meta"):
-                state = make().state_dict()
-            require_like(self.tensors, {f"{name}.{key}": value for key, value in state.items()}, subject=self.subject)
+                network = make()
+            state = network.state_dict(prefix=f"{name}.", keep_vars=True)
+            require_like(self.tensors, state, subject=self.subject)
 
     def track(self, most: int) -> tuple[list[int], Tensor]:
         """Read the frames (T,) and control points (T, K, 3) of the tracked surface, K at most `most`."""

@@ -124,8 +124,14 @@ class SignedDistanceField:
         self._vertex_border = np.zeros(mesh.vertex_count, dtype=bool)
         self._vertex_border[edges[self._edge_border]] = True
 
-    def query(self, points: Float[np.ndarray, "N 3"]) -> SignedDistance:
-        """Return the signed distances of (N, 3) points, metres."""
+    def query(self, points: Float[np.ndarray, "N 3"], *, sided: Bool[np.ndarray, " N"] | None = None) -> SignedDistance:
+        """Return the signed distances of (N, 3) points, metres.
+
+        Args:
+            points: where to ask.
+            sided: for a solid, the points whose side is asked, because winding numbers take most of the time; the
+                others count as outside. None: all.
+        """
         points = np.ascontiguousarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise InputError("query points", expected="finite (N, 3)", received=f"shape {points.shape} or NaN")
@@ -140,6 +146,9 @@ class SignedDistanceField:
         inside = np.einsum("ij,ij->i", offset, normal) < 0
         if self._winding is not None:
             clear = length > self._resolution
+            if sided is not None:
+                inside &= sided
+                clear &= sided
             inside[clear] = self._inside(points[clear])
         side = np.where(inside, -1.0, 1.0)
         # On the surface the direction to the closest point is noise; the normal is its limit.

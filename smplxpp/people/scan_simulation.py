@@ -174,7 +174,7 @@ def _level_set(
     band = 2 * config.cell
     level = np.where(solid, -band, band)
     near = np.flatnonzero(_near_vertices(mesh, grid, config.cell))
-    where = SignedDistanceField(mesh, solid=True).query(grid[near])
+    where = SignedDistanceField(mesh, solid=True).query(grid[near], sided=solid[near])
     close = np.abs(where.distance) < band
     outside = ~solid[near] | ((where.distance > 0) & seen[where.face])
     level[near] = np.where(outside, 1.0, -1.0) * np.where(close, np.abs(where.distance), band)

@@ -279,9 +279,8 @@ def _places(mesh: TriangleMesh, own: BodyChart, posed: TriangleMesh, used: Bool[
     # The body's vertices are centimetres apart along a shin, so that heights go on between them by their gradient.
     place = own[nearest]
     beside = offset - along[:, None] * normals[nearest]
-    height, reach = (
-        value[nearest] + _between_vertices(posed, value, nearest, beside) for value in (own.height, own.reach)
-    )
+    change = _between_vertices(posed, np.stack([own.height, own.reach]), nearest, beside)
+    height, reach = own.height[nearest] + change[0], own.reach[nearest] + change[1]
     return replace(place, height=height, reach=reach, distance=distance)
 
 
@@ -314,25 +313,31 @@ def _hidden_hand(mesh: TriangleMesh, own: BodyChart, posed: TriangleMesh, chart:
 
 
 def _between_vertices(
-    posed: TriangleMesh, value: Float64[np.ndarray, " V"], nearest: np.ndarray, beside: Float64[np.ndarray, "M 3"]
-) -> Float64[np.ndarray, " M"]:
-    """Return by how much a function of the vertices changes from the nearest vertex over an offset along the surface.
+    posed: TriangleMesh, values: Float64[np.ndarray, "K V"], nearest: np.ndarray, beside: Float64[np.ndarray, "M 3"]
+) -> Float64[np.ndarray, "K M"]:
+    """Return by how much functions of the vertices change from the nearest vertex over an offset along the surface.
 
     The gradient g at a vertex minimises sum_j (value_j - value - g (x_j - x))^2 over its neighbours j; the change is
     bounded by half of the largest difference to a neighbour, where the next vertex begins.
     """
+    count = len(posed.vertices)
     ends = np.concatenate([posed.faces[:, [k, (k + 1) % 3]] for k in range(3)])
     start, end = np.concatenate([ends, ends[:, ::-1]]).T
-    step, rise = posed.vertices[end] - posed.vertices[start], value[end] - value[start]
-    matrix, right = np.zeros((len(value), 3, 3)), np.zeros((len(value), 3))
-    np.add.at(matrix, start, step[:, :, None] * step[:, None, :])
-    np.add.at(right, start, step * rise[:, None])
+    step = posed.vertices[end] - posed.vertices[start]
+    matrix = np.empty((count, 3, 3))
+    for i, j in np.ndindex(3, 3):
+        matrix[:, i, j] = np.bincount(start, step[:, i] * step[:, j], count)
     # The normal direction, in which the neighbours do not lie, is kept from the gradient by a small regularisation.
-    damping = 1e-3 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-    gradient = np.linalg.solve(matrix + damping, right[:, :, None])[:, :, 0]
-    bound = np.zeros(len(value))
-    np.maximum.at(bound, start, 0.5 * np.abs(rise))
-    return np.clip(np.einsum("ij,ij->i", gradient[nearest], beside), -bound[nearest], bound[nearest])
+    matrix += 1e-3 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+    out = np.empty((len(values), len(nearest)))
+    for row, value in zip(out, values, strict=True):
+        rise = value[end] - value[start]
+        right = np.stack([np.bincount(start, step[:, i] * rise, count) for i in range(3)], axis=1)
+        gradient = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+        bound = np.zeros(count)
+        np.maximum.at(bound, start, 0.5 * np.abs(rise))
+        row[:] = np.clip(np.einsum("ij,ij->i", gradient[nearest], beside), -bound[nearest], bound[nearest])
+    return out
 
 
 def in_column(chart: BodyChart) -> np.ndarray:

@@ -94,7 +94,6 @@ def find_objects(
         return FoundObjects.none(mesh.face_count)
     # The distance from each face to the body, and the part of it that is nearest, wherever the face looks.
     distance, nearest = cKDTree(posed.vertices).query(mesh.face_centers)
-    to_hand = cKDTree(posed.vertices[hand]).query(mesh.face_centers)[0]
     region = own.region[nearest]
     # Height of the standard person above which no cloth stands far off the trunk, metres.
     waist = 1.05
@@ -121,6 +120,7 @@ def find_objects(
     if not (mesh.face_areas[evidence > 0].sum() * _CM2 > _LEAST_AREA):
         return FoundObjects.none(mesh.face_count)
     # Boards at an arm or on the chest, from both sides.
+    to_hand = cKDTree(posed.vertices[hand]).query(mesh.face_centers)[0]
     flat = flat_share(mesh, to_hand < _BOARD_REACH)
     beside = np.where(chest, np.interp(distance, *_BOARD_ON_CHEST), np.isin(region, (ARM, HAND)))
     evidence = np.maximum(evidence, (1.0 + _BOARD) * flat * beside - 1.0)

@@ -61,10 +61,10 @@ def flat_share(mesh: TriangleMesh, near: Bool[np.ndarray, " M"]) -> Float64[np.n
     tree = cKDTree(points)
     one, other = tree.query_pairs(_SMOOTHED, output_type="ndarray").T
     beside = np.einsum("ij,ij->i", own[one], own[other]) > 0.7
-    normals = own.copy()
-    for a, b in ((one[beside], other[beside]), (other[beside], one[beside])):
-        np.add.at(normals, a, own[b])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    every = np.arange(count)  # a sample's own normal, then those of its neighbours
+    into, given = (np.concatenate([every, a[beside], b[beside]]) for a, b in ((one, other), (other, one)))
+    summed = np.stack([np.bincount(into, own[given, axis], count) for axis in range(3)], axis=1)
+    normals = summed / np.linalg.norm(summed, axis=1, keepdims=True)
     flat = _with_backs(_flat(points, normals, tree), points, normals, tree)
     # A face has the share of its own samples, and that of the nearest sample that looks the same way if it has none.
     drawn = np.bincount(face, minlength=part.face_count)

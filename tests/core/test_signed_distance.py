@@ -41,6 +41,14 @@ def test_sphere_agrees_with_libigl_and_the_formula(solid):
     assert not found.on_border.any()
 
 
+def test_points_whose_side_is_not_asked_count_as_outside():
+    points = np.random.default_rng(3).normal(0, 0.8, (500, 3))
+    field, asked = SignedDistanceField(sphere(), solid=True), np.arange(500) % 2 == 0
+    whole, some = field.query(points), field.query(points, sided=asked)
+    assert (whole.distance[~asked] < 0).any()
+    assert np.array_equal(some.distance, np.where(asked, whole.distance, np.abs(whole.distance)))
+
+
 @pytest.mark.parametrize("solid", [True, False])
 def test_gradient_leads_to_the_asked_distance(solid):
     mesh, points = sphere(), np.random.default_rng(1).normal(0, 0.8, (300, 3))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -55,10 +56,10 @@ class FirFilter(nn.Module):
 
     def __init__(self, *, gain: float = 1.0) -> None:
         super().__init__()
-        taps = torch.tensor(FIR_TAPS)
+        taps = np.array(FIR_TAPS, dtype=np.float32)
         # The outer product of the taps with themselves, normalised to sum `gain`.
-        kernel = torch.outer(taps, taps) * (gain / sum(FIR_TAPS) ** 2)
-        self.register_buffer("kernel", kernel[None, None], persistent=False)
+        kernel = np.outer(taps, taps) * np.float32(gain / sum(FIR_TAPS) ** 2)
+        self.register_buffer("kernel", torch.tensor(kernel[None, None]), persistent=False)
 
     def forward(self, image: Float[Tensor, "B C H W"], *, padding: int) -> Float[Tensor, "B C h w"]:
         """Filter images; each side becomes `2 padding - 3` pixels longer."""
@@ -76,12 +77,23 @@ class FirFilter(nn.Module):
         return self.kernel.to(image.dtype).expand(image.shape[1], -1, -1, -1)
 
 
+def _normal(*size: int, over: float = 1.0) -> Tensor:
+    """Draw from N(0, 1 / over^2); on the device "meta", whose tensors have no values, draw nothing.
+
+    Torch's draws there import its compiler, which takes 1.5 s of every process that reads or foresees a teacher.
+    """
+    if torch.get_default_device().type == "meta":
+        return torch.empty(size)
+    drawn = torch.randn(size)
+    return drawn if over == 1.0 else drawn / over
+
+
 class EqualizedLinear(nn.Module):
     """`y = r (W x / sqrt(fan in) + b)` with W ~ N(0, 1 / r^2): r is the layer's learning-rate multiplier."""
 
     def __init__(self, inputs: int, outputs: int, *, bias: float = 0.0, lr_multiplier: float = 1.0) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs) / lr_multiplier)
+        self.weight = nn.Parameter(_normal(outputs, inputs, over=lr_multiplier))
         self.bias = nn.Parameter(torch.full((outputs,), bias))
         self.lr_multiplier = lr_multiplier
         self.scale = 1.0 / math.sqrt(inputs)
@@ -97,7 +109,7 @@ class _EqualizedConv(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
+        self.weight = nn.Parameter(_normal(outputs, inputs, kernel, kernel))
         self.bias = nn.Parameter(torch.zeros(outputs))
         self.scale = GAIN / math.sqrt(inputs * kernel**2)
 
@@ -148,7 +160,7 @@ class ModulatedWeight(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, kernel: int, style_size: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
+        self.weight = nn.Parameter(_normal(outputs, inputs, kernel, kernel))
         self.affine = EqualizedLinear(style_size, inputs, bias=1.0)
 
     def forward(self, style: Float[Tensor, " S"]) -> Float[Tensor, "O I K K"]:
@@ -186,7 +198,7 @@ class StyledConv(nn.Module):
         # The gain of the activation, and that of the zeros in between, ride on the filter where there is one.
         self.filter = FirFilter(gain=4.0 * GAIN) if up else None
         if noise_size is not None:
-            self.register_buffer("noise", torch.randn(1, 1, noise_size, noise_size))
+            self.register_buffer("noise", _normal(1, 1, noise_size, noise_size))
             self.noise_strength = nn.Parameter(torch.zeros(()))
         else:
             self.noise = None
