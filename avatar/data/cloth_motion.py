@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 
 from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment
-from smplxpp.cloth.driver import LONGEST_STEP
 from smplxpp.cloth.play import SMOOTHING, followed
 from smplxpp.cloth.poses import resampled
 from smplxpp.cloth.quality import ClothQuality, merged
@@ -136,7 +135,7 @@ class ClothMotions:
         out: dict[int, list[BodyParams]] = {}
         apart = int(np.diff(self._frames).min()) if len(self._frames) > 1 else 1
         # Cut at long gaps.
-        cuts = np.flatnonzero(np.diff(frames) > max(apart, LONGEST_STEP * self._fps)) + 1
+        cuts = np.flatnonzero(np.diff(frames) > max(apart, self.config.driver.longest_step * self._fps)) + 1
         for stretch in np.split(np.array(frames), cuts):
             found = [self._params(int(frame)) for frame in stretch]
             poses = BodyParams.concatenate([one for one in found if one is not None])

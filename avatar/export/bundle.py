@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from avatar.models.networks.blend_shapes import BlendShapes
 from avatar.models.networks.pose_dependence import BODY_JOINTS
 from avatar.models.student import Student
 from avatar.runtime.bundle import GARMENTS, MOTION, AboutAvatar, motion_tensors, save_bundle
+from smplxpp.cloth.driver import DriverConfig
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.garment_file import garments_to_arrays
 from smplxpp.core import BodyParams, require_positive
@@ -69,6 +70,7 @@ class BundleExtras:
         licence: see `AboutAvatar`.
         provenance: see `AboutAvatar`.
         garments: the loose clothes.
+        cloth: how players step these.
         motion: to play; None: none is stored.
     """
 
@@ -76,6 +78,7 @@ class BundleExtras:
     licence: str = ""
     provenance: Mapping[str, str] = field(default_factory=dict)
     garments: Sequence[Garment] = ()
+    cloth: DriverConfig = field(default_factory=DriverConfig)
     motion: BodyParams | None = None
 
 
@@ -114,7 +117,7 @@ def write_bundle(
         known = {"known": student.pose_gate.poses, "scale": student.pose_gate.scale}
         pieces["poses"] = ({name: value.cpu().numpy() for name, value in known.items()}, {})
     if extras.garments:
-        pieces[GARMENTS] = _garments(extras.garments, cut)
+        pieces[GARMENTS] = _garments(extras, cut)
     if extras.motion is not None:
         pieces[MOTION] = (motion_tensors(extras.motion), {})
     # The header describes the avatar, so that a player can name joints and expressions without the template.
@@ -335,12 +338,12 @@ def _blend(
     return out
 
 
-def _garments(garments: Sequence[Garment], cut: _Cut) -> tuple[Tensors, Mapping[str, Any]]:
-    """Return garments over the bundle's vertices, with float64 arrays narrowed to float32."""
-    own = [garment.with_vertices_at(cut.place) for garment in garments]
+def _garments(extras: BundleExtras, cut: _Cut) -> tuple[Tensors, Mapping[str, Any]]:
+    """Return garments over the bundle's vertices, with float64 arrays narrowed to float32, and how they are stepped."""
+    own = [garment.with_vertices_at(cut.place) for garment in extras.garments]
     arrays, about = garments_to_arrays(own)
     narrow = {name: value.astype(np.float32) for name, value in arrays.items() if value.dtype == np.float64}
-    return {**arrays, **narrow}, about
+    return {**arrays, **narrow}, {**about, "simulation": asdict(extras.cloth)}
 
 
 def _numbers(value: Tensor) -> Float[np.ndarray, "*N"]:

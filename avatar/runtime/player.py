@@ -33,7 +33,7 @@ class AvatarPlayer:
     Args:
         bundle: the avatar, or its file.
         threads: of the kernels; None: the number of CPUs, at most 8.
-        cloth: configuration of the cloth simulation.
+        cloth: configuration of the cloth simulation; None: the bundle's.
         clock: returns seconds.
 
     Attributes:

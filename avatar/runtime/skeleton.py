@@ -12,7 +12,7 @@ from avatar.runtime.bundle import AvatarBundle
 from smplxpp.body.model import BodyModel
 from smplxpp.body.retarget import PoseRange
 from smplxpp.cloth.driver import ClothDriver, ClothShape, DriverConfig
-from smplxpp.cloth.garment_file import garments_from_arrays
+from smplxpp.cloth.garment_file import garments_from_arrays, simulation_from
 from smplxpp.cloth.poses import pose_between
 from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import BodyParams, SkinWeights, require_positive
@@ -141,8 +141,9 @@ class LooseClothes:
             if name.split(".")[-1] in ("particles", "vertices", "collider_vertices"):
                 inside = value.size == 0 or (value.dtype.kind in "iu" and 0 <= value.min() <= value.max() < len(at))
                 wide[name] = at[value] if inside else np.full_like(value, -1)  # the reader refuses -1
-        garments = garments_from_arrays(wide, bundle.garments_about, template, subject="garments of the avatar")
-        self._driver = ClothDriver(template, garments, config)
+        about, subject = bundle.garments_about, "garments of the avatar"
+        garments = garments_from_arrays(wide, about, template, subject=subject)
+        self._driver = ClothDriver(template, garments, config or simulation_from(about, subject=subject))
         self._place = np.full(template.vertex_count, -1, dtype=np.int64)
         self._place[at] = np.arange(len(at))
 

@@ -19,35 +19,51 @@ from smplxpp.core import BodyParams, InputError, require_at_least, require_choic
 from smplxpp.core.errors import one_line
 from smplxpp.template.template import Template
 
-# Longest step that is simulated; a longer one is a cut.
-LONGEST_STEP = 0.26
-
 
 @dataclass(frozen=True, kw_only=True)
 class DriverConfig:
     """Options of a cloth driver: cold starts, cuts and the solver.
 
+    A bundle holds all of them, so that a page repeats none.
+
     Attributes:
         ramp: seconds in which a cold start goes from the reference pose, where the cloth is at rest, to the first one.
+        ramp_step: seconds of its steps.
         hold: seconds for which it then stays there.
+        longest_step: seconds; a longer step is a cut and restarts, because cloth does not follow straight lines.
         teleport: speed, in metres a second, of the cloth's attachments above which a motion is a cut and restarts.
         most_stretch: length of the longest edge over that at rest from which the cloth is taken to have exploded.
         most_drawn: longest drawn edge over its length at rest; above `SolverConfig.most_stretch`, because the drawn
             surface bends about the simulated one at a distance.
+        sliver: metres; shorter drawn edges count as that long, because a scan's decimation leaves slivers.
+        beside: metres in the plane of the triangle that carries a vertex, from which this bridges an opening.
+        drawn_margin: metres that drawn vertices keep from the skin, which comes through between particles.
+        least_determinant: of a blend of rotations; below, its inverse would blow up what the cloth did.
+        wander: metres of the root from the origin of the particles' places above which that follows it, because
+            float32 loses precision with the distance.
         solver: how time is stepped.
     """
 
     ramp: float = 0.7
+    ramp_step: float = 1.0 / 30.0
     hold: float = 0.2
+    longest_step: float = 0.26
     teleport: float = 12.0
     most_stretch: float = 4.0
     most_drawn: float = 1.5
+    sliver: float = 0.005
+    beside: float = 0.005
+    drawn_margin: float = 0.002
+    least_determinant: float = 0.2
+    wander: float = 4.0
     solver: SolverConfig = field(default_factory=SolverConfig)
 
     def __post_init__(self) -> None:
-        for name in ("ramp", "hold"):
+        for name in ("ramp", "hold", "beside", "drawn_margin"):
             require_at_least(f"cloth driver: {name}", getattr(self, name), 0.0)
-        for name in ("teleport", "most_stretch"):
+        for name in (
+            *("ramp_step", "longest_step", "teleport", "most_stretch", "sliver", "least_determinant", "wander"),
+        ):
             require_positive(f"cloth driver: {name}", getattr(self, name))
         require_at_least("cloth driver: most_drawn", self.most_drawn, 1.0)
 
@@ -151,8 +167,8 @@ class ClothDriver:
     def step(self, params: BodyParams | None, seconds: float, *, posed: PosedBody | None = None) -> ClothShape:
         """Step the clothes to the next pose.
 
-        The first one, one that lies `LONGEST_STEP` or more after the last, and one that what holds the cloth could not
-        have reached start cold: a ramp leads there from the reference pose.
+        The first one, one that lies `DriverConfig.longest_step` or more after the last, and one that what holds the
+        cloth could not have reached start cold: a ramp leads there from the reference pose.
 
         Args:
             params: one frame; None: the pose is not known at this time, and the cloth stays as it is on the body.
@@ -178,7 +194,7 @@ class ClothDriver:
             return posed
         require_positive("seconds of a step", seconds)
         self._time += seconds
-        if seconds > LONGEST_STEP:
+        if seconds > self.config.longest_step:
             self.notes.append(f"{seconds:.2f} s without a pose before {self._time:.2f} s: the clothes restart")
             self._start(params, posed)
         # A leap faster than the teleport speed is a cut in the motion: carrying the state across would tear the cloth.
@@ -192,8 +208,7 @@ class ClothDriver:
         """Come to a first pose from the reference pose, where the cloth hangs as it was scanned."""
         # The reference is turned to face as the first pose does, so that the ramp does not whirl the cloth around.
         start = reference_facing_as(self._threads[0].garment.reference, params)
-        # Step of the ramp of a cold start.
-        ramp_step = 1.0 / 30.0
+        ramp_step = self.config.ramp_step
         steps, still = (round(t / ramp_step) for t in (self.config.ramp, self.config.hold))
         self._origin = np.array(posed.joints[0, 0])
         places = self._places(self.template.posed_body(start) if steps else posed)
@@ -220,9 +235,7 @@ class ClothDriver:
         """Move all garments on to a pose; False, and nothing moved, where what holds them went too fast."""
         # Keep the origin near the person: float32 coordinates lose precision with their distance from it.
         away = posed.joints[0, 0] - self._origin
-        # Distance, in metres, of the root from the origin of the particles' places above which the origin follows it.
-        far = 4.0
-        if np.abs(away).max() > far:
+        if np.abs(away).max() > self.config.wander:
             self._origin = self._origin + away
             for thread in self._threads:
                 thread.shift(-away.astype(np.float32))
@@ -274,7 +287,9 @@ class ClothDriver:
         """Take the cloth as it is back to the T-pose."""
         each = [thread.carried() for thread in self._threads]
         carried = np.concatenate(each)
-        displacements = self._fine_skinned.unposed(posed, self._rest, carried, origin=self._origin)
+        displacements = self._fine_skinned.unposed(
+            posed, self._rest, carried, origin=self._origin, least_determinant=self.config.least_determinant
+        )
         self._shape = ClothShape(self._fine, displacements, self._shape.share)
         self._measure(each)
         return self._shape

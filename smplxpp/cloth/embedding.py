@@ -135,15 +135,15 @@ class SkinnedRows:
         places: Float32[np.ndarray, "R 3"],
         *,
         origin: Float[np.ndarray, " 3"],
+        least_determinant: float,
     ) -> Float32[np.ndarray, "R 3"]:
         """Return the displacements in the T-pose that skinning takes to places: `(sum_j w_j G_j)^-1 x - v`, metres.
 
-        Joints that turn against each other flatten a blend; such a vertex stays with skinning.
+        Joints that turn against each other flatten a blend; a vertex whose blend has less than the least determinant
+        stays with skinning.
         """
         assert places.shape == (self._count, 3)
         out = np.empty((self._count, 3), dtype=np.float32)
-        # Of a blend of rotations; below, its inverse blows up what the cloth did.
-        least_determinant = 0.2
         native_library().smplxpp_cloth_unposed(
             *(ctypes.byref(self._native), address(self._transforms(body, origin)), address(rest), address(places)),
             *(ctypes.c_float(least_determinant), address(out)),

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from smplxpp.cloth.collider import ColliderMesh
+from smplxpp.cloth.driver import DriverConfig
 from smplxpp.cloth.embedding import Embedding
 from smplxpp.cloth.garment import Garment, GarmentConfig
-from smplxpp.cloth.model import Fabric
+from smplxpp.cloth.model import Fabric, SolverConfig
 from smplxpp.core import BodyParams, InputError, TriangleMesh, row_lengths
-from smplxpp.core.files import as_list, as_number, as_object, as_text, parse_json, read_arrays, write_arrays
+from smplxpp.core.files import as_integer, as_list, as_number, as_object, as_text, parse_json, read_arrays, write_arrays
 from smplxpp.core.params import ARRAY_NAMES
 from smplxpp.template.template import Template
 
@@ -205,3 +206,30 @@ def _config(stored: Mapping[str, Any], subject: str) -> GarmentConfig:
 def _numbers(stored: Mapping[str, Any], cls: type, subject: str, *, without: tuple[str, ...] = ()) -> dict[str, float]:
     names = [field.name for field in fields(cls) if field.name not in without]
     return {name: as_number(stored.get(name), subject=f"{subject}: {name}", least=0.0, most=1e9) for name in names}
+
+
+def simulation_from(about: Mapping[str, Any], *, subject: str) -> DriverConfig:
+    """Return how garments are stepped, as a bundle says beside them; numbers that it lacks are the defaults.
+
+    Raises:
+        InputError: other than numbers, or ones so far from the defaults that a step would take minutes.
+    """
+    stored = as_object(about.get("simulation", {}), subject=f"{subject}: simulation")
+    solver = as_object(stored.get("solver", {}), subject=f"{subject}: simulation: solver")
+    return DriverConfig(
+        **_options(stored, DriverConfig(), f"{subject}: simulation"),
+        solver=SolverConfig(**_options(solver, SolverConfig(), f"{subject}: simulation: solver")),
+    )
+
+
+def _options(stored: Mapping[str, Any], usual: DriverConfig | SolverConfig, subject: str) -> dict[str, Any]:
+    """The stored numbers of a configuration, up to ten times the default; steps of time from a tenth of it."""
+    out: dict[str, Any] = {}
+    for name, value in asdict(usual).items():
+        if name not in stored or name == "solver":
+            continue
+        least, most = 0.1 * value if name in ("substep", "ramp_step") else 0.0, max(10.0 * value, 0.1)
+        out[name] = as_number(stored[name], subject=f"{subject}: {name}", least=least, most=most)
+        if isinstance(value, int):
+            out[name] = as_integer(stored[name], subject=f"{subject}: {name}", least=1)
+    return out

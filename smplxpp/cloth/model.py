@@ -59,6 +59,7 @@ class SolverConfig:
         own_margin: metres that particles of one garment keep from each other; 0: they may pass through each other.
         most_speed: metres a second; a safeguard, above what a garment does.
         most_stretch: longest edge over its length at rest: a hard bound at the end of every span of time.
+        gravity: m/s^2 downwards.
     """
 
     substep: float = 1.0 / 500.0
@@ -66,13 +67,15 @@ class SolverConfig:
     own_margin: float = 0.0
     most_speed: float = 8.0
     most_stretch: float = 1.2
+    gravity: float = 9.81
 
     def __post_init__(self) -> None:
         for name in ("substep", "most_speed"):
             require_positive(f"solver: {name}", getattr(self, name))
         require_at_least("solver: most_stretch", self.most_stretch, 1.0)
         require_at_least("solver: contacts_every", self.contacts_every, 1)
-        require_at_least("solver: own_margin", self.own_margin, 0.0)
+        for name in ("own_margin", "gravity"):
+            require_at_least(f"solver: {name}", getattr(self, name), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

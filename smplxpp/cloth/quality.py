@@ -164,42 +164,47 @@ class EdgeLengths:
         return float(np.sqrt(most)) if np.isfinite(most) else float("inf")
 
 
-def drawn_edges(garment: Garment, faces: Int[np.ndarray, "F 3"]) -> EdgeLengths:
+def drawn_edges(garment: Garment, faces: Int[np.ndarray, "F 3"], *, beside: float) -> EdgeLengths:
     """Return the lengths of a drawn garment's edges where the simulation alone moves both ends.
 
     Args:
         faces: of the template, over its vertices.
+        beside: see `carried_edges`.
     """
-    edges, rest = carried_edges(garment, faces)
+    edges, rest = carried_edges(garment, faces, beside=beside)
     alone = (garment.share() >= 1.0)[edges].all(axis=1)
     # Metres: shorter edges are slivers, of which a scan's decimation leaves some of a millimetre.
     return EdgeLengths(edges[alone], rest[alone], 0.01)
 
 
 def drawn_bounds(
-    garment: Garment, faces: Int[np.ndarray, "F 3"], most: float
+    garment: Garment, faces: Int[np.ndarray, "F 3"], *, most: float, least: float, beside: float
 ) -> tuple[Int[np.ndarray, "e 2"], Float[np.ndarray, " e"]]:
     """Return the edges of a drawn garment, as pairs of its vertices, and how long each may be drawn, metres.
 
     Args:
         faces: of the template, over its vertices.
         most: times the length at rest.
+        least: metres; shorter edges are slivers, which count as that long.
+        beside: see `carried_edges`.
     """
-    least = 0.005  # metres; shorter edges are slivers, which count as that long
-    edges, rest = carried_edges(garment, faces)
+    edges, rest = carried_edges(garment, faces, beside=beside)
     return edges, most * np.maximum(rest, least)
 
 
 def carried_edges(
-    garment: Garment, faces: Int[np.ndarray, "F 3"]
+    garment: Garment, faces: Int[np.ndarray, "F 3"], *, beside: float
 ) -> tuple[Int[np.ndarray, "e 2"], Float[np.ndarray, " e"]]:
     """Return the edges of what a garment carries, as pairs of its vertices, and their lengths at rest, metres.
 
     Vertices of bridges over an opening lie beside the triangle that carries them: they are no cloth.
+
+    Args:
+        faces: of the template, over its vertices.
+        beside: metres in the triangle's plane from which a vertex is one of a bridge.
     """
     at = np.full(int(max(faces.max(initial=-1), garment.vertices.max(initial=-1))) + 1, -1)
     at[garment.vertices] = np.arange(len(garment.vertices))
-    beside = 0.005  # metres
     at[garment.vertices[np.abs(garment.embedding.offset[:, :2]).max(axis=1, initial=0.0) >= beside]] = -1
     corners = at[faces]
     pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])

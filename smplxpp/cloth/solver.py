@@ -14,8 +14,6 @@ from smplxpp.cloth.model import ClothModel, Fabric, SolverConfig
 from smplxpp.core.errors import InputError
 from smplxpp.native import address, native_library
 
-GRAVITY = 9.81
-
 
 @dataclass(frozen=True, eq=False)
 class Collider:
@@ -91,7 +89,7 @@ class ClothSolver:
         )
         self._report = np.zeros(2, dtype=np.int64)
         self._forces = _Forces(
-            GRAVITY,
+            config.gravity,
             *(fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction),
             *(config.own_margin, config.most_speed, config.most_stretch, address(self._report, "int64")),
         )

@@ -17,9 +17,6 @@ from smplxpp.core.mesh import row_lengths
 if TYPE_CHECKING:
     from smplxpp.cloth.driver import DriverConfig
 
-# Metres that what is carried keeps from the skin.
-_FINE_MARGIN = 0.002
-
 
 class GarmentThread:
     """State of one garment while it is simulated.
@@ -37,20 +34,20 @@ class GarmentThread:
         config: DriverConfig,
         faces: Int[np.ndarray, "F 3"],
     ) -> None:
-        self.garment, self._most_stretch = garment, config.most_stretch
+        self.garment, self._config = garment, config
         self._model = garment.model()
         collider = garment.collider
         self._solver = ClothSolver(self._model, collider.native, garment.config.fabric, config.solver)
         self._carried = CarriedVertices(
             *(garment.embedding, garment.rest.faces, self._solver.collider, len(garment.particles)),
-            drawn_bounds(garment, faces, config.most_drawn),
+            drawn_bounds(garment, faces, most=config.most_drawn, least=config.sliver, beside=config.beside),
         )
         self._particles = np.searchsorted(rows, garment.particles)
         self._skin = np.searchsorted(rows, collider.vertices)
         self._pinned = np.flatnonzero(garment.pinned)
         self._share = garment.share()
         self._edges = EdgeLengths(self._model.edges, self._model.lengths, 0.0)
-        self._drawn = drawn_edges(garment, faces)
+        self._drawn = drawn_edges(garment, faces, beside=config.beside)
         self._resets = self._released = 0
         self._state = ClothState.at_rest(garment.rest.vertices)
         self._places: list[Float32[np.ndarray, "n 3"]] = []
@@ -110,11 +107,11 @@ class GarmentThread:
         return self._state.position.copy()
 
     def carried(self) -> Float32[np.ndarray, "N 3"]:
-        """Return the vertices that the garment carries, metres, `_FINE_MARGIN` outside of what it touches.
+        """Return the vertices that the garment carries, metres, `drawn_margin` outside of what it touches.
 
         Between particles that keep their margin a limb's curve can come through.
         """
-        return self._carried.at(self._state.position, self._surfaces[-1], margin=_FINE_MARGIN)
+        return self._carried.at(self._state.position, self._surfaces[-1], margin=self._config.drawn_margin)
 
     def buried(self) -> int:
         """Return how many particles lie inside what the garment touches, by so much that no contact pushes them out."""
@@ -171,7 +168,7 @@ class GarmentThread:
         x = self._state.position
         if not (np.isfinite(x).all() and np.isfinite(self._state.velocity).all()):
             return False
-        return self._edges.longest(x) <= self._most_stretch
+        return self._edges.longest(x) <= self._config.most_stretch
 
 
 def _four_moments(

@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from smplxpp.cloth import solver as solver_module
 from smplxpp.cloth.model import Fabric, SolverConfig, build_model
-from smplxpp.cloth.solver import GRAVITY, ClothState, move_before_collider
+from smplxpp.cloth.solver import ClothState, move_before_collider
 from smplxpp.core import InputError, TriangleMesh, matrix_from_rotvec
-from tests.cloth.oracle import substep
+from tests.cloth.oracle import GRAVITY, substep
 from tests.cloth.sheets import PLAIN, Scene, ball, bent, collider, free, grid, hanging, held, hung, lying, permuted
 
 ROOT = Path(__file__).parents[2]
@@ -25,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture
 def weightless(monkeypatch):
     """No gravity."""
-    monkeypatch.setattr(solver_module, "GRAVITY", 0.0)
+    monkeypatch.setitem(SolverConfig.__init__.__kwdefaults__, "gravity", 0.0)
 
 
 def shaken(seed: int = 0, count: int = 35, speed: float = 0.5) -> np.ndarray:

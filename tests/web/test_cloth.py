@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ import pytest
 
 from avatar.runtime import AvatarPlayer
 from avatar.runtime.skeleton import LooseClothes
-from smplxpp.cloth import DriverConfig
+from smplxpp.cloth import DriverConfig, SolverConfig
+from smplxpp.core import InputError
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import standing
 from tests.cloth.test_driver import QUICK, swaying
@@ -34,7 +35,7 @@ for (const [frame, seconds, how] of given.steps) {
 }"""
 
 
-def followed(path: Path, config: DriverConfig, steps: list[tuple[int, float]]) -> list[dict[str, Any]]:
+def followed(path: Path, config: DriverConfig | None, steps: list[tuple[int, float]]) -> list[dict[str, Any]]:
     """What the runtime makes of the same steps."""
     player = AvatarPlayer(path, threads=1, cloth=config)
     out, motion = [], player.motion
@@ -46,8 +47,8 @@ def followed(path: Path, config: DriverConfig, steps: list[tuple[int, float]]) -
     return out
 
 
-def played(path: Path, config: DriverConfig, steps: list[tuple]) -> list[dict[str, Any]]:
-    start = {"ramp": config.ramp, "hold": config.hold}
+def played(path: Path, config: DriverConfig | None, steps: list[tuple]) -> list[dict[str, Any]]:
+    start = {} if config is None else {"ramp": config.ramp, "hold": config.hold}
     return node(PLAYED, given={"path": str(path), "start": start, "steps": steps})
 
 
@@ -175,9 +176,62 @@ def changed(path: Path, out: Path, change: Callable[[dict[str, Any]], None]) -> 
     return out
 
 
+# Every number other than its default, and so that a swaying skirt shows it.
+OTHERS = DriverConfig(
+    **{"ramp": 0.25, "ramp_step": 0.05, "hold": 0.1, "longest_step": 0.07, "teleport": 6.0, "most_stretch": 3.0},
+    **{
+        "most_drawn": 1.05,
+        "sliver": 0.002,
+        "beside": 0.02,
+        "drawn_margin": 0.015,
+        "least_determinant": 0.5,
+        "wander": 2.0,
+    },
+    solver=SolverConfig(
+        substep=0.003, contacts_every=4, own_margin=0.005, most_speed=1.0, most_stretch=1.05, gravity=3.0
+    ),
+)
+
+
+def told(numbers: dict[str, Any]) -> Callable[[dict[str, Any]], None]:
+    """Say in a bundle how its garments are stepped."""
+    return lambda about: about.update(simulation=numbers)
+
+
+def test_the_page_and_the_runtime_step_clothes_by_the_numbers_of_the_bundle(dressed, tmp_path):
+    """Eighteen of them stood in TypeScript a second time."""
+    usual_numbers, others = asdict(DriverConfig()), asdict(OTHERS)
+    for found, own in ((others, usual_numbers), (others["solver"], usual_numbers["solver"])):
+        assert all(found[name] != value for name, value in own.items()), "a number that is not tried"
+    path = changed(dressed, tmp_path / "other.avatar", told(others))
+    steps = [(k, 1.0 / FPS) for k in range(12)]
+    ours, theirs, usual = played(path, None, steps), followed(path, None, steps), followed(dressed, None, steps)
+    assert differences(ours, theirs).max() < 5e-4
+    assert differences(arrays(ours), usual).min() > 5e-3
+    for one, other in zip(ours[::3], theirs[::3], strict=True):
+        np.testing.assert_allclose(np.reshape(one["means"], (-1, 3)), other["means"], atol=5e-3)
+
+
+def test_bundles_that_say_no_numbers_are_stepped_as_before(dressed, tmp_path):
+    older = changed(dressed, tmp_path / "older.avatar", lambda about: about.pop("simulation"))
+    empty = changed(dressed, tmp_path / "empty.avatar", told({"solver": {}}))
+    steps = [(k, 1.0 / FPS) for k in range(3)]
+    found = played(older, None, steps)
+    assert differences(found, followed(older, None, steps)).max() < 5e-4
+    assert differences(found, arrays(played(empty, None, steps))).max() == 0.0
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [
+        (told({"ramp": "long"}), "ramp"),
+        (told({"solver": {"substep": 1e-9}}), "substep"),
+        (told({"solver": {"contacts_every": 2.5}}), "contacts_every"),
+        (told({"sliver": 0.0}), "sliver"),
+        (told({"teleport": -1.0}), "teleport"),
+        (told({"solver": {"most_stretch": 0.5}}), "most_stretch"),
+        (told({"solver": [1.0]}), "solver"),
+        (told(None), "simulation"),
         (lambda about: about.update(schema=99), "version 99"),
         (lambda about: about["garments"][0]["config"].update(pin_depth="deep"), "pin_depth"),
         (lambda about: about["garments"][0]["config"]["fabric"].update(density=0.0), "density"),
@@ -191,3 +245,5 @@ def test_garments_that_do_not_fit_are_refused(dressed, tmp_path, change, word):
         "let result = ''; try { await read(given); } catch (error) { result = error.message; }", given=str(path)
     )
     assert word in said
+    with pytest.raises(InputError, match=word):
+        AvatarPlayer(path)

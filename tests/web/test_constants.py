@@ -19,10 +19,7 @@ from avatar.speech.coarticulation import ARTICULATORS, Timing
 from avatar.speech.face import JAW_ANGLE, MAX_UNOBSERVED
 from avatar.speech.lips import PHONES, VERSION
 from pipelines.web.chat_server import REPLACED
-from smplxpp.cloth import garment_file, quality, solver, thread
-from smplxpp.cloth.driver import LONGEST_STEP, ClothDriver, DriverConfig
-from smplxpp.cloth.embedding import SkinnedRows
-from smplxpp.cloth.model import SolverConfig
+from smplxpp.cloth import garment_file
 from smplxpp.core.params import DEFAULT_FPS
 
 WEB = Path(__file__).resolve().parents[2] / "web"
@@ -65,36 +62,13 @@ def local(function: Callable[..., object], name: str) -> float:
     raise AssertionError(f"{function.__qualname__} gives no number the name {name}")
 
 
-DRIVER, SOLVER, TIMING = DriverConfig(), SolverConfig(), Timing()
+TIMING = Timing()
 REPEATED = {
     "src/bundle/motion.ts": {"USUAL_RATE": DEFAULT_FPS},
     "src/chat/connection.ts": {"REPLACED": REPLACED},
     "src/chat/conversation.ts": {"MOST_TYPED": MOST_TYPED},
     "src/chat/microphone.ts": {"RATE": RATE},
-    "src/cloth/carried.ts": {
-        "MOST_DRAWN": DRIVER.most_drawn,
-        "LEAST": local(quality.drawn_bounds, "least"),
-        "BESIDE": local(quality.carried_edges, "beside"),
-        "LEAST_DETERMINANT": local(SkinnedRows.unposed, "least_determinant"),
-    },
-    "src/cloth/driver.ts": {
-        "LONGEST_STEP": LONGEST_STEP,
-        "RAMP": DRIVER.ramp,
-        "HOLD": DRIVER.hold,
-        "TELEPORT": DRIVER.teleport,
-        "RAMP_STEP": local(ClothDriver._start, "ramp_step"),
-        "FAR": local(ClothDriver._advance, "far"),
-        "SAME": local(garment_file._garment, "same"),
-    },
-    "src/cloth/thread.ts": {
-        "SUBSTEP": SOLVER.substep,
-        "CONTACTS_EVERY": SOLVER.contacts_every,
-        "MOST_SPEED": SOLVER.most_speed,
-        "MOST_STRETCH": DRIVER.most_stretch,
-        "LONGEST_EDGE": SOLVER.most_stretch,
-        "GRAVITY": solver.GRAVITY,
-        "FINE_MARGIN": thread._FINE_MARGIN,
-    },
+    "src/cloth/driver.ts": {"SAME": local(garment_file._garment, "same")},
     "src/lips/features.ts": {
         "RATE": audio_features.RATE,
         "HOP": audio_features.HOP,

@@ -1,6 +1,7 @@
 /** What the player knows of an avatar once its bundle is read: plain typed arrays, rows one after the other. */
 
 import type { Garment } from "../cloth/garment.ts";
+import type { Simulation } from "../cloth/simulation.ts";
 
 /** Joints, and how expressions move them at rest. */
 export interface Skeleton {
@@ -171,6 +172,7 @@ export interface Avatar {
   gaussians: Gaussians;
   /** Loose clothes to be simulated, the inner ones first. */
   garments: Garment[];
+  simulation: Simulation;
   motion: Motion | null;
   /** Of the file. */
   bytes: number;

@@ -3,8 +3,9 @@
 import type { Avatar } from "../avatar/avatar.ts";
 import { poseAt } from "../avatar/motion.ts";
 import { edgesOf, type Fabric, type Garment } from "../cloth/garment.ts";
+import { UNTOLD, type Simulation } from "../cloth/simulation.ts";
 import { BundleError, EXPORT_AGAIN } from "./errors.ts";
-import { asList, asNumber, asObject, asText } from "./json.ts";
+import { asInteger, asList, asNumber, asObject, asText } from "./json.ts";
 import type { Tensors } from "./layout.ts";
 import { readMotion } from "./motion.ts";
 import type { Tensor } from "./tensors.ts";
@@ -30,6 +31,9 @@ const FABRIC: Record<keyof Fabric, boolean> = {
 };
 const CONFIG = { spacing: false, collider_spacing: false, pin_depth: false, band: false, skin_margin: true, sheet_margin: true };
 const MOST = 1e9;
+/** Numbers of a simulation that are whole, that are steps of time, and that may be 0. */
+const COUNTS = ["contacts_every"], STEPS = ["substep", "ramp_step"];
+const MAY_BE_0 = ["ramp", "hold", "beside", "drawn_margin", "own_margin", "gravity"];
 
 /**
  * Reads them. @param about what the piece says of itself.
@@ -49,6 +53,26 @@ export function readGarments(piece: Map<string, Tensor>, about: Record<string, u
     if (!known || String(Number(k)) !== k || Number(k) >= rows.length) throw wrong("garments", "the arrays of their version", name.slice(0, 80));
   }
   return rows.map((row, k) => garment(piece, k, asObject(row, `garment ${k}`), avatar, tensors));
+}
+
+/** Reads how garments are stepped; numbers that the piece lacks are those of bundles that say nothing of it. */
+export function readSimulation(about: Record<string, unknown>): Simulation {
+  const { solver, ...usual } = UNTOLD, told = (value: unknown, subject: string) => (value === undefined ? {} : asObject(value, subject));
+  const stored = told(about.simulation, "simulation");
+  return { ...options(stored, usual), solver: options(told(stored.solver, "simulation: solver"), solver) };
+}
+
+/** Numbers by name, up to ten times the usual ones, steps of time from a tenth of these: others would halt the page. */
+function options<Numbers extends { [name in keyof Numbers]: number }>(stored: Record<string, unknown>, usual: Numbers): Numbers {
+  return Object.fromEntries(Object.entries<number>(usual).map(([name, value]) => {
+    if (!Object.hasOwn(stored, name)) return [name, value];
+    const subject = `simulation: ${name}`;
+    if (COUNTS.includes(name)) return [name, asInteger(stored[name], subject, 1, Math.max(10 * value, 0.1))];
+    const found = asNumber(stored[name], subject, STEPS.includes(name) ? 0.1 * value : 0, Math.max(10 * value, 0.1));
+    const least = name.startsWith("most_stretch") || name === "most_drawn" ? 1 : 0;
+    if (found < least || (!found && !MAY_BE_0.includes(name))) throw wrong(subject, least ? "1 or more" : "a number above 0", String(found));
+    return [name, found];
+  })) as Numbers;
 }
 
 function garment(piece: Map<string, Tensor>, k: number, about: Record<string, unknown>, avatar: Avatar, tensors: Tensors): Garment {

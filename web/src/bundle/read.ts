@@ -2,9 +2,10 @@
 
 import type { Avatar, BlendShapes, BlendSide, Field, FieldNetwork, Gaussians, Layer } from "../avatar/avatar.ts";
 import { encodedPoints } from "../avatar/networks.ts";
+import { UNTOLD } from "../cloth/simulation.ts";
 import { checkConsistency, readAbout, type About } from "./consistency.ts";
 import { BundleError, EXPORT_AGAIN } from "./errors.ts";
-import { readGarments } from "./garments.ts";
+import { readGarments, readSimulation } from "./garments.ts";
 import { asInteger, asObject, asText, parseJson } from "./json.ts";
 import { PIECES, Tensors } from "./layout.ts";
 import { readMotion } from "./motion.ts";
@@ -30,7 +31,10 @@ export async function readBundle(data: Uint8Array<ArrayBuffer>): Promise<Avatar>
   checkConsistency(about, tensors);
   const avatar = assembled(about, tensors, data.length), [motion, garments] = [pieces.get("motion"), pieces.get("garments")];
   if (motion?.tensors.size) avatar.motion = readMotion(motion.tensors, avatar, tensors);
-  if (garments?.tensors.size) avatar.garments = readGarments(garments.tensors, garments.about, avatar, tensors);
+  if (garments?.tensors.size) {
+    avatar.garments = readGarments(garments.tensors, garments.about, avatar, tensors);
+    avatar.simulation = readSimulation(garments.about);
+  }
   return avatar;
 }
 
@@ -96,6 +100,7 @@ function assembled(about: About, t: Tensors, bytes: number): Avatar {
     known: t.has("poses.known") ? { poses: t.floats("poses.known"), scale: t.floats("poses.scale")[0] } : null,
     gaussians: gaussians(t, faces, parts),
     garments: [],
+    simulation: UNTOLD,
     motion: null,
     bytes,
   };

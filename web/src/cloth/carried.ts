@@ -3,13 +3,8 @@
 import type { Deformer } from "../avatar/deform.ts";
 import type { Block, Native } from "../native/memory.ts";
 import { edgesOf, type Garment } from "./garment.ts";
+import type { Simulation } from "./simulation.ts";
 
-/** Of a blend of rotations; below, its inverse blows up what the cloth did. */
-const LEAST_DETERMINANT = 0.2;
-/** How long a drawn edge may be over its length at rest, metres at least (`smplxpp/cloth/quality.py`). */
-const MOST_DRAWN = 1.5, LEAST = 0.005;
-/** Metres in the plane of the triangle that carries a vertex, beyond which that is no cloth but a bridge over an opening. */
-const BESIDE = 0.005;
 /** Metres at which there is nothing. */
 const FAR_AWAY = 1e6;
 
@@ -22,6 +17,7 @@ export class CarriedVertices {
   /** @param deepest of the collider, @param faces its faces, @param drawn the faces of the avatar. */
   constructor(
     private readonly native: Native, garment: Garment, deepest: Block<Float32Array>, faces: Block<Int32Array>, drawn: ArrayLike<number>,
+    numbers: Simulation,
   ) {
     const { corners, weights, offset, rest, collider } = garment, n = rest.length / 3, which = new Int32Array(corners.length / 3);
     const known = new Map<number, number>(), triangles: number[] = [];
@@ -33,7 +29,7 @@ export class CarriedVertices {
       }
       which[v] = known.get(key)!;
     }
-    const edges = carriedEdges(garment, drawn), most = native.keep(new Float32Array(edges.length / 2).fill(Infinity));
+    const edges = carriedEdges(garment, drawn, numbers.beside), most = native.keep(new Float32Array(edges.length / 2).fill(Infinity));
     this.points = native.floats(corners.length);
     this.carried = native.struct(
       [which.length, known.size, n, garment.faces.length / 3, collider.vertices.length, collider.faces.length / 3, edges.length / 2],
@@ -46,7 +42,7 @@ export class CarriedVertices {
     const x = this.points.view;
     most.view.forEach((_, e) => {
       const [a, b] = [3 * edges[2 * e], 3 * edges[2 * e + 1]];
-      most.view[e] = MOST_DRAWN * Math.max(Math.hypot(x[a] - x[b], x[a + 1] - x[b + 1], x[a + 2] - x[b + 2]), LEAST);
+      most.view[e] = numbers.most_drawn * Math.max(Math.hypot(x[a] - x[b], x[a + 1] - x[b + 1], x[a + 2] - x[b + 2]), numbers.sliver);
     });
   }
 
@@ -56,10 +52,13 @@ export class CarriedVertices {
   }
 }
 
-/** The edges of faces (F, 3) of the avatar that a garment carries, as pairs of its vertices; bridges over openings are none. */
-function carriedEdges({ vertices, offset }: Garment, faces: ArrayLike<number>): Int32Array {
+/**
+ * The edges of faces (F, 3) of the avatar that a garment carries, as pairs of its vertices; bridges over openings, which lie
+ * `beside` metres in the plane of the triangle that carries them, are none.
+ */
+function carriedEdges({ vertices, offset }: Garment, faces: ArrayLike<number>, beside: number): Int32Array {
   const at = new Map<number, number>();
-  vertices.forEach((vertex, i) => Math.max(Math.abs(offset[3 * i]), Math.abs(offset[3 * i + 1])) < BESIDE && at.set(vertex, i));
+  vertices.forEach((vertex, i) => Math.max(Math.abs(offset[3 * i]), Math.abs(offset[3 * i + 1])) < beside && at.set(vertex, i));
   return edgesOf(Int32Array.from(faces, (vertex) => at.get(vertex) ?? -1), vertices.length);
 }
 
@@ -85,8 +84,8 @@ export class SkinnedRows {
 
   /** The displacements in the T-pose that the deformer's transforms take to places (R, 3). */
   unpose(rest: Block<Float32Array>, places: Block<Float32Array>): Float32Array {
-    const { native, transforms } = this.deformer;
-    native.run("cloth_unposed", this.rows, transforms, rest, places, LEAST_DETERMINANT, this.out);
+    const { native, transforms, avatar } = this.deformer;
+    native.run("cloth_unposed", this.rows, transforms, rest, places, avatar.simulation.least_determinant, this.out);
     return this.out.view;
   }
 }

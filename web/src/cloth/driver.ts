@@ -8,26 +8,15 @@ import { multiply, quaternionFromRotvec, rotvecFromQuaternion } from "../math/ro
 import type { Block } from "../native/memory.ts";
 import { SkinnedRows } from "./carried.ts";
 import type { Garment } from "./garment.ts";
+import type { Simulation } from "./simulation.ts";
 import { GarmentThread } from "./thread.ts";
 
-/** Seconds: a longer step is a cut; the ramp of a cold start, its rest at the end, and its steps. */
-const LONGEST_STEP = 0.26, RAMP = 0.7, HOLD = 0.2, RAMP_STEP = 1 / 30;
-/** Metres a second of what holds the cloth; faster motion is a cut. */
-const TELEPORT = 12;
-/** Metres of the root from what places are measured from, beyond which that follows it. */
-const FAR = 4;
 /** Metres from where what holds the cloth was at the last cold start, within which that start serves again. */
 const AGAIN = 0.06;
 /** Metres between a vertex and the particle that is one. */
 const SAME = 1e-4;
 /** Seconds between pictures beyond which a motion is not followed. */
 export const LONGEST_FOLLOWED = 1;
-
-/** How cold starts go, seconds. */
-export interface Start {
-  ramp: number;
-  hold: number;
-}
 
 /** What a garment needs of the surface: vertices of the avatar and what moves them. */
 interface Rows {
@@ -53,9 +42,13 @@ export class ClothDriver {
   /** Goes back to the end of the last cold start. */
   private begun: (() => void) | null = null;
 
-  constructor(private readonly deformer: Deformer, garments: readonly Garment[], private readonly start: Start = { ramp: RAMP, hold: HOLD }) {
-    const { native, avatar: { mesh, gaussians } } = deformer, V = mesh.vertices.length / 3;
-    this.threads = garments.map((garment) => new GarmentThread(native, garment, mesh.faces));
+  private readonly numbers: Simulation;
+
+  /** @param start in the place of how the avatar says that its garments start cold, seconds. */
+  constructor(private readonly deformer: Deformer, garments: readonly Garment[], start: Partial<Pick<Simulation, "ramp" | "hold">> = {}) {
+    const { native, avatar: { mesh, gaussians, simulation } } = deformer, V = mesh.vertices.length / 3;
+    const numbers = (this.numbers = { ...simulation, ...start });
+    this.threads = garments.map((garment) => new GarmentThread(native, garment, mesh.faces, numbers));
     this.rows = garments.map(({ particles, collider, vertices }, k) => {
       const under = new Map<number, [number, number]>();
       garments.slice(0, k).forEach(({ vertices }, inner) => {
@@ -104,7 +97,7 @@ export class ClothDriver {
   /** Goes on to a pose `seconds` after the last as `step` does, by poses between them where pictures are far apart. */
   follow(pose: Pose, seconds: number): Displaced {
     if (this.last && seconds === 0) return this.shaped(pose);
-    const steps = Math.max(1, Math.ceil(seconds / LONGEST_STEP)), { last } = this;
+    const steps = Math.max(1, Math.ceil(seconds / this.numbers.longest_step)), { last } = this;
     if (!(seconds <= LONGEST_FOLLOWED)) this.restart();
     else if (last) for (let k = 1; k < steps; ++k) this.move(between(last, pose, k / steps), seconds / steps);
     return this.step(pose, seconds / steps);
@@ -117,7 +110,7 @@ export class ClothDriver {
   }
 
   private move(pose: Pose, seconds: number): void {
-    if (!this.last || !(seconds > 0 && seconds <= LONGEST_STEP) || !this.advance(pose, seconds, false)) this.begin(pose);
+    if (!this.last || !(seconds > 0 && seconds <= this.numbers.longest_step) || !this.advance(pose, seconds, false)) this.begin(pose);
     this.last = pose;
   }
 
@@ -125,15 +118,15 @@ export class ClothDriver {
   private begin(pose: Pose): void {
     if (this.again(pose)) return;
     const start = facingAs(this.threads[0].garment.reference, pose);
-    const steps = Math.round(this.start.ramp / RAMP_STEP), still = Math.round(this.start.hold / RAMP_STEP);
+    const { ramp, hold, ramp_step } = this.numbers, steps = Math.round(ramp / ramp_step), still = Math.round(hold / ramp_step);
     this.origin = this.root(pose);
     this.joints(steps ? start : pose);
     this.threads.forEach((thread, k) => thread.reset(this.places(this.rows[k].particles), this.places(this.rows[k].collider)));
     for (let k = 1; k < steps; ++k) {
       const t = k / steps;
-      this.advance(between(start, pose, t * t * (3 - 2 * t)), RAMP_STEP, true);
+      this.advance(between(start, pose, t * t * (3 - 2 * t)), ramp_step, true);
     }
-    for (let k = 0; k < still + Math.min(steps, 1); ++k) this.advance(pose, RAMP_STEP, true);
+    for (let k = 0; k < still + Math.min(steps, 1); ++k) this.advance(pose, ramp_step, true);
     const { origin } = this, back = this.threads.map((thread) => thread.kept());
     this.begun = () => {
       this.origin = origin;
@@ -147,19 +140,19 @@ export class ClothDriver {
     this.begun();
     this.joints(pose);
     if (this.rows.some(({ particles }, k) => this.threads[k].wayTo(this.places(particles)) > AGAIN)) return false;
-    return this.advance(pose, RAMP_STEP, true);
+    return this.advance(pose, this.numbers.ramp_step, true);
   }
 
   /** Moves all garments on to a pose; false, and nothing moved, where what holds them went too fast. */
   private advance(pose: Pose, seconds: number, atAnySpeed: boolean): boolean {
     const root = this.root(pose), away = root.map((value, k) => value - this.origin[k]);
-    if (away.some((value) => Math.abs(value) > FAR)) {
+    if (away.some((value) => Math.abs(value) > this.numbers.wander)) {
       this.origin = root;
       for (const thread of this.threads) thread.shift(away.map((value) => -value));
     }
     this.joints(pose);
     const own = this.rows.map(({ particles }) => this.places(particles));
-    if (!atAnySpeed && own.some((places, k) => this.threads[k].wayTo(places) > TELEPORT * seconds)) return false;
+    if (!atAnySpeed && own.some((places, k) => this.threads[k].wayTo(places) > this.numbers.teleport * seconds)) return false;
     this.threads.forEach((thread, k) => {
       const { collider, under } = this.rows[k], surface = this.places(collider);
       // Where an inner garment lies it counts as it is.

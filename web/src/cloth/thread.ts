@@ -4,15 +4,7 @@ import type { Block, Native } from "../native/memory.ts";
 import { CarriedVertices } from "./carried.ts";
 import { pinned, shareOf, type Garment } from "./garment.ts";
 import { buildModel } from "./model.ts";
-
-/** Longest edge over its length at rest, which the solver keeps. */
-const LONGEST_EDGE = 1.2;
-/** Seconds of a substep at most, substeps between two searches for contacts, metres a second at most. */
-const SUBSTEP = 1 / 500, CONTACTS_EVERY = 8, MOST_SPEED = 8, GRAVITY = 9.81;
-/** Metres that what is carried keeps from the skin. */
-const FINE_MARGIN = 0.002;
-/** Length of an edge over that at rest from which the cloth is taken to have exploded. */
-const MOST_STRETCH = 4;
+import type { Simulation } from "./simulation.ts";
 
 /** Places of the last moment but one, the last, now, and the next as it would come without acceleration. */
 class Moments {
@@ -73,23 +65,26 @@ export class GarmentThread {
   private readonly surfaces: Moments;
 
   /** @param drawn the faces of the avatar. */
-  constructor(private readonly native: Native, readonly garment: Garment, drawn: ArrayLike<number>) {
+  constructor(
+    private readonly native: Native, readonly garment: Garment, drawn: ArrayLike<number>, private readonly numbers: Simulation,
+  ) {
+    const { gravity, own_margin, most_speed, most_stretch } = numbers.solver;
     const { fabric, collider } = garment, n = garment.particles.length, c = collider.vertices.length;
     const fixed = pinned(garment), model = buildModel(garment, fixed);
     this.pins = Int32Array.from([...fixed.keys()].filter((i) => fixed[i]));
     this.share = shareOf(garment);
     this.edges = model.edges;
-    this.mostSquared = Float64Array.from(model.lengths, (length) => (MOST_STRETCH * length + 0.01) ** 2);
+    this.mostSquared = Float64Array.from(model.lengths, (length) => (numbers.most_stretch * length + 0.01) ** 2);
     [this.position, this.velocity] = [native.floats(3 * n), native.floats(3 * n)];
     const colliderFaces = native.keep(collider.faces), deepest = native.keep(collider.deepest);
-    this.fine = new CarriedVertices(native, garment, deepest, colliderFaces, drawn);
+    this.fine = new CarriedVertices(native, garment, deepest, colliderFaces, drawn, numbers);
     this.model = native.struct([n, garment.faces.length / 3, model.edges.length / 2, model.bend.length, c, collider.faces.length / 3], [
       ...[model.inverseMass, garment.faces, model.edges, model.lengths, model.stretch, model.compress, model.hinges, model.curvature,
         model.restCurvature, model.bend].map((array) => native.keep<Float32Array | Int32Array>(array)),
       null, native.keep(model.anchor), native.keep(model.tether), colliderFaces, native.keep(collider.margin), deepest,
     ]);
     this.forces = native.keep(Float64Array.of(
-      GRAVITY, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, 0, MOST_SPEED, LONGEST_EDGE, 0));
+      gravity, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, own_margin, most_speed, most_stretch, 0));
     [this.places, this.surfaces] = [new Moments(native, n), new Moments(native, c)];
     this.moments = native.struct([], [...this.places.blocks, ...this.surfaces.blocks]);
   }
@@ -115,14 +110,14 @@ export class GarmentThread {
   advance(places: Float32Array, surface: Float32Array, seconds: number): void {
     this.places.tell(places);
     this.surfaces.tell(surface);
-    const substeps = Math.max(1, Math.ceil(seconds / SUBSTEP - 1e-6));
-    this.native.run("cloth_advance", this.model, this.forces, this.moments, seconds, substeps, CONTACTS_EVERY, this.position, this.velocity);
+    const { substep, contacts_every } = this.numbers.solver, substeps = Math.max(1, Math.ceil(seconds / substep - 1e-6));
+    this.native.run("cloth_advance", this.model, this.forces, this.moments, seconds, substeps, contacts_every, this.position, this.velocity);
     if (!this.sound()) this.rest(places);
   }
 
-  /** Brings what the garment carries to where the particles are, `FINE_MARGIN` outside of what it touches. */
+  /** Brings what the garment carries to where the particles are, `drawn_margin` outside of what it touches. */
   carry(): void {
-    this.fine.carry(this.position, this.surfaces.blocks[2], FINE_MARGIN);
+    this.fine.carry(this.position, this.surfaces.blocks[2], this.numbers.drawn_margin);
   }
 
   /** (N, 3) where the carried vertices are, after `carry`. */
