@@ -136,12 +136,17 @@ class _Asked(TorchFunctionMode):
             return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(META)
         if func is Tensor.cuda:
             return args[0].to(META)
-        if any(isinstance(value, torch.device) and value.type == "meta" for value in (*args, *kwargs.values())):
+        named = [value for value in (*args, *kwargs.values()) if type(value) in _NAMES]
+        if not named:
+            return func(*args, **kwargs)
+        if any(type(value) is torch.device and value.type == "meta" for value in named):
             with _really_meta():
                 return func(*args, **kwargs)
         return func(*map(_known, args), **{name: _known(value) for name, value in kwargs.items()})
 
 
+_NAMES = (str, torch.device)
+"""Types of what may name a device."""
 _META_IS_MEANT = [False]
 """Whether "meta" is asked for by its name: by who wants a tensor without numbers."""
 
@@ -184,21 +189,33 @@ def _call(func: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     return found if asked is not None and not placed else _shown(found)
 
 
+_NUMBERS = frozenset({int, float, bool, type(None), torch.dtype, torch.device, torch.layout})
+"""Types of arguments that hold no tensor; most calls have nothing else beside their tensors."""
+
+
 def _tensors_in(values: Iterable[Any]) -> list[Tensor]:
     found = []
     for value in values:
-        if isinstance(value, Tensor):
+        kind = type(value)
+        if kind is PretendedTensor or kind is Tensor:
             found.append(value)
-        elif isinstance(value, list | tuple):
+        elif kind is list or kind is tuple:
             found += _tensors_in(value)
+        elif kind not in _NUMBERS and isinstance(value, Tensor):
+            found.append(value)
     return found
 
 
 def _held(value: Any) -> Any:
     """What the CPU computes with."""
+    kind = type(value)
+    if kind is PretendedTensor:
+        return value.held
+    if kind in _NUMBERS:
+        return value
     if isinstance(value, PretendedTensor):
         return value.held
-    return type(value)(map(_held, value)) if isinstance(value, list | tuple) else value
+    return kind(map(_held, value)) if isinstance(value, list | tuple) else value
 
 
 def _shown(value: Any) -> Any:

@@ -221,10 +221,11 @@ def _middles(
 ) -> Int[np.ndarray, " n"]:
     """Return for each cell its vertex that is nearest to the cell's mean, on the border for cells seeded there."""
     used = used[source[used] >= 0]
-    order = used[np.argsort(source[used], kind="stable")]
-    cells = np.split(order, np.flatnonzero(np.diff(source[order])) + 1)
-    out = []
-    for cell in cells:
-        own = cell[border[cell]] if border[cell].any() else cell
-        out.append(own[np.argmin(row_lengths(points[own] - points[own].mean(axis=0)))])
-    return np.array(out)
+    seed, cell = np.unique(source[used], return_inverse=True)
+    # Of a cell with vertices on the border only these count.
+    kept = border[used] | ~(np.bincount(cell, border[used], len(seed)) > 0.0)[cell]
+    used, cell = used[kept], cell[kept]
+    size = np.bincount(cell, minlength=len(seed))
+    mean = np.stack([np.bincount(cell, points[used, axis], len(seed)) / size for axis in range(3)], axis=1)
+    order = np.lexsort((row_lengths(points[used] - mean[cell]), cell))
+    return used[order[np.cumsum(size) - size]]

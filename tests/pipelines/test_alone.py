@@ -28,8 +28,17 @@ from smplxpp.segment import read_labels
 PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 BODY = load_body()
 FACES = 20_000
-# A search of a fifth of the length, which finds this person; that of the default length is among the slow tests.
-FEW = LocateConfig(directions=6, starts=6, limbs_tried=2, candidates=2, dress_steps=5, finish_steps=5)
+# A search of an eighth of the length, which finds this person; that of the default length is among the slow tests.
+FEW = LocateConfig(
+    directions=6,
+    starts=6,
+    limbs_tried=2,
+    candidates=2,
+    coarse_points=400,
+    fine_points=2000,
+    dress_steps=5,
+    finish_steps=5,
+)
 
 
 @cache

@@ -124,9 +124,11 @@ def _farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     picked = np.empty(count, dtype=np.int64)
     picked[0] = np.argmax(np.linalg.norm(points - points.mean(0), axis=1))
     distance = np.full(len(points), np.inf)
+    columns = np.ascontiguousarray(points.T)
     # Sequential, because each choice depends on the one before.
     for i in range(1, count):
-        distance = np.minimum(distance, np.sum((points - points[picked[i - 1]]) ** 2, axis=1))
+        x, y, z = (columns - columns[:, picked[i - 1], None]) ** 2
+        np.minimum(distance, x + y + z, out=distance)
         picked[i] = np.argmax(distance)
     return picked
 
