@@ -53,6 +53,7 @@ LONGEST = (
     "tests/fuzz/test_fuzz.py",
     "tests/transfer/test_transfer_confidence.py",
     "tests/benchmarks/test_gpu.py",
+    "tests/web/test_embed.py",
     "tests/people/test_people.py",
     "tests/pipelines/stages/test_completeness.py",
     "tests/pipelines/test_evaluate_cloth.py",
