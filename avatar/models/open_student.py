@@ -50,7 +50,7 @@ def load(path: str | Path, *, template: Template | None = None, device: str = "c
         path: a bundle `NAME.avatar`; a student's file `NAME.safetensors`; or a folder that `avatar.train` or
             `smplxpp train` wrote.
         template: of a student's file; None: the one in the file's folder or in that of the training around it.
-        device: of a student's tensors.
+        device: of a student's tensors or a bundle's player, see `AvatarPlayer`.
 
     Returns:
         A player for a bundle, else the student with its template and its loose clothes. `avatar.render` draws either.
@@ -60,7 +60,7 @@ def load(path: str | Path, *, template: Template | None = None, device: str = "c
     """
     path = Path(path)
     if path.suffix.lower() == SUFFIX:
-        return AvatarPlayer(path)
+        return AvatarPlayer(path, device=device)
     if path.suffix.lower() != ".safetensors":
         return open_student(path, _layout_of(path), device=device)
     if template is not None:

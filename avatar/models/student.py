@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,11 +20,10 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.networks.control_points import choose_control_points, template_control_points
 from avatar.models.networks.deformation_field import DeformationField, FieldConfig, FrameCodes
 from avatar.models.networks.pose_dependence import PoseGate, PoseRegression, seen_joints
+from avatar.rendering.on_device import record_graph
 from avatar.rig.rig import Pose, PosedAvatar, Rig
 from smplxpp.cloth.garment import Garment
 from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, require_at_least
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -255,7 +253,7 @@ class CompiledStudent:
             if part is not None and dtype != torch.float32:
                 self.student._modules[name] = copy.deepcopy(part).to(dtype)
         self._graph = graph and self.rig.device.type == "cuda"
-        self._replay: Callable[[], object] | None = None
+        self._replay: tuple[Callable[[], object], PosedAvatar] | None = None
         self._widths: dict[str, int] = {}
         self._flat = False
 
@@ -287,12 +285,12 @@ class CompiledStudent:
         if not self._widths:
             self._widths, self._flat = widths, params.flat_hand_mean
             self._input = packed.to(self.rig.device)
-            self._record()
+            self._replay = record_graph(self._posed, subject="the student") if self._graph else None
         self._input.copy_(packed)
         if self._replay is None:
             return self._posed()
-        self._replay()
-        return self._output
+        self._replay[0]()
+        return self._replay[1]
 
     def _posed(self) -> PosedAvatar:
         """Compute the pose of the input, without copies from the CPU and without waiting for the device."""
@@ -306,23 +304,6 @@ class CompiledStudent:
         bound = self.student.compensated(pose)
         world = world_from_frames(bound, frames)
         return PosedAvatar(vertices, world, view_colors(bound, frames, world.means, center[None]), bound, moved)
-
-    def _record(self) -> None:
-        if not self._graph:
-            return
-        try:
-            aside = torch.cuda.Stream()
-            aside.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(aside):  # what is set up by first calls must not be part of the graph
-                for _ in range(3):
-                    self._posed()
-            torch.cuda.current_stream().wait_stream(aside)
-            recorded = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(recorded):
-                self._output = self._posed()
-            self._replay = recorded.replay
-        except Exception as error:  # noqa: BLE001  whatever a driver raises, the student itself computes
-            log.warning("the student is not recorded as a CUDA graph: %s", str(error).split("\n")[0][:300])
 
 
 def _make_field(config: FieldConfig, student: StudentConfig, rig: Rig) -> DeformationField:

@@ -49,15 +49,22 @@ class DisplacementField:
         )
         """Control points of each vertex, and their interpolation weights."""
 
+    def code(self, frame: int | None) -> Float32[np.ndarray, " Z"] | None:
+        """Return the code of a frame; None for a new pose where there is a regression, else the null code."""
+        row = None if frame is None else self._row.get(frame)
+        if row is None:
+            return None if self.regression is not None else self.null_code
+        return self._codes[row]
+
     def displacements(
         self, theta: Float32[np.ndarray, " 63"], frame: int | None, threads: int
     ) -> Float32[np.ndarray, "C 3"]:
         """Return the control points' displacements, metres; the next call overwrites them."""
         # The regression replaces the networks for every pose without a code of its own.
-        row = None if frame is None else self._row.get(frame)
-        if row is None and self.regression is not None:
+        code = self.code(frame)
+        if code is None:
+            assert self.regression is not None
             return self._regress(theta, **self.regression)
-        code = self.null_code if row is None else self._codes[row]
         # Inputs of each set: the angles of its joints (others 0), and the frame's code. The body's network writes all
         # control points, then the cloth's adds to those of clothes.
         frames = np.concatenate([theta * self._sets, np.broadcast_to(code, (len(self._sets), len(code)))], axis=1)

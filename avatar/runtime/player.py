@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -33,11 +34,13 @@ class AvatarPlayer:
     Args:
         bundle: the avatar, or its file.
         threads: of the kernels; None: the number of CPUs, at most 8.
+        device: "cpu"; or "cuda", which needs torch and gsplat: all but joints and simulated clothes is computed there,
+            and splats are copied to the CPU when their arrays are asked for.
         cloth: configuration of the cloth simulation; None: the bundle's.
         clock: returns seconds.
 
     Attributes:
-        seconds: duration of the last pose and picture, by `PARTS`.
+        seconds: duration of the last pose and picture, by `PARTS`; on a GPU `world` is all that follows the joints.
 
     Example:
         >>> player = AvatarPlayer("me.avatar")
@@ -51,6 +54,7 @@ class AvatarPlayer:
         bundle: AvatarBundle | str | Path,
         *,
         threads: int | None = None,
+        device: str = "cpu",
         cloth: DriverConfig | None = None,
         clock: Callable[[], float] = perf_counter,
     ) -> None:
@@ -60,14 +64,27 @@ class AvatarPlayer:
         self._clock = clock
         # Skeleton in float64, since errors add up along the chains
         # of joints; field, blend shapes and clothes are optional.
-        about, t, sizes = self.bundle.about, self.bundle.tensors, self.bundle.sizes
+        t = self.bundle.tensors
         self._body = skeleton_body(self.bundle)
         self._parents = np.ascontiguousarray(t["skeleton.parents"], dtype=np.int32)
         self._joints, self._joint_basis = t["skeleton.joints"].astype(np.float64), t["skeleton.expression"]
         self._field = DisplacementField(self.bundle) if "field" in self.bundle else None
-        self._sides = [BlendShapes(self.bundle, side) for side in ("head", "body")] if "blend" in self.bundle else []
         self._clothes = LooseClothes(self.bundle, cloth) if self.bundle.garments else None
-        # Kernels, prepared once: skinning, and Gaussians to the world.
+        self._rest = t["surface.vertices"]
+        self._face_of = np.repeat(np.arange(self.bundle.sizes["F"]), t["gaussians.per_face"])
+        self._device = None
+        if device == "cpu":
+            self._prepare()
+        else:
+            import avatar  # what needs torch lies above this room; the front door knows where
+
+            self._device = avatar.BundleOnDevice(self.bundle, device)
+
+    def _prepare(self) -> None:
+        """Make the kernels of the CPU and the arrays that they write, once."""
+        about, t, sizes = self.bundle.about, self.bundle.tensors, self.bundle.sizes
+        self._sides = [BlendShapes(self.bundle, side) for side in ("head", "body")] if "blend" in self.bundle else []
+        # Kernels: skinning, and Gaussians to the world.
         # Rounded to 16 bits, skinning weights may miss a sum of
         # 1, and the surface would then be scaled about the origin.
         weights = t["surface.joint_weights"] / t["surface.joint_weights"].sum(axis=1, keepdims=True)
@@ -80,11 +97,9 @@ class AvatarPlayer:
             shares,
             sizes.get("C", 0),
         )
-        self._rest = t["surface.vertices"]
         self._posed = np.empty_like(self._rest)
         # Gaussians are sorted by face, so that `first[f] .. first[f + 1]` are those of face f.
         first = np.concatenate([[0], np.cumsum(t["gaussians.per_face"])]).astype(np.int32)
-        self._face_of = np.repeat(np.arange(sizes["F"]), t["gaussians.per_face"])
         own = {name: t[f"gaussians.{name}"] for name in ("barycentric", "offset", "quats", "dc")}
         self._world = WorldKernel(
             t["surface.faces"],
@@ -175,6 +190,13 @@ class AvatarPlayer:
         # Joints and T-pose, displacement field, blend shapes, then skinning and the world; each is timed.
         times = [self._clock()]
         transforms, features, expression = self.joints(params)
+        if self._device is not None:
+            times.append(self._clock())
+            numbers, coded = self._numbers(params, frame, transforms, features, expression)
+            spread = None if cloth is None else self._spread_cloth(cloth)
+            self._splats = self._device.pose(numbers, spread, coded=coded)
+            self.seconds |= {"pose": times[1] - times[0], "world": self._clock() - times[1]}
+            return self._splats
         rest = self._shape(expression, features)
         theta = params.body_pose[0].astype(np.float32)
         times.append(self._clock())
@@ -211,18 +233,17 @@ class AvatarPlayer:
             InputError: as `Splatter.draw`.
         """
         begin = self._clock()
+        draw = self._device.draw if self._device is not None else self._draw
         # Draw the colours; a relit picture also needs the normals, which the same splats blend in a second pass.
-        image, alpha = self._splatter.draw(
-            self._splats, camera, background=background, eps2d=self._eps2d, threads=self.threads
-        )
+        image, alpha = draw(camera, background=background)
         if relighting is not None:
-            facing = facing_normals(self.normals, self._splats, camera.position)
-            normals, _ = self._splatter.draw(
-                self._splats, camera, eps2d=self._eps2d, threads=self.threads, features=facing
-            )
+            normals, _ = draw(camera, features=facing_normals(self.normals, self._splats, camera.position))
             image = relit_picture(image, alpha, normals, relighting, background)
         self.seconds["draw"] = self._clock() - begin
         return image, alpha
+
+    def _draw(self, camera: Camera, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+        return self._splatter.draw(self._splats, camera, eps2d=self._eps2d, threads=self.threads, **options)
 
     @property
     def normals(self) -> Float32[np.ndarray, "N 3"]:
@@ -230,7 +251,7 @@ class AvatarPlayer:
         # Interpolate the vertex normals (faces weighted by angle) at each Gaussian's barycentrics, and normalise.
         t = self.bundle.tensors
         faces = t["surface.faces"]
-        smooth = TriangleMesh(self._posed, faces).vertex_normals
+        smooth = TriangleMesh(self.vertices, faces).vertex_normals
         u, v = t["gaussians.barycentric"].T.astype(np.float64)
         corners = smooth[faces[self._face_of]]
         bary = np.stack([u, v, 1.0 - u - v], axis=1)
@@ -239,7 +260,7 @@ class AvatarPlayer:
     @property
     def vertices(self) -> Float32[np.ndarray, "V 3"]:
         """The posed vertices that carry Gaussians, metres; the next pose overwrites them."""
-        return self._posed
+        return self._posed if self._device is None else self._device.vertices
 
     def joints(
         self, params: BodyParams
@@ -270,6 +291,25 @@ class AvatarPlayer:
             features="surface.pose" in self.bundle.tensors,
         )
         return transforms, features, expression
+
+    def _numbers(
+        self,
+        params: BodyParams,
+        frame: int | None,
+        transforms: Float32[np.ndarray, "J 3 4"],
+        features: Float32[np.ndarray, " P"] | None,
+        expression: Float32[np.ndarray, " E"],
+    ) -> tuple[dict[str, np.ndarray], bool]:
+        """Return what a GPU needs of a pose, and whether the field takes a code."""
+        theta = params.body_pose[0].astype(np.float32)
+        numbers = {"transforms": transforms, "expression": expression, "jaw": params.jaw_pose[0], "theta": theta}
+        numbers["known"] = np.array([self.pose_similarity(theta, frame)])
+        if features is not None:
+            numbers["features"] = features
+        if self._field is None:
+            return numbers, False
+        code = self._field.code(frame)
+        return {**numbers, "code": self._field.null_code if code is None else code}, code is not None
 
     def _shape(
         self, expression: Float32[np.ndarray, " E"], features: Float32[np.ndarray, " P"] | None

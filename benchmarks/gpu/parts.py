@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.gpu.timing import EnoughError, Probe, frames_a_second, largest_difference_mm, probed
+from benchmarks.gpu.timing import EnoughError, Probe, frames_a_second, largest_difference_mm, played, probed
 from benchmarks.support.results import ROOT
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE
 from smplxpp.capture import open_capture
@@ -203,7 +203,10 @@ def loader(job: Job, note: Note) -> None:
 
 
 def student(job: Job, note: Note) -> None:
-    """Frames a second of a student with the paper's sizes, pose included: float32, half, with and without graph."""
+    """Frames a second of a student with the paper's sizes, pose included: float32, half, with and without graph.
+
+    Those of its bundle in a player end with the picture in the CPU's memory.
+    """
     import avatar
     from avatar.models.networks.blend_shapes import BlendShapeConfig
     from avatar.models.student import StudentConfig
@@ -234,6 +237,9 @@ def student(job: Job, note: Note) -> None:
                 seen = fitted(camera, width, height)
                 row[f"{width}x{height}"] = frames_a_second(fast, params, seen, pictures=pictures)
                 note(rows=rows)
+    avatar.export_student(model, job.work / "student.avatar")
+    player = avatar.load(job.work / "student.avatar", device=job.device)
+    rows["player"] = {f"{w}x{h}": played(player, params, fitted(camera, w, h), pictures=pictures) for w, h in sizes}
     note(rows=rows, **_memory(job))
 
 

@@ -18,6 +18,7 @@ from torch.profiler import ProfilerActivity, profile
 from avatar.models.student import CompiledStudent
 from avatar.rendering.avatar_view import render_view
 from avatar.rig.rig import PosedAvatar
+from avatar.runtime import AvatarPlayer
 from avatar.training.engine.loop import LoopConfig, Progress
 from avatar.training.tracking.track import TrackTask
 from smplxpp.core import BodyParams
@@ -54,6 +55,18 @@ def frames_a_second(
         "render_ms": 1e3 * median(render for _, render in times),
         "fps": 1.0 / median(sum(both) for both in times),
     }
+
+
+def played(player: AvatarPlayer, params: Sequence[BodyParams], camera: Camera, *, pictures: int) -> dict[str, float]:
+    """Median milliseconds of a player from parameters to the picture in the CPU's memory, and frames a second."""
+    times = []
+    for one in itertools.islice(itertools.cycle(params), WARM_UP + pictures):
+        begin = time.perf_counter()
+        player.pose(one)
+        player.draw(camera)
+        times.append(time.perf_counter() - begin)
+    whole = median(times[WARM_UP:])
+    return {"ms": 1e3 * whole, "fps": 1.0 / whole}
 
 
 def largest_difference_mm(one: PosedAvatar, other: PosedAvatar) -> float:

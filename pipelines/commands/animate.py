@@ -82,6 +82,8 @@ class Animate:
     """Whose motion it is."""
     lighting: Annotated[Lighting, tyro.conf.arg(name="")] = field(default_factory=Lighting)
     """The light that the person is shown in."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where a student is posed and drawn; cuda needs torch and gsplat. Clothes are simulated on the CPU."""
     json: bool = False
     """Print what was written as JSON."""
     _notes: tyro.conf.Suppress[list[str]] = field(default_factory=list, init=False)
@@ -166,6 +168,7 @@ class Animate:
             clamp=self.outside == "clamp",
             numbered_from=begin if self.codes == "trained" else None,
             relighting=self.lighting.relighting(),
+            device=self.device,
         )
         cameras, frames = student_frames(bundle, motion, shown, film, self._notes, self._quality)
         shown_frames = track(
@@ -199,6 +202,8 @@ class Animate:
         if self.cloth == "field" and not self._of_student:
             expected = "simulate or skin for the template, which has no field"
             raise InputError("option cloth", expected=expected, received="field", remedy="--model student has one")
+        if self.device != "cpu" and not self._of_student:
+            raise InputError("option device", expected="cpu, which draws the template", received=self.device)
         if self.loose_parts and self._of_student:
             expected = "none for a student, whose loose parts its training found"
             raise InputError("option loose-parts", expected=expected, received=" ".join(self.loose_parts))

@@ -39,6 +39,7 @@ class StudentFilm:
             frames as new poses.
         relighting: the light; None keeps that of the capture.
         below: height of the picture below the highest point, metres; None shows the whole person.
+        device: where it is posed and drawn, see `AvatarPlayer`.
     """
 
     view: str
@@ -49,6 +50,7 @@ class StudentFilm:
     numbered_from: int | None = None
     relighting: Relighting | None = None
     below: float | None = None
+    device: str = "cpu"
 
 
 def motion_for(bundle: AvatarBundle, path: Path, *, fps: float | None = None) -> BodyParams:
@@ -90,7 +92,7 @@ def student_frames(
                 f"more than 10 degrees farther than training saw: {done}"
             )
         motion = limits.clamped(motion) if film.clamp else motion
-    player = AvatarPlayer(bundle)
+    player = AvatarPlayer(bundle, device=film.device)
     cameras = _cameras(player, motion.select(list(shown)), film)
     return cameras, _pictures(player, motion, shown, cameras, film, notes, quality)
 

@@ -71,6 +71,8 @@ class Talk:
     """Height of the picture in pixels."""
     cloth: ClothMode = "simulate"
     """Loose clothes of a film: simulated, moved by the student's own field, or by the joints alone."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where a film is drawn; cuda needs gsplat. Clothes are simulated on the CPU."""
     verbose: bool = False
     """Print each word of a recording with its times."""
     json: bool = False
@@ -176,6 +178,8 @@ class Talk:
             )
         if self.sound_out is not None and self.sound_out.suffix.lower() != ".wav":
             raise InputError(f"output {self.sound_out}", expected=".wav", received=self.sound_out.suffix or "no suffix")
+        if self.device != "cpu" and suffix != FILM:
+            raise InputError("option device", expected="cpu where no film is drawn", received=self.device)
         # Pixels, least height of a picture.
         smallest = 16
         require_at_least("height", self.height, smallest)
@@ -202,6 +206,7 @@ class Talk:
             cloth=self.cloth,
             clamp=False,
             below=_PORTRAIT if portrait else None,
+            device=self.device,
         )
         cameras, frames = student_frames(bundle, motion, range(lead, len(motion)), film, notes)
         shown = track(frames, total=len(cameras), description="frames", console=Console(stderr=True), disable=self.json)

@@ -23,6 +23,7 @@ from smplxpp.figures.film import write_film
         ("a.mp4", {"text": " "}, "text"),
         ("a.mp4", {"audio": Path("a.wav"), "voice": Path("v.onnx")}, "voice"),
         ("a.npz", {"text": "hello", "sound_out": Path("a.mp3")}, "wav"),
+        ("a.npz", {"text": "hello", "device": "cuda"}, "device"),
         ("a.npz", {"text": "hello"}, "run nowhere"),
         ("a.mp4", {"text": "hello", "height": 2}, "height"),
         (None, {"text": "hello"}, "--web"),
