@@ -2,6 +2,7 @@
 
 python -m benchmarks web_player parts --run RUN [--before MODULES] [--repeats 20] [--no-store]
 python -m benchmarks web_player threads --run RUN [--rounds 10] [--no-store]
+python -m benchmarks web_player cloth [--garments "knee skirt"] [--motions walk] [--no-store]
 """
 
 from __future__ import annotations
@@ -12,22 +13,34 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
+from unittest.mock import patch
 
 import numpy as np
 import tyro
 
 from avatar.export.bundle import BundleExtras, write_bundle
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models.networks.deformation_field import FieldConfig
+from avatar.models.student import Student, StudentConfig
+from avatar.rig.rig import Rig
 from avatar.runtime import AvatarPlayer
+from avatar.runtime.skeleton import LooseClothes
+from benchmarks.accuracy.cloth_stress import MOTIONS, dressed, motion, wardrobe
 from benchmarks.speed.runtime import from_the_front, poses_of, students_of
 from benchmarks.support.results import ROOT, store_results
 from pipelines.runs import layout
 from pipelines.web.page import PageContent, PageLight, single_page
 from pipelines.web.server import PageServer
+from smplxpp.body import load_body
+from smplxpp.cloth import cut_garment
 from smplxpp.cloth.garment_file import load_garments
+from smplxpp.cloth.solver import ClothSolver
 from smplxpp.core import BodyParams, Camera
 from smplxpp.core.light import STUDIO, Irradiance, Relighting, panoramas
+from smplxpp.people.garments.mannequin import Mannequin
 from tests.web.chromium import Page, find_chromium
 
 WEB = ROOT / "web"
@@ -317,5 +330,104 @@ def summary(rows: list[Row]) -> Row:
     return {**least, WHOLE: min(whole), f"{WHOLE}, median": float(np.median(whole))}
 
 
+_CLOTH = """<!doctype html><script type="module">
+import * as m from "./modules.js";
+const avatar = await m.readBundle(new Uint8Array(await (await fetch("me.avatar")).arrayBuffer()));
+const driver = new m.ClothDriver(new m.Deformer(avatar), avatar.garments), { framesPerSecond } = avatar.motion;
+window.step = (k) => {
+  const pose = m.poseAt(avatar.motion, k / framesPerSecond), start = performance.now();
+  driver.step(pose, 1 / framesPerSecond);
+  return performance.now() - start;
+};
+</script>"""
+
+
+@dataclass(frozen=True)
+class WebClothBenchmark:
+    """Time a step of loose clothes in the page and in the runtime: garments of `cloth_stress` in its motions.
+
+    Milliseconds of a step of 1/30 s from pose to displacements, the least of each frame's runs, cold starts aside: of
+    the processor in headless Chromium, with the call that asks for it, by the clock there, of the processor in the
+    runtime, which measures the cloth in every step, and in the solver's kernel alone. Needs Chromium.
+    """
+
+    garments: tuple[str, ...] = ("mini skirt", "knee skirt", "cape")
+    motions: tuple[str, ...] = ("walk", "squat", "dance")
+    runs: int = 4
+    """Runs of each motion."""
+    store: bool = True
+    """Store the figures."""
+
+    def run(self) -> None:
+        """Print and store the figures."""
+        subprocess.run(["node", "build.mjs", "--tests"], cwd=WEB, check=True)
+        mannequin = Mannequin.of(body := load_body(), np.zeros(body.num_betas))
+        figures: dict[str, Row] = {}
+        for name, which in product(self.garments, self.motions):
+            garment = wardrobe(mannequin)[name]
+            template = dressed(mannequin, garment)
+            cut = cut_garment(template, garment.label, mannequin.params)
+            config = StudentConfig(FieldConfig(width=8, hidden_layers=2, code_size=4), None, control_points=40)
+            student = Student(config, Rig(template), sample_on_mesh(template, SamplingConfig(count=2000)), (0,))
+            params = motion(body, MOTIONS[which], mannequin.params.betas[0]).without_shape()
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "me.avatar"
+                write_bundle(path, student, BundleExtras(name="benchmark", garments=[cut], motion=params))
+                runs = [in_chromium(path, len(params)) | natively(path) for _ in range(self.runs)]
+            row = figures[f"{name}, {which}"] = {"particles": float(len(cut.particles))}
+            for part in runs[0]:
+                least = np.min([run[part] for run in runs], axis=0)[1:]
+                row |= {part: float(np.median(least)), f"{part}, 95 %": float(np.quantile(least, 0.95))}
+            print(name, which, row, flush=True)
+        if self.store:
+            store_results("web_cloth", "python -m benchmarks web_player cloth", figures)
+
+
+def in_chromium(path: Path, frames: int) -> dict[str, list[float]]:
+    """Return milliseconds of the steps along a bundle's motion in a page, of the processor and of the clock."""
+    modules = (WEB / "build" / "modules.mjs").read_bytes()
+    files = {"index.html": _CLOTH.encode(), "modules.js": modules, "me.avatar": path.read_bytes()}
+    out: dict[str, list[float]] = {"page": [], "page, clock": []}
+    with PageServer(files) as server, tempfile.TemporaryDirectory() as folder, Page(Path(folder) / "profile") as page:
+
+        def spent() -> float:
+            metrics = page.send("Performance.getMetrics")["metrics"]
+            return next(1e3 * one["value"] for one in metrics if one["name"] == "ThreadTime")
+
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page.send("Performance.setTimeDomain", timeDomain="threadTicks")
+        page.send("Performance.enable")
+        page.send("Page.navigate", url=server.address)
+        page.evaluate(_WAIT.replace("ready", "step").replace("done(step)", "done(0)"))
+        for k in range(frames):
+            before = spent()
+            out["page, clock"].append(page.evaluate(f"step({k})"))
+            out["page"].append(spent() - before)
+        server.shutdown()
+    return out
+
+
+def natively(path: Path) -> dict[str, list[float]]:
+    """Return the same of the runtime, and of the solver in it, of the processor."""
+    out: dict[str, list[float]] = {"runtime": [], "solver": []}
+    player, advance, spent = AvatarPlayer(path, threads=1), ClothSolver.advance, [0.0]
+    assert player.motion is not None
+
+    def timed(*args: Any) -> None:
+        begin = time.process_time()
+        advance(*args)
+        spent[0] += time.process_time() - begin
+
+    with patch.object(ClothSolver, "advance", timed):
+        clothes = LooseClothes(player.bundle)
+        for k in range(len(player.motion)):
+            spent[0], begin = 0.0, time.process_time()
+            clothes.step(player.motion.frame(k), STEP)
+            out["runtime"].append(1e3 * (time.process_time() - begin))
+            out["solver"].append(1e3 * spent[0])
+    return out
+
+
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"parts": WebPlayerBenchmark, "threads": WebThreadsBenchmark}).run()
+    parts = {"parts": WebPlayerBenchmark, "threads": WebThreadsBenchmark, "cloth": WebClothBenchmark}
+    tyro.extras.subcommand_cli_from_dict(parts).run()
