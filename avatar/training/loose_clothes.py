@@ -27,14 +27,14 @@ class ClothConfig:
     Attributes:
         parts: names of the parts; None: those whose tracked surface departs from skinning, and whose simulation brings
             the person's outline in training views nearer to the masks. Named parts are simulated without that test.
-        garment: settings of the cut.
+        garment: settings of the cut; None: those of cloth, or of hair where a part is hair.
         calibration: settings of the fit to the tracked surface.
         seed: nothing is drawn; there for the stage.
         iterations: steps that a bar of progress shows for the stage.
     """
 
     parts: tuple[str, ...] | None = None
-    garment: GarmentConfig = field(default_factory=GarmentConfig)
+    garment: GarmentConfig | None = None
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     seed: int = 0
     iterations: int = 1

@@ -20,7 +20,7 @@ from pipelines.commands.options import ClothMode, Lighting, OptionalFloat, Optio
 from pipelines.commands.templates import BUNDLE_SUFFIX, load_run_template
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS, STUDENT
-from smplxpp.cloth import Garment, cut_garment
+from smplxpp.cloth import DriverConfig, Garment, cut_garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.play import play
 from smplxpp.cloth.quality import ClothQuality, all_checks
@@ -66,6 +66,8 @@ class Animate:
     cloth: ClothMode = "simulate"
     """What moves the loose clothes that the run has found (83_cloth), or that --loose-parts names: a simulation, the
     joints alone, or (students) their own field. A GLB's clothes always follow the joints."""
+    floor: OptionalFloat = None
+    """Height of the ground in metres, on which simulated clothes of who kneels or lies come to rest."""
     loose_parts: tuple[str, ...] = ()
     """Simulate these parts of the template, in the place of those that training found."""
     height: int = 720
@@ -152,7 +154,11 @@ class Animate:
             shown = range(round(first / (fps * self.step) * self.interpolate), len(motion))
             fps = self.interpolate
         # Training codes hold for clothes as the field moved them, not for simulated ones.
-        loose = bundle.garments_about.get("garments", [])
+        about = dict(bundle.garments_about)
+        loose = about.get("garments", [])
+        if self.floor is not None:
+            about["simulation"] = {**about.get("simulation", {}), "floor": self.floor}
+            bundle = replace(bundle, garments_about=about)
         simulated = [row["part"] for row in loose] if self.cloth == "simulate" else []
         if simulated and self.codes == "trained":
             received = f"simulated: {', '.join(simulated)}"
@@ -283,7 +289,9 @@ class Animate:
         if not garments:
             yield from _pose_blocks(template, chosen)
             return
-        surfaces = play(template, garments, whole, fps=fps * self.step, notes=self._notes, quality=self._quality)
+        config = DriverConfig(floor=self.floor)
+        notes, quality = self._notes, self._quality
+        surfaces = play(template, garments, whole, fps=fps * self.step, config=config, notes=notes, quality=quality)
         first = len(whole) - 1 - (len(chosen) - 1) * self.step
         for k, vertices in enumerate(surfaces):
             if k >= first and (k - first) % self.step == 0:

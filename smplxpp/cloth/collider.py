@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Int32, Int64
 from scipy.spatial import cKDTree
 
 from smplxpp.cloth.cloth_mesh import coarsen
@@ -18,7 +18,7 @@ from smplxpp.template.template import BODY_PART, Template
 if TYPE_CHECKING:
     from smplxpp.cloth.garment import GarmentConfig
 
-# Metres from the garment at rest: skin farther off is not looked at. A leg that lifts takes the skirt along first.
+# Metres from the garment at rest: other skin is not looked at, unless cloth that hangs free comes there.
 NEAR = 0.3
 # Metres behind a surface up to which cloth is pushed out of it: half a limb, little of a sheet.
 SOLID_DEPTH, SHEET_DEPTH = 0.05, 0.02
@@ -48,15 +48,24 @@ class ColliderMesh:
         return Collider(self.faces, self.margin, self.deepest)
 
 
-def collider_of(template: Template, part: str, posed: TriangleMesh, config: GarmentConfig) -> ColliderMesh:
+def collider_of(
+    template: Template, part: str, posed: TriangleMesh, config: GarmentConfig, *, hangs: float
+) -> ColliderMesh:
     """Choose what a part may touch: skin without head and fingers, and the parts whose layer lies under its own.
 
     Args:
         posed: the template in the pose that the part was scanned in.
+        hangs: metres along the cloth from what carries it to the hem, the most.
     """
-    # Only surfaces near the part at rest can touch it; this keeps the collider small.
+    # Only surfaces near the part at rest can touch it; this keeps the collider small. Cloth that hangs from a waist
+    # comes to all skin below it within its own length: who squats puts shins and feet into a skirt that ended 40 cm
+    # above them, and where a foot is not seen to be there, the cloth slides over the whole leg. Not where loose clothes
+    # lie over each other: a foot that kicks the inner one drives it through the outer one between two searches for
+    # contacts.
+    hangs = 0.0 if set(template.loose_parts) - {part} else hangs
     own = posed.vertices[np.unique(template.faces[template.part_faces(part)])]
-    near = cKDTree(own).query(posed.vertices, distance_upper_bound=NEAR)[0] < NEAR
+    away = cKDTree(own).query(posed.vertices, distance_upper_bound=max(NEAR, hangs))[0]
+    near = (away < NEAR) | ((away < hangs) & (posed.vertices[:, 1] < own[:, 1].min()))
     # Fingers and the face are too fine for the collider's spacing; only hair collides with the head.
     hair = template.label_of(part).kind == HAIR.name
     usable = near & ~_small_skin(template, head=hair)
@@ -104,12 +113,24 @@ def _layers_under(template: Template, part: str) -> list[str]:
     return sorted((name for name in others if place(name) < place(part)), key=place)
 
 
+def head_skin(template: Template) -> Bool[np.ndarray, " V"]:
+    """Return the vertices of the body that follow the head."""
+    out = np.zeros(template.vertex_count, dtype=bool)
+    out[: template.body.vertex_count] = _follows(template, _FACE)
+    return out
+
+
+def _follows(template: Template, words: tuple[str, ...]) -> np.ndarray:
+    """The vertices of the body that follow most a joint with one of the words in its name."""
+    body = template.body
+    strongest = np.asarray(template.weights.dense()[: body.vertex_count].argmax(axis=1))
+    return np.array([any(word in name for word in words) for name in body.joint_names])[strongest]
+
+
 def _small_skin(template: Template, *, head: bool) -> np.ndarray:
     """(V,) the vertices of the body that follow the head or a finger, or that lie inside it, as eyes do."""
     body = template.body
-    strongest = np.asarray(template.weights.dense()[: body.vertex_count].argmax(axis=1))
-    words = _FINGERS if head else (*_FINGERS, *_FACE)
-    small = np.array([any(word in name for word in words) for name in body.joint_names])[strongest]
+    small = _follows(template, _FINGERS if head else (*_FINGERS, *_FACE))
     if BODY_PART in body.part_label_names:  # a body whose file names eyes and teeth apart
         small |= body.part_labels != body.part_label_names.index(BODY_PART)
     out = np.zeros(template.vertex_count, dtype=bool)

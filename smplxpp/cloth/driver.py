@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
 
 from smplxpp.body.model import PosedBody
 from smplxpp.cloth.embedding import SkinnedRows
@@ -41,6 +41,8 @@ class DriverConfig:
         least_determinant: of a blend of rotations; below, its inverse would blow up what the cloth did.
         wander: metres of the root from the origin of the particles' places above which that follows it, because
             float32 loses precision with the distance.
+        floor: height of the ground, metres of the world, on which cloth of who kneels, falls or lies comes to rest;
+            None: there is none.
         solver: how time is stepped.
     """
 
@@ -56,6 +58,7 @@ class DriverConfig:
     drawn_margin: float = 0.002
     least_determinant: float = 0.2
     wander: float = 4.0
+    floor: float | None = None
     solver: SolverConfig = field(default_factory=SolverConfig)
 
     def __post_init__(self) -> None:
@@ -123,7 +126,7 @@ class ClothDriver:
         self._threads = [GarmentThread(g, self._rows, self.config, template.faces) for g in garments]
         self.quality = [ClothQuality(part=g.part) for g in garments]
         # What places are measured from: near the person, so that float32 knows micrometres wherever that stands.
-        self._origin = np.zeros(3)
+        self._measure_from(np.zeros(3))
         self._time = 0.0
         self._last: BodyParams | None = None
         share = np.concatenate([g.share() for g in garments])
@@ -210,7 +213,7 @@ class ClothDriver:
         start = reference_facing_as(self._threads[0].garment.reference, params)
         ramp_step = self.config.ramp_step
         steps, still = (round(t / ramp_step) for t in (self.config.ramp, self.config.hold))
-        self._origin = np.array(posed.joints[0, 0])
+        self._measure_from(posed.joints[0, 0])
         places = self._places(self.template.posed_body(start) if steps else posed)
         for thread in self._threads:
             thread.reset(places)
@@ -224,6 +227,7 @@ class ClothDriver:
             self._advance(posed, ramp_step, at_any_speed=True)
         # Contact cannot push out particles that start too deep; report them instead of failing.
         for thread in self._threads:
+            thread.begin_measuring()
             if buried := thread.buried():
                 self.notes.append(
                     f"{thread.garment.part} at {self._time:.2f} s: {buried} of {len(thread.garment.particles)} "
@@ -236,7 +240,7 @@ class ClothDriver:
         # Keep the origin near the person: float32 coordinates lose precision with their distance from it.
         away = posed.joints[0, 0] - self._origin
         if np.abs(away).max() > self.config.wander:
-            self._origin = self._origin + away
+            self._measure_from(self._origin + away)
             for thread in self._threads:
                 thread.shift(-away.astype(np.float32))
         places = self._places(posed)
@@ -250,6 +254,12 @@ class ClothDriver:
             if note:
                 self.notes.append(f"{thread.garment.part} at {self._time:.2f} s: {note}")
         return True
+
+    def _measure_from(self, origin: Float[np.ndarray, " 3"]) -> None:
+        """Take places from another origin, world, metres."""
+        self._origin = np.array(origin)
+        for thread in self._threads:
+            thread.floor = None if self.config.floor is None else float(self.config.floor - origin[1])
 
     def _places(self, posed: PosedBody) -> Float32[np.ndarray, "R 3"]:
         """Return where skinning has the vertices that steps need, metres from the origin."""

@@ -228,6 +228,10 @@ def _options(stored: Mapping[str, Any], usual: DriverConfig | SolverConfig, subj
     for name, value in asdict(usual).items():
         if name not in stored or name == "solver":
             continue
+        if value is None:  # the floor: a height, or none
+            if stored[name] is not None:
+                out[name] = as_number(stored[name], subject=f"{subject}: {name}", least=-1e4, most=1e4)
+            continue
         least, most = 0.1 * value if name in ("substep", "ramp_step") else 0.0, max(10.0 * value, 0.1)
         out[name] = as_number(stored[name], subject=f"{subject}: {name}", least=least, most=most)
         if isinstance(value, int):

@@ -25,6 +25,9 @@ class GarmentThread:
         garment: what it is.
         rows: (R,) vertices of the template whose places it is given, increasing.
         faces: of the template, whose edges are measured as they are drawn.
+
+    Attributes:
+        floor: height of the ground, metres from the driver's origin; None: there is none.
     """
 
     def __init__(
@@ -35,6 +38,7 @@ class GarmentThread:
         faces: Int[np.ndarray, "F 3"],
     ) -> None:
         self.garment, self._config = garment, config
+        self.floor: float | None = None
         self._model = garment.model()
         collider = garment.collider
         self._solver = ClothSolver(self._model, collider.native, garment.config.fabric, config.solver)
@@ -57,6 +61,10 @@ class GarmentThread:
         """Put the particles where skinning has them, at rest."""
         self._state = ClothState.at_rest(places[self._particles])
         self._places, self._surfaces = [places[self._particles]], [places[self._skin]]
+
+    def begin_measuring(self) -> None:
+        """Forget the contacts that were let go until now, in a ramp that no frame shows."""
+        self._released = self._solver.released
 
     def way_to(self, places: Float32[np.ndarray, "R 3"]) -> float:
         """Return the largest displacement, metres, of the garment's attachments since the last step."""
@@ -87,10 +95,28 @@ class GarmentThread:
         finally:
             self._places, self._surfaces = [self._places[-1], own], [self._surfaces[-1], surface]
         if self._sound():
+            if self.floor is not None:
+                self._lay_on(self.floor + self._config.drawn_margin)
             return None
         self._state = ClothState.at_rest(own)
         self._resets += 1
         return "the simulation broke down; the cloth was laid on the body again and continues from there"
+
+    def _lay_on(self, height: float) -> None:
+        """Lift what sank below the ground onto it; Coulomb's friction against what it fell with.
+
+        The foot of a perpendicular on a half-space is no farther from another foot than the points were: no edge
+        becomes longer, so that the bound of the solver holds.
+        """
+        x, v = self._state.position, self._state.velocity
+        low = np.flatnonzero(x[:, 1] < height)
+        stopped = np.maximum(-v[low, 1], 0.0)
+        along = v[low][:, [0, 2]]
+        speed = row_lengths(along)
+        left = np.maximum(speed - self.garment.config.fabric.friction * stopped, 0.0) / np.maximum(speed, 1e-9)
+        x[low, 1] = height
+        v[low, 0], v[low, 2] = (along * left[:, None]).T
+        v[low, 1] += stopped
 
     def place(self, particles: Float32[np.ndarray, "n 3"]) -> None:
         """Put the particles elsewhere, metres from the driver's origin; their velocities stay."""
@@ -111,7 +137,10 @@ class GarmentThread:
 
         Between particles that keep their margin a limb's curve can come through.
         """
-        return self._carried.at(self._state.position, self._surfaces[-1], margin=self._config.drawn_margin)
+        out = self._carried.at(self._state.position, self._surfaces[-1], margin=self._config.drawn_margin)
+        if self.floor is not None:
+            np.maximum(out[:, 1], self.floor, out=out[:, 1])
+        return out
 
     def buried(self) -> int:
         """Return how many particles lie inside what the garment touches, by so much that no contact pushes them out."""

@@ -10,6 +10,7 @@ import pytest
 
 from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment, GarmentConfig, cut_garment
 from smplxpp.cloth.play import play
+from smplxpp.cloth.solver import ClothSolver
 from smplxpp.core import BodyParams, InputError, matrix_from_rotvec
 from tests.cloth.persons import PART, person, standing
 
@@ -261,3 +262,49 @@ def test_cloth_that_is_drawn_over_another_pose_is_measured_once_there():
         other.step(pose, 1 / 60)
     np.testing.assert_array_equal(shape.displacements, other.over(drawn).displacements)
     assert one.quality[0].frames == before + 2 < other.quality[0].frames
+
+
+def test_contacts_that_a_ramp_lets_go_are_not_counted(monkeypatch):
+    """An open coat had 214 of them in each of ten motions, all from arms that came down before the first frame."""
+    advance = ClothSolver.advance
+
+    def pinched(self, *args):
+        advance(self, *args)
+        self._report[0] += 3
+
+    monkeypatch.setattr(ClothSolver, "advance", pinched)
+    one = driver()
+    one.step(standing(), 0.0)
+    assert one.quality[0].released == 0
+    one.step(standing(lifted=0.1), 1 / 30)
+    assert one.quality[0].released == 3
+
+
+@pytest.mark.parametrize("up", [0.0, 7.0])
+def test_a_skirt_that_reaches_the_ground_comes_to_rest_on_it(up):
+    """Hems of who kneels, falls or lies sank through the ground; 7 m up the places are measured from elsewhere."""
+    ground = 0.6 + up
+    one, free = driver(replace(QUICK, floor=ground)), driver()
+    for k in range(12):
+        for each in (one, free):
+            each.step(standing(at=(0.02 * k, up, 0.0)), 1 / 30)
+    lowest, sunk = one.particles(PART)[:, 1].min(), free.particles(PART)[:, 1].min()
+    assert sunk < ground - 0.1 < ground < lowest + 1e-5 < ground + 0.01
+    drawn = one._threads[0].carried() + one._origin
+    assert drawn[:, 1].min() >= ground - 1e-5
+    (found,) = one.quality
+    assert found.holds and found.longest <= 1.2 + 1e-3, "to be lifted makes no edge longer"
+
+
+def test_the_ground_stops_what_falls_and_slows_what_slides():
+    """Coulomb: mu = 0.15 times the speed of the fall is taken from that along the ground, down to none."""
+    one = driver(replace(QUICK, floor=0.0))
+    one.step(standing(), 0.0)
+    thread = one._threads[0]
+    position, velocity = thread._state.position, thread._state.velocity
+    position[:4] = [[0, -0.3, 0], [0, -0.3, 0], [0, -0.3, 0], [0, 0.3, 0]]
+    velocity[:4] = [[3, -2, 4], [0.1, -2, 0], [3, 1, 0], [3, -2, 4]]
+    thread._lay_on(0.1)
+    np.testing.assert_allclose(position[:4, 1], [0.1, 0.1, 0.1, 0.3])
+    slid = (5.0 - 0.15 * 2.0) / 5.0
+    np.testing.assert_allclose(velocity[:4], [[3 * slid, 0, 4 * slid], [0, 0, 0], [3, 1, 0], [3, -2, 4]], rtol=1e-6)

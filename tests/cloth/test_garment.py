@@ -8,10 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.accuracy.cloth_stress import dressed
+from smplxpp.body import load_body
 from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
 from smplxpp.cloth.cloth_mesh import find_opening_bridges
-from smplxpp.cloth.garment import find_carriers
-from smplxpp.core import GeometryWarning, InputError, TriangleMesh
+from smplxpp.cloth.garment import find_carriers, usual_config
+from smplxpp.core import HAIR, GeometryWarning, InputError, TriangleMesh
+from smplxpp.people.garments.hair import hairstyles
+from smplxpp.people.garments.mannequin import Mannequin
 from smplxpp.template.template import BODY_PART
 from tests.cloth.persons import HEM, PART, WAIST, person, standing
 
@@ -72,6 +76,31 @@ def test_it_touches_skin_near_it_that_faces_out():
     skin = body.vertex_normals[collider.vertices[collider.faces]].mean(axis=1)
     assert (np.einsum("fi,fi->f", mesh.face_normals, skin) > 0.3).mean() > 0.98
     np.testing.assert_allclose(collider.margin, garment.config.skin_margin)
+
+
+def test_a_skirt_touches_all_of_the_leg_that_it_can_fall_over():
+    """Skin 30 cm about it was all that it knew: in a squat the shins of a full circle skirt came through sideways."""
+    garment, template = cut(), person()
+    height = template.vertices[garment.collider.vertices, 1]
+    assert garment.depth.max() > 0.45 and height.min() < HEM - 0.4 == pytest.approx(0.05)
+    # What lies above its hem is still looked at within 30 cm alone.
+    assert height.max() < WAIST + 0.3
+
+
+def test_hair_hangs_from_the_head_alone():
+    """Where it lay on shoulders it was pinned to them, and tore from the head that turns."""
+    body = load_body()
+    mannequin = Mannequin.of(body, np.zeros(body.num_betas))
+    template = dressed(mannequin, hairstyles(mannequin)[1])
+    garment = cut_garment(template, HAIR.name, mannequin.params)
+    shoulder = mannequin.joints["left_shoulder"][1]
+    held = garment.rest.vertices[garment.pinned]
+    assert len(held) >= 3 and held[:, 1].min() > shoulder + 0.08
+    assert garment.rest.vertices[:, 1].min() < shoulder - 0.2
+    # It is hair and no cloth: heavier, rounder, and its strands rub against each other.
+    assert garment.config == usual_config(template, HAIR.name) != GarmentConfig()
+    assert garment.config.fabric.density > Fabric().density
+    assert usual_config(person(), PART) == GarmentConfig()
 
 
 def test_another_pin_depth_holds_more_without_cutting_anew():

@@ -186,6 +186,7 @@ OTHERS = DriverConfig(
         "drawn_margin": 0.015,
         "least_determinant": 0.5,
         "wander": 2.0,
+        "floor": 0.55,
     },
     solver=SolverConfig(
         substep=0.003, contacts_every=4, own_margin=0.005, most_speed=1.0, most_stretch=1.05, gravity=3.0
@@ -229,6 +230,7 @@ def test_bundles_that_say_no_numbers_are_stepped_as_before(dressed, tmp_path):
         (told({"solver": {"contacts_every": 2.5}}), "contacts_every"),
         (told({"sliver": 0.0}), "sliver"),
         (told({"teleport": -1.0}), "teleport"),
+        (told({"floor": "none"}), "floor"),
         (told({"solver": {"most_stretch": 0.5}}), "most_stretch"),
         (told({"solver": [1.0]}), "solver"),
         (told(None), "simulation"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
 
 import numpy as np
@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.data.cloth_motion import ClothMotions
-from smplxpp.cloth import Garment, GarmentConfig, cut_garment
+from smplxpp.cloth import Garment, cut_garment
+from smplxpp.cloth.garment import usual_config
 from smplxpp.cloth.quality import ClothQuality
 from smplxpp.core import DEFAULT_FPS, BodyParams, GeometryWarning, InputError
 from smplxpp.template.template import Template
@@ -109,7 +110,9 @@ def _loose_parts(template: Template, reference: BodyParams) -> list[Garment]:
     garments = []
     for name in template.loose_parts:
         with suppress(InputError):
-            garments.append(cut_garment(template, name, reference, GarmentConfig(pin_depth=pin_depth)))
+            garments.append(
+                cut_garment(template, name, reference, replace(usual_config(template, name), pin_depth=pin_depth))
+            )
     return garments
 
 

@@ -57,9 +57,13 @@ export function readGarments(piece: Map<string, Tensor>, about: Record<string, u
 
 /** Reads how garments are stepped; numbers that the piece lacks are those of bundles that say nothing of it. */
 export function readSimulation(about: Record<string, unknown>): Simulation {
-  const { solver, ...usual } = UNTOLD, told = (value: unknown, subject: string) => (value === undefined ? {} : asObject(value, subject));
+  const { solver, floor, ...usual } = UNTOLD, told = (value: unknown, subject: string) => (value === undefined ? {} : asObject(value, subject));
   const stored = told(about.simulation, "simulation");
-  return { ...options(stored, usual), solver: options(told(stored.solver, "simulation: solver"), solver) };
+  return {
+    ...options(stored, usual),
+    floor: stored.floor === undefined || stored.floor === null ? floor : asNumber(stored.floor, "simulation: floor", -1e4, 1e4),
+    solver: options(told(stored.solver, "simulation: solver"), solver),
+  };
 }
 
 /** Numbers by name, up to ten times the usual ones, steps of time from a tenth of these: others would halt the page. */

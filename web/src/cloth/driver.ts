@@ -73,7 +73,7 @@ export class ClothDriver {
 
   /** Refuses a garment of another avatar: its particles are vertices of this one in the reference pose. */
   private checkPlaces(reference: Pose, rest: Float64Array, particles: SkinnedRows): void {
-    this.origin = this.root(reference);
+    this.measureFrom(this.root(reference));
     this.joints(reference);
     const off = this.places(particles).reduce((most, value, i) => Math.max(most, Math.abs(value + this.origin[i % 3] - rest[i])), 0);
     if (!(off < SAME)) throw new BundleError("garments of the avatar", "particles that are its vertices", `some that are ${(1e3 * off).toPrecision(3)} mm off`, EXPORT_AGAIN);
@@ -119,7 +119,7 @@ export class ClothDriver {
     if (this.again(pose)) return;
     const start = facingAs(this.threads[0].garment.reference, pose);
     const { ramp, hold, ramp_step } = this.numbers, steps = Math.round(ramp / ramp_step), still = Math.round(hold / ramp_step);
-    this.origin = this.root(pose);
+    this.measureFrom(this.root(pose));
     this.joints(steps ? start : pose);
     this.threads.forEach((thread, k) => thread.reset(this.places(this.rows[k].particles), this.places(this.rows[k].collider)));
     for (let k = 1; k < steps; ++k) {
@@ -129,7 +129,7 @@ export class ClothDriver {
     for (let k = 0; k < still + Math.min(steps, 1); ++k) this.advance(pose, ramp_step, true);
     const { origin } = this, back = this.threads.map((thread) => thread.kept());
     this.begun = () => {
-      this.origin = origin;
+      this.measureFrom(origin);
       for (const one of back) one();
     };
   }
@@ -147,7 +147,7 @@ export class ClothDriver {
   private advance(pose: Pose, seconds: number, atAnySpeed: boolean): boolean {
     const root = this.root(pose), away = root.map((value, k) => value - this.origin[k]);
     if (away.some((value) => Math.abs(value) > this.numbers.wander)) {
-      this.origin = root;
+      this.measureFrom(root);
       for (const thread of this.threads) thread.shift(away.map((value) => -value));
     }
     this.joints(pose);
@@ -170,6 +170,13 @@ export class ClothDriver {
   private root({ translation, expression }: Pose): number[] {
     const { rest, byExpression } = this.deformer.avatar.skeleton, size = expression.length;
     return [0, 1, 2].map((k) => expression.reduce((sum, value, e) => sum + byExpression[k * size + e] * value, rest[k] + translation[k]));
+  }
+
+  /** Takes places from another origin, world, metres. */
+  private measureFrom(origin: number[]): void {
+    const { floor } = this.numbers;
+    this.origin = origin;
+    for (const thread of this.threads) thread.floor = floor === null ? null : floor - origin[1];
   }
 
   /** Brings the skeleton to a pose, measured from the origin. */

@@ -22,12 +22,13 @@ export interface Simulation {
   drawn_margin: number;
   least_determinant: number;
   wander: number;
+  floor: number | null;
   solver: SolverNumbers;
 }
 
 /** The numbers of bundles that were written before they held any. These are history: they change no more. */
 export const UNTOLD: Simulation = {
   ramp: 0.7, ramp_step: 1 / 30, hold: 0.2, longest_step: 0.26, teleport: 12, most_stretch: 4, most_drawn: 1.5, sliver: 0.005,
-  beside: 0.005, drawn_margin: 0.002, least_determinant: 0.2, wander: 4,
+  beside: 0.005, drawn_margin: 0.002, least_determinant: 0.2, wander: 4, floor: null,
   solver: { substep: 1 / 500, contacts_every: 8, own_margin: 0, most_speed: 8, most_stretch: 1.2, gravity: 9.81 },
 };

@@ -60,6 +60,8 @@ export class GarmentThread {
   private readonly fine: CarriedVertices;
   private readonly model: Block<Uint8Array>;
   private readonly forces: Block<Float64Array>;
+  /** Height of the ground, metres from the driver's origin; null: there is none. */
+  floor: number | null = null;
   private readonly moments: Block<Uint8Array>;
   private readonly places: Moments;
   private readonly surfaces: Moments;
@@ -113,11 +115,29 @@ export class GarmentThread {
     const { substep, contacts_every } = this.numbers.solver, substeps = Math.max(1, Math.ceil(seconds / substep - 1e-6));
     this.native.run("cloth_advance", this.model, this.forces, this.moments, seconds, substeps, contacts_every, this.position, this.velocity);
     if (!this.sound()) this.rest(places);
+    else if (this.floor !== null) this.layOn(this.floor + this.numbers.drawn_margin);
   }
 
   /** Brings what the garment carries to where the particles are, `drawn_margin` outside of what it touches. */
   carry(): void {
     this.fine.carry(this.position, this.surfaces.blocks[2], this.numbers.drawn_margin);
+    if (this.floor === null) return;
+    const { view } = this.carried, floor = Math.fround(this.floor);
+    for (let i = 1; i < view.length; i += 3) view[i] = Math.max(view[i], floor);
+  }
+
+  /** Lifts what sank below the ground onto it; Coulomb's friction against what it fell with. */
+  private layOn(height: number): void {
+    const x = this.position.view, v = this.velocity.view, { friction } = this.garment.fabric;
+    for (let i = 0; i < x.length; i += 3) {
+      if (x[i + 1] >= height) continue;
+      const stopped = Math.max(-v[i + 1], 0), speed = Math.hypot(v[i], v[i + 2]);
+      const left = Math.max(speed - friction * stopped, 0) / Math.max(speed, 1e-9);
+      x[i + 1] = height;
+      v[i] *= left;
+      v[i + 1] += stopped;
+      v[i + 2] *= left;
+    }
   }
 
   /** (N, 3) where the carried vertices are, after `carry`. */
