@@ -132,7 +132,8 @@ def train(
     how = config.refinement(wanted=refine == "on" or (refine == "auto" and has_estimated_params(capture)))
     if how is not None:
         settings = {"refinement": how, "reference": scene.frame}
-        found = training.once("refine", settings, scene, {}, lambda session, made: _refine(scene, how, session, made))
+        work = lambda session, made: _refine(scene, how, session, made, training.device)  # noqa: E731
+        found = training.once("refine", settings, scene, {}, work)
         refined = with_refined_poses(capture, found)
         scene = prepare_scene(template, refined, built_frame=config.template_frame, before=scene)
     note_missing_normals(scene.capture, recipe, steps)
@@ -161,13 +162,14 @@ def _refuse_held_out_template(capture: Capture, frame: int | None) -> None:
         )
 
 
-def _refine(scene: TrainScene, config: Any, session: Session, folder: Path) -> Progress:
+def _refine(scene: TrainScene, config: Any, session: Session, folder: Path, device: str) -> Progress:
     def show(step: str, share: float) -> None:
         session.report(Progress(round(100 * share), 100, 0.0, 0.0))
 
     until, work = time.monotonic() + session.max_seconds, session.folder / session.key[:16]
     try:
-        refine_capture(scene, config, folder, work=work, progress=show, stop=lambda: time.monotonic() > until)
+        stop = lambda: time.monotonic() > until  # noqa: E731
+        refine_capture(scene, config, folder, work=work, progress=show, stop=stop, device=device)
     except RefinementStoppedError:
         return Progress(0, 1, 0.0, 0.0)
     return Progress(1, 1, 0.0, 0.0)

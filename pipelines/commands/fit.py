@@ -89,12 +89,12 @@ class Fit:
         config = self.config()
         inputs = TrainInputs(self.capture, self.params, self.body, self.hold_out, self.scale, self.protocol)
         # Refined poses are used by all later stages, so that refinement comes before the fit.
+        device = choose_device(self.device)
         if wants_refinement(self.run_folder, inputs, self.refine_poses):
             with shared_progress(enabled=not self.json) as show:
-                refine(self.run_folder, inputs, RefineConfig(seed=self.seed), progress=show)
+                refine(self.run_folder, inputs, RefineConfig(seed=self.seed), progress=show, device=device)
         # `by_hand` in the record tells a later training to keep this fit.
         scene = open_frame(self.run_folder, inputs, self.frame)
-        device = choose_device(self.device)
         with training_progress("fit", config.iterations, enabled=not self.json) as progress:
             options = TrainOptions(
                 max_seconds=60.0 * self.max_minutes, force=self.force, bar=lambda name, total: nullcontext(progress)

@@ -183,7 +183,7 @@ class Train:
                 return training_progress(name, total, held_out=held_out, enabled=not self.json and together.first)
 
             if self.refine_help:
-                return self._help(inputs, scene, recipe.refine)
+                return self._help(inputs, scene, recipe.refine, together.device)
             options = TrainOptions(
                 max_seconds=60.0 * self.max_minutes,
                 force=self.force,
@@ -236,14 +236,14 @@ class Train:
         answer = {"run": str(self.run_folder), "facts": vars(facts), "plan": plan, "memory_gib": needs}
         return {**answer, "free_gb": free / 1e9}
 
-    def _help(self, inputs: TrainInputs, scene: TrainScene, config: RefineConfig | None) -> dict[str, Any]:
+    def _help(self, inputs: TrainInputs, scene: TrainScene, config: RefineConfig | None, device: str) -> dict[str, Any]:
         """Compute chunks of the refinement; nothing where poses are not refined, or are already."""
         from pipelines.stages.refine import help_refine
 
         until, finished = time.monotonic() + 60.0 * self.max_minutes, True
         if config is not None:
             stop = lambda: time.monotonic() > until  # noqa: E731
-            finished = help_refine(self.run_folder, inputs, config, scene=scene, stop=stop)
+            finished = help_refine(self.run_folder, inputs, config, scene=scene, stop=stop, device=device)
         return {"run": str(self.run_folder), "finished": finished}
 
     def steps(self) -> tuple[str, ...]:

@@ -70,10 +70,10 @@ def refine(
     config: RefineConfig,
     *,
     scene: TrainScene | None = None,
-    held_out: bool = True,
     force: bool = False,
     progress: ProgressCallback = ignore_progress,
     stop: Callable[[], bool] = lambda: False,
+    device: str = "cpu",
 ) -> StageRecord:
     """Refine the poses of a run's capture, unless template, capture, code and choices are unchanged.
 
@@ -84,22 +84,22 @@ def refine(
         inputs: sources of the views, with the initial parameters.
         config: choices of the refinement.
         scene: of these inputs, opened without refined poses; None: it is opened.
-        held_out: whether held-out frames are refined too.
         force: refine even if the stage stands.
         progress: called with the share of the evaluations of frames that are done.
         stop: asked after every pass and every chunk; then the record is unfinished, and the same call continues.
+        device: where pictures are drawn and compared. It is no part of the key, because poses differ by rounding alone.
 
     Raises:
         InputError: see `open_scene`.
     """
     # Start from the parameters before any refinement, so that the result does not depend on how often it ran.
     scene = open_scene(run, inputs, refined=False) if scene is None else scene
-    stage = _stage(scene, inputs, config, held_out=held_out)
+    stage = _stage(scene, inputs, config)
 
     def work(folder: Path) -> StageOutput:
         begin, state = time.perf_counter(), run / stage.work_name
         try:
-            refined = refine_capture(scene, config, folder, held_out=held_out, work=state, progress=progress, stop=stop)
+            refined = refine_capture(scene, config, folder, work=state, progress=progress, stop=stop, device=device)
         except RefinementStoppedError:
             seconds = time.perf_counter() - begin
             return StageOutput(
@@ -118,6 +118,7 @@ def help_refine(
     *,
     scene: TrainScene | None = None,
     stop: Callable[[], bool] = lambda: False,
+    device: str = "cpu",
 ) -> bool:
     """Compute chunks of a refinement that other processes work at, too; `refine` then finds them, and ends the stage.
 
@@ -129,6 +130,7 @@ def help_refine(
         config: as of `refine`.
         scene: as of `refine`.
         stop: asked after every pass and every chunk.
+        device: as of `refine`.
 
     Returns:
         Whether nothing is left to compute.
@@ -137,20 +139,20 @@ def help_refine(
         InputError: the state of a refinement with other choices.
     """
     scene = open_scene(run, inputs, refined=False) if scene is None else scene
-    stage = _stage(scene, inputs, config, held_out=True)
+    stage = _stage(scene, inputs, config)
     if decide(run, stage) == "skip":
         return True
     state = begin_state(run, stage)
     with tempfile.TemporaryDirectory() as folder, suppress(RefinementStoppedError):
-        refine_capture(scene, config, Path(folder), work=state, stop=stop)
+        refine_capture(scene, config, Path(folder), work=state, stop=stop, device=device)
         return True
     return False
 
 
-def _stage(scene: TrainScene, inputs: TrainInputs, config: RefineConfig, *, held_out: bool) -> Stage:
+def _stage(scene: TrainScene, inputs: TrainInputs, config: RefineConfig) -> Stage:
     return Stage(
         name=REFINE_STAGE,
-        config={"refinement": config, "reference": scene.frame, "scale": inputs.scale, "held_out": held_out},
+        config={"refinement": config, "reference": scene.frame, "scale": inputs.scale, "held_out": True},
         inputs=scene.digests,
         code=(__name__,),
         libraries=TRAINING,
@@ -218,13 +220,13 @@ def write_pictures(folder: Path, sequence: AvatarSequence, found: Refinement) ->
         names = [name for name in sequence.train_cameras if sequence.capture.file(name, frame) is not None]
         views = [read_view(sequence.capture, name, frame) for name in names]
         view = max(views, key=lambda one: np.count_nonzero(one.alpha.numpy()))
-        rendered = []
+        there, rendered = view.to(sequence.device), []
         # Render with the initial and the refined pose, at rest (without learned deformation), so that only the pose
         # differs.
         for params in (found.start, found.params):
             with at_rest(avatar):
-                posed = avatar(sequence.rig.pose(params.frame(int(row))), view.position[None])
-                rendered.append(eight_bit(render_view(posed, 0, view, sequence.background).image).numpy())
+                posed = avatar(sequence.rig.pose(params.frame(int(row))), there.position[None])
+                rendered.append(eight_bit(render_view(posed, 0, there, sequence.background).image).numpy())
         file = f"pictures/{view.name}_{frame:06d}.png"
         write_tiles(folder / file, view.photograph(sequence.background.tolist()), rendered)
         out.append({"file": file, "title": f"frame {frame}, {view.name}"})

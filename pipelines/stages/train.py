@@ -156,13 +156,16 @@ def _refined(
             def show(step: str, share: float) -> None:
                 report(Progress(round(100 * share), 100, 0.0, 0.0))
 
-            return refine(run, inputs, config, scene=scene, force=options.force, progress=show, stop=stop)
+            return refine(
+                run, inputs, config, scene=scene, force=options.force, progress=show, stop=stop, device=together.device
+            )
 
     # Processes share the chunks of a long take, see `Board`; the first one ends the stage.
     if len(scene.capture.splits.train_frames) > config.chunk_frames and together.world_size > 1 and not options.force:
         together.run_on_rank0(lambda: help_refine(run, inputs, config, scene=scene, stop=lambda: True))
         together.share_out(
-            range(together.world_size), lambda _: help_refine(run, inputs, config, scene=scene, stop=stop)
+            range(together.world_size),
+            lambda _: help_refine(run, inputs, config, scene=scene, stop=stop, device=together.device),
         )
     return together.run_on_rank0(whole, kinds=(StageRecord,))
 

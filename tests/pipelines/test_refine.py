@@ -23,6 +23,7 @@ from smplxpp.body import load_params
 from smplxpp.capture import read_cameras
 from smplxpp.core.errors import InputError
 from tests.dolls.gesturing import FRAMES, NOVEL_POSES, disturbed, doll, gestures, write_gestures
+from tests.pretended_cuda import pretended_cuda
 from tests.training.refinement.test_refine import QUICK
 
 
@@ -65,6 +66,19 @@ def refined(capture, tmp_path_factory):
         use_quick(patch)
         assert refine(run, capture) == 0  # the capture says that these are tracked
     return run
+
+
+@pytest.mark.slow
+def test_a_refinement_on_cuda_is_that_of_the_cpu_and_stands_for_it(refined, capture, tmp_path, capsys):
+    run = doll().write_run(tmp_path / "run")
+    with pretended_cuda():
+        assert refine(run, capture, "--device", "cuda") == 0
+    there, here = load_params(run / REFINED_PARAMS), load_params(refined / REFINED_PARAMS)
+    np.testing.assert_allclose(there.body_pose, here.body_pose, rtol=0, atol=1e-4)
+    pictures = {path.name for path in (refined / "66_refine" / "pictures").iterdir()}
+    assert pictures and pictures == {path.name for path in (run / "66_refine" / "pictures").iterdir()}
+    key = read_manifest(run / "66_refine")["key"]
+    assert refine(run, capture) == 0 and read_manifest(run / "66_refine")["key"] == key
 
 
 def test_every_frame_has_a_row_and_held_out_frames_keep_theirs(refined):

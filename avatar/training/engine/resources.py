@@ -185,7 +185,8 @@ def check_memory(foretold: Mapping[str, StageMemory], device: str) -> None:
     Raises:
         InputError: a stage that needs half more than the GPU has. Less than that is a warning.
     """
-    if not device.startswith("cuda"):
+    # A refinement of poses alone is not foretold: it holds a picture at a time.
+    if not device.startswith("cuda") or not foretold:
         return
     step, need = max(((step, one.device) for step, one in foretold.items()), key=lambda pair: pair[1])
     there = torch.cuda.mem_get_info()[1] / 2**30

@@ -60,12 +60,12 @@ class PhotometricLoss:
 
     Args:
         faces: of the template.
-        background: sRGB.
+        background: sRGB; where it lies pictures are drawn and compared. All else comes and goes where vertices lie.
         config: robust scale, weight of the opacity, and noise of a pixel.
     """
 
     def __init__(self, faces: Tensor, background: Float[Tensor, " 3"], config: RefineConfig) -> None:
-        self.faces, self.background, self.config = faces, background, config
+        self.faces, self.background, self.config = faces.to(background.device), background, config
 
     def linearize(
         self,
@@ -86,14 +86,15 @@ class PhotometricLoss:
             each_camera: keep the sums of each view apart too.
         """
         # Cut the graph at the Gaussians, so that their gradients can be read before they pass on to the vertices.
-        leaf = vertices.detach().requires_grad_(True)
+        gaussians, leaf = self._here(gaussians, vertices)
+        leaf.requires_grad_(True)
         world = world_from_frames(gaussians, triangle_frames(leaf, self.faces))
         cut = [t.detach().requires_grad_(True) for t in (world.means, world.quats, world.scales)]
         N = len(cut[0])
         curvature, loss = cut[0].new_zeros(N, 3, 3), 0.0
         colors, mass = cut[0].new_zeros(N, 3), cut[0].new_zeros(N)
         own: dict[str, tuple[Tensor, Tensor]] = {}
-        for view in views:
+        for view in map(self._placed, views):
             # Render and backpropagate one view: gradients of centres, colours, structure tensors and masses.
             features = torch.cat([gaussians.dc, gaussians.dc.new_zeros(N, 4)], dim=1).requires_grad_(True)
             before = cut[0].grad.clone() if each_camera and cut[0].grad is not None else torch.zeros_like(cut[0])
@@ -113,7 +114,18 @@ class PhotometricLoss:
         mean_gradient = cut[0].grad
         assert mean_gradient is not None
         means, normals = cut[0].detach(), world.normals.detach()
-        return Linearization(loss, leaf.grad, curvature, means, normals, mean_gradient, colors, mass, own)
+        there = vertices.device
+        return Linearization(
+            loss,
+            leaf.grad.to(there),
+            curvature.to(there),
+            means.to(there),
+            normals.to(there),
+            mean_gradient.to(there),
+            colors.to(there),
+            mass.to(there),
+            {name: (gradient.to(there), matrices.to(there)) for name, (gradient, matrices) in own.items()},
+        )
 
     def rigid_loss(
         self,
@@ -133,10 +145,12 @@ class PhotometricLoss:
             views: photographs.
         """
         total = weight = 0.0
+        gaussians, vertices = self._here(gaussians, vertices)
+        rigidity = rigidity.to(vertices.device)
         with torch.no_grad():
             world = world_from_frames(gaussians, triangle_frames(vertices, self.faces))
             features = torch.cat([gaussians.dc, rigidity[:, None]], dim=1)
-            for view in views:
+            for view in map(self._placed, views):
                 image, alpha = self._draw(world, features, view)
                 q, _, _ = self._difference(image, alpha, view)
                 # The fourth channel is the rigidity, blended like a colour: how much of the pixel shows rigid
@@ -145,6 +159,15 @@ class PhotometricLoss:
                 total += float((share * q / (q + self.config.robust**2)).sum())
                 weight += float(share.sum())
         return total / max(weight, 1e-9)
+
+    def _here(self, gaussians: BoundGaussians, vertices: Tensor) -> tuple[BoundGaussians, Tensor]:
+        """Return Gaussians and vertices, these without gradients, where pictures are drawn."""
+        device = self.background.device
+        return gaussians if device.type == "cpu" else gaussians.to(device=device), vertices.detach().to(device)
+
+    def _placed(self, view: View) -> View:
+        """Return a photograph where pictures are drawn; one at a time, since a frame's can be gigabytes."""
+        return view if self.background.device.type == "cpu" else view.to(self.background.device)
 
     def _view(self, world: WorldGaussians, features: Tensor, view: View, halvings: int) -> float:
         """Backpropagate one view into `world` and `features`, and return its loss."""

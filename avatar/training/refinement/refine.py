@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from avatar.training.refinement.nuisance import CameraCorrections
 from avatar.training.refinement.photometric import PhotometricLoss
 from avatar.training.refinement.posing import PosedTemplate, rigidity
 from smplxpp.core import BodyParams, InputError, ProgressCallback, ignore_progress, require_known, rotvec_from_matrix
+from smplxpp.native import thread_count
 from smplxpp.register import BodyState
 
 
@@ -70,7 +72,8 @@ def refine_poses(
     """Refine training frames: the reference frame first, then all together, with the colours of the Gaussians.
 
     Only images of training cameras are read. The body's shape is the template's and stays. A frame whose photographs
-    fit its start better keeps the start. Everything is computed on the CPU, whatever the sequence's device.
+    fit its start better keeps the start. Pictures are drawn and compared on the sequence's device, and all else is
+    computed on the CPU.
 
     Args:
         sequence: its parameters are the registered start; its images are read at full size.
@@ -247,7 +250,7 @@ def _require_training(sequence: AvatarSequence, frames: Sequence[int]) -> None:
 def _scene(sequence: AvatarSequence, config: RefineConfig) -> Scene:
     template = sequence.rig.template
     posed = PosedTemplate(template, rigidity(template, config.reach))
-    photometric = PhotometricLoss(posed.faces, sequence.background.cpu(), config)
+    photometric = PhotometricLoss(posed.faces, sequence.background, config)
     cameras = _corrections(sequence, config) if config.cameras else None
     return Scene(posed, photometric, config, cameras, sequence.capture.fps)
 
@@ -275,9 +278,16 @@ def _cameras(sequence: AvatarSequence, frame: int) -> list[str]:
 
 def _training_views(sequence: AvatarSequence) -> Callable[[int], list[View]]:
     """Return a reader of a frame's views by training cameras, cut to the person; empty masks are left out."""
+    # A CPU has other frames to compute meanwhile; a GPU would wait for one photograph after the other.
+    on_gpu = sequence.background.device.type != "cpu"
+    threads = ThreadPoolExecutor(thread_count(sequence.config.readers), "photographs") if on_gpu else None
 
     def read(frame: int) -> list[View]:
-        views = (read_view(sequence.capture, name, frame) for name in _cameras(sequence, frame))
-        return [view.cropped(sequence.config.margin) for view in views if torch.any(view.alpha)]
+        def one(name: str) -> View | None:
+            view = read_view(sequence.capture, name, frame)
+            return view.cropped(sequence.config.margin) if torch.any(view.alpha) else None
+
+        views = (threads.map if threads else map)(one, _cameras(sequence, frame))
+        return [view for view in views if view is not None]
 
     return read

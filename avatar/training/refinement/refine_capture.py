@@ -56,6 +56,7 @@ def refine_capture(
     work: Path | None = None,
     progress: ProgressCallback = ignore_progress,
     stop: Callable[[], bool] = lambda: False,
+    device: str = "cpu",
 ) -> RefinedCapture:
     """Refine the poses of a capture on the photographs of its training cameras, and write them.
 
@@ -73,12 +74,13 @@ def refine_capture(
             that make it at the same time share; None: none is kept.
         progress: called with the share of the frames' evaluations that are done.
         stop: asked after every pass and every chunk of frames.
+        device: where pictures are drawn and compared, see `refine_poses`.
 
     Raises:
         InputError: a frame without parameters or photographs.
         RefinementStoppedError: `stop` returned True; the same call continues.
     """
-    sequence = AvatarSequence(scene.capture, scene.template, SequenceConfig(normals=False))
+    sequence = AvatarSequence(scene.capture, scene.template, SequenceConfig(normals=False), device=device)
     if work is not None:
         work.mkdir(parents=True, exist_ok=True)
     training, apart_state = (None, None) if work is None else (work / TRAINING_STATE, work / HELD_OUT_STATE)

@@ -88,6 +88,7 @@ def test_more_gaussians_pixels_and_views_need_more_memory():
 
 def test_a_gpu_with_too_little_memory_is_told_before_work(caplog):
     with pretended_cuda():
+        check_memory({}, "cuda")  # a refinement of poses alone ended in a ValueError
         check_memory({"fit": StageMemory(1.0, 60.0)}, "cuda")
         assert not caplog.text
         check_memory({"fit": StageMemory(1.0, 2.0), "teacher": StageMemory(1.0, 75.0)}, "cuda")

@@ -10,6 +10,7 @@ import torch
 
 from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.sampling import SamplingConfig
+from avatar.training.refinement import photometric
 from avatar.training.refinement.align import Alignment
 from avatar.training.refinement.config import Level, RefineConfig
 from avatar.training.refinement.refine import Refinement, refine_held_out, refine_poses
@@ -134,14 +135,29 @@ def test_the_same_seed_gives_the_same_bits(frames):
     assert not np.array_equal(one.params.transl, refine_poses(frames, replace(QUICK, seed=1)).params.transl)
 
 
-def test_a_sequence_on_cuda_is_refined_on_the_cpu(frames):
+def test_a_sequence_on_cuda_has_its_pictures_drawn_there(frames, monkeypatch):
+    """Poses, colours and cameras are those of the CPU up to rounding; what is kept lies on the CPU."""
+    config, drawn = replace(QUICK, cameras=True), set()
+    real, some = photometric.rasterize, frames.train_frames[:2]
+
+    def recorded(means, *others, **options):
+        drawn.add(means.device.type)
+        return real(means, *others, **options)
+
+    monkeypatch.setattr(photometric, "rasterize", recorded)
     with pretended_cuda():
         moved = AvatarSequence(frames.capture, template(), device="cuda")
-        there = refine_poses(moved, QUICK)
-        apart = refine_held_out(moved, there.gaussians, QUICK)
+        there = refine_poses(moved, config, frames=some)
+        apart = refine_held_out(moved, there.gaussians, config)
+    assert drawn == {"cuda"}
     assert there.gaussians.dc.device.type == apart.gaussians.dc.device.type == "cpu"
-    here = refine_poses(frames, QUICK)
+    here = refine_poses(frames, config, frames=some)
+    assert drawn == {"cuda", "cpu"}
     np.testing.assert_allclose(there.params.body_pose, here.params.body_pose, atol=1e-4)
+    np.testing.assert_allclose(there.after, here.after, rtol=1e-3)
+    np.testing.assert_allclose(there.gaussians.dc, here.gaussians.dc, atol=1e-3)
+    for name, pose in here.cameras.items():
+        np.testing.assert_allclose(there.cameras[name], pose, atol=1e-5)
 
 
 def test_held_out_cameras_are_never_read_and_held_out_frames_are_refused(frames, monkeypatch):
