@@ -235,9 +235,29 @@ def with_perceptual(preset: TrainingPreset) -> TrainingPreset:
     )
 
 
-def with_batch(preset: TrainingPreset, items: int | None = None, *, least: int = 1) -> TrainingPreset:
-    """Return the preset with `items` poses in a step of every training (None: its own), and at least `least`."""
-    return _with_changes(preset, lambda config: {"poses_per_step": max(least, items or config.poses_per_step)})
+def with_batch(preset: TrainingPreset, items: int) -> TrainingPreset:
+    """Return the preset with `items` poses in a step of every training."""
+    return _with_changes(preset, lambda config: {"poses_per_step": items})
+
+
+def with_processes(preset: TrainingPreset, count: int) -> TrainingPreset:
+    """Return the preset with a pose of each step for every process, and no more poses in all.
+
+    A batch that grows k times takes a k-th of the steps at sqrt(k) times the rates, because Adam's steps follow the
+    noise of the gradient, which falls with sqrt(k) (Malladi et al. 2022, "On the SDEs and scaling rules for adaptive
+    gradient algorithms").
+    """
+
+    def changes(config: PhotometricConfig) -> dict[str, Any]:
+        grown = max(1.0, count / config.poses_per_step)
+        names = [name for name in ("lr", "attributes", "position_lr", "color_lr") if hasattr(config, name)]
+        return {
+            "poses_per_step": max(count, config.poses_per_step),
+            "iterations": math.ceil(config.iterations / grown),
+            **{name: getattr(config, name) * math.sqrt(grown) for name in names},
+        }
+
+    return _with_changes(preset, changes)
 
 
 def _with_changes(preset: TrainingPreset, changes: Callable[[PhotometricConfig], Mapping[str, Any]]) -> TrainingPreset:

@@ -145,7 +145,7 @@ class Train:
         from avatar.data.one_frame import views_of_turn
         from avatar.training.engine.processes import join_processes
         from avatar.training.engine.resources import choose_device
-        from avatar.training.recipe import with_batch
+        from avatar.training.recipe import with_processes
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.models import TrainOptions
         from pipelines.stages.refine import wants_refinement
@@ -169,7 +169,9 @@ class Train:
             )
             recipe = config.recipe(self.preset, cloth=self.cloth, turn_views=views_of_turn(scene.capture))
             # Every process needs a pose of each step.
-            preset = with_batch(recipe.preset, least=together.world_size)
+            preset = with_processes(recipe.preset, together.world_size)
+            if together.first and preset != recipe.preset:
+                log.info("batches grow to %d poses, with fewer steps at larger rates", together.world_size)
             recipe = replace(recipe, preset=preset, refine=config.refinement(wanted=first))
             if not recipe.teacher and self.stage in ("teacher", "cloth"):
                 raise InputError(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from avatar.training.presets import TRAINING_PRESETS, training_preset, with_iterations
-from avatar.training.recipe import TrainConfig
+from avatar.training.recipe import TrainConfig, with_batch, with_processes
 from smplxpp.core.errors import InputError
 
 STAGES = ("fit", "teacher", "bake", "compensate")
@@ -134,3 +134,21 @@ def test_of_a_turn_a_student_is_fitted_without_a_teacher_and_options_still_count
         and preset.bake.lr < 1e-6
     )
     assert TrainConfig().recipe("cpu").preset == own
+
+
+def test_several_processes_see_no_more_poses_than_one():
+    """A batch of 1 grew to 4 for four processes at the same number of steps: four times the work in the same hours."""
+    one = training_preset("paper")
+    four = with_processes(one, 4)
+    for before, after in zip(
+        (one.teacher, one.bake, one.compensate), (four.teacher, four.bake, four.compensate), strict=True
+    ):
+        grown = max(1, 4 // before.poses_per_step)
+        assert after.poses_per_step == max(4, before.poses_per_step)
+        assert after.iterations * grown == before.iterations
+        assert after.lr == pytest.approx(before.lr * grown**0.5)
+        assert after.attributes == pytest.approx(before.attributes * grown**0.5)
+    assert four.teacher.lr == 2.0 * one.teacher.lr and four.fit == one.fit
+    shapes = with_processes(replace(one, compensate=replace(one.compensate, poses_per_step=1)), 4).compensate
+    assert (shapes.position_lr, shapes.color_lr) == (2.0 * one.compensate.position_lr, 2.0 * one.compensate.color_lr)
+    assert with_processes(one, 1) == one and with_processes(with_batch(one, 4), 4) == with_batch(one, 4)
