@@ -161,23 +161,26 @@ def captured(name: str) -> PersonScan:
     )
 
 
-def worn_template(body: BodyModel, case: Case) -> Template:
-    """Return the person of a case in its garment: a template of two parts by the authored weights.
+def worn_template(body: BodyModel, case: Case, *, under: Bool[np.ndarray, " N"] | None = None) -> Template:
+    """Return the person of a case in its garment: a template of two or three parts by the authored weights.
 
     In the pose of the scan it has the scan's shape, folds and noise included. The part has the garment's label as its
-    name.
+    name. Where vertices are `under` the others, and come first, they are the part "lower" and the rest is "outer".
     """
     rest = unpose(case.mesh.vertices, case.weights, body.forward(case.params).posed_from_rest[0]).vertices
     bare = BodyParams.rest(betas=case.params.betas[0], expressions=body.num_expressions)
     count = body.vertex_count
-    part = np.repeat([0, 1], [count, len(rest)])
+    part, names = np.repeat([0, 1], [count, len(rest)]), ("body", case.garment.label)
+    if under is not None and under.any():
+        part[count:] += ~under
+        names = ("body", "lower", "outer")
     return Template(
         body=body,
         vertices=np.concatenate([body.forward(bare).vertices[0], rest]),
         faces=np.concatenate([body.faces, case.mesh.faces + count]),
-        vertex_labels=np.where(part == 0, 0, LABEL_BY_NAME[case.garment.label].id),
+        vertex_labels=np.array([0, *(LABEL_BY_NAME[name].id for name in names[1:])])[part],
         vertex_part=part,
-        part_names=("body", case.garment.label),
+        part_names=names,
         vertex_colors=np.full((len(part), 3), 128),
         weights=SkinWeights.from_dense(np.concatenate([body.weights, case.weights])),
         betas=case.params.betas[0],

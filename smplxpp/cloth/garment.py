@@ -27,7 +27,7 @@ from smplxpp.cloth.model import ClothModel, Fabric, build_model
 from smplxpp.core import BodyParams, TriangleMesh, require_at_least, require_choice, require_positive
 from smplxpp.core.errors import GeometryWarning, InputError, one_line
 from smplxpp.core.labels import HAIR
-from smplxpp.core.mesh import row_lengths
+from smplxpp.core.mesh import normalize_rows, row_lengths
 from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.core.topology import border_loops, component_labels
 from smplxpp.template.template import BODY_PART, Template
@@ -48,8 +48,8 @@ def find_carriers(
 
     A garment hangs on its upper openings, a waistband or a neckline, on tight ones, and on what it covers from above,
     shoulders and the crown. A hem is an opening too, but looks down and is not tight; the median of an opening's
-    distances decides. A garment that is torn from one opening to another has a single border: where nothing else holds
-    it, what is tight of the border's upper half does.
+    distances decides. An apron, and a garment that is torn from one opening to another, have a single border: where
+    nothing else holds it, its upper half does, as far as it is tight or looks up and is near.
 
     Args:
         cloth: N vertices, without bridges.
@@ -66,8 +66,10 @@ def find_carriers(
         grows = head[skin][cKDTree(body.vertices[skin]).query(cloth.vertices)[1]]
         tight = grows & (distance < TIGHT)
         return tight if tight.any() else grows & (distance < WORN)
-    # Cloth that lies on the body from above, with a normal that looks up, is held by it.
-    out = (distance < TIGHT) & (cloth.vertex_normals[:, 1] > LIES)
+    # Cloth that lies on the body from above, with a normal that looks up, is held by it; one vertex is no cloth.
+    lies = (distance < TIGHT) & (cloth.vertex_normals[:, 1] > LIES)
+    out = np.zeros(cloth.vertex_count, dtype=bool)
+    out[cloth.faces[lies[cloth.faces].all(axis=1)]] = True
     for loop in border_loops(cloth.faces):
         if loop_length(cloth, loop) < SHORTEST_OPENING:
             continue
@@ -75,11 +77,28 @@ def find_carriers(
         reach = WORN if opening_axis(cloth, loop)[1] > UP else TIGHT
         if float(np.median(distance[loop])) < reach:
             out[loop] = True
-    # Nothing holds it and there is a border: the part torn from opening to opening hangs on the tight upper half of it.
+    # Nothing holds it and there is a border: what is torn from opening to opening, or tied, hangs on its upper half.
     if not out.any() and len(border := np.unique(cloth.border_edges)):
         height = cloth.vertices[:, 1]
         middle = 0.5 * (height[used].min() + height[used].max())
-        out[border] = (distance[border] < TIGHT) & (height[border] > middle)
+        near = np.where(_border_looks_up(cloth), WORN, TIGHT)
+        out[border] = (distance[border] < near[border]) & (height[border] > middle)
+    return out
+
+
+def _border_looks_up(cloth: TriangleMesh) -> Bool[np.ndarray, " N"]:
+    """Return the vertices of border edges from which the cloth goes down."""
+    faces = cloth.faces
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    _, index, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    at = np.flatnonzero(count[index.ravel()] == 1)
+    a, b = (cloth.vertices[edges[at, k]] for k in (0, 1))
+    # Away from the third corner, across the edge.
+    across = a - cloth.vertices[np.roll(faces, -2, axis=1).ravel()[at]]
+    along = normalize_rows(b - a)
+    across = normalize_rows(across - np.einsum("ij,ij->i", across, along)[:, None] * along)
+    out = np.zeros(cloth.vertex_count, dtype=bool)
+    out[edges[at[across[:, 1] > UP]]] = True
     return out
 
 

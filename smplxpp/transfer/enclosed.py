@@ -32,16 +32,19 @@ class Enclosure:
         weights: of that limb's skin at the same place along it; zero where `share` is.
         limb: index of the limb, -1 where `share` is 0.
         centre: the point of the limb's axis at its place, metres; zero where `share` is.
+        about_legs: whether a closed ring about one leg or both cuts a face of the vertex.
     """
 
     share: Float64[np.ndarray, " N"]
     weights: Float64[np.ndarray, "N J"]
     limb: Int[np.ndarray, " N"]
     centre: Float64[np.ndarray, "N 3"]
+    about_legs: Bool[np.ndarray, " N"]
 
     def of(self, rows: Int[np.ndarray, " n"]) -> Enclosure:
         """Return the enclosure of some of the vertices."""
-        return Enclosure(self.share[rows], self.weights[rows], self.limb[rows], self.centre[rows])
+        about_legs = self.about_legs[rows]
+        return Enclosure(self.share[rows], self.weights[rows], self.limb[rows], self.centre[rows], about_legs)
 
     def joining_legs(self, faces: Int[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
         """Return the faces from one leg to the other, where a scan has fused trousers."""
@@ -147,7 +150,7 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         places = np.arange(len(axis.points))
         for out, values in ((weights, axis.weights), (centre, axis.points)):
             out[rows] = np.stack([np.interp(at[rows], places, column) for column in values.T], axis=1)
-    return Enclosure(share, weights, limb, centre)
+    return Enclosure(share, weights, limb, centre, (alone[:2] + other[:2]).any(axis=0))
 
 
 def _continue_to_hems(

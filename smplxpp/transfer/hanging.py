@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
-from smplxpp.core import TriangleMesh, row_lengths
+from smplxpp.core import TriangleMesh, normalize_rows, row_lengths
 from smplxpp.transfer.anchors import smooth_step
 from smplxpp.transfer.checks import extent
 from smplxpp.transfer.enclosed import Enclosure
@@ -22,6 +22,8 @@ _LEAST = 0.1
 """The bound above the ramp: a tutu, which stands off the hips, follows the thighs a little (worst ratio there)."""
 _LEGS = 0.03
 """Depth below the hip joints that cloth has to reach, as a share of the body's extent (6 cm): a shirt ends above it."""
+_THIGHS = 0.08
+"""Depth of the middle of the thighs below the hip joints, as a share of the body's extent (15 cm)."""
 _HALF = 1.2
 """Cone of a skirt (distance off the legs by height below the waist) of which the legs have at most a half (worst ratio
 of loose garments on three persons)."""
@@ -29,8 +31,6 @@ _RING = 0.02
 """Height of the bins over which distances are averaged, as a share of the body's extent (4 cm)."""
 _TOUCHES = 0.01
 """Distance within which cloth touches the skin, as a share of the body's extent (2 cm)."""
-_TOP = 0.1
-"""Share of a component's height from which it hangs."""
 _LEG_SHARE = 0.05
 """Share of a component that rings about one leg alone hold from which on it counts as trousers."""
 
@@ -54,7 +54,8 @@ def hung_from_top(
     low, high = np.full((2, len(nearest)), np.inf)
     np.minimum.at(low, component, height)
     np.minimum.at(high, component, -height)
-    return hangs & (height >= (-high - _TOP * (-high - low))[component]), hangs
+    top = 0.1  # share of a component's height from which it hangs
+    return hangs & (height >= (-high - top * (-high - low))[component]), hangs
 
 
 def beside_trunk(
@@ -101,6 +102,7 @@ def leg_bound(
     component: Int[np.ndarray, " N"],
     distance: Float[np.ndarray, " N"],
     limbs: Enclosure,
+    behind: Float[np.ndarray, " N"],
     *,
     size: float,
     cone: tuple[float, float],
@@ -113,18 +115,22 @@ def leg_bound(
 
         1 - hung (1 - ramp(u) / (1 + r / 1.2)) ,   ramp from 0.1 at u = -0.05 E to 1 at 0.1 E
 
-    where `hung` is 1 off the skin (from 0.005 E to 0.015 E) where r is above `cone`, no ring goes around one limb alone
-    and, in a component with trouser legs, below the crotch. A shirt ends before there are legs below it; its r is 0.
+    where `hung` is 1 off the skin (from 0.005 E to 0.015 E) where r is above `cone` or the cloth is open, no ring goes
+    around one limb alone and, in a component with trouser legs, below the crotch. A shirt ends before there are legs
+    below it; its r is 0. Open is what goes around the legs at few heights, as an apron, a coat and a cape: a leg pushes
+    it and does not draw it along, so that behind the legs, which turn forwards, the bound of open cloth is halved.
 
     Args:
         depth: of N vertices, by `depth_below_hips`.
         component: of each vertex.
         distance: to the skin, metres; infinite where that is an arm's.
         limbs: of `enclosed_by_one`.
+        behind: of `behind_legs`.
         size: E, the body's extent, metres.
         cone: r up to which there is no bound, and from which on it is full.
     """
     depth = depth / size
+    open_cloth = _open_below_hips(depth, component, limbs)
     free = (1.0 - limbs.share) * _below_crotch(component, depth, limbs)
     known = np.isfinite(distance)
     off = np.where(known, distance, 0.0) / size
@@ -133,9 +139,40 @@ def leg_bound(
         rows = component == k
         wide[rows] = _mean_at_depth(depth[rows], off[rows], (free * known)[rows])
     r = wide / (np.maximum(depth, _LEGS) - _RAMP[0])
-    hung = free * smooth_step(distance / size, 0.005, 0.015) * smooth_step(r, *cone)
+    wide_or_open = np.maximum(smooth_step(r, *cone), open_cloth)
+    hung = free * smooth_step(distance / size, 0.005, 0.015) * wide_or_open
     ramp = _LEAST + (1.0 - _LEAST) * smooth_step(depth, *_RAMP)
-    return 1.0 - hung * (1.0 - ramp / (1.0 + r / _HALF))
+    pushed = 1.0 - 0.5 * open_cloth * behind
+    return 1.0 - hung * (1.0 - pushed * ramp / (1.0 + r / _HALF))
+
+
+def behind_legs(vertices: Float[np.ndarray, "N 3"], axes: list[LimbAxis]) -> Float64[np.ndarray, " N"]:
+    """Return how far behind its nearest leg a vertex lies: 1 straight behind it, 0 from beside it forwards."""
+    offset, nearest = np.zeros((len(vertices), 3)), np.full(len(vertices), np.inf)
+    for axis in axes[:2]:
+        own, index = cKDTree(axis.points).query(vertices)
+        closer = own < nearest
+        offset[closer], nearest[closer] = (vertices - axis.points[index])[closer], own[closer]
+    back = -normalize_rows(offset) @ _directions(axes)[2]
+    return smooth_step(back, 0.0, 0.7)
+
+
+def _open_below_hips(depth: np.ndarray, component: np.ndarray, limbs: Enclosure) -> Float64[np.ndarray, " N"]:
+    """Return 1 for vertices of cloth that goes around the legs at few of its heights below the hips, 0 for rings."""
+    below, open_cloth = depth > _LEGS, np.zeros(len(depth))
+    # Crumbs of a scan are as open as the whole of it.
+    crumbs, plane = 0.05 * len(depth), 0.01
+    for k in np.unique(component):
+        rows = component == k
+        chosen = rows & below if rows.sum() > crumbs else below
+        about = np.sort(depth[chosen & limbs.about_legs])
+        # What ends above the middle of the thighs, as a tutu does, has too few heights to tell.
+        if depth[chosen].max(initial=-np.inf) < _THIGHS:
+            continue
+        # A height is that of a ring if one crosses the cloth within the distance of two planes.
+        at = np.searchsorted(about, depth[chosen] - plane), np.searchsorted(about, depth[chosen] + plane)
+        open_cloth[rows] = smooth_step(np.mean(at[1] > at[0]), 0.5, 0.2)
+    return open_cloth
 
 
 def lifted_by_thighs(
@@ -167,19 +204,14 @@ def lifted_by_thighs(
     legs = [list(axis.joints) for axis in axes[:2]]
     own = np.stack([weights[:, joints].sum(axis=1) for joints in legs], axis=1)
     total = own.sum(axis=1)
-    # What ends above the middle of the thighs, 15 cm of a person below the hip joints, is no skirt that they lift.
-    lifted_depth = 0.08  # share of the body's extent
+    # What ends above the middle of the thighs is no skirt that they lift.
     deepest = np.full(component.max() + 1, -np.inf)
     np.maximum.at(deepest, component, depth)
-    held = np.flatnonzero((total > bound + 1e-3) & (deepest > lifted_depth * extent(source))[component])
+    held = np.flatnonzero((total > bound + 1e-3) & (deepest > _THIGHS * extent(source))[component])
     if not len(held):
         return bound
     # The turn about the line from hip to hip.
-    side, up = axes[0].points[0] - axes[1].points[0], axes[-1].points[-1] - axes[-1].points[0]
-    side /= np.linalg.norm(side)
-    front = np.cross(side, up)
-    front /= np.linalg.norm(front)
-    up = np.cross(front, side)
+    side, up, front = _directions(axes)
     turn = np.outer(side, side) + np.outer(up, front) - np.outer(front, up)
 
     def raised(points: np.ndarray, shares: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
@@ -218,6 +250,15 @@ def lifted_by_thighs(
     for _ in range(rings):
         step = np.maximum(step, graph @ step / degree)
     return bound + step * np.maximum(total - bound, 0.0)
+
+
+def _directions(axes: list[LimbAxis]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return unit vectors to the body's left, upwards and forwards, across the line from hip to hip."""
+    side, up = axes[0].points[0] - axes[1].points[0], axes[-1].points[-1] - axes[-1].points[0]
+    side /= np.linalg.norm(side)
+    front = np.cross(side, up)
+    front /= np.linalg.norm(front)
+    return side, np.cross(front, side), front
 
 
 def bounded_legs(

@@ -39,6 +39,7 @@ from smplxpp.transfer.correspond import (
 from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
 from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.hanging import (
+    behind_legs,
     beside_trunk,
     bounded_legs,
     depth_below_hips,
@@ -325,7 +326,8 @@ def _transferred(
         arms = [joint for axis in axes[2:4] for joint in axis.joints]
         off = np.where(copied[:, arms].sum(axis=1) > 0.5, np.inf, found.distance)
         depth = depth_below_hips(target.vertices, axes[:2])
-        bound = leg_bound(depth, component, off, limbs, size=size, cone=config.hanging)
+        behind = behind_legs(target.vertices, axes)
+        bound = leg_bound(depth, component, off, limbs, behind, size=size, cone=config.hanging)
         bound = lifted_by_thighs(target, dense, bound, depth, component, source, weights, axes)
         dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
     return _Weighted(dense, matched, found.distance, found.angle, policies)

@@ -166,6 +166,16 @@ def test_waists_carry_and_hems_do_not():
     assert not find_carriers(wide, body).any()
 
 
+def test_an_apron_that_is_tied_in_the_back_hangs_from_its_upper_edge():
+    template = person()
+    cloth = template.mesh.submesh(template.part_faces(PART))[0]
+    lowered = cloth.vertices * [1.2, 1, 1.2]  # as far off as a waistband: nothing of it is tight
+    front = cloth.with_vertices(lowered).submesh((lowered[:, 2] > -1e-6)[cloth.faces].all(axis=1))[0]
+    carriers = find_carriers(front, template.part_mesh(BODY_PART))
+    assert carriers.sum() == 25
+    np.testing.assert_allclose(front.vertices[carriers][:, 1], WAIST)
+
+
 def test_a_garment_that_nothing_holds_is_refused_with_what_to_do():
     with pytest.raises(InputError, match="to hang from") as error:
         cut(tight=False)
