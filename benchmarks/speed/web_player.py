@@ -353,7 +353,7 @@ class WebClothBenchmark:
 
     garments: tuple[str, ...] = ("mini skirt", "knee skirt", "cape")
     motions: tuple[str, ...] = ("walk", "squat", "dance")
-    runs: int = 4
+    runs: int = 3
     """Runs of each motion."""
     store: bool = True
     """Store the figures."""
