@@ -225,7 +225,8 @@ def weigh_evidence(
     skin_like = np.full(mesh.face_count, 0.5)
     if lab is not None:
         palette = Palette.of(lab)
-        skin = fit_skin(lab, face, chart.hand_core, area)
+        hands = (chart.hand_core & (chart.side > 0), chart.hand_core & (chart.side <= 0))
+        skin = fit_skin(lab, face, hands, area)
         ratio = skin.log_ratio(lab)
         skin_like = 1.0 / (1.0 + np.exp(-(ratio + 1.0)))
         layers = find_layers(chart, palette, ratio, area, pairs)

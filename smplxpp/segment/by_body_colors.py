@@ -119,26 +119,42 @@ def looks_like_skin(lab: Float64[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
 def fit_skin(
     lab: Float64[np.ndarray, "M 3"],
     face: Bool[np.ndarray, " M"],
-    hands: Bool[np.ndarray, " M"],
+    hands: tuple[Bool[np.ndarray, " M"], Bool[np.ndarray, " M"]],
     area: Float64[np.ndarray, " M"],
 ) -> SkinModel:
     """Fit the skin colour from the main colours of face and hands; hands that differ from the face wear gloves.
 
+    Where the hands differ from each other, one holds something: the one that has more of the face's colour counts.
+
     Args:
         lab: colours in OKLab.
         face: faces well within the face.
-        hands: faces well within the hands.
-        area: areas of the faces.
+        hands: faces well within the left and the right hand.
+        area: areas of the faces; one without any, such as of a thing in the hand, shows no skin.
     """
-    of_face, of_hands = _main_color(lab[face], area[face]), _main_color(lab[hands], area[hands])
+    # A brown ball that a hand holds has as many faces as the hand, and its colour was the skin's.
+    face = face & (area > 0.0)
+    # Skin of one person differs by at most 0.2 in lightness and 0.04 in chroma.
+    alike = np.array([0.2, 0.04, 0.04])
+
+    def like(color: tuple[np.ndarray, np.ndarray]) -> Bool[np.ndarray, " M"]:
+        return (np.abs(lab - color[0]) < alike).all(axis=1)
+
+    each = [
+        (own, color) for own in (one & (area > 0.0) for one in hands) if (color := _main_color(lab[own], area[own]))
+    ]
+    bare = (hands[0] | hands[1]) & (area > 0.0)
+    if len(each) == 2 and (np.abs(each[0][1][0] - each[1][1][0]) > alike).any():
+        bare = max(each, key=lambda one: area[face & like(one[1])].sum())[0]
+    of_face, of_hands = _main_color(lab[face], area[face]), _main_color(lab[bare], area[bare])
     agree = False
     if of_face is not None and of_hands is not None:
         # Hair over the face, or a body turned by some degrees, leaves the hands' colour to part of the face: a quarter
-        # is enough. Skin of one person differs by at most 0.2 in lightness and 0.04 in chroma.
-        like_hands = (np.abs(lab - of_hands[0]) < np.array([0.2, 0.04, 0.04])).all(axis=1)
+        # is enough.
+        like_hands = like(of_hands)
         agree = bool(area[face & like_hands].sum() > 0.25 * area[face].sum())
         face = face & like_hands if agree else face
-    chosen = (face | hands) if agree else face if of_face is not None else hands
+    chosen = (face | bare) if agree else face if of_face is not None else bare
     main = _main_color(lab[chosen], area[chosen]) or of_face or of_hands
     if main is None:
         hue = np.radians(_SKIN_HUE)
@@ -148,7 +164,7 @@ def fit_skin(
         main[0],
         np.clip(main[1], _LEAST_SPREAD, _MOST_SPREAD),
         True,
-        None if not hands.any() else agree or of_face is None,
+        None if not bare.any() else agree or of_face is None,
     )
 
 

@@ -182,10 +182,8 @@ def _rotation(turn: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
 def _glasses(head: _Around) -> Float64[np.ndarray, " M"] | None:
     """Return evidence of glasses; None where neither lens nor frame stands before both eyes."""
     left, up, front = head.place.T
-    stands, enough = (
-        0.008,
-        0.12,
-    )  # metres off the face; share of the surface about an eye, of frames without lenses, too
+    stands = 0.008  # metres off the face
+    enough = 0.12  # share of the surface about an eye, which frames without lenses have, too
     for sign in (1.0, -1.0):
         eye = (np.abs(left - sign * head.eye) < 0.028) & (np.abs(up) < 0.024) & (front > 0) & (head.normal[:, 2] > 0.2)
         if head.area[eye & (head.off > stands)].sum() < enough * head.area[eye].sum() or not eye.any():

@@ -19,6 +19,7 @@ from smplxpp.core.mesh_files.mesh_io import read_mesh
 from smplxpp.core.params import BodyParams
 from smplxpp.core.rotations import matrix_from_rotvec, rotvec_from_matrix
 from smplxpp.segment import UNSURE, SegmentedScan, label_by_body, read_labels, segment_scan
+from smplxpp.segment.by_body_colors import fit_skin
 from smplxpp.segment.by_body_outfit import NAT, RUNS, OutfitConfig, find_outfit, label_shares
 from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 from smplxpp.synth.tracker import tracker_noise
@@ -358,6 +359,34 @@ def test_bare_arms_in_changing_light_are_no_sleeves():
     red = np.tile(np.eye(6)[5], (rings, 1))
     shirt = Rings(0.0, np.ones(rings), red, np.tile([0.0, 3.9], (rings, 1)), np.full(rings, 0.015), np.zeros(rings))
     assert find_outfit(shirt, arm, OutfitConfig(), misfit=0.008).cuff <= 0.0
+
+
+@pytest.mark.parametrize("ball_is_a_thing", [True, False])
+def test_what_a_hand_holds_does_not_give_the_colour_of_skin(ball_is_a_thing):
+    # 100 faces of each: the face with as much brown hair, the left hand, and the right hand behind a brown ball.
+    rng = np.random.default_rng(0)
+    skin, brown = np.array([0.75, 0.04, 0.05]), np.array([0.4, 0.03, 0.03])
+    lab = np.repeat([skin, brown, skin, skin, brown, brown], (100, 100, 100, 20, 80, 100), axis=0)
+    lab = lab + rng.normal(0, 0.005, lab.shape)
+    rows = np.arange(500)
+    face, left, right = rows < 200, (rows >= 200) & (rows < 300), (rows >= 300)
+    area = np.ones(500)
+    if ball_is_a_thing:
+        area[320:] = 0.0
+    else:
+        face = face & (rows < 150)
+    found = fit_skin(lab, face, (left, right), area)
+    assert found.found and found.hands
+    np.testing.assert_allclose(found.center, skin, atol=0.01)
+
+
+def test_gloves_are_no_skin():
+    skin, glove = np.array([0.75, 0.04, 0.05]), np.array([0.3, 0.0, 0.0])
+    lab = np.repeat([skin, glove], 100, axis=0) + np.random.default_rng(0).normal(0, 0.005, (200, 3))
+    rows = np.arange(200)
+    found = fit_skin(lab, rows < 100, ((rows >= 100) & (rows < 150), rows >= 150), np.ones(200))
+    assert found.hands is False
+    np.testing.assert_allclose(found.center, skin, atol=0.01)
 
 
 def test_shares_of_labels_are_sums_over_all_outlines():
