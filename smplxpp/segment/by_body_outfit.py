@@ -109,7 +109,15 @@ class Outfit:
 
 
 def find_outfit(
-    column: Rings, arm: Rings, config: OutfitConfig, *, misfit: float, chest: bool = True, heels: bool = False
+    column: Rings,
+    arm: Rings,
+    config: OutfitConfig,
+    *,
+    misfit: float,
+    chest: bool = True,
+    heels: bool = False,
+    shod: float = 0.0,
+    apart: Float64[np.ndarray, " R"] | None = None,
 ) -> Outfit:
     """Find the cheapest borders of a column (from the soles up) and an arm (from the shoulder out).
 
@@ -120,8 +128,12 @@ def find_outfit(
         misfit: typical distance between body and bare skin, metres.
         chest: whether the scan reaches the chest.
         heels: whether the feet stand on heels, so that there are shoes, even in the colour of skin.
+        shod: `by_body_hems.nats_for_shoes`.
+        apart: `by_body_hems.legs_apart` of the column's rings; None: the legs say nothing of long coats.
     """
-    order = _column_costs(column, config, misfit, chest=chest, heels=heels)
+    # Leather stands off the body's foot, which alone tells dusty boots from dark skin. Colours count once a sample.
+    bare_feet = _NO_SHOE if heels else config.samples * max(shod, 0.0)
+    order = _column_costs(column, config, misfit, chest=chest, bare_feet=bare_feet, heels=heels, apart=apart)
     borders, margins = _cut_column(column.places, order)
     shoe_top, lower_start, lower_end, upper_start = borders
     of_arm = _arm_costs(arm, config, misfit, skin_colored=column.looks_like_skin(upper_start, COLUMN_END))
@@ -201,7 +213,16 @@ def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[
     return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
 
 
-def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: bool, heels: bool) -> list[np.ndarray]:
+def _column_costs(
+    rings: Rings,
+    config: OutfitConfig,
+    misfit: float,
+    *,
+    chest: bool,
+    bare_feet: float,
+    heels: bool,
+    apart: Float64[np.ndarray, " R"] | None,
+) -> list[np.ndarray]:
     """Return the costs of each of the column's `RUNS`, (R + 1, R + 1): at [i, j] those of rings i..j-1."""
     place = rings.places
     runs = _RunCosts.of(rings, config, misfit)
@@ -216,22 +237,37 @@ def _column_costs(rings: Rings, config: OutfitConfig, misfit: float, *, chest: b
     skin = runs.skin + _between(config.bare_pelvis * ((middle > 0.80) & (middle < 0.95)))
     # Priors on the place and length of each run: linear penalties outside of the usual range, and a waist at its
     # height.
-    bare_feet = _NO_SHOE if heels else 2.0
-    shoe = (runs.worn if heels else runs.shoe) + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, bare_feet, 0.0)
+    shoe = (runs.worn if heels else runs.shoe) + _usual(place[j], 0.06, 0.30, 20.0) + np.where(empty, 2.0, 0.0)
+    shoe += bare_feet * (empty if heels else np.clip(1.0 - place[j] / 0.06, 0.0, 1.0))
     # Light on one dye changes slowly along the leg, a boot's top at once.
     shoe += _hidden_top(runs, place)[j]
-    usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + _usual(place[j], HIP - 0.12, 1.12, 30.0)
-    usual += np.where(place[j] < 0.72, 30.0, 0.0) + np.where(length < 0.2, 10.0, 0.0)
+    usual = _usual(place[i], 0.02, KNEE + 0.32, 30.0) + np.where(length < 0.2, 10.0, 0.0)
     at_waist = 0.5 * np.minimum(((place[j] - _WAIST) / 0.06) ** 2, 16.0)
+    usual_end = _usual(place[j], HIP - 0.12, 1.12, 30.0) + np.where(place[j] < 0.72, 30.0, 0.0)
     # Visible legs: cloth within 25 mm of the thighs on average, where a skirt hangs farther.
     legs_show = float(rings.distance[(middle > 0.5) & (middle < 0.75)].mean()) < 0.025
-    split = at_waist + config.split_at_legs if legs_show else config.split
+    split = usual_end + (at_waist + config.split_at_legs if legs_show else config.split)
+    if apart is not None:
+        # A coat hides the waist of the trousers, which end for the eye where it does.
+        over = _hem_over_legs(apart, place) * np.clip(jump / 0.010, 0.0, 1.0)
+        split = split + (config.split_at_legs - split) * over[j] * (length >= 0.2)
     # Where a scan ends below the chest, one garment about the legs is the lower one.
-    first, second = (split, 0.0) if chest else (0.0, np.where(_between(rings.weight) > 0, config.split, 0.0))
+    first, second = (split, 0.0) if chest else (usual_end, np.where(_between(rings.weight) > 0, config.split, 0.0))
     lower = np.where(empty, 6.0, runs.cloth + first + usual + on_foot)
     midriff = skin + np.where(empty, 0.0, config.midriff)
     upper = runs.top + second + on_foot + _usual(place[i], -0.1, COLUMN_END, 60.0) - np.where(i > 0, fold[i], 0.0)
     return [shoe, skin, lower, midriff, upper]
+
+
+def _hem_over_legs(apart: Float64[np.ndarray, " R"], place: np.ndarray) -> Float64[np.ndarray, " R1"]:
+    """Return, for each border, how far the surface goes round each leg below it and round both above, 0 to 1.
+
+    Borders from the crotch up do not count, because above it every surface goes round both legs.
+    """
+    # `apart` is a mean of five rings, so that the nearest that do not see across the border are three rings away.
+    low, high = np.arange(len(place)) - 4, np.arange(len(place)) + 3
+    within = (low >= 0) & (high < len(apart)) & (place < HIP - 0.12)
+    return np.where(within, np.maximum(apart[low.clip(0)] - apart[high.clip(0, len(apart) - 1)], 0.0), 0.0)
 
 
 def _hidden_top(runs: _RunCosts, place: np.ndarray) -> Float64[np.ndarray, " R1"]:

@@ -213,6 +213,64 @@ def test_a_jacket_ends_at_its_hem_and_not_at_the_waist(body, open_by):
         assert area @ (labels.face_labels[own] == label.id) > 0.9 * area.sum(), label.name
 
 
+def test_boots_in_the_colour_of_dust_are_no_bare_feet_of_a_dark_person(body):
+    """Tan boots are little lighter than dark skin in changing light: they became feet."""
+    mesh, colors, params = painted(body, {"shirt": _BLUE, "trousers": _BLUE, "hair": (20, 18, 16)})
+    skin = (colors == _SKIN_RGB).all(axis=1)
+    # Skin of a dark person in light from above.
+    rng = np.random.default_rng(0)
+    shade = rng.uniform(0.6, 1.4, (mesh.vertex_count, 1))
+    ankle = body.forward(params).joints[0, body.joint_names.index("left_ankle"), 1]
+    boots = mesh.vertices[:, 1] < ankle + 0.1
+    colors = np.where(skin[:, None], np.array([104, 68, 48]) * shade, colors)
+    colors = np.where(boots[:, None], np.array([140, 100, 68]) * (0.8 + 0.25 * shade), colors).clip(0, 255)
+    scan = mesh.with_vertices(mesh.vertices + np.where(boots, 0.011, 0.0)[:, None] * mesh.vertex_normals)
+    for shod in (scan, mesh):
+        labels = label_by_body(shod, body, params, colors=colors.astype(np.uint8)).face_labels
+        foot = shod.face_centers[:, 1] < ankle
+        assert (labels[foot] == (SHOE if shod is scan else SKIN).id).mean() > 0.9
+
+
+def test_a_suit_of_one_colour_is_cut_at_the_jackets_hem(body):
+    """A jacket in the colour of its trousers ended at the waist, below which the light on it fades."""
+    mesh, colors, params = painted(body, {"shirt": _GREY, "trousers": _GREY, "hair": _GREY})
+    joint = dict(zip(body.joint_names, body.forward(params).joints[0], strict=True))
+    x, y, _ = mesh.vertices.T
+    light = 1.0 - 0.1 * np.clip((joint["spine1"][1] - y) / 0.3 + 0.5, 0.0, 1.0)
+    light += np.random.default_rng(1).normal(0.0, 0.08, len(y))
+    grey = (colors == _GREY).all(axis=1)
+    colors = np.where(grey[:, None], colors * light[:, None], colors).clip(0, 255).astype(np.uint8)
+    hem, top = joint["left_hip"][1] - 0.06, joint["neck"][1] - 0.03
+    inner = np.abs(x) < joint["left_elbow"][0]
+    above = np.where(inner & (y < top), np.where(y > hem, 0.03, np.where(y > joint["left_ankle"][1], 0.008, 0.0)), 0.0)
+    suit = mesh.with_vertices(mesh.vertices + above[:, None] * mesh.vertex_normals)
+    labels = label_by_body(suit, body, params, colors=colors).face_labels
+    trunk = np.abs(suit.face_centers[:, 0]) < joint["left_shoulder"][0]
+    height = suit.face_centers[:, 1]
+    for low, high, label in ((hem + 0.03, hem + 0.25, UPPER), (hem - 0.4, hem - 0.03, LOWER)):
+        own = trunk & (height > low) & (height < high)
+        assert suit.face_areas[own] @ (labels[own] == label.id) > 0.9 * suit.face_areas[own].sum(), label.name
+
+
+def test_a_coat_to_the_knees_ends_over_trousers():
+    """A doctor's coat was shirt and skirt, and her blue trousers were shoes."""
+    places = STEP * np.arange(round(COLUMN_END / STEP))
+    hem = 0.45
+    # Two of ten shades.
+    shade = np.where(places < hem, 1.0, 8.0)
+    spread = np.exp(-0.5 * ((np.arange(10) - shade[:, None]) / 1.2) ** 2)
+    ones = np.ones(len(places))
+    colors, skin = spread / spread.sum(axis=1, keepdims=True), np.outer(ones, [0.0, 4.0])
+    column = Rings(0.0, ones, colors, skin, np.where(places < hem, 0.015, 0.06), 0.003 * ones)
+    arm = Rings(ARM_START, ones[:45], column.colors[-45:], column.skin[:45], column.distance[:45], column.spread[:45])
+    # Mean of five rings of what is 1 where the surface goes round each leg.
+    apart = np.convolve(places < hem, np.ones(5) / 5, mode="same")
+    found = find_outfit(column, arm, OutfitConfig(), misfit=0.005, apart=apart)
+    assert found.upper_start == found.lower_end == pytest.approx(hem, abs=0.02) and found.shoe_top < 0.2
+    # Where nothing goes round each leg there are no trousers.
+    assert not find_outfit(column, arm, OutfitConfig(), misfit=0.005, apart=0.0 * apart).has_lower
+
+
 @pytest.mark.parametrize("half", [0.0, 0.05])
 def test_an_open_jacket_is_told_from_a_closed_one_by_its_lips(body, half):
     """Without colours every open jacket was a shirt, and a coat's tails were trousers."""
