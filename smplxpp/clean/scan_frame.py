@@ -235,6 +235,7 @@ def _cost(surface: SurfacePoints, bodies: _Bodies, up: str) -> float:
     """Return the distance between the scan with an upward axis and the nearest body, metres of that body."""
     # Scale the scan to the body's height, place it on the floor, and turn the body to eight headings.
     headings = 8
+    turns = [matrix_from_rotvec(np.array([0.0, 2.0 * np.pi * k / headings, 0.0])) for k in range(headings)]
     points, normals = (convert_points(values, up=up) for values in (surface.points, surface.normals))
     points = points - points.mean(axis=0)
     low, high = points[:, 1].min(), points[:, 1].max()
@@ -244,8 +245,7 @@ def _cost(surface: SurfacePoints, bodies: _Bodies, up: str) -> float:
         placed = points * scale
         placed[:, 1] += body_points[:, 1].min() - placed[:, 1].min()
         target = SurfacePoints.from_arrays(placed, normals)
-        for k in range(headings):
-            turn = matrix_from_rotvec(np.array([0.0, 2.0 * np.pi * k / headings, 0.0]))
+        for turn in turns:
             best = min(best, truncated_distance(body_points @ turn.T, body_normals @ turn.T, target))
     return best
 

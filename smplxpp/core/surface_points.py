@@ -129,9 +129,30 @@ def truncated_distance(
 
     Distances are those of `position_normal_features`, so that opposite normals add to them.
     """
-    # Points and normals as one feature vector, so that a nearest-neighbour query respects both.
-    there = position_normal_features(points, normals)
-    # Beyond the bound the query returns infinity, which the truncation replaces.
-    one, _ = surface.tree.query(there, distance_upper_bound=far)
-    other, _ = cKDTree(there).query(surface.tree.data, distance_upper_bound=far)
+    # Points and normals as one feature vector, so that a nearest neighbour respects both.
+    there, here = position_normal_features(points, normals), surface.tree.data
+    # Searches of tree by tree pass the product of matrices that is all distances only from a million pairs on.
+    if len(there) * len(here) <= 1_000_000:
+        one, other = _nearest_of_all(there, here)
+    else:
+        # Beyond the bound the query returns infinity, which the truncation replaces.
+        one, _ = surface.tree.query(there, distance_upper_bound=far)
+        other, _ = cKDTree(there).query(here, distance_upper_bound=far)
     return float(0.5 * (np.minimum(one, far).mean() + np.minimum(other, far).mean()))
+
+
+def _nearest_of_all(
+    one: Float64[np.ndarray, "N K"], other: Float64[np.ndarray, "M K"]
+) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " M"]]:
+    """Return the distance of each point to the nearest of the others, both ways.
+
+    All squared distances `|a|^2 - 2 a.b + |b|^2` are one product of matrices. Points are taken from the middle of the
+    others, because a difference of large squares loses digits.
+    """
+    middle = other.mean(axis=0)
+    one, other = one - middle, other - middle
+    left = np.column_stack([-2.0 * one, np.einsum("nk,nk->n", one, one), np.ones(len(one))])
+    right = np.column_stack([other, np.ones(len(other)), np.einsum("mk,mk->m", other, other)])
+    squared = left @ right.T
+    nearest, nearest_other = (np.sqrt(np.maximum(squared.min(axis=axis), 0.0)) for axis in (1, 0))
+    return nearest, nearest_other

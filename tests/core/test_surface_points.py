@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.core.surface_points import SurfacePoints, truncated_distance
+from smplxpp.core.surface_points import SurfacePoints, position_normal_features, truncated_distance
 
 
 def _square(y: float) -> TriangleMesh:
@@ -38,3 +39,15 @@ def test_two_planes_are_as_far_from_each_other_as_they_are_and_no_farther_than_f
 def test_a_surface_that_faces_away_is_not_near():
     below = SurfacePoints.sample(_square(0.0), 500)
     assert truncated_distance(below.points, -below.normals, below) > 0.2
+
+
+def test_the_distance_is_that_of_search_trees_far_from_the_origin_too():
+    below = SurfacePoints.sample(_square(0.0), 300)
+    above = SurfacePoints.sample(_square(0.1), 200, seed=1)
+    away = np.array([300.0, -20.0, 40.0])
+    there, here = position_normal_features(above.points, above.normals), below.tree.data
+    one, other = cKDTree(here).query(there)[0], cKDTree(there).query(here)[0]
+    expected = 0.5 * (np.minimum(one, 0.12).mean() + np.minimum(other, 0.12).mean())
+    moved = SurfacePoints.from_arrays(below.points + away, below.normals)
+    assert abs(truncated_distance(above.points, above.normals, below, far=0.12) - expected) < 1e-14
+    assert abs(truncated_distance(above.points + away, above.normals, moved, far=0.12) - expected) < 1e-12
