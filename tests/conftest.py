@@ -7,7 +7,7 @@ import gc
 import logging
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import hypothesis
@@ -75,12 +75,32 @@ SHORTEST = tuple(ROOT / "tests" / room for room in ("capture", "core", "formats"
 assert all(path.is_dir() for path in SHORTEST)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Let every worker of a test run begin to collect at another room.
+
+    In a new clone each of them would compile every test and rewrite its assertions; so they share the rooms, and read
+    what another one has written.
+    """
+    report = yield
+    if collector.path == ROOT / "tests" and isinstance(collector, pytest.Directory):
+        worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+        first = worker * len(report.result) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+        report.result = [*report.result[first:], *report.result[:first]]
+    return report
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order files: the longest first, then those of other rooms; `--no-loadscope-reorder` hands them out so."""
     place = {ROOT / name: k for k, name in enumerate(LONGEST)}
-    for path in {item.path for item in items} - place.keys():  # once a file: every process orders thousands of tests
+    paths = {item.path for item in items}  # once a file: every process orders thousands of tests
+    for path in paths - place.keys():
         place[path] = len(LONGEST) + any(room in path.parents for room in SHORTEST)
-    items.sort(key=lambda item: place[item.path])
+    # By name among equals, because every worker has collected them in another order.
+    rank = {path: k for k, path in enumerate(sorted(paths, key=lambda path: (place[path], path)))}
+    items.sort(key=lambda item: rank[item.path])
 
 
 def pytest_collection_finish() -> None:
