@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64
 from avatar.gaussians.binding import BoundGaussians
 from avatar.training.refinement.board import Arrays, Board, OvertakenError, RefinementStoppedError, in_threads
 from avatar.training.refinement.config import Level, RefineConfig
-from avatar.training.refinement.nuisance import AppearanceUpdate, CameraCorrections, Photographs, Views
+from avatar.training.refinement.nuisance import AppearanceUpdate, CameraCorrections, CameraEquations, Photographs, Views
 from avatar.training.refinement.photometric import Linearization, PhotometricLoss
 from avatar.training.refinement.posing import PosedTemplate
 from avatar.training.refinement.solve import Normal, changes, smoothness, solve, with_prior
@@ -232,10 +232,11 @@ class Alignment:
             cameras.clear()
         losses, gradients, curvatures = [], [], []
         count = self._counted(on_frame)
-        for linear, gradient, curvature in in_threads(lambda row: self._linearize(row, halvings), rows, count):
+        found = in_threads(lambda row: self._linearize(row, halvings), rows, count)
+        for linear, gradient, curvature, equations in found:
             appearance.add(linear)
             if cameras is not None:
-                cameras.add(linear, self._jacobian.rigidity)
+                cameras.add(equations)
             losses.append(linear.loss)
             gradients.append(gradient)
             curvatures.append(curvature)
@@ -313,8 +314,8 @@ class Alignment:
 
     def _linearize(
         self, row: int, halvings: int
-    ) -> tuple[Linearization, Float64[np.ndarray, " P"], Float64[np.ndarray, "P P"]]:
-        """Return the linearised loss of a frame, and gradient and Gauss-Newton matrix of its unknowns."""
+    ) -> tuple[Linearization, Float64[np.ndarray, " P"], Float64[np.ndarray, "P P"], dict[str, CameraEquations]]:
+        """Return the linearised loss of a frame, and the normal equations of its unknowns and of its cameras."""
         posed, cameras = self.scene.posed, self.scene.cameras
         # Pose the template with leaves at zero steps, then linearise the photographs about it.
         placed = posed.place(self.state, row)
@@ -327,7 +328,8 @@ class Alignment:
         )
         # The chain rule takes the gradient of the vertices to the steps; the Gauss-Newton matrix is J^T M J.
         gradient = self.variables.packed(*posed.gradient(placed, linear.vertex_gradient))
-        return linear, gradient, self._jacobian.curvature(placed, linear)
+        equations = {} if cameras is None else cameras.normal_equations(linear, self._jacobian.rigidity)
+        return linear, gradient, self._jacobian.curvature(placed, linear), equations
 
     def _stepped(self, normal: Normal, damping: Float64[np.ndarray, " F"]) -> BodyState:
         """Return the state after one Levenberg-Marquardt step of all frames."""

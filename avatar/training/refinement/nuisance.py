@@ -92,6 +92,10 @@ class AppearanceUpdate:
 _APPEARANCE = ("gradient", "mass", "depth_gradient", "depth_curvature")
 
 
+CameraEquations = tuple[Float64[np.ndarray, " 6"], Float64[np.ndarray, "6 6"]]
+"""Gradient and Gauss-Newton matrix of a camera's correction."""
+
+
 class CameraCorrections:
     """A rigid transform of the world for each camera, `cam_from_world <- cam_from_world X_c`; intrinsics stay.
 
@@ -126,21 +130,31 @@ class CameraCorrections:
         camera = view.camera
         return replace(view, camera=replace(camera, cam_from_world=camera.cam_from_world @ self.matrix(view.name)))
 
-    def add(self, linear: Linearization, rigidity: Float32[Tensor, " N"]) -> None:
-        """Add the views of a frame to the normal equations of their cameras, `J = [-[x - center]_x, I]`."""
-        gradient, curvature = self._sums
+    def normal_equations(self, linear: Linearization, rigidity: Float32[Tensor, " N"]) -> dict[str, CameraEquations]:
+        """Return the normal equations of the cameras from the views of a frame, `J = [-[x - center]_x, I]`.
+
+        The bits of their products depend on the number of threads, so that each frame's thread computes its own.
+        """
         # Jacobian of a point by a rigid motion about the centre: rotation -[x - c]_x, translation I.
         arm = linear.means - torch.tensor(self.center, dtype=torch.float32)
         zero = torch.zeros_like(arm[:, 0])
         x, y, z = arm.unbind(-1)
         turned = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], dim=-1).view(-1, 3, 3)
         J = torch.cat([turned, torch.eye(3).expand(len(arm), 3, 3)], dim=-1)
+        out = {}
         for name, (mean_gradient, own) in linear.cameras.items():
             # J^T g and J^T M J, summed over the Gaussians with their rigidity.
-            row = self.names.index(name)
-            gradient[row] += torch.einsum("nij,ni,n->j", J, mean_gradient, rigidity).double().numpy()
+            gradient = torch.einsum("nij,ni,n->j", J, mean_gradient, rigidity).double().numpy()
             moved = (own * rigidity[:, None, None]) @ J
-            curvature[row] += (J.reshape(-1, 6).T @ moved.reshape(-1, 6)).double().numpy()
+            out[name] = gradient, (J.reshape(-1, 6).T @ moved.reshape(-1, 6)).double().numpy()
+        return out
+
+    def add(self, equations: Mapping[str, CameraEquations]) -> None:
+        """Add the normal equations of a frame."""
+        for name, (gradient, curvature) in equations.items():
+            row = self.names.index(name)
+            self._sums[0][row] += gradient
+            self._sums[1][row] += curvature
 
     def sums(self) -> dict[str, np.ndarray]:
         """Return the normal equations that were summed, as arrays by name."""
