@@ -24,7 +24,6 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float, Int
-from scipy.stats import spearmanr
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.gaussians.binding import BoundGaussians
@@ -145,6 +144,8 @@ class Bench:
 
     def measured(self, sequence: AvatarSequence, track: Track, gaussians: BoundGaussians) -> dict[str, Any]:
         """Distances of the part to the truth, mm, over the frames, and the expected ones; dB of held-out cameras."""
+        from scipy.stats import spearmanr  # importing it takes half a second
+
         rig, apart, worst, found = sequence.rig, {}, {}, []
         true, expected = [], []
         for frame in sequence.train_frames[1:]:
@@ -177,6 +178,8 @@ class Bench:
 
     def _drift(self, track: Track, true: list[np.ndarray]) -> dict[str, float]:
         """Return the mean drift after tracking back, mm, and its rank correlation with the error; empty without it."""
+        from scipy.stats import spearmanr  # importing it takes half a second
+
         if track.drift is None:
             return {}
         drift = 1e3 * track.cage(track.drift[:, None])[:, 0].numpy()[self.same.own]

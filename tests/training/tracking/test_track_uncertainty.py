@@ -8,7 +8,6 @@ from math import exp, sqrt
 import numpy as np
 import pytest
 import torch
-from scipy.stats import spearmanr
 
 from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.binding import world_from_local
@@ -125,6 +124,8 @@ def test_structure_tensors_of_hidden_points_are_near_zero(dances):
 
 def test_expected_errors_of_a_plain_skirt_are_larger_and_rank_its_true_errors(tmp_path):
     """Compare expected and true errors of a swinging hem, striped and plain."""
+    from scipy.stats import spearmanr  # importing it takes half a second
+
     found, wrong = {}, []
     for stripes in (STRIPED, PLAIN):
         frames = AvatarSequence(open_capture(write_skirted(tmp_path / f"{stripes:g}", stripes=stripes)), person())
