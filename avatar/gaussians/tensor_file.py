@@ -91,7 +91,7 @@ def require_finite(tensors: Mapping[str, Tensor], *, subject: str, remedy: str =
     """Raise `InputError` that names the first tensor with NaN or infinity in it, and how many."""
     for name, value in tensors.items():
         # The sum is not finite where a value is not, and where it overflows; it takes a quarter of the time.
-        if not value.is_floating_point() or math.isfinite(value.sum()):
+        if not value.is_floating_point() or math.isfinite(value.detach().sum()):
             continue
         if not bool(torch.isfinite(value).all()):
             wrong = int((~torch.isfinite(value)).sum())
