@@ -150,7 +150,7 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         places = np.arange(len(axis.points))
         for out, values in ((weights, axis.weights), (centre, axis.points)):
             out[rows] = np.stack([np.interp(at[rows], places, column) for column in values.T], axis=1)
-    return Enclosure(share, weights, limb, centre, (alone[:2] + other[:2]).any(axis=0))
+    return Enclosure(share, weights, limb, centre, np.asarray((alone[:2] + other[:2]).any(axis=0)))
 
 
 def _continue_to_hems(

@@ -171,7 +171,7 @@ def _open_below_hips(depth: np.ndarray, component: np.ndarray, limbs: Enclosure)
             continue
         # A height is that of a ring if one crosses the cloth within the distance of two planes.
         at = np.searchsorted(about, depth[chosen] - plane), np.searchsorted(about, depth[chosen] + plane)
-        open_cloth[rows] = smooth_step(np.mean(at[1] > at[0]), 0.5, 0.2)
+        open_cloth[rows] = smooth_step(np.asarray(np.mean(at[1] > at[0])), 0.5, 0.2)
     return open_cloth
 
 
