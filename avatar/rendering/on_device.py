@@ -91,7 +91,12 @@ class BundleOnDevice:
 
     def __init__(self, bundle: AvatarBundle, device: str) -> None:
         if torch.device(device).type != "cuda" or not torch.cuda.is_available():
-            raise InputError("device of a player", expected="cpu, or a CUDA device of torch", received=device)
+            raise InputError(
+                "device of a player",
+                expected="cpu, or a CUDA device that torch can use",
+                received=device,
+                remedy="leave it out to play on the CPU, or install torch's build for CUDA where there is a GPU",
+            )
         self.device, self._sizes, self._eps2d = torch.device(device), bundle.sizes, bundle.about.eps2d
         t = bundle.tensors
         # Surface: rounded to 16 bits, skin weights may miss a sum of 1, as the field's interpolation.

@@ -332,7 +332,12 @@ def choose_device(name: str) -> str:
             return "cpu"
         return "cuda"
     if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("option device", expected="a CUDA device that torch can use", received="none")
+        raise InputError(
+            "option device",
+            expected="a CUDA device that torch can use",
+            received="none",
+            remedy="leave it out to train on the CPU, or install torch's build for CUDA where there is a GPU",
+        )
     return name
 
 
