@@ -46,6 +46,6 @@ _EXPORTS: dict[str, str] = {
 
 __all__ = [*_EXPORTS]
 
-# The player asks for the last one here, because it lies in a room below the one with torch.
+# `avatar.runtime` plays without torch: its player takes `BundleOnDevice` from here, where a GPU is asked for.
 _MORE = {"__version__": "smplxpp", "BundleOnDevice": "avatar.rendering.on_device"}
 __getattr__, __dir__ = lazy_exports("avatar", {**_EXPORTS, **_MORE})

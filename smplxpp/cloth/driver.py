@@ -64,9 +64,8 @@ class DriverConfig:
     def __post_init__(self) -> None:
         for name in ("ramp", "hold", "beside", "drawn_margin"):
             require_at_least(f"cloth driver: {name}", getattr(self, name), 0.0)
-        for name in (
-            *("ramp_step", "longest_step", "teleport", "most_stretch", "sliver", "least_determinant", "wander"),
-        ):
+        positive = "ramp_step", "longest_step", "teleport", "most_stretch", "sliver", "least_determinant", "wander"
+        for name in positive:
             require_positive(f"cloth driver: {name}", getattr(self, name))
         require_at_least("cloth driver: most_drawn", self.most_drawn, 1.0)
 

@@ -20,7 +20,8 @@ The terms are found one after the other:
    upper along the column, and the end of the sleeve. Their cost sums the KL divergence of each ring's colours from its
    run's, likelihood ratios of skin by colour and distance, and priors on usual clothes. Dynamic programming over rings
    gives the exact minimum; the sum over all outlines (forward-backward) gives P(label) of every ring. Without colours
-   `by_body_shape` finds the same from hems, folds, feet and distances, which `by_body_hems` measures.
+   `by_body_shape` finds the same from hems, folds, feet and distances, which `by_body_hems` measures. Where colours do
+   not show the border of upper and lower garment either, `by_body_waist` takes it from folds.
 6. `by_body_prior`: P(label | place), the outline softened by the uncertainty of its borders.
 7. `by_body_colors.label_costs`: P(colour | label) by expectation maximisation, averaged over neighbours of like colour.
 8. `graph_cut`: alpha-expansion of the energy, with weights w that prefer concave folds and edges of colour.

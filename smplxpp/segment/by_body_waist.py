@@ -1,4 +1,4 @@
-"""Find without colours where the upper garment ends over the lower one, by a cut along folds of the surface.
+"""Find where the upper garment ends over the lower one where colours do not show it, by a cut along folds.
 
 A jacket that is open ends at its hem at the back and at a waistband in front, and no ring about the body follows that.
 About the waist, faces have no label of their own; above and below they are upper and lower. The border is the shortest
