@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 
 from smplxpp.core import InputError, require_choice
 from smplxpp.core.files.json_file import as_numbers
@@ -88,6 +88,23 @@ class RationalDistortion(Distortion):
     radial: tuple[float, float, float, float, float, float]
     tangential: tuple[float, float]
     native_id: ClassVar[int] = 0
+
+    @property
+    def fold(self) -> float:
+        """Radius on the plane z = 1 from which the distorted radius decreases; infinity where it never does.
+
+        Coefficients are fitted to a pattern that rarely reaches a picture's edges. Outside of it a pinhole would show
+        parts of the picture a second time, mirrored.
+        """
+        k1, k2, k3, k4, k5, k6 = self.radial
+        # With s = r^2, r q(s) increases while N D + 2 s (N' D - N D') > 0, and has a pole where D = 0.
+        above, below = (np.polynomial.Polynomial([1.0, *k]) for k in ((k1, k2, k3), (k4, k5, k6)))
+        slope = above * below + 2.0 * np.polynomial.Polynomial([0.0, 1.0]) * (
+            above.deriv() * below - above * below.deriv()
+        )
+        roots = np.concatenate([np.asarray(p.trim(1e-15).roots(), dtype=np.complex128) for p in (slope, below)])
+        turns = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
+        return float(np.sqrt(turns.min(initial=np.inf)))
 
     @staticmethod
     def from_coefficients(values: Float64[np.ndarray, " N"], *, subject: str) -> RationalDistortion | None:
@@ -299,7 +316,23 @@ def undistort(
         width,
         height,
     )
+    if isinstance(distortion, RationalDistortion):
+        out[beyond_fold(distortion, target_K, size)] = 0
     return out
+
+
+def beyond_fold(
+    distortion: RationalDistortion, K: Float[np.ndarray, "3 3"], size: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels of a pinhole that a lens does not show, because its radial polynomial has turned back there."""
+    width, height = size
+    ray = np.linalg.inv(K)
+    corners = np.array([[u, v, 1.0] for u in (0.0, width) for v in (0.0, height)]) @ ray.T
+    if (corners[:, :2] ** 2).sum(axis=1).max() <= distortion.fold**2:
+        return np.zeros((height, width), dtype=bool)
+    u, v = np.arange(width) + 0.5, (np.arange(height) + 0.5)[:, None]
+    x, y = (ray[row, 0] * u + ray[row, 1] * v + ray[row, 2] for row in (0, 1))
+    return x * x + y * y > distortion.fold**2
 
 
 def _scaled_radially(xy: Float[np.ndarray, "N 2"], change: Any) -> Float64[np.ndarray, "N 2"]:

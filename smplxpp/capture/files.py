@@ -147,6 +147,33 @@ def subfolders(folder: Path) -> list[str]:
         return sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))
 
 
+def images_beside(folder: Path, cameras: Sequence[str]) -> dict[str, FileSeries]:
+    """Find the images of cameras that lie in one folder: `cam1_000012.jpg`, `007_0001.png`, `1.jpg`.
+
+    The camera is the name before its last numbers, or the whole name, spelled as `matched_names` compares it; the frame
+    is the last number after it, 0 without one.
+
+    Returns:
+        The series of each camera. Nothing where an image is no camera's, or two are one camera's of one frame: the
+        folder then holds something else.
+    """
+    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
+    own = {_tokens(camera): camera for camera in cameras}
+    found: dict[str, dict[int, str]] = {}
+    for name in names:
+        # Numbers are taken off the end until a camera is left.
+        stem, numbers = Path(name).stem, list[int]()
+        while _tokens(stem) not in own and (match := re.fullmatch(r"(.*[^0-9])([0-9]{1,15})", stem)):
+            stem = match[1].rstrip("_-. ")
+            numbers.append(int(match[2]))
+        frame = numbers[0] if numbers else 0
+        files = found.setdefault(own.get(_tokens(stem), ""), {})
+        if "" in found or frame in files:
+            return {}
+        files[frame] = name
+    return {camera: FileSeries.from_names(folder, files) for camera, files in found.items()}
+
+
 def matched_names(cameras: Sequence[str], files: Sequence[str]) -> dict[str, str]:
     """Return for each camera the file or folder (without its suffix) that is its own; cameras without one are left out.
 

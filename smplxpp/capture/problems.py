@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from smplxpp.capture.capture import Capture
-from smplxpp.capture.distortion import Distortion, RationalDistortion
+from smplxpp.capture.distortion import Distortion, RationalDistortion, beyond_fold
 from smplxpp.capture.recording import Problem
 from smplxpp.core import Camera, InputError
 
@@ -76,7 +76,7 @@ def _wrong_up_axis(capture: Capture) -> Iterator[Problem]:
         name = ("+" if up[axis] > 0 else "-") + "xyz"[axis]
         yield Problem(
             f"the upper edges of the cameras' pictures point along {name} of the world, "
-            "where +y is expected: turn cameras and parameters (docs/captures.md)"
+            f"where +y is expected: `smplxpp capture convert DIR --out NEW --up {name.lstrip('+')}` turns them"
         )
 
 
@@ -160,9 +160,10 @@ def lost_share(camera: Camera, distortion: Distortion) -> float:
 
 
 def lens_problems(cameras: Mapping[str, Camera], distortions: Mapping[str, Distortion]) -> list[Problem]:
-    """Find wide-angle lenses whose undistorted images cut off more than 5 % of the distorted ones.
+    """Find wide-angle lenses whose undistorted images cut off more than 5 % of the distorted ones, and folds.
 
-    Smaller losses are margins that every undistortion has.
+    Smaller losses are margins that every undistortion has. A fold is a radius from which a polynomial of OpenCV's model
+    turns back; it is named where 1 % of the undistorted image lies outside of it.
     """
     # One computation for all cameras of the same lens and intrinsics.
     alike: dict[tuple, list[str]] = {}
@@ -177,4 +178,12 @@ def lens_problems(cameras: Mapping[str, Camera], distortions: Mapping[str, Disto
         if share >= 0.05:
             shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
             found.append(Problem(f"camera {shown}: {share:.0%} of the picture is outside of the undistorted one"))
+    for name, distortion in distortions.items():
+        if name in cameras and isinstance(distortion, RationalDistortion):
+            # On a grid of 64 x 64 cells, because a rig has many cameras.
+            grid = np.diag([64 / cameras[name].width, 64 / cameras[name].height, 1.0])
+            share = float(beyond_fold(distortion, grid @ cameras[name].K, (64, 64)).mean())
+            if share >= 0.01:
+                text = "its lens turns back within the picture, where the pattern that calibrated it was not"
+                found.append(Problem(f"camera {name}: {text}: {share:.0%} of the undistorted one stay black"))
     return found

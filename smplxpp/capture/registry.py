@@ -6,10 +6,13 @@ import re
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from smplxpp.body import BodyModel
+from smplxpp.body import BodyModel, UpAxis
+from smplxpp.body.rest_pose import upright_rotation
+from smplxpp.capture.calibrations.world import UNITS
 from smplxpp.capture.capture import Capture
 from smplxpp.capture.files import require_folder, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
@@ -30,6 +33,7 @@ from smplxpp.capture.readers import (
 )
 from smplxpp.capture.readers.common import ReaderOptions, RigOptions
 from smplxpp.capture.recording import Recording, Splits
+from smplxpp.capture.sources import ParamFiles
 from smplxpp.capture.subject import SubjectKeypoints
 from smplxpp.capture.views import ArrayCache, read_alpha
 from smplxpp.capture.window import Window
@@ -71,7 +75,7 @@ def open_capture(
         person: id in the files of the person whose keypoints are taken, in each view by itself; None: the subject.
         subject: where several people are in view, the place of the one that is taken, in the order in which views agree
             on them, by size and nearness to the middle (`smplxpp.capture.subject`); None: the first.
-        rig: calibration, unit and axes of a rig that has no layout of a data set.
+        rig: calibration of a rig that has no layout of a data set; unit and upward axis of any capture's world.
         body: body model of the parameters, for layouts that rotate it about the origin; None: open body.
         hold_out_every: hold out every n-th training camera as a novel view.
         protocol: name of the capture's protocol whose files are read; `params` replaces its parameters.
@@ -111,6 +115,8 @@ def open_capture(
             received=f"one of the layout {recording.format}",
             remedy="name its parameters with --params, or convert it with `smplxpp capture convert`",
         )
+    if recording.format != "rig":
+        recording = _upright(recording, options)
     lost = lens_problems(recording.cameras, recording.distortions)
     recording = replace(recording, problems=(*recording.problems, *lost))
     if masks is not None:
@@ -124,6 +130,37 @@ def open_capture(
         splits = splits.hold_out_cameras(hold_out_every)
     windows = {name: Window.full(camera) for name, camera in recording.cameras.items()}
     return Capture(recording, splits, windows, ArrayCache(cache_bytes))
+
+
+def _upright(recording: Recording, options: ReaderOptions) -> Recording:
+    """Return the recording in metres with y up, where unit and axis of its world are stated.
+
+    Parameters that the options bring are of the world that results.
+
+    Raises:
+        InputError: meshes, normals or parameters that cannot be turned or scaled alike.
+    """
+    up, scale = options.rig.up, UNITS[options.rig.units or "m"]
+    if up in (None, "y") and scale == 1.0:
+        return recording
+    own = None if options.params is not None else recording.params
+    if recording.meshes or recording.files.get("normal") or not (own is None or isinstance(own, ParamFiles)):
+        raise InputError(
+            "--up and --units",
+            expected="cameras and images, with a file of parameters for each frame at most",
+            received=f"a capture of the layout {recording.format} with meshes, normals or stacked parameters",
+            remedy="leave --up and --units away: their world is that of the cameras",
+        )
+    if isinstance(own, ParamFiles) and scale != 1.0:
+        raise InputError("--units", expected="m: parameters are in metres", received=str(options.rig.units))
+    # x_cam = R x + t, with x = U^T x' in the world that stands on y, and lengths times the unit.
+    turn, cameras = upright_rotation(up or "y"), {}
+    for name, camera in recording.cameras.items():
+        pose = camera.cam_from_world.copy()
+        pose[:3, :3], pose[:3, 3] = pose[:3, :3] @ turn.T, scale * pose[:3, 3]
+        cameras[name] = replace(camera, cam_from_world=pose)
+    params = replace(own, up=cast("UpAxis", up)) if isinstance(own, ParamFiles) and up else recording.params
+    return replace(recording, cameras=cameras, params=params)
 
 
 def _with_subject(recording: Recording, subject: int | None) -> Recording:

@@ -31,6 +31,8 @@ class FaultBounds:
         least_sightings: sightings that a view needs to be judged for another person or a wrong calibration.
         far: multiple of the threshold above which a sighting contradicts the others.
         other_person: a view shows another person if a smaller share of its sightings agrees.
+        contradicts: a camera is judged if its median distance, in thresholds, times the root of its frames exceeds
+            this: a detector's errors depend on the view and are alike within a frame, where a new pose explains them.
         moved: a new pose of a camera counts if it moves the projections by more than this share of the threshold.
         better: the new pose must leave less than this share of the old distance ...
         as_well: ... and less than this multiple of what is typical of the cameras.
@@ -46,6 +48,7 @@ class FaultBounds:
     least_sightings: int = 8
     far: float = 3.0
     other_person: float = 0.4
+    contradicts: float = 1.0
     moved: float = 0.2
     better: float = 0.9
     as_well: float = 1.6
@@ -164,6 +167,9 @@ def find_camera_fault(table: Table, points: Float64[np.ndarray, "N 3"]) -> tuple
         # The points follow the other cameras. A calibration fault is one that a rigid motion of this camera repairs:
         # its error falls to what is typical, or to a fraction of what it was. If no motion does, the view is of another
         # person.
+        frames = int(table.by_frame(known)[k].any(axis=1).sum())
+        if before[k] * np.sqrt(frames) < _BOUNDS.contradicts:
+            continue
         found = resection(s, k, points)
         as_well = found.median < min(_BOUNDS.as_well * typical, _BOUNDS.better * before[k])
         if found.moved > _BOUNDS.moved and (as_well or found.median < min(1.0, _BOUNDS.far_better * before[k])):

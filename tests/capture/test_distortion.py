@@ -10,7 +10,8 @@ import pytest
 
 from smplxpp.capture import open_capture, read_cameras
 from smplxpp.capture.distortion import FISHEYE, FOV, Distortion, RationalDistortion, undistort
-from smplxpp.capture.problems import lost_share
+from smplxpp.capture.problems import lens_problems, lost_share
+from smplxpp.core import Camera
 from smplxpp.core.errors import InputError
 from tests.capture.scene import HEIGHT, LENS, WIDTH, make_scene, overlap
 from tests.capture.writers import write_simple
@@ -104,6 +105,25 @@ def test_resizing_and_cropping_a_distorted_capture_keep_the_scene_on_its_masks(t
 
 
 FISHEYES = [(0.0, 0.0, 0.0, 0.0), (0.03, 0.005, -0.002, 0.0003), (-0.05, 0.01, -0.004, 0.0006)]
+
+
+def test_beyond_the_fold_of_a_polynomial_nothing_is_shown_twice(tmp_path):
+    """Lenses of a real rig, calibrated with a board in the middle, showed curtains a second time, mirrored."""
+    lens = Distortion.from_opencv((0.0, -1.6, 0.0, 0.0, 0.0), subject="lens")
+    # d/dr (r - 1.6 r^5) = 0 at r^4 = 1 / 8.
+    assert lens.fold == pytest.approx(8**-0.25)
+    assert Distortion.from_opencv((0.3, 0.1, 0.0, 0.0, 0.0), subject="lens").fold == np.inf
+    # A pole of the rational model is a fold, too: 1 - 2 r^2 = 0 below.
+    assert Distortion.from_opencv((0, 0, 0, 0, 0, -2.0, 0, 0), subject="lens").fold <= 2**-0.5
+    K = np.array([[100.0, 0, 100], [0, 100, 10], [0, 0, 1]])
+    ramp = np.broadcast_to(np.arange(1, 201, dtype=np.uint8), (20, 200))
+    row = undistort(ramp, lens, source_K=K, target_K=K, size=(200, 20))[10].astype(int)
+    seen = np.flatnonzero(row)
+    assert (np.diff(row[seen]) >= 0).all() and (np.diff(seen) == 1).all()
+    assert abs(seen[-1] + 0.5 - (100 + 100 * lens.fold)) <= 1
+    camera = Camera(K, np.eye(4), 200, 20, name="A")
+    (problem,) = lens_problems({"A": camera}, {"A": lens})
+    assert "turns back" in problem.message and f"{(row == 0).mean():.0%}" in problem.message
 
 
 @pytest.mark.parametrize("k", FISHEYES)

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from pipelines.cli import main
+from smplxpp.body import load_body
 from smplxpp.capture import find_problems, open_capture
-from smplxpp.capture.files import FileSeries
+from smplxpp.capture.files import FileSeries, images_beside
+from smplxpp.capture.readers.common import RigOptions
 from smplxpp.capture.writers import save_params_by_row
 from smplxpp.core.errors import InputError
 from tests.capture.calibration_writers import pose2sim as write_calibration
@@ -48,6 +50,64 @@ def test_easymocap_leaves_out_a_camera_called_none(tmp_path):
     problems = find_problems(capture, decode=False)
     assert [problem.message for problem in problems] == ["camera none, which EasyMocap itself drops: left aside"]
     assert len(capture.without(problems).views()) == 6
+
+
+def test_lenses_of_more_cameras_than_a_session_has(tmp_path):
+    """A studio's intri.yml has 32 cameras, the extri.yml of a session 11."""
+    root = write_easymocap(make_scene(lens=LENS), tmp_path / "set")
+    path = root / "extri.yml"
+    text = path.read_bytes().decode().replace("names:\r\n", 'names:\r\n  - "D"\r\n')
+    path.write_bytes("".join(line for line in text.split("R_B:")[0]).encode() + text[text.index("R_C:") :].encode())
+    for options in ({}, {"rig": RigOptions(calibration=root / "intri.yml", up="y")}):
+        capture = open_capture(root, **options)
+        assert list(capture.cameras) == ["A", "C"]
+        assert any("without a pose in extri.yml" in p.message and "B" in p.message for p in capture.problems)
+    path.write_text("%YAML:1.0\n---\n")
+    with pytest.raises(InputError, match=r"extri.yml: expected the pose of a camera"):
+        open_capture(root)
+
+
+def test_images_of_all_cameras_in_one_folder(tmp_path):
+    """Named as recorders export them: 007_0001_00001.jpg is camera 7, moment 1."""
+    scene = make_scene(names=("7", "11", "31"), lens=LENS)
+    root = write_easymocap(scene, tmp_path / "set")
+    for path in sorted((root / "images").glob("*/*.jpg")):
+        path.rename(root / "images" / f"{int(path.parent.name):03d}_0001_{int(path.stem):05d}.jpg")
+        if not any(path.parent.iterdir()):
+            path.parent.rmdir()
+    capture = open_capture(root)
+    assert list(capture.cameras) == ["7", "11", "31"] and len(capture.views()) == 6
+    assert capture.file("7", 1).name == "007_0001_00001.jpg"
+    as_rig = open_capture(root, rig=RigOptions(calibration=root / "intri.yml", up="y"))
+    assert [(str(c), f) for c, f in as_rig.views()] == [(str(c), f) for c, f in capture.views()]
+    # A picture that is no camera's makes it a folder of something else.
+    (root / "images" / "plan.jpg").write_bytes((root / "images" / "007_0001_00000.jpg").read_bytes())
+    assert images_beside(root / "images", ["7", "11", "31"]) == {}
+    (root / "images" / "plan.jpg").rename(root / "images" / "7.jpg")
+    assert images_beside(root / "images", ["7", "11", "31"]) == {}
+
+
+@pytest.mark.parametrize("up", ["z", "-x"])
+def test_a_world_that_stands_on_another_axis_is_turned_as_asked(tmp_path, up):
+    """EasyMocap's boards have z up: `--up` was accepted and did nothing."""
+    scene = make_scene(lens=LENS)
+    root = write_easymocap(scene, tmp_path / "set")
+    given, turned = open_capture(root), open_capture(root, rig=RigOptions(up=up))
+    standing = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    for name, camera in turned.cameras.items():
+        before = given.cameras[name].cam_from_world
+        np.testing.assert_allclose(camera.cam_from_world[:3, 1], before[:3, :3] @ standing, atol=1e-12)
+        np.testing.assert_array_equal(camera.cam_from_world[:3, 3], before[:3, 3])
+    # The person moves with the cameras: joints have the same places in each camera.
+    body = load_body()
+    places = [body.forward(c.params(1)).joints[0] for c in (given, turned)]
+    for name in given.cameras:
+        seen = [p @ c.cameras[name].cam_from_world[:3, :3].T for p, c in zip(places, (given, turned), strict=True)]
+        np.testing.assert_allclose(*seen, atol=1e-5)
+    with pytest.raises(InputError, match="--units"):
+        open_capture(root, rig=RigOptions(units="mm"))
+    with pytest.raises(InputError, match="stacked parameters"):
+        open_capture(write_avatarrex(scene, tmp_path / "other"), rig=RigOptions(up=up))
 
 
 def test_stacked_v_shape_follows_the_rows(tmp_path):

@@ -158,17 +158,24 @@ def _yaml_camera(path: Path, content: Mapping[str, Any]) -> FileCamera:
 
 
 def _read_pair(path: Path) -> RigFile:
-    """Read EasyMocap's two files: `K_CAM`, `dist_CAM`; `R_CAM` or `Rot_CAM`, `T_CAM`. Metres."""
+    """Read EasyMocap's two files: `K_CAM`, `dist_CAM`; `R_CAM` or `Rot_CAM`, `T_CAM`. Metres.
+
+    Lenses are calibrated once, poses for each session: cameras with intrinsics alone are left out with a note.
+    """
     intri, extri = (read_opencv_yaml(path.with_name(name)) for name in ("intri.yml", "extri.yml"))
-    source, cameras = f"calibration {path.with_name('intri.yml')}", []
+    source, cameras, without = f"calibration {path.with_name('intri.yml')}", [], []
     for name in entry(intri, "names", source=source):
+        if not any(f"{part}_{name}" in extri for part in ("R", "Rot", "T")):
+            without.append(name)
+            continue
         K, T = entry(intri, f"K_{name}", source=source), entry(extri, f"T_{name}", source=f"calibration {path}")
         R = extri[f"R_{name}"] if f"R_{name}" in extri else entry(extri, f"Rot_{name}", source=f"calibration {path}")
         size = (intri.get(f"W_{name}", 0.0), intri.get(f"H_{name}", 0.0))
         dist = intri.get(f"dist_{name}", intri.get(f"D_{name}", ()))
         known = all(isinstance(side, float) and side >= 1 for side in size)
         cameras.append(file_camera(name, K, R, T, source=source, size=size if known else None, dist=dist))
-    return RigFile(tuple(cameras), 1.0)
+    notes = (f"cameras without a pose in extri.yml are left out: {', '.join(without)}",) if without else ()
+    return RigFile(tuple(cameras), 1.0, notes=notes)
 
 
 def _first(content: Mapping[str, Any], names: tuple[str, ...]) -> Any:

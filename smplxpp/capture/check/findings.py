@@ -66,7 +66,7 @@ KINDS: dict[str, tuple[Area, Status, str]] = {
     "world-up": (
         "calibration",
         "warn",
-        "turn cameras and parameters, so that y points up (`smplxpp params convert --up` for the latter)",
+        "turn cameras and parameters as the line says; parameters of your own by `smplxpp params convert --up`",
     ),
     "calibration": (
         "calibration",

@@ -21,7 +21,7 @@ _KINDS = (
     (r"calibrated, but without any image$", "camera-without-images"),
     (r"an image in camera .* alone$", "frame-alone"),
     (r"no image of frame \d+$|: named in .*, but missing$", "image-missing"),
-    (r"is outside of the undistorted one$", "lens-loss"),
+    (r"is outside of the undistorted one$|of the undistorted one stay black$", "lens-loss"),
     (r": left aside$", "left-aside"),
     (r"where \+y is expected", "world-up"),
     (r"name the model that they were fitted with", "params-body"),
@@ -114,7 +114,7 @@ def parameter_findings(capture: Capture, params: dict[int, BodyParams], body: Bo
     found: list[Finding] = []
     for frame, p in params.items():
         found += _out_of_range(frame, p, body)
-    found += _varying_betas(params)
+    found += [*_large_betas(params), *_varying_betas(params)]
     if params:
         # Units come before jumps: in millimetres every step is a jump.
         units = list(_wrong_units(capture, params))
@@ -123,10 +123,6 @@ def parameter_findings(capture: Capture, params: dict[int, BodyParams], body: Bo
 
 
 def _out_of_range(frame: int, p: BodyParams, body: BodyModel) -> Iterator[Finding]:
-    # Betas are in standard deviations of the shapes that the model was learned from.
-    largest = float(np.abs(p.betas).max(initial=0.0))
-    if largest > BETA_LIMIT:
-        yield Finding("params-betas", f"frame {frame}: betas reach {largest:.3g}", None, frame)
     # Learned expressions are unbounded principal components, named blend shapes are weights.
     named = not body.expression_names[:1] == ("expression_00",)
     low, high = _BLEND_SHAPE_LIMITS if named else _EXPRESSION_LIMITS
@@ -141,6 +137,19 @@ def _out_of_range(frame: int, p: BodyParams, body: BodyModel) -> Iterator[Findin
     if angle > _ANGLE_LIMIT:
         unit = ", as degrees would" if angle > 30 else ""
         yield Finding("params-angles", f"frame {frame}: {name} reaches {angle:.3g} radians{unit}", None, frame)
+
+
+def _large_betas(params: dict[int, BodyParams]) -> Iterator[Finding]:
+    """Find shapes outside of `BETA_LIMIT`, once for all frames that share one."""
+    # Betas are in standard deviations of the shapes that the model was learned from.
+    alike: dict[float, list[int]] = {}
+    for frame, p in params.items():
+        largest = float(np.abs(p.betas).max(initial=0.0))
+        if largest > BETA_LIMIT:
+            alike.setdefault(largest, []).append(frame)
+    for largest, frames in alike.items():
+        where = f"frame {frames[0]}" if len(frames) == 1 else f"frames {in_ranges(np.array(frames))}"
+        yield Finding("params-betas", f"{where}: betas reach {largest:.3g}", None, frames[0])
 
 
 def _varying_betas(params: dict[int, BodyParams]) -> Iterator[Finding]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from smplxpp.capture.calibrations.camera_files import read_opencv_yaml
 from smplxpp.capture.distortion import Distortion
-from smplxpp.capture.files import FileSeries
+from smplxpp.capture.files import FileSeries, images_beside
 from smplxpp.capture.keypoints import found_keypoints
 from smplxpp.capture.readers.common import (
     ReaderOptions,
@@ -41,18 +41,25 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     """Find the files of a recording: photographs, masks in `masks/` or `mask/`, keypoints in `annots/`.
 
     Photographs are distorted on disk. The calibration follows OpenCV, with pixel centres at whole numbers. The image
-    size is `H_CAM`, `W_CAM`, or that of the camera's first image. A camera named `none` is left out, as EasyMocap does.
+    size is `H_CAM`, `W_CAM`, or that of the camera's first image. A camera named `none` is left out, as EasyMocap does,
+    and so are cameras with intrinsics alone: lenses are calibrated once, poses for each session.
 
     Raises:
-        InputError: a broken camera file, or a camera in only one of the two files.
+        InputError: a broken camera file, or one without a single camera that has intrinsics and a pose.
     """
     intri, extri = read_opencv_yaml(root / "intri.yml"), read_opencv_yaml(root / "extri.yml")
     listed = required(intri, "names", source=f"file {root / 'intri.yml'}")
     if not isinstance(listed, list):
         raise InputError(f"file {root / 'intri.yml'}: names", expected="a list", received=type(listed).__name__)
-    names = [name for name in listed if name != _NO_CAMERA]
-    images = numbered_images({name: root / "images" / name for name in names})
-    masks = first_folder(root, ("masks", "mask"))
+    posed = [name for name in listed if any(f"{part}_{name}" in extri for part in ("R", "Rot", "T"))]
+    names = [name for name in posed if name != _NO_CAMERA]
+    without = [name for name in listed if name not in posed and name != _NO_CAMERA]
+    if not names:
+        raise InputError(f"file {root / 'extri.yml'}", expected="the pose of a camera of intri.yml", received="none")
+    notes = [f"camera {_NO_CAMERA}, which EasyMocap itself drops: left aside"] if _NO_CAMERA in listed else []
+    if without:
+        notes.append(f"cameras without a pose in extri.yml ({', '.join(without)}): left aside")
+    images, masks = _files(root, "images", names), first_folder(root, ("masks", "mask"))
     cameras, distortions = {}, {}
     for name in names:
         size: Any = (intri.get(f"W_{name}", 0.0), intri.get(f"H_{name}", 0.0))
@@ -75,14 +82,17 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         distortions=distortions,
         files={
             "image": images,
-            "mask": {} if masks is None else numbered_images({name: masks / name for name in names}),
+            "mask": {} if masks is None else _files(root, masks.name, names),
         },
         params=_params(root, options),
-        problems=()
-        if len(names) == len(listed)
-        else (Problem(f"camera {_NO_CAMERA}, which EasyMocap itself drops: left aside"),),
+        problems=tuple(Problem(note) for note in notes),
         keypoints=found_keypoints(root / "annots", cameras, format="easymocap", person=options.person),
     )
+
+
+def _files(root: Path, folder: str, names: list[str]) -> dict[str, FileSeries]:
+    """Return the images in a folder for each camera, else those in the folder itself that its cameras name."""
+    return numbered_images({name: root / folder / name for name in names}) or images_beside(root / folder, names)
 
 
 def _pose(extri: dict[str, Any], name: str, path: Path) -> tuple[np.ndarray, np.ndarray]:

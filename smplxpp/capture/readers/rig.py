@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from smplxpp.capture.calibrations import find_calibration, read_calibration
-from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FileSeries, matched_names, subfolders
+from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FileSeries, images_beside, matched_names, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoints import KeypointFiles, find_places
 from smplxpp.capture.readers.common import ReaderOptions, chosen_params
@@ -137,12 +137,15 @@ def find_keypoints(root: Path, names: list[str]) -> dict[str, Path]:
 
 
 def find_series(root: Path, names: list[str], folders: tuple[str, ...]) -> dict[str, FileSeries]:
-    """Return the numbered images of each camera in the first folder that has those of two cameras."""
+    """Return the numbered images of each camera in the first folder that has those of two cameras.
+
+    They lie in a folder a camera, or all in one with names that begin with the camera's.
+    """
 
     def there(folder: Path) -> dict[str, FileSeries]:
         matched = matched_names(names, subfolders(folder))
         found = {name: FileSeries.find(folder / inside, _NUMBERED) for name, inside in matched.items()}
-        return {name: series for name, series in found.items() if len(series)}
+        return {name: series for name, series in found.items() if len(series)} or images_beside(folder, names)
 
     return _first(root, folders, there)
 

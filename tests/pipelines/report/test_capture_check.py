@@ -106,6 +106,12 @@ def test_parameters_out_of_range_are_named(fault, rig, body):
     assert any(words in message for message in messages.get(kind, [])), messages
 
 
+def test_one_shape_of_all_frames_is_one_finding(rig, body):
+    """Of a turn of 53 frames the report had 53 lines about one shape."""
+    edit_params(rig, PARAMETER_FAULTS["betas out of range"][0], range(3))
+    assert found(rig, body)["params-betas"] == ["frames 0-2: betas reach 7"]
+
+
 def test_nan_in_a_frames_file_is_named(rig, body):
     path = rig / "params/000001.npz"
     np.savez(path, **{**np.load(path), "transl": np.full((1, 3), np.nan)})
