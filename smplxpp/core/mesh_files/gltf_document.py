@@ -245,9 +245,11 @@ class GltfDocument:
         return self._buffers[index]
 
     @property
-    def file_bytes(self) -> int:
-        """Total size in bytes of the other files that were read so far."""
-        return sum(len(data) for data in self._files.values())
+    def held_bytes(self) -> int:
+        """Total size in bytes of what was read or decompressed so far, the document's own file included."""
+        files = sum(len(data) for data in self._files.values())
+        unpacked = sum(len(view) for view, _ in self._views.values()) + sum(v.nbytes for v in self._decoded.values())
+        return self.size + files + unpacked
 
     def resource(self, uri: str) -> bytes | None:
         """Return the bytes of a data URI or of a file inside the document's folder; None without such a file.

@@ -168,10 +168,11 @@ class _Parts:
         """Refuse a small file that repeats its meshes until memory is exhausted.
 
         A file may contain a mesh once and show it many times. Allowed are as many vertices and faces as the file has
-        bytes, or a million, and a thousand million reads of shared vertices.
+        bytes after decompression, because Draco packs dense scans into less than a byte a vertex or face, or a million,
+        and a thousand million reads of shared vertices.
         """
         self._made += elements
-        most = max(1_000_000, self._document.size + self._document.file_bytes)
+        most = max(1_000_000, self._document.held_bytes)
         if self._made > most or self._visits > 1_000_000_000:
             raise InputError(
                 self._document.subject,

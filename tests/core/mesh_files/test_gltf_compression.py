@@ -161,3 +161,22 @@ def test_without_the_codec_the_extra_is_named(tmp_path: Path, monkeypatch, make,
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingExtraError, match=r"compressed glTF files needs.*gltf"):
         _read(tmp_path, document, data)
+
+
+def test_a_dense_scan_in_less_than_a_byte_a_face_is_not_taken_for_a_repeated_mesh(tmp_path: Path):
+    # Draco packs a fine scan of half a million vertices into fewer bytes than it has vertices and faces. Here the least
+    # that is always allowed is out of reach: 250 x 250 vertices and their faces are 186,502, seen six times.
+    side = 250
+    x, y = np.meshgrid(np.arange(float(side)), np.arange(float(side)))
+    points = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3).astype(np.float32)
+    corner = (side * np.arange(side - 1)[:, None] + np.arange(side - 1)).reshape(-1)
+    faces = np.concatenate([corner[:, None] + np.array(k) for k in ((0, 1, side + 1), (0, side + 1, side))])
+    data = DracoPy.encode(points, faces, quantization_bits=8)
+    assert len(data) < len(points) + len(faces)
+    extension = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    document = _document([{"buffer": 0, "byteLength": len(data)}], {"extensions": extension})
+    document["meshes"][0]["primitives"][0]["attributes"] = {"POSITION": 0}
+    document |= {"nodes": [{"mesh": 0}] * 6, "scenes": [{"nodes": list(range(6))}]}
+    document |= {"buffers": [{"byteLength": len(data)}]}
+    raw = _read(tmp_path, document, data)
+    assert len(raw.vertices) + len(raw.faces) > 1_000_000
