@@ -35,7 +35,9 @@ class LocateBounds:
         least_shown: smallest share of hands, face and feet that the surface must show.
         largest_shape: mean square of betas above which no person exists; they have unit variance.
         doubtful_covered: share of the surface below which the confidence falls.
-        doubtful_shape: mean square of betas above which the confidence falls.
+        doubtful_shape: mean square of betas above which the confidence falls, unless the surface is that of the body.
+        own_shape: share of the surface that a body must explain, with `good_bare` at hands, face and feet, to have any
+            shape: a heavy woman has a mean square of 10, and her body explains .99.
         margin: difference of cost, millimetres, from which two facings are clearly distinct.
         doubtful_cost: cost from which rare poses are tried, millimetres.
         good_bare: mean distance of hands, face and feet to the surface at which the confidence is half, metres. Chosen
@@ -55,6 +57,7 @@ class LocateBounds:
     largest_shape: float = 30.0
     doubtful_covered: float = 0.8
     doubtful_shape: float = 6.0
+    own_shape: float = 0.95
     margin: float = 4.0
     doubtful_cost: float = 18.0
     good_bare: float = 0.024
@@ -137,7 +140,7 @@ def findings_of(
     # Beside a person whose hands, face and feet are there; crossed boards have round places, too.
     carried: tuple[tuple[Piece, float], ...] = ()
     if best.misfit.bare < _BOUNDS.good_bare:
-        carried = others_carried(mesh, surface, best.misfit.unexplained, least=_BOUNDS.least_carried)
+        carried = others_carried(mesh, surface, best.misfit.unexplained, posed=posed, least=_BOUNDS.least_carried)
     if carried:
         trust = 0.1
     for other, height in carried if not out else ():
@@ -174,6 +177,11 @@ def findings_of(
     if piece is not None and piece.share > 0.1 and not carried:
         what = "furniture, another person, something held or a wide garment"
         what = "armour, something held or a wide garment" if pads else what
+        # A person who sits is found with the chair, whose legs and back would become clothes that limbs draw along.
+        # Something held is flat as well; furniture stands on legs of its own.
+        flat = unlike_person(mesh, surface) if feet_of(surface) > 2 else ""
+        if flat:
+            trust, what = min(trust, 0.1), f"furniture, which it stands on beside the feet ({flat}); cut it away"
         out.append(f"{piece.share:.0%} of the surface, in one piece of {piece}, is no part of the body found: {what}")
     if float(high - low) < 1.2:
         out.append(
@@ -229,8 +237,8 @@ def confidence_of(best: Found, others: Sequence[Found]) -> float:
 
     A logistic function of its margin over the other facing (1/2 at half of the margin that is clearly distinct), one of
     the distance of its hands, face and feet to the surface, the share of the surface that it explains, 0.2 for an
-    unlikely shape, and 0.4 for missing parts. Clothes do not count: wide ones are as far from a right body as tight
-    ones from a wrong one, while hands, face and feet are bare, or nearly so.
+    unlikely shape that the surface does not show, and 0.4 for missing parts. Clothes do not count: wide ones are as far
+    from a right body as tight ones from a wrong one, while hands, face and feet are bare, or nearly so.
     """
     rival = [one.cost - best.cost for one in others if one.facing @ best.facing < 0]
     apart = min(rival) if rival else _BOUNDS.margin
@@ -240,7 +248,7 @@ def confidence_of(best: Found, others: Sequence[Found]) -> float:
     whole = np.clip(
         (best.misfit.covered - _BOUNDS.least_covered) / (_BOUNDS.doubtful_covered - _BOUNDS.least_covered), 0.0, 1.0
     )
-    likely = 1.0 if _shape(best) <= _BOUNDS.doubtful_shape else 0.2
+    likely = 0.2 if _unlike_people(best) else 1.0
     return float(distinct * good * whole * likely * (0.4 if missing_parts(best) else 1.0))
 
 
@@ -292,9 +300,15 @@ def notes_of(best: Found, others: Sequence[Found]) -> tuple[str, ...]:
             f"fingers not found: {', '.join(closed)}. A fist, a glove or something held hides them; the arm is found, "
             "and the pose of the fingers is a guess"
         )
-    if _shape(best) > _BOUNDS.doubtful_shape:
+    if _unlike_people(best):
         out.append("the body that fits is unlike people: check --units and --up, and that the scan is whole")
     return tuple(out)
+
+
+def _unlike_people(found: Found) -> bool:
+    """Return whether a candidate has a shape that few people have and the surface does not show."""
+    shown = found.misfit.covered >= _BOUNDS.own_shape and found.misfit.bare < _BOUNDS.good_bare
+    return _shape(found) > _BOUNDS.doubtful_shape and not shown
 
 
 def _shape(found: Found) -> float:

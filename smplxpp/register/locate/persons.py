@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import igl
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
@@ -179,7 +180,12 @@ def largest_piece(surface: SurfacePoints, unexplained: Bool[np.ndarray, " N"]) -
 
 
 def others_carried(
-    mesh: TriangleMesh, surface: SurfacePoints, unexplained: Bool[np.ndarray, " N"], *, least: float
+    mesh: TriangleMesh,
+    surface: SurfacePoints,
+    unexplained: Bool[np.ndarray, " N"],
+    *,
+    posed: TriangleMesh,
+    least: float,
 ) -> tuple[tuple[Piece, float], ...]:
     """Return the pieces that a body does not explain and that have a head of their own, with its height.
 
@@ -190,6 +196,7 @@ def others_carried(
         mesh: the surface.
         surface: points of it.
         unexplained: whether a point is no part of the body.
+        posed: the body; a head whose centre lies within it is its own, about which hair stands that no body explains.
         least: share of the surface from which a piece counts.
     """
     # Heads of babies, dolls and dogs, too. Knees, fists and buns are as large: only surface without a body counts.
@@ -204,6 +211,7 @@ def others_carried(
         near = dense.select(np.flatnonzero(np.isfinite(distance)))
         area = float(mesh.face_areas.sum()) * len(near) / len(dense)
         found = heads(near, area, radii)
+        found = found[igl.fast_winding_number(posed.vertices, posed.faces, found) < 0.5] if len(found) else found
         # Others lie on feet and joints of the same one: the highest is the head.
         if len(found):
             out.append((_piece_of(surface, rows), float(found[:, 1].max() - surface.points[:, 1].min())))

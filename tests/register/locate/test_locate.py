@@ -245,6 +245,18 @@ def test_wide_clothes_do_not_lower_the_confidence_and_hands_and_face_elsewhere_d
     assert confidence_of(_found(bare=0.030), ()) < 0.01
 
 
+def test_a_heavy_woman_is_believed_and_a_shape_that_the_surface_does_not_show_is_not():
+    """The scan of a heavy woman, explained to 99 %, had a confidence of 0.2 and was told to check its units."""
+    found = _found()
+    heavy = replace(found, state=replace(found.state, betas=np.full(10, 3.2)))
+    assert confidence_of(heavy, ()) == confidence_of(found, ()) > 0.8 and notes_of(heavy, ()) == ()
+    for misfit in (replace(heavy.misfit, covered=0.85), replace(heavy.misfit, bare=0.0245)):
+        doubtful = replace(heavy, misfit=misfit)
+        usual = replace(found, misfit=misfit)
+        assert confidence_of(doubtful, ()) == pytest.approx(0.2 * confidence_of(usual, ()))
+        assert "unlike people" in notes_of(doubtful, ())[-1]
+
+
 def test_fists_are_no_missing_hands_but_a_hand_is_lost_with_its_forearm():
     """A fist shows some of an open hand; an arm that lies elsewhere shows as much of the hand and no forearm."""
     fist, elsewhere = _found(left_hand=0.3), _found(left_hand=0.3, left_forearm=0.05)

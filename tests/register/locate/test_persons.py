@@ -15,7 +15,15 @@ from smplxpp.people.things import _ball, _box, _joined, _tube
 from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.landmarks import visible_vertices
 from smplxpp.register.locate.decision import confidence_of, findings_of, without_pads
-from smplxpp.register.locate.persons import convex_share, feet_of, heads, largest_piece, people_apart, unlike_person
+from smplxpp.register.locate.persons import (
+    convex_share,
+    feet_of,
+    heads,
+    largest_piece,
+    others_carried,
+    people_apart,
+    unlike_person,
+)
 from smplxpp.register.locate.search import LocateConfig, Search
 
 BODY = load_body()
@@ -143,6 +151,23 @@ def test_a_child_in_arms_and_a_part_of_a_person_are_refused(person):
     box = TriangleMesh(corners, hull.simplices.astype(np.int64))
     confidence, words = _judged(_together(person, box))
     assert confidence > LEAST_CONFIDENCE and "a head" not in words and "is no part of the body found" in words
+
+
+def test_a_persons_own_head_among_long_hair_is_no_child(person):
+    """A doctor in a long open coat with two ponytails was refused: her head, beside them, was "a head of its own"."""
+    surface = SurfacePoints.sample(person, 3000, seed=0)
+    upper = surface.points[:, 1] > person.vertices[:, 1].max() - 0.5
+    assert not others_carried(person, surface, upper, posed=person, least=0.1)
+    elsewhere = _moved(person, 1.0, (0.0, 0.0, 3.0))
+    assert len(others_carried(person, surface, upper, posed=elsewhere, least=0.1)) == 1
+
+
+def test_a_chair_that_a_person_is_scanned_with_is_refused_by_name(person):
+    """A man on a chair was found, and its legs and back became sleeves and trousers that his limbs drew along."""
+    low = float(person.vertices[:, 1].min())
+    chair = _moved(_joined(THINGS["furniture as a chair"]), 0.7, (0.0, low, -0.35))
+    confidence, words = _judged(_together(person, chair))
+    assert confidence < LEAST_CONFIDENCE and "furniture, which it stands on beside the feet" in words
 
 
 def test_an_arm_in_the_air_beside_one_that_no_body_explains_is_refused(person):
