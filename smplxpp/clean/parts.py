@@ -22,6 +22,7 @@ from smplxpp.core import (
     as_mesh,
     require_choice,
     require_known,
+    row_lengths,
 )
 from smplxpp.core.errors import one_line
 from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
@@ -87,6 +88,72 @@ def fill_pinholes(mesh: MeshLike, *, max_length: float = 0.04) -> tuple[Triangle
     return TriangleMesh(np.concatenate(vertices), np.concatenate(faces)), np.concatenate(source)
 
 
+def split_long_edges(
+    mesh: MeshLike, *, longest: float, most: int
+) -> tuple[TriangleMesh, list[Int64[np.ndarray, "_ 2"]]]:
+    """Split edges longer than `longest` metres at their middles, round by round, until none is left.
+
+    The faces of both sides of an edge meet at the same new vertex, so that no gap opens. A face is cut into two, three
+    or four, as one, two or three of its edges are split. The surface stays where it is.
+
+    Args:
+        mesh: manifold.
+        longest: length of an edge, metres; made longer by a quarter until the faces are at most `most`.
+        most: number of faces; a mesh that has as many is returned as it is.
+
+    Returns:
+        The mesh with new vertices at the end, and of each round the two ends of each new vertex. The first
+        one is not on a border if only one of them is.
+    """
+    mesh = as_mesh(mesh, subject="mesh")
+    if mesh.face_count >= most:
+        return mesh, []
+    while True:
+        out, rounds = mesh, list[Int64[np.ndarray, "_ 2"]]()
+        while out.face_count <= most:
+            step, ends = _split_once(out, longest)
+            if not len(ends):
+                return out, rounds
+            out, rounds = step, [*rounds, ends]
+        longest *= 1.25
+
+
+def _split_once(mesh: TriangleMesh, longest: float) -> tuple[TriangleMesh, Int64[np.ndarray, "_ 2"]]:
+    """Return the mesh with each edge longer than `longest` split once, and the ends of the new vertices."""
+    edges, faces = mesh.edges, mesh.faces
+    long = row_lengths(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]]) > longest
+    ends = edges[long]
+    if not len(ends):
+        return mesh, ends
+    on_border = np.zeros(mesh.vertex_count, dtype=bool)
+    on_border[mesh.border_edges] = True
+    turned = on_border[ends[:, 0]] & ~on_border[ends[:, 1]]
+    # The new vertex of each half edge (k, k + 1) of a face, -1 for those that stay: edges as numbers, in order.
+    key = np.sort(ends, axis=1) @ [mesh.vertex_count, 1]
+    order = np.argsort(key)
+    half = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [mesh.vertex_count, 1]
+    at = np.minimum(np.searchsorted(key[order], half), len(key) - 1)
+    middle = np.where(key[order][at] == half, mesh.vertex_count + order[at], -1)
+    # Turn each face so that its split edges are the first ones: (0, 1); (0, 1) and (1, 2); all three.
+    split = middle >= 0
+    count = split.sum(axis=1)
+    first = np.where(count == 1, split.argmax(axis=1), (~split).argmin(axis=1))
+    first = np.where(count == 2, ((~split).argmax(axis=1) + 1) % 3, first)
+    turn = (first[:, None] + np.arange(3)) % 3
+    corner, middle = np.take_along_axis(faces, turn, axis=1), np.take_along_axis(middle, turn, axis=1)
+    (a, b, c), (ab, bc, ca) = corner.T, middle.T
+    new = [faces[count == 0]]
+    for number, triangles in (
+        (1, ((a, ab, c), (ab, b, c))),
+        (2, ((ab, b, bc), (a, ab, bc), (a, bc, c))),
+        (3, ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))),
+    ):
+        new += [np.stack(triangle, axis=1)[count == number] for triangle in triangles]
+    middles = mesh.vertices[ends].mean(axis=1)
+    ends = np.where(turned[:, None], ends[:, ::-1], ends)
+    return TriangleMesh(np.concatenate([mesh.vertices, middles]), np.concatenate(new)), ends
+
+
 @dataclass(frozen=True)
 class PartsConfig:
     """Options of cleaning parts with `clean_parts`.
@@ -96,6 +163,8 @@ class PartsConfig:
         speck_area: area fraction of the part below which components are removed.
         pinhole_length: perimeter, metres, below which border loops are closed.
         method: "quadric" edge collapse (`simplify`) or "isotropic" remeshing (`remesh`).
+        longest_edge: metres; longer edges of a part below its budget are split, because a large face bends with the
+            weights of its corners alone, and skin comes through it. 95 % of the skin's edges are below 32 mm.
         labels: what the ids of labels stand for.
     """
 
@@ -103,6 +172,7 @@ class PartsConfig:
     speck_area: float = 1e-3
     pinhole_length: float = 0.04
     method: str = "quadric"
+    longest_edge: float = 0.03
     labels: Labels = LABELS
 
     def __post_init__(self) -> None:
@@ -204,9 +274,8 @@ def clean_parts(
             continue
         # Clean the part; its vertices keep the colours of the scan's vertices that they stand for.
         budget = config.face_budgets.get(label.name, label.face_budget)
-        part, source, report = _clean_part(mesh, selected, budget=budget, config=config)
-        colors = None if vertex_colors is None else np.asarray(vertex_colors)[source]
-        parts[label.name] = CleanedPart(part, label.id, source, colors, report)
+        given = None if vertex_colors is None else np.asarray(vertex_colors)
+        parts[label.name] = _clean_part(mesh, selected, given, label=label.id, budget=budget, config=config)
     if not parts:
         raise InputError(
             "face labels",
@@ -218,9 +287,15 @@ def clean_parts(
 
 
 def _clean_part(
-    scan: TriangleMesh, selected: np.ndarray, *, budget: int, config: PartsConfig
-) -> tuple[TriangleMesh, np.ndarray, PartReport]:
-    """Return the cleaned part of the selected faces, the scan's vertex for each of its vertices, and the report."""
+    scan: TriangleMesh,
+    selected: np.ndarray,
+    colors: UInt8[np.ndarray, "N 3"] | None,
+    *,
+    label: int,
+    budget: int,
+    config: PartsConfig,
+) -> CleanedPart:
+    """Return the cleaned part of the selected faces of a scan with its colours."""
     # Cut the part out, drop specks, and cut non-manifold vertices apart.
     part, source = scan.submesh(selected)
     kept = drop_specks(part, area_fraction=config.speck_area)
@@ -232,15 +307,25 @@ def _clean_part(
     loops = len(border_loops(part.faces))
     part, of_cut = fill_pinholes(part, max_length=config.pinhole_length)
     source = source[of_cut]
+    colors = None if colors is None else colors[source]
+    # Split what is coarser than the skin. New vertices have the mean colour of their two ends, and stand for the end
+    # inside the part: those that stand for vertices on borders count as borders.
+    part, rounds = split_long_edges(part, longest=config.longest_edge, most=budget)
+    for ends in rounds:
+        source = np.concatenate([source, source[ends[:, 0]]])
+        if colors is not None:
+            colors = np.concatenate([colors, np.rint(colors[ends].mean(axis=1)).astype(np.uint8)])
     small = remesh(part, budget) if config.method == "isotropic" else simplify(part, budget)
     tree = igl.AABB()
     tree.init(small.mesh.vertices, small.mesh.faces)
     distance = np.sqrt(tree.squared_distance(small.mesh.vertices, small.mesh.faces, part.vertices)[0])
     openings = border_loops(small.mesh.faces)
     lengths = sorted(loop_lengths(small.mesh, openings).tolist(), reverse=True)
-    return (
+    return CleanedPart(
         small.mesh,
+        label,
         source[small.source_vertex],
+        None if colors is None else colors[small.source_vertex],
         PartReport(
             faces_before=int(selected.sum()),
             faces_after=small.mesh.face_count,

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from smplxpp.clean import PartsConfig, clean_parts, drop_specks, fill_pinholes, loop_lengths, sanitize, simplify
+from smplxpp.clean.parts import split_long_edges
 from smplxpp.clean.simplify import _collapse
 from smplxpp.core import LOWER, SHOE, SKIN, UPPER, GeometryWarning, InputError, TriangleMesh, concatenate_meshes
 from smplxpp.core.mesh_files.mesh_io import read_mesh
@@ -168,6 +169,38 @@ def test_parts_of_a_scan():
     for name, label in (("upper", UPPER), ("lower", LOWER)):
         assert parts[name].mesh.face_count == (labels == label.id).sum()
         np.testing.assert_array_equal(scan.vertices[parts[name].source_vertex], parts[name].mesh.vertices)
+
+
+def test_a_coarse_garment_is_split_until_its_faces_bend_as_the_skin_does():
+    # The jacket of a game character has faces of 13 cm. Its shoulder bent with the weights of their corners alone, and
+    # the shoulder blades came through it.
+    sleeve = tube(rows=3, columns=9)
+    labels = np.full(sleeve.face_count, UPPER.id)
+    colors = np.where(sleeve.vertices[:, [1]] > 0.2, 200, 0) * np.ones(3)
+    part = clean_parts(sleeve, labels, vertex_colors=colors.astype(np.uint8))["upper"]
+    ends = part.mesh.vertices[part.mesh.edges]
+    assert np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max() <= 0.03
+    # The surface is the same, whole and the same side out; its two openings are as long as before.
+    assert part.mesh.face_areas.sum() == pytest.approx(sleeve.face_areas.sum(), rel=1e-12)
+    assert igl.is_edge_manifold(part.mesh.faces) and part.report.components == 1
+    lengths = sorted(loop_lengths(sleeve, border_loops(sleeve.faces)), reverse=True)
+    np.testing.assert_allclose(part.report.opening_lengths, lengths)
+    _, face, _ = igl.point_mesh_squared_distance(part.mesh.face_centers, sleeve.vertices, sleeve.faces)
+    assert np.einsum("ij,ij->i", part.mesh.face_normals, sleeve.face_normals[face]).min() > 1 - 1e-9
+    # Colours blend along the edges, and only borders stand for borders.
+    height = part.mesh.vertices[:, 1]
+    assert np.ptp(part.vertex_colors[np.abs(height - 0.125) < 0.02]) > 20
+    border = np.zeros(part.mesh.vertex_count, dtype=bool)
+    border[part.mesh.border_edges] = True
+    stands = np.isin(part.source_vertex, np.unique(sleeve.border_edges))
+    assert stands[border].all() and not stands[np.abs(height - 0.25) < 1e-9].any()
+
+
+def test_edges_are_split_no_finer_than_the_budget_allows():
+    sleeve = tube(rows=3, columns=9)
+    fine, rounds = split_long_edges(sleeve, longest=0.03, most=200)
+    assert sleeve.face_count < fine.face_count <= 200 and rounds
+    assert split_long_edges(sleeve, longest=0.03, most=sleeve.face_count)[0] is sleeve
 
 
 def test_bad_labels_are_refused():
