@@ -101,7 +101,9 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", h
         vertices, faces = (raw.vertices, raw.faces) if not raw.is_cloud else _rough_surface(raw)
         stated = _stated_units(path, raw) if units == AUTO and height is None else units
         try:
-            frame = find_scan_frame(vertices, faces, units=stated, up=up, height=height)
+            # glTF has +Y up by its specification; a person who kneels is as near to one who stands on the head.
+            usual = "y" if path is not None and path.suffix.lower() in (".glb", ".gltf") else ""
+            frame = find_scan_frame(vertices, faces, units=stated, up=up, height=height, usual=usual)
         except InputError as error:
             raise _named(error, name) from None
         scale, up, note = frame.units, frame.up, frame.note

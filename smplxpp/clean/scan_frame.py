@@ -122,6 +122,7 @@ def find_scan_frame(
     units: str = AUTO,
     up: str = AUTO,
     height: float | None = None,
+    usual: str = "",
 ) -> ScanFrame:
     """Find the units and the upward axis of a person's scan.
 
@@ -134,6 +135,7 @@ def find_scan_frame(
         units: known units; "auto" finds them.
         up: known upward axis; "auto" finds it.
         height: metres from the lowest to the highest point; the units then follow from it.
+        usual: upward axis of the file's format, taken where no other one fits clearly better; empty for none.
 
     Raises:
         InputError: no surface, units that are stated beside a height, or a size that is no standing person's in any
@@ -148,6 +150,10 @@ def find_scan_frame(
         bodies = _bodies()
         costs = {axis: _cost(surface, bodies, axis) for axis in _Y_FROM_UP}
     order = sorted(costs, key=lambda axis: costs[axis])
+    # The distance of the second best is more than 15 % larger where the axis is unambiguous.
+    clearly = 1.15
+    if usual in costs and costs[usual] <= clearly * costs[order[0]]:
+        order.sort(key=lambda axis: axis != usual)
     best = order[0]
     whole = convert_points(points[np.unique(corners)], up=best)[:, 1]
     whole = whole[np.isfinite(whole)]
@@ -159,8 +165,7 @@ def find_scan_frame(
     if units == AUTO:
         _refuse_normalised(whole)
     chosen = _units(size) if units == AUTO else units
-    # The axis is unambiguous if the second best has a distance more than 15 % larger.
-    unambiguous = len(order) == 1 or costs[order[1]] > 1.15 * costs[best]
+    unambiguous = len(order) == 1 or costs[order[1]] > clearly * costs[best]
     note = f"{'stated' if units != AUTO else 'found'} units {chosen}: {size:.4g} {chosen} from head to foot; "
     note += f"{'stated' if up != AUTO else 'found'} upward axis {best}"
     if not unambiguous:

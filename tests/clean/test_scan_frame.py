@@ -96,3 +96,13 @@ def test_a_stated_height_gives_the_scale_whatever_lies_around(person):
 def test_heights_that_are_none_are_refused(person, height, units, words):
     with pytest.raises(InputError, match=f"option height.*{words}"):
         find_scan_frame(person.vertices, person.faces, units=units, height=height)
+
+
+def test_the_axis_of_the_files_format_is_kept_where_no_other_fits_clearly_better(person, monkeypatch):
+    """The glTF file of a kneeling woman, with these distances to standing bodies, was turned upside down."""
+    kneeling = {"y": 0.166, "z": 0.204, "x": 0.234, "-y": 0.157, "-z": 0.211, "-x": 0.232}
+    monkeypatch.setattr("smplxpp.clean.scan_frame._bodies", list)
+    monkeypatch.setattr("smplxpp.clean.scan_frame._cost", lambda surface, bodies, up: kneeling[up])
+    found = find_scan_frame(person, usual="y")
+    assert found.up == "y" and not found.unambiguous and "though -y fits nearly as well" in found.note
+    assert find_scan_frame(person).up == find_scan_frame(person, usual="z").up == "-y"

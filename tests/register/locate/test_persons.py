@@ -167,7 +167,7 @@ def test_a_chair_that_a_person_is_scanned_with_is_refused_by_name(person):
     low = float(person.vertices[:, 1].min())
     chair = _moved(_joined(THINGS["furniture as a chair"]), 0.7, (0.0, low, -0.35))
     confidence, words = _judged(_together(person, chair))
-    assert confidence < LEAST_CONFIDENCE and "furniture, which it stands on beside the feet" in words
+    assert confidence < LEAST_CONFIDENCE and "furniture, which stands beside the feet" in words
 
 
 def test_an_arm_in_the_air_beside_one_that_no_body_explains_is_refused(person):
