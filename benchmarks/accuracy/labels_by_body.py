@@ -9,9 +9,10 @@ and by number. The body is
   a fit   every joint turned by 1.5 to 3 degrees about each axis, betas off by 0.3 to 0.5 (stature kept), placed rigidly
           as a fit would place it and then moved by 8 to 15 mm: 13 to 45 mm of mean vertex error; two draws a person
   exact   the truth's; of an outsider the model's nearest shape
-and the scan is as it is, or as photographs give it (a fit, colours blurred over 6 rings of vertices, 3 mm of smooth
-noise), or without colours (a fit, exact). `--faces` simplifies every scan first, `--draws` and `--cases` leave out fits
-and cases, where time is short.
+and the scan is as it is, or half in shadow (a fit, the left half in 35 % of the light), or as photographs give it (a
+fit, colours blurred over 6 rings of vertices, 3 mm of smooth noise), or without colours (a fit, exact). Faces are sure
+whose confidence is that of a label for fits, `UNSURE`. `--faces` simplifies every scan first, `--draws` and `--cases`
+leave out fits and cases, where time is short.
 """
 
 from __future__ import annotations
@@ -31,10 +32,12 @@ from benchmarks.support.results import store_results
 from smplxpp.body import BodyModel, load_body
 from smplxpp.clean import simplify
 from smplxpp.core import LABELS, BodyParams, TriangleMesh, matrix_from_rotvec, rotvec_from_matrix
+from smplxpp.core.colors import linear_from_srgb, srgb_from_linear
 from smplxpp.people import CAST, OUTSIDERS, PersonScan, person
 from smplxpp.people.outside import reachable
 from smplxpp.people.textures import smooth_noise
 from smplxpp.segment import label_by_body
+from smplxpp.segment.by_body_confidence import UNSURE
 from smplxpp.synth.tracker import tracker_noise
 
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
@@ -77,6 +80,17 @@ def as_photographed(scan: PersonScan, seed: int) -> tuple[TriangleMesh, np.ndarr
     return moved, np.clip(np.rint(colors), 0, 255).astype(np.uint8)
 
 
+def half_in_shadow(scan: PersonScan, body: BodyModel, params: BodyParams) -> np.ndarray:
+    """The colours in a shadow over the left half of the body, whose border is 2 cm wide."""
+    assert scan.colors is not None
+    joints = body.forward(params).joints[0]
+    left, right = (joints[body.joint_names.index(f"{side}_hip")] for side in ("left", "right"))
+    across = (left - right) * [1.0, 0.0, 1.0]
+    along = (scan.mesh.vertices - (left + right) / 2) @ (across / np.linalg.norm(across))
+    light = 1.0 - 0.65 / (1.0 + np.exp(-np.clip(along / 0.005, -50, 50)))
+    return srgb_from_linear(linear_from_srgb(scan.colors) * light[:, None])
+
+
 def simplified(scan: PersonScan, faces: int | None) -> PersonScan:
     """Return a scan with about so many faces, whose truth is that of the nearest faces before."""
     if faces is None or scan.mesh.face_count <= faces:
@@ -114,6 +128,8 @@ def measure(scan: PersonScan, body: BodyModel, seed: int, *, draws: int = 2, cas
                 "accuracy_faces": float(right[scan.seen].mean()),
                 "worst": _worst(wrong),
                 "notes": list(found.notes),
+                "unsure": float(area[found.confidence < UNSURE].sum() / area.sum()),
+                "sure_and_wrong": float(area[(found.confidence >= UNSURE) & ~right].sum() / area.sum()),
                 "bin_area": np.bincount(bins, area / area.sum(), minlength=len(BINS) - 1).tolist(),
                 "bin_right": np.bincount(bins, area * right / area.sum(), minlength=len(BINS) - 1).tolist(),
                 "seconds": seconds,
@@ -123,6 +139,7 @@ def measure(scan: PersonScan, body: BodyModel, seed: int, *, draws: int = 2, cas
     if scan.colors is not None:
         for fit in fits:
             add("a fit", scan.mesh, fit, scan.colors)
+        add("half in shadow, a fit", scan.mesh, fits[0], half_in_shadow(scan, body, nearest))
         add("exact", scan.mesh, nearest, scan.colors)
         mesh, colors = as_photographed(scan, seed)
         add("photographs, a fit", mesh, fits[0], colors)
@@ -177,6 +194,8 @@ def summarise(rows: list[dict]) -> dict[str, dict]:
             "mean_faces": float(np.mean([r["accuracy_faces"] for r in own])),
             "median": float(np.median(of)),
             "at_least_93": float((of >= 0.93).mean()),
+            "unsure": float(np.mean([r["unsure"] for r in own])),
+            "sure_and_wrong": float(np.mean([r["sure_and_wrong"] for r in own])),
             "share_by_confidence": (area / area.sum()).tolist(),
             "right_by_confidence": np.divide(right, area, out=np.full(len(area), np.nan), where=area > 0).tolist(),
             "worst_by_confidence": _worst_by_confidence(own),
@@ -191,14 +210,18 @@ def show(summary: dict[str, dict], rows: list[dict]) -> None:
         own = sorted((r for r in rows if r["case"] == case), key=lambda r: r["accuracy"])
         print(
             f"\n{case}: {len(own)} scans, mean {s['mean']:.1%} by area, {s['mean_faces']:.1%} by faces, "
-            f"median {s['median']:.1%}, at least 93 %: {s['at_least_93']:.0%}"
+            f"median {s['median']:.1%}, at least 93 %: {s['at_least_93']:.0%}; "
+            f"not sure {s['unsure']:.1%}, sure and wrong {s['sure_and_wrong']:.1%}"
         )
         told = zip(s["share_by_confidence"], s["right_by_confidence"], s["worst_by_confidence"], strict=True)
         for low, high, (share, good, worst) in zip(BINS[:-1], BINS[1:], told, strict=True):
             least = "" if worst["scan"] is None else f", worst {worst['right']:6.1%} ({worst['scan'][:40]})"
             print(f"  confidence {low:.2f} to {high:.2f}: {share:6.1%} of the area, {good:6.1%} right{least}")
         for r in own[:12]:
-            print(f"  {r['accuracy']:6.1%} {r['accuracy_faces']:6.1%}  {r['person'][:44]:44s} {r['worst']}")
+            print(
+                f"  {r['accuracy']:6.1%} {r['accuracy_faces']:6.1%} not sure {r['unsure']:6.1%}, sure and wrong "
+                f"{r['sure_and_wrong']:6.1%}  {r['person'][:44]:44s} {r['worst']}"
+            )
 
 
 def main() -> None:

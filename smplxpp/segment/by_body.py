@@ -10,12 +10,14 @@ The terms are found one after the other:
 1. `by_body_chart`: the body's limbs are moved onto the scan, then every face gets a place on the body (region, height
    along the column of feet, legs and trunk, reach along the arm, azimuth, signed distance) from the body vertex that is
    nearest in position and normal.
-2. `by_body_colors`: a palette of the scan (k-means in OKLab), and a normal distribution of this person's skin colour
-   from the face and the hands, whose log-likelihood ratio tells skin from other colours.
+2. `by_body_colors`: light that falls on one side alone is taken out; a palette of the scan (k-means in OKLab), and a
+   normal distribution of this person's skin colour from the face and the hands, whose log-likelihood ratio tells skin
+   from other colours.
 3. `by_body_objects`, `by_body_headwear`: things in hands and on the head, by cuts of their own; all other steps leave
    them out.
 4. `by_body_layers`: long hair, open coats and bibs, as connected faces whose colours are nearer to the layer's
-   histogram than to all others; they are left out of the next step, which they would disturb.
+   histogram than to all others; they are left out of the next step, which they would disturb. Coats and capes that
+   colours do not show are found after it, by their lips or by what hangs off the legs.
 5. `by_body_outfit`: the outline of the clothes. The unknowns are the four borders between shoe, skin, lower, skin and
    upper along the column, and the end of the sleeve. Their cost sums the KL divergence of each ring's colours from its
    run's, likelihood ratios of skin by colour and distance, and priors on usual clothes. Dynamic programming over rings
@@ -49,11 +51,19 @@ from smplxpp.core import (
 from smplxpp.core.topology import face_adjacency
 from smplxpp.raster import outer_visible_points
 from smplxpp.segment.by_body_chart import FOOT, LEG, TRUNK, BodyChart, chart_of_scan, in_arm, in_column, settled_body
-from smplxpp.segment.by_body_colors import Blend, Palette, SkinModel, fit_skin, has_colors, label_costs
+from smplxpp.segment.by_body_colors import (
+    Blend,
+    Palette,
+    SkinModel,
+    fit_skin,
+    has_colors,
+    label_costs,
+    without_one_sided_light,
+)
 from smplxpp.segment.by_body_confidence import BODY_ELSEWHERE, confidence_bound, notes_on_labels
 from smplxpp.segment.by_body_headwear import find_headwear
-from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_shoes, on_heels, roughness
-from smplxpp.segment.by_body_layers import Layers, find_layers, open_coat_by_shape
+from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_hair, nats_for_shoes, on_heels, roughness
+from smplxpp.segment.by_body_layers import Layers, around_both, coat_by_shape, find_layers
 from smplxpp.segment.by_body_objects import FoundObjects, find_objects
 from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
@@ -118,6 +128,7 @@ class Evidence:
         layers: layers over other clothes.
         objects: things in hands and on the head.
         misfit: robust standard deviation, in metres, of bare skin's distance to the body.
+        lab: colours without the light on one side; None without colours.
         costs: unary costs of all labels, nats.
     """
 
@@ -127,6 +138,7 @@ class Evidence:
     layers: Layers
     objects: FoundObjects
     misfit: float
+    lab: Float64[np.ndarray, "M 3"] | None
     costs: Float64[np.ndarray, "M L"]
 
 
@@ -165,7 +177,7 @@ def label_by_body(
     found = weigh_evidence(mesh, body, params, lab, config)
     # Minimise the Potts energy. Unary costs are capped at 12 nats, so that a single face can be overruled by its patch.
     cost = found.costs - found.costs.min(axis=1, keepdims=True)
-    weights = edge_weights(mesh, pairs, ends, config.smoothing, lab=lab)
+    weights = edge_weights(mesh, pairs, ends, config.smoothing, lab=found.lab)
     problem = PottsProblem.from_costs(np.minimum(cost, _CERTAIN), pairs, weights)
     before = problem.energy(cost.argmin(axis=1))
     cut, after = minimize_potts(problem)
@@ -183,7 +195,14 @@ def label_by_body(
     confidence = own * min(1.0, BODY_ELSEWHERE / max(found.misfit, 1e-9))
     seen = outer_visible_points(mesh, mesh.face_centers, tolerance=0.005)
     notes = notes_on_labels(
-        found.chart, mesh.face_areas, labels, confidence, found.outfit, found.skin, misfit=found.misfit
+        found.chart,
+        mesh.face_areas,
+        labels,
+        confidence,
+        found.outfit,
+        found.skin,
+        misfit=found.misfit,
+        hanging=found.layers.vague is not None,
     )
     notes = (*found.objects.notes, *notes)
     return SegmentedScan(
@@ -225,6 +244,7 @@ def weigh_evidence(
     layers = Layers.none(mesh.face_count)
     skin_like = np.full(mesh.face_count, 0.5)
     if lab is not None:
+        lab = without_one_sided_light(lab, chart)
         palette = Palette.of(lab)
         hands = (chart.hand_core & (chart.side > 0), chart.hand_core & (chart.side <= 0))
         skin = fit_skin(lab, face, hands, area)
@@ -256,6 +276,8 @@ def weigh_evidence(
         used = np.where(layers.hair | layers.coat, 0.0, area)
         shape = _shape_evidence(mesh, chart, column, arm, area=used, chest=chest, heels=heels)
         outfit = outfit_by_shape(shape)
+        hairy = nats_for_hair(mesh, chart, area)
+        layers = replace(layers, bald=hairy < 0.0, scalp=float(1.0 / (1.0 + np.exp(-abs(hairy)))))
     else:
         shod, apart = nats_for_shoes(chart, area), legs_apart(chart, area, len(column))
         outfit = find_outfit(
@@ -269,19 +291,26 @@ def weigh_evidence(
     close_call = 25.0
     clothes = ~(layers.hair | layers.coat | objects.faces)
     waist = find_waist(mesh, chart, outfit, pairs, ends, used=clothes, smoothing=config.smoothing)
+    seamless, legs = waist is not None and waist.seamless, legs_apart(chart, area, len(column))
+    if waist is not None and not waist.shown:
+        waist = None
     if waist is not None and layers.bib:
         # A front that ends over the trousers is a waistcoat's.
         layers = replace(layers, bib=False)
     elif lab is not None and outfit.margins["lower_end"] > close_call:
-        waist = None
+        waist, seamless = None, False
     if waist is not None:
         outfit = replace(outfit, waist_step=np.inf)
-    if lab is None:
+    if seamless and not layers.bib:
+        # Without a border a skirt is a dress, and trousers of the colours above them are a jumpsuit.
+        joined = around_both(legs, column) or (lab is not None and outfit.alike(column))
+        outfit = outfit.as_one_piece() if joined else replace(outfit, seamless=lab is None)
+    # Coats and capes by shape, where colours show none.
+    if not layers.coat.any():
         upper = chart.height > outfit.upper_start
         upper = upper if waist is None else np.where(waist.faces, waist.upper, upper)
-        layers = replace(
-            layers, coat=open_coat_by_shape(chart, area, outfit, column, shape.apart, upper=upper) & clothes
-        )
+        coat, vague = coat_by_shape(chart, area, outfit, column, legs, pairs=pairs, upper=upper, lips=lab is None)
+        layers = replace(layers, coat=coat & clothes, hair=layers.hair & ~coat, vague=vague)
     prior = place_prior(
         chart, outfit, layers, softness=config.softness, body_softness=config.body_softness, waist=waist
     )
@@ -311,7 +340,7 @@ def weigh_evidence(
     # Nothing but the cut that found them makes faces of objects.
     costs[objects.faces] += _CERTAIN
     costs[:, OBJECT.id] = np.where(objects.faces, 0.0, _CERTAIN)
-    return Evidence(chart, outfit, skin, layers, objects, misfit, costs)
+    return Evidence(chart, outfit, skin, layers, objects, misfit, lab, costs)
 
 
 def _shape_evidence(

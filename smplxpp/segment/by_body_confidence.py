@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.ndimage import maximum_filter1d
 
-from smplxpp.core import LABELS, LOWER, SKIN, UPPER
-from smplxpp.segment.by_body_chart import ARM, LEG, REGION_NAMES, TRUNK, BodyChart, in_arm, in_column
+from smplxpp.core import HAIR, LABELS, LOWER, OUTER, SKIN, UPPER
+from smplxpp.segment.by_body_chart import ARM, HEAD, HIP, LEG, REGION_NAMES, TRUNK, BodyChart, in_arm, in_column
 from smplxpp.segment.by_body_colors import SkinModel
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import RUNS, Outfit
-from smplxpp.segment.by_body_rings import ARM_START, STEP
+from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, STEP
 
 BODY_ELSEWHERE = 0.05
 """Distance, in metres, between body and bare skin from which the body is not the scan's."""
@@ -60,19 +60,31 @@ def confidence_bound(
     # without a coat is no jacket, cape or waistcoat.
     upper = labels == UPPER.id
     if outfit.one_piece:
-        most[upper & np.isin(chart.region, (TRUNK, LEG))] *= 0.55 if colored else 0.7
+        most[upper & np.isin(chart.region, (TRUNK, LEG))] *= 0.55
     if not layers.coat.any():
         most[upper] *= 0.93
     # Without colours skin and what lies on it like skin, leggings and tight tops, look the same. Three of four such
-    # people are bare; 0.57 is the least share of right area that leaving one out gives, and it is not sure.
-    if not colored and outfit.unclothed:
-        most[(labels == SKIN.id) & np.isin(chart.region, (TRUNK, ARM, LEG))] *= 0.57
+    # people are bare; 0.57 is the least share of right area that leaving one out gives, below `UNSURE`. Legs
+    # below a garment that ends at the crotch are the same, as one man's in tight jeans below a wide T-shirt.
+    if not colored:
+        parts = [TRUNK, ARM] if outfit.upper_start >= COLUMN_END - 1e-9 else []
+        parts += [LEG] if not outfit.has_lower and outfit.upper_start > HIP - 0.2 else []
+        most[(labels == SKIN.id) & np.isin(chart.region, parts)] *= 0.57
+    scalp = (chart.region == HEAD) & ~chart.face_core & np.isin(labels, (HAIR.id, SKIN.id))
+    most[scalp] = np.minimum(most[scalp], layers.scalp)
+    # Nothing shows how far a coat or cape reaches, or whether cloth without a seam at the waist is one garment.
+    vague, cloth = 0.59, np.isin(labels, (UPPER.id, LOWER.id, OUTER.id))
+    if layers.vague is not None:
+        most[layers.vague & cloth] = np.minimum(most[layers.vague & cloth], vague)
+    if outfit.seamless:
+        cloth &= np.isin(chart.region, (TRUNK, LEG))
+        most[cloth] = np.minimum(most[cloth], vague)
     # A waist at which nothing steps is a guess: at 17 of 21 in scans of 46 people a fifth of the area within 12 cm or
     # more is wrong, at a third of those with a step above 3 nats. 0.6 of the area is right there.
     step_seen, about = 1.0, 0.12
     if outfit.has_lower and outfit.waist_step < step_seen:
         beside = np.isin(labels, (UPPER.id, LOWER.id)) & np.isin(chart.region, (TRUNK, LEG))
-        most[beside & (np.abs(chart.height - outfit.upper_start) < about)] *= 0.59
+        most[beside & (np.abs(chart.height - outfit.upper_start) < about)] *= vague
     return most
 
 
@@ -98,6 +110,7 @@ def notes_on_labels(
     skin: SkinModel | None,
     *,
     misfit: float,
+    hanging: bool = False,
 ) -> tuple[str, ...]:
     """Return notes on labels that are uncertain, for the user; empty where everything is clear."""
     # Colours and skin: what the labels depend on.
@@ -119,8 +132,12 @@ def notes_on_labels(
     out.extend(f"it is a close call {words}" for words in dict.fromkeys(close))
     if outfit.one_piece:
         out.append("no seam at the waist: taken as one garment (dress, jumpsuit), labelled upper")
+    elif outfit.seamless:
+        out.append("no seam at the waist: may be one garment (jumpsuit, overalls) or two; both are labelled")
     elif outfit.unclothed:
         out.append(TAKEN_AS_BARE if skin is None else f"{_NO_HEM}; clothes in its colour may look the same")
+    if hanging:
+        out.append("cloth hangs off the legs: nothing shows how far a cape reaches above, or a coat from a skirt")
     # The parts of the body on which most of the uncertain area lies, if that is more than 5 % of the surface.
     low = confidence < UNSURE
     pairs = np.stack([chart.region[low], labels[low]], axis=1)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, TriangleMesh
-from smplxpp.segment.by_body_chart import FOOT, LEG, BodyChart, chart_of_body
+from smplxpp.segment.by_body_chart import FOOT, HEAD, LEG, BodyChart, chart_of_body
 from smplxpp.segment.by_body_rings import STEP
 
 _UNEVEN = 1
@@ -196,6 +196,19 @@ def roughness(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"], *, most: int = 
 
 _PATCH = 0.03
 """Radius of a patch, metres: folds are 2 to 8 cm apart, and a limb is a quadric over less than its own radius."""
+
+
+def nats_for_hair(mesh: TriangleMesh, chart: BodyChart, area: Float64[np.ndarray, " M"]) -> float:
+    """Return the log odds that a head without colours has hair, from the roughness of its sides; 0 if it is unknown.
+
+    Hair ends in an edge about forehead, ears and nape, and lies in strands; a bare skull is as smooth as its ears leave
+    it. Of 51 procedural heads the sides of five bare ones have 0.45 to 0.63 mm, of the others, cropped ones first, 0.71
+    mm and more: 0.66 mm is between, for a tenth off which the odds are e.
+    """
+    between, spread = 0.00066, 0.1
+    sides = (chart.region == HEAD) & ~chart.skull_cap & ~chart.face_core & (area > 0)
+    rough = roughness(mesh, sides)
+    return float(np.clip(np.log(rough / between) / spread, -4.0, 4.0)) if np.isfinite(rough) else 0.0
 
 
 def nats_for_shoes(chart: BodyChart, area: Float64[np.ndarray, " M"]) -> float:

@@ -15,14 +15,15 @@ the probability of every label in every ring. Constants were chosen on the proce
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
 
 from smplxpp.core.labels import LABELS, LOWER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import HIP, KNEE, WRIST
-from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, Rings
+from smplxpp.segment.by_body_colors import ONE_CLOTH, divergence
+from smplxpp.segment.by_body_rings import ARM_START, COLUMN_END, STEP, Rings
 
 # Height of the usual waist, standard metres.
 _WAIST = 0.98
@@ -81,6 +82,7 @@ class Outfit:
         sleeve: P(sleeve) in the arm's rings.
         waist_step: nats of the surface's step at the border of lower and upper garment; inf where colours, or
             folds, show it.
+        seamless: whether the surface has no seam at the waist, so that both may be one garment.
     """
 
     shoe_top: float
@@ -92,6 +94,23 @@ class Outfit:
     column: Float64[np.ndarray, "R L"]
     sleeve: Float64[np.ndarray, " Q"]
     waist_step: float = np.inf
+    seamless: bool = False
+
+    def as_one_piece(self) -> Outfit:
+        """Return the outline with upper and lower garment as one, which is `upper`."""
+        column = self.column.copy()
+        column[:, UPPER.id] += column[:, LOWER.id]
+        column[:, LOWER.id] = 0.0
+        return replace(self, lower_end=self.lower_start, upper_start=self.lower_start, column=column)
+
+    def alike(self, column: Rings) -> bool:
+        """Return whether upper and lower garment have the same colours: a divergence of at most `ONE_CLOTH`."""
+        middle, colors = column.places[:-1] + 0.5 * STEP, column.colors * column.weight[:, None]
+        lower, upper = (
+            np.maximum(colors[part].sum(axis=0), 1e-9)
+            for part in ((middle > self.lower_start) & (middle < self.lower_end), middle > self.upper_start)
+        )
+        return divergence(lower / lower.sum(), upper / upper.sum()) < ONE_CLOTH
 
     @property
     def has_lower(self) -> bool:
@@ -210,7 +229,10 @@ def _distance_costs(rings: Rings, config: OutfitConfig, misfit: float) -> tuple[
     # A normal distribution for skin against an exponential one of mean 12 mm for cloth, bounded to [-0.7, 3] nats.
     ratio = np.clip(0.5 * z**2 - np.maximum(rings.distance, 0) / 0.012 - np.log(0.012 / spread), -0.7, 3.0)
     ratio = np.where(z < 0, -0.7, ratio) * config.distance * rings.weight
-    return np.maximum(-ratio, 0.0), np.maximum(ratio, 0.0)
+    # Bodies that are fitted within clothes keep a distance of 1 to 2 cm from a bare trunk, too.
+    trunk, share = rings.places[:-1] > 0.78, 0.25
+    skin = np.maximum(ratio, 0.0)
+    return np.maximum(-ratio, 0.0), np.where(trunk, share * skin, skin)
 
 
 def _column_costs(

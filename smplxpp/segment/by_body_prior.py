@@ -86,7 +86,7 @@ def place_prior(
     out /= out.sum(axis=1, keepdims=True)
     # Layers replace the outline where they were found.
     if layers.bald:
-        out[:, HAIR.id] *= 0.02
+        out[~off, HAIR.id] *= 0.02
     if layers.bib:
         front = top & (np.abs(chart.azimuth) < 1.2)
         out[front] = 0.6 * out[front] + 0.4 * _only(LOWER.id)

@@ -3,7 +3,8 @@
 A jacket that is open ends at its hem at the back and at a waistband in front, and no ring about the body follows that.
 About the waist, faces have no label of their own; above and below they are upper and lower. The border is the shortest
 cut between them, in the weights of the graph cut of all labels, which make hems, lips of cloth and waistbands short. It
-is taken where the surface speaks for it: where it is much shorter than the same edges would be without folds.
+is taken where the surface speaks for it: where it is much shorter than the same edges would be without folds. Where it
+is hardly shorter, there is no border: a dress, a jumpsuit, overalls.
 """
 
 from __future__ import annotations
@@ -22,8 +23,11 @@ from smplxpp.segment.graph_cut import PottsProblem, SmoothingConfig, edge_weight
 _LOW, _HIGH, _BESIDE = 0.74, 1.06, 0.06
 """Heights between which hems of shirts and jackets lie, standard metres, and how far beside the outline's border."""
 _FOLDED = 0.55
-"""Length of the border with its folds, as a share of its length without, up to which the surface speaks for it. Each of
-45 procedural people has it where the others are right most often."""
+_SEAMLESS = 0.62
+"""Length of the border with its folds, as a share of its length without, up to which the surface speaks for it: each of
+45 procedural people has it where the others are right most often. From `_SEAMLESS` on it speaks for one garment: 41
+people in two have at most 0.57, one 0.75; of six in dresses, jumpsuits and overalls five have 0.66 to 0.78 and one,
+whose hair ends at the waist, 0.45."""
 _FIXED = 1e4
 """Cost of another label above and below, more than any cut."""
 
@@ -46,6 +50,16 @@ class Waist:
     folded: float
     top: float
 
+    @property
+    def shown(self) -> bool:
+        """Return whether the surface shows the border."""
+        return self.folded <= _FOLDED
+
+    @property
+    def seamless(self) -> bool:
+        """Return whether the best border hardly follows folds, as across one garment."""
+        return self.folded > _SEAMLESS
+
 
 def find_waist(
     mesh: TriangleMesh,
@@ -57,7 +71,7 @@ def find_waist(
     used: Bool[np.ndarray, " M"],
     smoothing: SmoothingConfig,
 ) -> Waist | None:
-    """Return the border between upper and lower garment, None where there are not both or nothing tells where it is.
+    """Return the shortest border between upper and lower garment, None where there are not both.
 
     Args:
         mesh: the scan.
@@ -92,8 +106,6 @@ def find_waist(
         smoothness=smoothing.smoothness, floor=smoothing.floor, eta_convex=0.0, eta_concave=0.0, fold=smoothing.fold
     )
     folded = float(weights[crossed].sum() / edge_weights(mesh, pairs, ends, flat)[within][crossed].sum())
-    if folded > _FOLDED:
-        return None
     border = mesh.vertices[edge[crossed]].mean(axis=1)
     faces, above, away = np.zeros(mesh.face_count, bool), np.zeros(mesh.face_count, bool), np.zeros(mesh.face_count)
     faces[part], above[part] = (place > low) & (place < high), upper
