@@ -139,8 +139,16 @@ def find_objects(
         (posed.vertices[hand & (own.side == side)], float(mesh.face_areas[left & (charted.side == side)].sum()) * _CM2)
         for side in (1, -1)
     ]
+    paired = np.zeros(mesh.face_count)
     where = _Where(distance, to_hand, _sectors(mesh, middle), flat, lacked, pairs, length, cost)
-    return _accepted(mesh, cut, where, hands)
+    found = _accepted(mesh, cut, where, hands, paired=paired)
+    # A wide sleeve has its like at the other arm, which is no thing; of two things in two hands both are found.
+    arms = np.flatnonzero(found.faces & np.isin(region, (ARM, HAND)) & (distance > 0.03))
+    if len(arms):
+        away = _from_mirrored(mesh, body, params, posed, arms, nearest[arms], among=~found.faces)
+        paired[arms] = away < 0.4 * distance[arms]
+        found = _accepted(mesh, cut, where, hands, paired=paired)
+    return found
 
 
 def _from_mirrored(
@@ -150,6 +158,8 @@ def _from_mirrored(
     posed: TriangleMesh,
     faces: Int64[np.ndarray, " F"],
     vertex: Int64[np.ndarray, " F"],
+    *,
+    among: Bool[np.ndarray, " M"] | None = None,
 ) -> Float64[np.ndarray, " F"]:
     """Return how far a scan is from where some of its faces would be on the other side of the person, metres.
 
@@ -163,6 +173,7 @@ def _from_mirrored(
         posed: the body.
         faces: some faces.
         vertex: for each of them the vertex of the body.
+        among: the faces of the scan that count; None: all.
     """
     flip = np.array([-1.0, 1.0, 1.0])
     other = cKDTree(body.v_template).query(body.v_template[vertex] * flip)[1]
@@ -170,7 +181,7 @@ def _from_mirrored(
     turn = body.forward(params).posed_from_rest[0][:, :3, :3]
     offset = np.einsum("nji,nj->ni", turn[joint[vertex]], mesh.face_centers[faces] - posed.vertices[vertex])
     place = posed.vertices[other] + np.einsum("nij,nj->ni", turn[joint[other]], offset * flip)
-    return cKDTree(mesh.face_centers).query(place)[0]
+    return cKDTree(mesh.face_centers if among is None else mesh.face_centers[among]).query(place)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +249,12 @@ def _evidence(distance: np.ndarray, region: np.ndarray, chest: np.ndarray) -> Fl
 
 
 def _accepted(
-    mesh: TriangleMesh, cut: Bool[np.ndarray, " M"], where: _Where, hands: list[tuple[np.ndarray, float]]
+    mesh: TriangleMesh,
+    cut: Bool[np.ndarray, " M"],
+    where: _Where,
+    hands: list[tuple[np.ndarray, float]],
+    *,
+    paired: Float64[np.ndarray, " M"],
 ) -> FoundObjects:
     """Keep the pieces of a cut that are things.
 
@@ -247,6 +263,7 @@ def _accepted(
         cut: faces on the side of things.
         where: measures of faces and edges.
         hands: points of either hand of the body, and what the rest of the scan shows of it, square centimetres.
+        paired: 1 where a face 3 cm off an arm or more has its like at the other arm, else 0.
     """
     inside, pairs = cut[where.pairs], where.pairs
     piece = component_labels(pairs[inside.all(axis=1)], len(cut))
@@ -261,6 +278,8 @@ def _accepted(
         # Clothes that hang far off the legs go round the person; a thing is on one side of her.
         around = np.bincount(where.sector[own], areas, minlength=_SECTORS) / area
         if (around > 0.02).sum() >= _ALL_ROUND:
+            continue
+        if areas @ paired[own] > 0.3 * area:
             continue
         # A hand that what is left of the scan does not show lies elsewhere: then a small piece is the hand itself.
         center = mesh.face_centers[own][to_hand.argmin()]
