@@ -1,7 +1,8 @@
 // Z-buffer triangle rasteriser: face id, barycentrics and depth of the nearest face at every pixel centre.
 //
 // Rows are dealt to threads in interleaved bands and every band visits the faces in index order with a strict
-// depth test, so the result does not depend on the number of threads. On equal depth the lower face index wins.
+// depth test, so the result does not depend on the number of threads. On equal depth the lower face index wins. One
+// thread alone draws all rows in one pass, because sorting faces into bands takes as long as drawing small ones.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -57,19 +58,26 @@ struct Box {
           y0(first_pixel(std::min({a[1], b[1], c[1]}), height)), y1(last_pixel(std::max({a[1], b[1], c[1]}), height)) {}
 };
 
+// Whether all coordinates in the image are finite; they are not at a corner on the camera's plane.
+bool on_screen(const double* a, const double* b, const double* c) {
+    return std::isfinite(a[0] + b[0] + c[0] + a[1] + b[1] + c[1]);
+}
+
 // `screen` holds x, y in pixels (pixel centres at +0.5), z, and the interpolation weight (1/z for perspective,
-// 1 for orthographic) of each vertex, in double: edge functions of slivers lose their sign in float.
+// 1 for orthographic) of each vertex, in double: edge functions of slivers lose their sign in float. Faces come in
+// `order`; without one all of them do.
 void raster_rows(const double* screen, const int32_t* faces, int64_t first, int64_t last, const int32_t* order,
                  double near, int y_begin, int y_end, const Target& t) {
     for (int64_t k = first; k < last; ++k) {
-        const int32_t f = order[k];
+        const int32_t f = order ? order[k] : int32_t(k);
         const double* a = screen + 4 * size_t(faces[3 * size_t(f)]);
         const double* b = screen + 4 * size_t(faces[3 * size_t(f) + 1]);
         const double* c = screen + 4 * size_t(faces[3 * size_t(f) + 2]);
-        if (a[2] <= near || b[2] <= near || c[2] <= near) continue;
+        if (a[2] <= near || b[2] <= near || c[2] <= near || (!order && !on_screen(a, b, c))) continue;
+        const Box box(a, b, c, t.width, t.height);
+        if (box.x0 > box.x1 || box.y0 > box.y1) continue;
         const double area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]);
         if (area == 0.0) continue;
-        const Box box(a, b, c, t.width, t.height);
         const int y0 = std::max(y_begin, box.y0), y1 = std::min(y_end - 1, box.y1);
         const double inv = 1.0 / area;
         const double ax = (b[1] - c[1]) * inv, ay = (c[0] - b[0]) * inv;
@@ -105,6 +113,11 @@ SMPLXPP_EXPORT int32_t smplxpp_zbuffer(
     const double* screen, const int32_t* faces, int64_t face_count, double near, int width, int height,
     int32_t* face_id, float* barycentric, float* depth, int threads) { return smplxpp::guarded([&] {
     const Target target{width, height, face_id, barycentric, depth};
+    if (threads == 1) {
+        clear_band(target, 0, height);
+        raster_rows(screen, faces, 0, face_count, nullptr, near, 0, height, target);
+        return;
+    }
     const int bands = (height + kBandRows - 1) / kBandRows;
 
     // Faces of each band, in index order (counting sort): small faces are touched by one band alone, and those that cover no
@@ -120,8 +133,7 @@ SMPLXPP_EXPORT int32_t smplxpp_zbuffer(
             const double* a = screen + 4 * size_t(faces[3 * size_t(f)]);
             const double* b = screen + 4 * size_t(faces[3 * size_t(f) + 1]);
             const double* c = screen + 4 * size_t(faces[3 * size_t(f) + 2]);
-            // The sum is NaN or infinite where a coordinate is (a corner on the camera's plane).
-            if (!std::isfinite(a[0] + b[0] + c[0] + a[1] + b[1] + c[1])) continue;
+            if (!on_screen(a, b, c)) continue;
             const Box box(a, b, c, width, height);
             if (box.y0 > box.y1 || box.x0 > box.x1) continue;
             spans[size_t(f)] = {box.y0 / kBandRows, box.y1 / kBandRows};
