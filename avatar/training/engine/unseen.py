@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -18,49 +19,59 @@ from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapes
 from avatar.models.student import Student
 from avatar.rendering.avatar_view import render_view
+from smplxpp.core import Camera
 from smplxpp.core.spread import spread_inside
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.mouth import inside_of_mouth, shown_mouth
+from smplxpp.template.template import Template
 
-# Results by sequence, because all stages of a training need the same, which takes seconds.
-_FACES: WeakKeyDictionary[FrameSequence, Bool[np.ndarray, " F"]] = WeakKeyDictionary()
+# Results by template and by what is looked at, because all stages of a training need the same, which takes seconds, and
+# some read the frames by a sequence of their own.
+_FACES: WeakKeyDictionary[Template, dict[bytes, Bool[np.ndarray, " F"]]] = WeakKeyDictionary()
 
 
 def unseen(sequence: FrameSequence, gaussians: LearnedGaussians) -> Bool[Tensor, " N"]:
     """Mark Gaussians inside a mouth that stays shut, and on clothes that are hidden in all views (an armpit)."""
-    if sequence not in _FACES:
-        clothes = _hidden_clothes(sequence)[sequence.rig.template.faces].all(axis=1)
-        _FACES[sequence] = _faces_of_shut_mouth(sequence) | clothes
-    return torch.tensor(_FACES[sequence], device=gaussians.face_index.device)[gaussians.face_index]
+    most_frames, most_views, most_cameras = 12, 600, 12  # more views would cost seconds and uncover little
+    rig, frames = sequence.rig, sequence.train_frames
+    cameras = [sequence.camera(name) for name in spread_inside(sequence.train_cameras, most_cameras)]
+    # Posed by skinning alone: of the mouth, of clothes, by frame.
+    ahead, around = spread_inside(frames, most_frames), spread_inside(frames, most_views // max(1, len(cameras)))
+    places = {frame: rig.skin_to_numpy(sequence.pose(frame).without_cloth()) for frame in sorted({*ahead, *around})}
+    sizes = [(one.width, one.height, one.orthographic) for one in cameras]
+    digest = hashlib.sha256(repr((ahead, around, sizes)).encode())
+    for array in (*places.values(), *(matrix for one in cameras for matrix in (one.K, one.cam_from_world))):
+        digest.update(array.tobytes())
+    known = _FACES.setdefault(rig.template, {})
+    if digest.digest() not in known:
+        clothes = _hidden_clothes(rig.template, [places[frame] for frame in around], cameras)
+        mouth = _faces_of_shut_mouth(rig.template, [places[frame] for frame in ahead])
+        known[digest.digest()] = mouth | clothes[rig.template.faces].all(axis=1)
+    return torch.tensor(known[digest.digest()], device=gaussians.face_index.device)[gaussians.face_index]
 
 
-def _faces_of_shut_mouth(sequence: FrameSequence) -> Bool[np.ndarray, " F"]:
-    """Return the faces inside the mouth that are hidden from the front of the head in up to 12 training frames."""
-    most_frames = 12
-    rig = sequence.rig
-    inside = inside_of_mouth(rig.template)
+def _faces_of_shut_mouth(template: Template, posed: list[Float64[np.ndarray, "V 3"]]) -> Bool[np.ndarray, " F"]:
+    """Return the faces inside the mouth that are hidden from the front of the head in all poses."""
+    inside = inside_of_mouth(template)
     shown = np.zeros_like(inside)
     if inside.any():
         # A vertex that any of the frames shows is trained by its photographs.
-        for frame in spread_inside(sequence.train_frames, most_frames):
-            shown |= shown_mouth(rig.template, inside, rig.skin_to_numpy(sequence.pose(frame).without_cloth()))
-    faces = rig.template.faces
-    return np.asarray(inside[faces].all(axis=1) & ~shown[faces].any(axis=1))
+        for places in posed:
+            shown |= shown_mouth(template, inside, places)
+    return np.asarray(inside[template.faces].all(axis=1) & ~shown[template.faces].any(axis=1))
 
 
-def _hidden_clothes(sequence: FrameSequence) -> Bool[np.ndarray, " V"]:
-    """Return the vertices of clothes, posed by skinning alone, that are hidden in all of up to 600 training views.
+def _hidden_clothes(
+    template: Template, posed: list[Float64[np.ndarray, "V 3"]], cameras: list[Camera]
+) -> Bool[np.ndarray, " V"]:
+    """Return the vertices of clothes that are hidden in all views of all poses.
 
     Skin is left out, because swinging cloth uncovers more of it than skinning shows.
     """
-    most_views, most_cameras = 600, 12  # more views would cost seconds and uncover little
     tolerance = 0.01  # metres that a visible vertex may lie behind the z-buffer
-    rig = sequence.rig
-    hidden = rig.template.vertex_part > 0
-    cameras = [sequence.camera(name) for name in spread_inside(sequence.train_cameras, most_cameras)]
-    for frame in spread_inside(sequence.train_frames, most_views // max(1, len(cameras))):
-        places = rig.skin_to_numpy(sequence.pose(frame).without_cloth())
-        mesh = rig.template.mesh.with_vertices(places)
+    hidden = template.vertex_part > 0
+    for places in posed:
+        mesh = template.mesh.with_vertices(places)
         for camera in cameras:
             # Project the vertices that no view has shown yet, and compare their depths with the z-buffer.
             todo = np.flatnonzero(hidden)
@@ -69,8 +80,7 @@ def _hidden_clothes(sequence: FrameSequence) -> Bool[np.ndarray, " V"]:
             x, y, depth = camera.screen_from_world(places[todo]).T[:3]
             inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
             # The farthest depth among a pixel's neighbours, which errs on the side of visible. A background pixel is
-            # infinitely
-            # far, so that silhouettes count as visible too.
+            # infinitely far, so that silhouettes count as visible too.
             front = maximum_filter(rasterize_mesh(mesh, camera).depth, 3)
             before = np.full(len(todo), -np.inf)
             before[inside] = front[y[inside].astype(int), x[inside].astype(int)]

@@ -13,6 +13,7 @@ from avatar.models.learned_gaussians import LEARNED, LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.student import Student, StudentConfig
 from avatar.rig.rig import Rig
+from avatar.training.engine import unseen as module
 from avatar.training.engine.unseen import color_clothed_skin, hold_colors, hold_unseen, unseen
 from smplxpp.body import load_body
 from smplxpp.core.params import BodyParams
@@ -136,3 +137,13 @@ def test_skin_under_clothes_takes_the_colour_of_bare_skin_and_keeps_it(tmp_path)
     sum(getattr(student.gaussians, name).sum() for name in ("dc", "sh", "offset")).backward()
     assert not student.gaussians.dc.grad[held].any() and student.gaussians.dc.grad[~held].all()
     assert not student.gaussians.sh.grad[held].any() and student.gaussians.offset.grad.all()
+
+
+def test_sequences_of_the_same_frames_share_what_is_seen_and_others_do_not(rig, bound, monkeypatch):
+    """Five stages of a training looked at the same mouth and clothes from all cameras, each by its own sequence."""
+    looks: list[int] = []
+    look = module._hidden_clothes
+    monkeypatch.setattr(module, "_hidden_clothes", lambda *seen: looks.append(1) or look(*seen))
+    gaussians = LearnedGaussians(bound)
+    one, same, other = (unseen(talking(rig, *jaws), gaussians) for jaws in ((0.01, 0.02), (0.01, 0.02), (0.01, 0.4)))
+    assert len(looks) == 2 and torch.equal(one, same) and not torch.equal(one, other)
