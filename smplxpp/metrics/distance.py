@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import math
 from dataclasses import replace
 from functools import partial
 from typing import cast
+from weakref import WeakKeyDictionary
 
 import igl
 import numpy as np
@@ -40,6 +42,14 @@ from smplxpp.metrics.sampling import (
 )
 from smplxpp.raster import outer_visible_points
 
+_TREES: WeakKeyDictionary[TriangleMesh, tuple[igl.AABB, Int64[np.ndarray, "F 3"], Int64[np.ndarray, " F"]]] = (
+    WeakKeyDictionary()
+)
+"""Search trees of the two meshes asked of last, because a comparison asks each of its meshes twice, and comparisons by
+several conventions ask the same two."""
+# What is alive when the interpreter ends, libigl's bindings report as a leak.
+atexit.register(_TREES.clear)
+
 
 def point_to_surface(
     points: PointsLike, mesh: MeshLike
@@ -54,15 +64,23 @@ def point_to_surface(
     mesh = as_mesh(mesh, subject="target mesh")
     found, _ = as_points(points)
     require_surface(mesh, "target mesh")
-    # The tree is built over faces with an area; `solid` leads back to their indices in the mesh.
-    solid = np.flatnonzero(mesh.face_areas > 0)
-    faces = mesh.faces[solid]
     if not len(found):
         return np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
-    tree = igl.AABB()
-    tree.init(mesh.vertices, faces)
+    tree, faces, solid = _tree_of(mesh)
     squared, face, closest = tree.squared_distance(mesh.vertices, faces, found)
     return np.sqrt(squared), closest, solid[face]
+
+
+def _tree_of(mesh: TriangleMesh) -> tuple[igl.AABB, Int64[np.ndarray, "F 3"], Int64[np.ndarray, " F"]]:
+    """Return the search tree over the faces with an area, these faces, and their indices in the mesh."""
+    if mesh not in _TREES:
+        solid = np.flatnonzero(mesh.face_areas > 0)
+        faces, tree = mesh.faces[solid], igl.AABB()
+        tree.init(mesh.vertices, faces)
+        _TREES[mesh] = tree, faces, solid
+        for oldest in list(_TREES)[:-2]:
+            _TREES.pop(oldest, None)
+    return _TREES[mesh]
 
 
 def directed_distances(
