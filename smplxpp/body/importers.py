@@ -189,14 +189,15 @@ def _read_parts(path: Path, layout: str, person: int | None, *, filled: list[int
     """
     # Files of the frames, and the layout that the first of them has.
     files = _frame_files(path)
-    name = detect_layout(path) if layout == "auto" else layout
-    if name not in LAYOUTS:
-        raise InputError("layout", expected=f"auto, {', '.join(LAYOUTS)}", received=name)
+    if layout != "auto" and layout not in LAYOUTS:
+        raise InputError("layout", expected=f"auto, {', '.join(LAYOUTS)}", received=layout)
+    first = _content(files[0])
+    name = recognise(first, source=f"file {files[0]}") if layout == "auto" else layout
     # Read file by file; frames without the person are noted.
     parts: list[Frames] = []
     absent: list[str] = []
     for file in files:
-        content = _content(file)
+        content = first if file is files[0] else _content(file)
         if filled is not None and len(files) == 1:
             content, invalid = with_valid_frames(content)
             filled += invalid

@@ -78,7 +78,7 @@ class StackedParams:
 
 @dataclass(frozen=True, eq=False)
 class ParamFiles:
-    """A file of parameters for each frame.
+    """A file of parameters for each frame, read once: a simulation asks for the frames of a run again and again.
 
     Attributes:
         files: files by frame.
@@ -96,9 +96,17 @@ class ParamFiles:
         """Return the frames with parameters, ascending."""
         return self.files.numbers
 
+    @cached_property
+    def _known(self) -> dict[int, BodyParams]:
+        """Frames that have been read; a frame is some kilobytes."""
+        return {}
+
     def read(self, frame: int) -> BodyParams:
         """Read the parameters of one frame with a file."""
-        return load_params(self.files.required(frame), layout=self.layout, body=self.body, up=self.up)
+        if frame not in self._known:
+            file = self.files.required(frame)
+            self._known[frame] = load_params(file, layout=self.layout, body=self.body, up=self.up)
+        return self._known[frame]
 
 
 @dataclass(frozen=True, eq=False)
