@@ -231,6 +231,8 @@ class Kinematics:
                 above = int(self.parents[above])
                 descends_from[joint, above] = True
         self.descends_from: Bool[np.ndarray, "J J"] = descends_from
+        # Joints ordered so that parents come before children.
+        self._outwards = [int(joint) for joint in np.argsort(descends_from.sum(axis=1), kind="stable")]
 
     def posture(self, state: BodyState, row: int) -> Posture:
         """Pose the skeleton in one frame of a state."""
@@ -268,11 +270,11 @@ class Kinematics:
         moved = rest @ posture.rotations.transpose(0, 2, 1).transpose(1, 0, 2).reshape(3, -1)
         moved = (moved.reshape(-1, count, 3) + posture.transforms[:, :3, 3]) * points.weights[..., None]
         # A_ij - W_ij p_j: sums over the descendants of j, the lever arm of a rotation about p_j.
-        descends = self.descends_from.astype(np.float64)
+        descends = self.descends_from[:, joints].astype(np.float64)
         arm = np.einsum("nkx,kj->njx", moved, descends, optimize=True)
-        arm -= (points.weights @ descends)[..., None] * posture.joints
+        arm -= (points.weights @ descends)[..., None] * posture.joints[joints]
         # -[a]_x P: its column c is the cross product of column c of P with the arm a. Joints vary fastest in memory.
-        ax, ay, az = np.ascontiguousarray(arm[:, joints].transpose(2, 0, 1))
+        ax, ay, az = np.ascontiguousarray(arm.transpose(2, 0, 1))
         pose = np.empty((len(arm), 3, len(joints), 3))
         for axis in range(3):
             px, py, pz = posture.parent_rotations[joints, :, axis].T
@@ -316,7 +318,7 @@ class Kinematics:
         """Return the derivative of each transform's translation by betas, `dp_j - R_j dJ_j`."""
         # dp_j, from the root outwards: a posed joint moves with its parent and with their rotated offset.
         moved = np.zeros_like(self.joint_dirs)
-        for level in _order(self.parents):
+        for level in self._outwards:
             parent = self.parents[level]
             if parent < 0:
                 moved[level] = self.joint_dirs[level]
@@ -324,16 +326,6 @@ class Kinematics:
                 offset = self.joint_dirs[level] - self.joint_dirs[parent]
                 moved[level] = moved[parent] + posture.rotations[parent] @ offset
         return moved - posture.rotations @ self.joint_dirs
-
-
-def _order(parents: np.ndarray) -> list[int]:
-    """Return the joints ordered so that parents come before children."""
-    depth = np.zeros(len(parents), dtype=int)
-    for joint in range(len(parents)):
-        above = joint
-        while parents[above] >= 0:
-            above, depth[joint] = int(parents[above]), depth[joint] + 1
-    return [int(j) for j in np.argsort(depth, kind="stable")]
 
 
 def _resized(values: np.ndarray, size: int) -> np.ndarray:

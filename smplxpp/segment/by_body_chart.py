@@ -6,6 +6,7 @@ size: a sleeve's length is a share of the arm.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, InputError, TriangleMesh, row_lengths
+from smplxpp.core.mesh import cross_rows
 from smplxpp.core.topology import face_adjacency
 from smplxpp.segment.graph_cut import SmoothingConfig, edge_weights
 
@@ -222,24 +224,59 @@ def settled_body(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> Tri
         turned = body.mesh(moved).vertex_normals
         tree = cKDTree(np.concatenate([moved, _NORMAL_WEIGHT * turned], axis=1))
         at = tree.query(np.concatenate([points, _NORMAL_WEIGHT * normals], axis=1))[1]
-        normal, arm = turned[at], start[at][:, None] - centers
-        parts = np.concatenate([np.broadcast_to(normal[:, None], arm.shape), np.cross(arm, normal[:, None])], axis=2)
-        rows = np.zeros((len(at), len(prior)))
-        rows[:, : 6 * count] = (weights[at][:, :, None] * parts).reshape(len(at), -1)
-        rows[np.arange(len(at)), 6 * count + ring[at]] = 1.0
+        normal = turned[at]
         off = row_lengths(points - moved[at]) > 0.05
         target = np.einsum("ij,ij->i", points - start[at], normal)
+        blocks = list(_motion_blocks(normal, start[at], weights[at], centers, ring[at]))
         for _ in range(2):
-            left = (target - rows @ found) / (0.06 if k < 4 else 0.036)
-            share = np.where(off, 0.0, np.maximum(1.0 - left**2, 0.0) ** 2) * (1000 / len(at) / 0.006**2)
-            weighted = rows * share[:, None]
-            found = np.linalg.solve(rows.T @ weighted + prior, weighted.T @ target)
+            matrix, right = prior.copy(), np.zeros(len(prior))
+            for chosen, columns, rows in blocks:
+                left = (target[chosen] - rows @ found[columns]) / (0.06 if k < 4 else 0.036)
+                share = np.where(off[chosen], 0.0, np.maximum(1.0 - left**2, 0.0) ** 2) * (1000 / len(at) / 0.006**2)
+                weighted = rows * share[:, None]
+                matrix[np.ix_(columns, columns)] += rows.T @ weighted
+                right[columns] += weighted.T @ target[chosen]
+            found = np.linalg.solve(matrix, right)
         motion = found[: 6 * count].reshape(count, 6)
         # sum_p W_p (t_p + w_p x (v - c_p)).
         turn = weights @ motion[:, 3:]
         shift = weights @ (motion[:, :3] - np.cross(motion[:, 3:], centers))
         moved = start + shift + np.cross(turn, start)
     return body.mesh(moved)
+
+
+def _motion_blocks(
+    normal: Float64[np.ndarray, "N 3"],
+    place: Float64[np.ndarray, "N 3"],
+    weights: Float64[np.ndarray, "N P"],
+    centers: Float64[np.ndarray, "P 3"],
+    ring: Int64[np.ndarray, " N"],
+) -> Iterator[tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " C"], Float64[np.ndarray, "n C"]]]:
+    """Yield the linear system of `settled_body` in blocks of faces that one part leads: a tenth of its columns each.
+
+    Columns are six of each part that has a weight in the block, then the block's rings.
+
+    Args:
+        normal: of the nearest vertices.
+        place: of these, metres.
+        weights: of the P parts there.
+        centers: of the parts, metres.
+        ring: of the vertices.
+
+    Yields:
+        The faces, the columns, and the rows of the faces in these columns.
+    """
+    lead = weights.argmax(axis=1)
+    for part in np.unique(lead):
+        chosen = np.flatnonzero(lead == part)
+        used, own = np.flatnonzero(weights[chosen].any(axis=0)), np.unique(ring[chosen])
+        along = np.broadcast_to(normal[chosen][:, None], (len(chosen), len(used), 3))
+        about = cross_rows((place[chosen][:, None] - centers[used]).reshape(-1, 3), along.reshape(-1, 3))
+        parts = np.concatenate([along, about.reshape(along.shape)], axis=2)
+        moved = (weights[chosen][:, used, None] * parts).reshape(len(chosen), -1)
+        rows = np.concatenate([moved, ring[chosen][:, None] == own], axis=1)
+        columns = np.concatenate([(6 * used[:, None] + np.arange(6)).ravel(), 6 * weights.shape[1] + own])
+        yield chosen, columns, rows
 
 
 def _parts(

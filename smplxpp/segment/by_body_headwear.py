@@ -217,9 +217,18 @@ def _ridge(head: _Around, rows: Int64[np.ndarray, " R"], *, axis: int) -> Float6
         off = head.off[pool[near]]
         sides = [off[(sign * step > 0.013) & (sign * step < 0.032)] for sign in (1.0, -1.0)]
         # Hair over a skull that the scan shows, too, is the outer half of what is beside.
-        level = max((float(np.quantile(side, 0.75)) for side in sides if len(side)), default=np.inf)
+        level = max((_upper_quartile(side) for side in sides if len(side)), default=np.inf)
         evidence[k] = np.interp(head.off[own[k]] - level, (0.001, 0.003, 0.006), (-0.5, 0.0, 1.0))
     return np.asarray(evidence[cKDTree(place).query(head.place[rows])[1]])
+
+
+def _upper_quartile(values: Float64[np.ndarray, " n"]) -> float:
+    """Return the 0.75 quantile of some values: that of `np.quantile`, which takes five times as long for a few."""
+    values = np.sort(values)
+    at = 0.75 * (len(values) - 1)
+    below, share = int(at), at - int(at)
+    low, high = float(values[below]), float(values[min(below + 1, len(values) - 1)])
+    return low + (high - low) * share if share < 0.5 else high - (high - low) * (1.0 - share)
 
 
 def _hat(head: _Around) -> Float64[np.ndarray, " M"] | None:
