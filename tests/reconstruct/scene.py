@@ -64,7 +64,7 @@ def photograph(mesh: TriangleMesh, camera: Camera, name: str, *, plain: bool = F
 
 
 @cache
-def dented_views(*, plain: bool = False) -> tuple[PhotoView, ...]:
+def dented_views(*, plain: bool = False, count: int = 14) -> tuple[PhotoView, ...]:
     """Photographs of the dented ball; plain ones for tests that look at masks alone."""
     mesh = zero_surface(inside_dented, BOX, cell=0.0125)
-    return tuple(photograph(mesh, camera, f"cam{k:02d}", plain=plain) for k, camera in enumerate(ring()))
+    return tuple(photograph(mesh, camera, f"cam{k:02d}", plain=plain) for k, camera in enumerate(ring(count)))

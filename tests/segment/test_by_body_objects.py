@@ -25,7 +25,7 @@ from smplxpp.segment.by_body_objects import FoundObjects, _enclosed, _Where, fin
 from smplxpp.segment.flat_patches import flat_share
 from smplxpp.transfer import rigid_weights
 
-_COARSE = ScanConfig(cell=0.012, views=14, resolution=256, faces=6000)
+_COARSE = ScanConfig(cell=0.015, views=14, resolution=256, faces=6000)
 
 
 @pytest.fixture(scope="module")
@@ -287,10 +287,10 @@ def head(open_body, stance) -> TriangleMesh:
     return skin.submesh(kept)[0]
 
 
-def scanned_head(head: TriangleMesh, *worn: TriangleMesh) -> tuple[TriangleMesh, np.ndarray]:
-    """A scan of a head with what it wears, and which of its faces show that."""
+def scanned_head(head: TriangleMesh, *worn: TriangleMesh, cell: float = 0.006) -> tuple[TriangleMesh, np.ndarray]:
+    """A scan of a head with what it wears, and which of its faces show that; cells in metres."""
     taken = simulate_scan(
-        concatenate_meshes([head, *worn]), [], ScanConfig(cell=0.006, views=12, resolution=128, faces=4000)
+        concatenate_meshes([head, *worn]), [], ScanConfig(cell=cell, views=12, resolution=128, faces=4000)
     )
     return taken.mesh, (taken.face >= head.face_count)[taken.mesh.faces].sum(axis=1) >= 2
 
@@ -299,7 +299,8 @@ def scanned_head(head: TriangleMesh, *worn: TriangleMesh) -> tuple[TriangleMesh,
 def test_what_is_worn_on_the_head_is_an_object_and_stiff_on_it(open_body, stance, head, kind):
     """Glasses were skin, hats hair, and lenses that lie nearest to an eyeball turned with it."""
     worn = thing_mesh(Thing(kind), open_body, stance[1])
-    mesh, truth = scanned_head(head, worn)
+    # Lenses are thin; the others are as well found in a third of the cells.
+    mesh, truth = scanned_head(head, worn, cell=0.006 if kind in ("sunglasses", "goggles") else 0.008)
     found = find_headwear(mesh, open_body, stance[0], *face_adjacency(mesh.faces))
     area = mesh.face_areas
     assert area[found.faces & truth].sum() > 0.85 * area[truth].sum()

@@ -35,7 +35,7 @@ def body() -> BodyModel:
 
 @pytest.fixture(scope="module")
 def scanned(body) -> tuple[TriangleMesh, np.ndarray, np.ndarray, BodyParams]:
-    """The fixture's scan with a quarter of its faces, its colours, true labels of faces, and its body's parameters."""
+    """The fixture's scan with a seventh of its faces, its colours, true labels of faces, and its body's parameters."""
     file = read_mesh(PERSON / "scans/scan_000000.ply")
     labels = read_labels(
         PERSON / "scans/scan_000000_labels.npz",
@@ -43,7 +43,7 @@ def scanned(body) -> tuple[TriangleMesh, np.ndarray, np.ndarray, BodyParams]:
         face_count=file.mesh.face_count,
         label_set="capture",
     )
-    coarse = simplify(file.mesh, 20_000)
+    coarse = simplify(file.mesh, 12_000)
     corner = labels[coarse.source_vertex][coarse.mesh.faces]
     truth = np.where(corner[:, 1] == corner[:, 2], corner[:, 1], corner[:, 0])
     params = load_params(PERSON / "params/params.npz", body=body).frame(0)
