@@ -21,9 +21,14 @@ from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import PART, person
 from tests.dolls.skirted import garment, write_skirted
-from tests.pipelines.test_evaluate import evaluate, refused, write_models
+from tests.pipelines.test_evaluate import draw_no_surfaces, evaluate, refused, write_models
 
-FEW = ("--sets", "novel_pose", "--every", "1", "--no-report", "--models", "student")
+FEW = ("--sets", "novel_pose", "--every", "1", "--no-report", "--shown", "0", "--models", "student")
+
+
+@pytest.fixture(autouse=True)
+def figures_alone(monkeypatch):
+    draw_no_surfaces(monkeypatch)
 
 
 @pytest.fixture(scope="module")

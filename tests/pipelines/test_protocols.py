@@ -26,7 +26,7 @@ from pipelines.stages.scene import TrainInputs, open_frame, open_scene
 from smplxpp.capture import open_capture
 from smplxpp.core import BodyParams, InputError
 from tests.dolls.standing import FRAMES, NOVEL, dressed, write_frames
-from tests.pipelines.test_evaluate import QUICK, write_dressed, write_models
+from tests.pipelines.test_evaluate import QUICK, draw_no_surfaces, write_dressed, write_models
 
 EXACT = {"parameters": "params.npz", "labels": "labels", "scan_labels": True, "normals": "normals", "keypoints": None}
 TRACKED = {
@@ -294,10 +294,11 @@ def test_covered_vertices_are_those_that_the_clothes_hide():
     assert not covered_vertices(template).any()  # the doll's dress is its own surface
 
 
-def test_an_evaluation_prints_poses_against_exact_ones_and_refined_ones(root, tmp_path, capsys, caplog):
+def test_an_evaluation_prints_poses_against_exact_ones_and_refined_ones(root, tmp_path, capsys, caplog, monkeypatch):
+    draw_no_surfaces(monkeypatch)
     caplog.set_level(logging.WARNING)
     run = write_models(run_of(tmp_path / "run", root, "tracked"), dressed())
-    options = ("--device", "cpu", *QUICK, "--no-report")
+    options = ("--device", "cpu", *QUICK, "--no-report", "--shown", "0")
     assert main(["evaluate", str(run), "--capture", str(root), *options]) == 0
     text = capsys.readouterr().out
     assert "poses in use against the exact ones" in text and "refined on" not in text
