@@ -88,10 +88,11 @@ def _seen_from_ahead(naked: Template, posed: Float[np.ndarray, "V 3"]) -> Bool[n
     mesh = TriangleMesh(np.asarray(posed, dtype=np.float64), naked.faces)
     rest, center = naked.vertices[head].mean(axis=0), mesh.vertices[head].mean(axis=0)
     turn = rotation_between(naked.vertices[head] - rest, mesh.vertices[head] - center)
+    shown = np.zeros(len(naked.faces) + 1, dtype=bool)  # the last is the background, face -1
     for direction in _VIEWS @ turn:
         camera = Camera.orthographic_view(center=center, direction=direction, half_extent=_HALF_EXTENT, size=_PIXELS)
-        ids = rasterize_mesh(mesh, camera).face_id
-        seen[naked.faces[np.unique(ids[ids >= 0])]] = True
+        shown[rasterize_mesh(mesh, camera).face_id] = True
+    seen[naked.faces[shown[:-1]]] = True
     return seen
 
 
