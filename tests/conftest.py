@@ -40,7 +40,6 @@ SHARED = ROOT.parent / "shared"
 LONGEST = (
     "tests/pipelines/test_build.py",
     "tests/test_examples.py",
-    "tests/segment/test_label_by_body.py",
     "tests/register/locate/test_locate.py",
     "tests/build/test_build_template.py",
     "tests/pipelines/test_train_on_cuda.py",
@@ -48,7 +47,9 @@ LONGEST = (
     "tests/models/test_model_file.py",
     "tests/pipelines/test_alone.py",
     "tests/register/test_fit.py",
+    "tests/segment/test_label_worn.py",
     "tests/segment/test_by_body_objects.py",
+    "tests/segment/test_label_by_body.py",
     "tests/synth/test_talking.py",
     "tests/fuzz/test_fuzz.py",
     "tests/transfer/test_transfer_confidence.py",
