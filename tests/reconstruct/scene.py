@@ -68,3 +68,8 @@ def dented_views(*, plain: bool = False, count: int = 14) -> tuple[PhotoView, ..
     """Photographs of the dented ball; plain ones for tests that look at masks alone."""
     mesh = zero_surface(inside_dented, BOX, cell=0.0125)
     return tuple(photograph(mesh, camera, f"cam{k:02d}", plain=plain) for k, camera in enumerate(ring(count)))
+
+
+def few_views() -> tuple[PhotoView, ...]:
+    """Ten of them, from the same three rings, which reconstruct it as well."""
+    return dented_views(count=10)

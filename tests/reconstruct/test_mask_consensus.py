@@ -8,8 +8,6 @@ from smplxpp.reconstruct.mask_consensus import find_consensus
 from smplxpp.reconstruct.views import Silhouette
 from tests.reconstruct.scene import RADIUS, dented_views
 
-VIEWS = dented_views(plain=True, count=10)
-
 
 def consensus(views):
     return find_consensus([Silhouette.of(view) for view in views])
@@ -32,7 +30,7 @@ def cut(view):
 
 
 def test_good_masks_are_all_trusted_and_the_box_holds_the_body():
-    found = consensus(VIEWS)
+    found = consensus(dented_views(plain=True))
     assert found.trusted.all() and not found.reasons
     assert found.explained.min() > 0.95
     assert (found.box.low < -RADIUS).all() and (found.box.high > RADIUS).all()
@@ -42,7 +40,7 @@ def test_good_masks_are_all_trusted_and_the_box_holds_the_body():
 @pytest.mark.parametrize("spoil", [turned, cut, lambda view: shifted(view, 30)], ids=["turned", "cut", "shifted"])
 def test_bad_masks_are_named_and_no_others(spoil):
     which = (3, 8)
-    views = list(VIEWS)
+    views = list(dented_views(plain=True))
     for k in which:
         views[k] = spoil(views[k])
     found = consensus(views)
@@ -51,7 +49,7 @@ def test_bad_masks_are_named_and_no_others(spoil):
 
 
 def test_the_order_of_the_views_does_not_matter():
-    views = list(VIEWS)
+    views = list(dented_views(plain=True))
     views[5] = cut(views[5])
     order = np.random.default_rng(0).permutation(len(views))
     one, other = consensus(views), consensus([views[k] for k in order])
@@ -63,13 +61,13 @@ def test_masks_a_pixel_or_two_off_are_trusted():
     from scipy import ndimage
 
     views = []
-    for k, view in enumerate(VIEWS):
+    for k, view in enumerate(dented_views(plain=True)):
         change = ndimage.grey_erosion if k % 2 else ndimage.grey_dilation
         views.append(replace(view, opacity=change(view.opacity, size=(3, 3))))
     assert consensus(views).trusted.all()
 
 
 def test_masks_that_contradict_each_other_are_refused():
-    views = [shifted(view, (-1) ** k * 35) for k, view in enumerate(VIEWS)]
+    views = [shifted(view, (-1) ** k * 35) for k, view in enumerate(dented_views(plain=True))]
     with pytest.raises(InputError, match="silhouettes of one body"):
         consensus(views)

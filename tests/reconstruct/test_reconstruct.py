@@ -8,15 +8,14 @@ from smplxpp.core.errors import GeometryWarning, InputError
 from smplxpp.reconstruct import ReconstructConfig, SweepLevel, reconstruct
 from smplxpp.reconstruct.hull import solid_status
 from smplxpp.reconstruct.views import silhouette_agreement
-from tests.reconstruct.scene import dented_views, inside_dented
+from tests.reconstruct.scene import few_views, inside_dented
 
-VIEWS = dented_views(count=10)
 CONFIG = ReconstructConfig(cell=0.025, levels=(SweepLevel(0.1, 0.01, 0.005, 0.06),))
 
 
 @pytest.fixture(scope="module")
 def found():
-    return reconstruct(VIEWS, CONFIG)
+    return reconstruct(few_views(), CONFIG)
 
 
 def test_the_surface_is_nearer_to_the_truth_than_the_hull(found):
@@ -29,13 +28,13 @@ def test_the_surface_is_nearer_to_the_truth_than_the_hull(found):
 def test_it_is_closed_and_fills_its_masks(found):
     assert solid_status(found.mesh) == ("NoError", 0)
     assert found.numbers["genus"] == 0 and found.numbers["status"] == "NoError"
-    shares = silhouette_agreement(found.mesh, VIEWS)
-    assert len(shares) == len(VIEWS) and min(shares.values()) > 0.96
+    shares = silhouette_agreement(found.mesh, few_views())
+    assert len(shares) == len(few_views()) and min(shares.values()) > 0.96
     assert not found.notes and not found.numbers["left_out"]
 
 
 def test_confidence_is_high_where_it_is_right_and_none_where_nobody_looks():
-    above = [view for view in VIEWS if view.camera.position[1] > 0]
+    above = [view for view in few_views() if view.camera.position[1] > 0]
     result = reconstruct(above, CONFIG)
     bottom = result.mesh.vertices[:, 1] < -0.49
     assert bottom.any()
@@ -46,7 +45,7 @@ def test_confidence_is_high_where_it_is_right_and_none_where_nobody_looks():
 
 
 def test_the_same_photographs_give_the_same_bits(found):
-    again = reconstruct(VIEWS, CONFIG)
+    again = reconstruct(few_views(), CONFIG)
     assert (again.mesh.vertices == found.mesh.vertices).all() and (again.colors == found.colors).all()
 
 
@@ -56,7 +55,7 @@ def test_a_scene_of_another_size_and_place_gives_the_same_surface(found):
 
     rotation, shift = matrix_from_rotvec(np.array([0.0, 0.7, 0.0])), np.array([3.0, 0.5, -2.0])
     views = []
-    for view in VIEWS:
+    for view in few_views():
         pose = view.camera.cam_from_world.copy()
         pose[:3, :3] = pose[:3, :3] @ rotation.T
         pose[:3, 3] -= pose[:3, :3] @ shift
@@ -69,7 +68,7 @@ def test_a_scene_of_another_size_and_place_gives_the_same_surface(found):
 
 
 def test_bad_masks_are_left_out_with_a_warning():
-    views = list(VIEWS)
+    views = list(few_views())
     views[2] = replace(views[2], opacity=255 - views[2].opacity)
     views[7] = replace(views[7], opacity=np.roll(views[7].opacity, 30, axis=1))
     with warnings.catch_warnings(record=True) as caught:
@@ -82,7 +81,7 @@ def test_bad_masks_are_left_out_with_a_warning():
 
 
 def test_without_refinement_it_is_the_hull():
-    result = reconstruct(VIEWS, replace(CONFIG, refine=False))
+    result = reconstruct(few_views(), replace(CONFIG, refine=False))
     assert (result.mesh.vertices == result.hull.vertices).all()
 
 
