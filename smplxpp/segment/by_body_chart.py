@@ -219,7 +219,8 @@ def settled_body(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> Tri
         prior += gap.T @ gap / 0.004**2
     # Correspondences, then the weights of the faces, in turn. Faces together count as 1000 of 6 mm of noise, because
     # neighbours err together; Tukey's weights end at 6 cm, then at 3.6 cm.
-    found, moved = np.zeros(len(prior)), start
+    found: np.ndarray = np.zeros(len(prior))
+    moved = start
     for k in range(8):
         turned = body.mesh(moved).vertex_normals
         tree = cKDTree(np.concatenate([moved, _NORMAL_WEIGHT * turned], axis=1))
