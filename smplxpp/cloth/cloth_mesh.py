@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -30,8 +32,20 @@ def find_opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
 
     A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, look along the
     opening's axis, which cloth that continues to the border does not, and have a hollow behind them. Small pieces that
-    only such faces join to the rest are bridges, too. A body without an inside has none.
+    only such faces join to the rest are bridges, too. A body without an inside has none. The array is read-only.
     """
+    if template not in _BRIDGES:
+        _BRIDGES[template] = _opening_bridges(template)
+        _BRIDGES[template].flags.writeable = False
+    return _BRIDGES[template]
+
+
+# Results by template, because each part that is cut for a simulation asks for those of all parts.
+_BRIDGES: WeakKeyDictionary[Template, Bool[np.ndarray, " F"]] = WeakKeyDictionary()
+
+
+def _opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
+    """Return the mask of `find_opening_bridges`, part by part."""
     out = np.zeros(len(template.faces), dtype=bool)
     parts = template.cloth_parts
     if not parts:
