@@ -25,7 +25,7 @@ from smplxpp.metrics.comparison import MM
 from smplxpp.skinning import UnposeConfig, Unposed, invertible_weights, unpose
 from smplxpp.transfer import TransferConfig, rigid_weights, shoe_weights, transfer_weights
 from smplxpp.transfer.checks import extent, surface_components
-from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
+from smplxpp.transfer.enclosed import Enclosure, LimbAxis, enclosed_by_one, limb_axes
 from smplxpp.transfer.unfollowed import webs_to_hands
 
 _FOLDED = 1e-6
@@ -69,6 +69,7 @@ def transfer_to_parts(
     weights: dict[str, SkinWeights] = {}
     checks: list[Check] = []
     numbers: dict[str, Any] = {}
+    axes = limb_axes(fit.mesh, body.weights, extent(fit.mesh), TransferConfig(joint_names=body.joint_names))
     for name, part in cleaned.items():
         label = labels[part.label]
         rule = PartRule.parse(config.rules.get(name, label.rule))
@@ -80,7 +81,7 @@ def transfer_to_parts(
             found = rigid_weights(fit.mesh, body.weights, mesh, joint_names=body.joint_names, joint=joint)
         else:
             settings = replace(transfer_config(label.kind, body, config), rule=config.rules.get(name, label.rule))
-            mesh, source, found = _without_bridges(part.mesh, fit, body, _Ruled(settings, pieces), config.bridges)
+            mesh, source, found = _without_bridges(part.mesh, fit, body, _Ruled(settings, pieces, axes), config.bridges)
             if is_shoe(replace(label, rule=settings.rule)) and not pieces and config.method != "paper":
                 found = shoe_weights(found, mesh, fit.joints, joint_names=body.joint_names)
         parts[name] = Part(mesh, part.label, part.source_vertex[source], part.colors[source])
@@ -120,10 +121,12 @@ def transfer_to_parts(
 
 @dataclass(frozen=True)
 class _Ruled:
-    """Settings of a part's transfer; for the cleaned part's vertices rules of some, and the limbs they go around."""
+    """Settings of a part's transfer; rules of some of the cleaned part's vertices; the body's limbs, and which of them
+    the vertices go around."""
 
     settings: TransferConfig
     rules: Mapping[int, str]
+    axes: list[LimbAxis]
     limbs: Enclosure | None = None
 
     def weights(self, fit: PosedFit, body: BodyModel, part: TriangleMesh, source: np.ndarray) -> SkinWeights:
@@ -200,7 +203,7 @@ def _without_bridges(
     """
     source = np.arange(part.vertex_count)
     opened = np.unique(part.border_edges)
-    axes = limb_axes(fit.mesh, body.weights, extent(fit.mesh), ruled.settings)
+    axes = ruled.axes
     known = axes and ruled.settings.confident is not None and config.rounds
     limbs = enclosed_by_one(part, axes, body.joint_count) if known else None
     # Cloth that passes a hand hangs on the sleeve where the scan has fused them, and would follow it.
