@@ -130,8 +130,8 @@ def measure(scan: PersonScan, body: BodyModel, seed: int, *, draws: int = 2, cas
                 "notes": list(found.notes),
                 "unsure": float(area[found.confidence < UNSURE].sum() / area.sum()),
                 "sure_and_wrong": float(area[(found.confidence >= UNSURE) & ~right].sum() / area.sum()),
-                "bin_area": np.bincount(bins, area / area.sum(), minlength=len(BINS) - 1).tolist(),
-                "bin_right": np.bincount(bins, area * right / area.sum(), minlength=len(BINS) - 1).tolist(),
+                "bin_area": np.bincount(bins, area / area.sum(), minlength=len(BINS) - 1).round(6).tolist(),
+                "bin_right": np.bincount(bins, area * right / area.sum(), minlength=len(BINS) - 1).round(6).tolist(),
                 "seconds": seconds,
             }
         )
