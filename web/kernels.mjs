@@ -12,7 +12,7 @@ const ZIG_VERSION = "0.17.1";
 const native = fileURLToPath(new URL("../smplxpp/native/", import.meta.url));
 /** As CMakeLists.txt has them: what must be the same on every machine, what may be reassociated, what has vectors. */
 const KINDS = [
-  { flags: ["-ffp-contract=off"], sources: ["cloth/xpbd.cpp", "cloth/carried.cpp", "web/memory.cpp", "web/threads.cpp"] },
+  { flags: ["-ffp-contract=off", "-fno-math-errno"], sources: ["cloth/xpbd.cpp", "cloth/carried.cpp", "web/memory.cpp", "web/threads.cpp"] },
   { flags: ["-ffast-math"], sources: ["runtime/surface.cpp", "runtime/gaussians.cpp", "web/splats.cpp"] },
   { flags: ["-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"], sources: ["runtime/pose.cpp", "runtime/field.cpp", "web/normals.cpp"] },
 ];

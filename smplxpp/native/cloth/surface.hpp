@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "cloth/lanes.hpp"
 #include "cloth/vec3.hpp"
 
 namespace smplxpp {
@@ -110,20 +111,18 @@ public:
         const Gathered& about = gather(grid_.block(p));
         int32_t near = -1;
         float best = kReach * kReach;
-        for (int32_t at = about.begin; at < about.end; ++at) {
-            const Candidates& c = candidates_[size_t(at)];
-            float squared[kWide];
-            for (int k = 0; k < kWide; ++k) {
-                const Vec3 d = {p.x - c.x[k], p.y - c.y[k], p.z - c.z[k]};
-                const float covers = c.nx[k] * cloth_normal.x + c.ny[k] * cloth_normal.y + c.nz[k] * cloth_normal.z;
-                // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact with cloth that lies in it;
-                // cloth before it stays there, whichever way its folds look.
-                const float against = c.nx[k] * other.x + c.ny[k] * other.y + c.nz[k] * other.z;
-                const float height = c.nx[k] * d.x + c.ny[k] * d.y + c.nz[k] * d.z;
-                squared[k] = (covers > kCovers || height > -kShallow) && against <= 0 ? dot(d, d) : kReach * kReach;
-            }
-            for (int k = 0; k < kWide; ++k)
-                if (squared[k] < best) best = squared[k], near = c.vertex[k];
+        const Soa place = broadcast(p), along = broadcast(cloth_normal), against = broadcast(other);
+        const Vec4 far = all_lanes(best);
+        for (int32_t k = about.begin; k < about.end; ++k) {
+            const Candidates& c = candidates_[size_t(k)];
+            const Soa d = place - c.place;
+            // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact with cloth that lies in it;
+            // cloth before it stays there, whichever way its folds look.
+            const Mask4 touches = (dot(c.normal, along) > kCovers) | (dot(c.normal, d) > -kShallow);
+            const Vec4 squared = select(touches & (dot(c.normal, against) <= 0), dot(d, d), far);
+            if (!any(squared < best)) continue;
+            for (int lane = 0; lane < kLanes; ++lane)
+                if (squared[lane] < best) best = squared[lane], near = c.vertex[lane];
         }
         return near;
     }
@@ -156,11 +155,10 @@ public:
     }
 
 private:
-    static constexpr int kWide = 16;
-    // Vertices of a block of the grid side by side, for one instruction to look at many; the last are filled up with far ones.
+    // Four vertices of a block of the grid side by side; lanes that stay empty are infinitely far.
     struct Candidates {
-        float x[kWide], y[kWide], z[kWide], nx[kWide], ny[kWide], nz[kWide];
-        int32_t vertex[kWide];
+        Soa place, normal;
+        int32_t vertex[kLanes];
     };
     struct Gathered {
         Grid::Block block;
@@ -171,17 +169,17 @@ private:
         Gathered& known = gathered_[block.hash() & (kGathered - 1)];
         if (known.end >= 0 && known.block == block) return known;
         const int32_t begin = int32_t(candidates_.size());
-        int k = kWide;
+        int lane = kLanes;
         grid_.in(block, [&](int32_t j) {
-            if (k == kWide) {
-                candidates_.emplace_back();
-                std::fill_n(candidates_.back().x, kWide, INFINITY);
-                k = 0;
+            if (lane == kLanes) {
+                candidates_.emplace_back().place.x = all_lanes(INFINITY);
+                lane = 0;
             }
             Candidates& c = candidates_.back();
-            c.x[k] = vertex_[j].x, c.y[k] = vertex_[j].y, c.z[k] = vertex_[j].z, c.vertex[k] = j;
-            c.nx[k] = normal_[size_t(j)].x, c.ny[k] = normal_[size_t(j)].y, c.nz[k] = normal_[size_t(j)].z;
-            ++k;
+            const Vec3 at = vertex_[j], n = normal_[size_t(j)];
+            c.place.x[lane] = at.x, c.place.y[lane] = at.y, c.place.z[lane] = at.z, c.vertex[lane] = j;
+            c.normal.x[lane] = n.x, c.normal.y[lane] = n.y, c.normal.z[lane] = n.z;
+            ++lane;
         });
         return known = {block, begin, int32_t(candidates_.size())};
     }
