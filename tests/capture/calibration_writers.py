@@ -218,10 +218,32 @@ def opencv(rig: Rig, folder: Path) -> Path:
     return path
 
 
+def aist(rig: Rig, folder: Path) -> Path:
+    """A list of aniposelib's tables, centimetres, y up."""
+    path, cameras = folder / "setting1.json", []
+    for name, camera in rig.items():
+        R, T = pose_in(camera, np.eye(3), 0.01)
+        one = {"name": name, "size": [camera.width, camera.height], "matrix": opencv_K(camera).tolist()}
+        turn = Rotation.from_matrix(R).as_rotvec().tolist()
+        cameras.append(one | {"rotation": turn, "translation": T.tolist(), "distortions": [*DIST, 0.0]})
+    path.write_text(json.dumps(cameras))
+    return path
+
+
+def humman(rig: Rig, folder: Path) -> Path:
+    """Cameras by name, metres, y down; with a lens, which HuMMan's pinholes have not."""
+    path, cameras = folder / "cameras.json", {}
+    for name, camera in rig.items():
+        R, T = pose_in(camera, Y_DOWN, 1.0)
+        cameras[name] = {"K": opencv_K(camera).tolist(), "R": R.tolist(), "T": T.tolist(), "dist": [*DIST, 0.0]}
+    path.write_text(json.dumps(cameras))
+    return path
+
+
 WRITERS: dict[str, Writer] = {
     one.__name__: one
     for one in (
         pose2sim, anipose, freemocap, caliscope, qualisys, vicon,
-        optitrack, panoptic, shelf, mvhumannet, opencap, opencv,
+        optitrack, panoptic, shelf, mvhumannet, aist, humman, opencap, opencv,
     )
 }  # fmt: skip

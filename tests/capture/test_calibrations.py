@@ -55,7 +55,8 @@ def test_known_points_fall_where_the_tool_projects_them(name, tmp_path):
         true = {key: replace(camera, K=true["cam_01"].K) for key, camera in true.items()}
     path = WRITERS[name](true, tmp_path)
     assert format_of(path).name == name
-    sizes = {"shelf": {f"Camera{k}": (640, 480) for k in range(4)}, "mvhumannet": {key: (640, 480) for key in true}}
+    own = {key: (640, 480) for key in true}
+    sizes = {"shelf": {f"Camera{k}": (640, 480) for k in range(4)}, "mvhumannet": own, "humman": own}
     read = read_calibration(path, sizes=sizes.get(name))
     assert read.format == name and len(read.cameras) == 4
     for expected, (key, camera) in zip(true.values(), read.cameras.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Read calibrations of data sets in JSON (CMU Panoptic, Shelf, Campus, MVHumanNet) and of tools in TOML.
+"""Read calibrations of data sets in JSON (CMU Panoptic, Shelf, MVHumanNet, AIST++, HuMMan) and of tools in TOML.
 
 Pose2Sim, anipose, FreeMoCap and caliscope hold for each camera `size`, `matrix`, `distortions`, `rotation` (rotation
 vector or matrix, world to camera) and `translation` in OpenCV's convention. anipose and FreeMoCap take the unit of the
@@ -20,6 +20,7 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_number, read_json
 from smplxpp.core.files.safe_pickle import safe_load
 
+_KEYS = ("matrix", "rotation", "translation")
 # Kinds of cameras of the Panoptic studio, the preferred one first.
 _PANOPTIC_KINDS = ("hd", "vga", "kinect-color")
 
@@ -39,6 +40,16 @@ def is_shelf(content: Any) -> bool:
 def is_mvhumannet(content: Any) -> bool:
     """Tell cameras by image name with `camera_pos`, `rotation` and `translation`."""
     return _all_entries(content, {"rotation", "translation", "camera_pos"})
+
+
+def is_aist(content: Any) -> bool:
+    """Tell a list of anipose's tables, as AIST++ keeps each of its settings."""
+    return _all_entries(_by_name(content), {*_KEYS, "name"})
+
+
+def is_humman(content: Any) -> bool:
+    """Tell cameras by name with OpenCV's `K`, `R` and `T`."""
+    return _all_entries(content, {"K", "R", "T"})
 
 
 def _all_entries(content: Any, keys: set[str]) -> bool:
@@ -111,7 +122,26 @@ def read_mvhumannet(path: Path, content: Any) -> RigFile:
     return RigFile(tuple(cameras), None if scale is None else 1e-3 * scale, None, notes)
 
 
-_KEYS = ("matrix", "rotation", "translation")
+def read_aist(path: Path, content: Any) -> RigFile:
+    """AIST++ (`setting1.json`): aniposelib's cameras in a list; the unit is guessed (AIST++: centimetres)."""
+    return RigFile(_cameras(path, _by_name(content)))
+
+
+def read_humman(path: Path, content: Any) -> RigFile:
+    """HuMMan's `cameras.json`: pinholes with `x_cam = R X + T`; the world is the first Kinect's, metres.
+
+    Files of the same form by other tools may have `dist` or `distCoeff`, `imgSize`, and other units.
+    """
+    source, cameras = f"calibration {path}", []
+    for name, one in content.items():
+        dist, size = one.get("dist", one.get("distCoeff", ())), one.get("imgSize")
+        cameras.append(file_camera(str(name), one["K"], one["R"], one["T"], source=source, size=size, dist=dist))
+    return RigFile(tuple(cameras))
+
+
+def _by_name(content: Any) -> dict[str, Any]:
+    """Return the entries of a list by their place; nothing of anything else."""
+    return {f"cam_{k}": one for k, one in enumerate(content)} if isinstance(content, list) else {}
 
 
 def is_caliscope(content: Any) -> bool:

@@ -73,6 +73,8 @@ FORMATS: tuple[CalibrationFormat, ...] = (
     CalibrationFormat(
         "mvhumannet", "json", data_set_files.is_mvhumannet, data_set_files.read_mvhumannet, "camera_extrinsics.json"
     ),
+    CalibrationFormat("aist", "json", data_set_files.is_aist, data_set_files.read_aist, "setting*.json"),
+    CalibrationFormat("humman", "json", data_set_files.is_humman, data_set_files.read_humman, "cameras.json"),
     CalibrationFormat(
         "opencap", "pickle", camera_files.is_opencap, camera_files.read_opencap, "cameraIntrinsicsExtrinsics.pickle"
     ),
@@ -112,7 +114,7 @@ def read_calibration(
     sizes: Mapping[str, tuple[int, int]] | None = None,
 ) -> Calibration:
     """Read a calibration of Pose2Sim, anipose, FreeMoCap, caliscope, Qualisys, Vicon, OptiTrack, OpenCap, CMU Panoptic,
-    Shelf, MVHumanNet or OpenCV's YAML.
+    Shelf, MVHumanNet, AIST++, HuMMan or OpenCV's YAML.
 
     Args:
         path: the file, or a folder with one.

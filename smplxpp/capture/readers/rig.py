@@ -22,8 +22,8 @@ NAME = "rig"
 LOOKS_FOR = "a calibration of a known tool, there or beside it, with keypoints, images or videos of its cameras"
 # Where tools put keypoints, images, masks and videos; the first folder that holds something of the cameras is taken.
 _KEYPOINTS = ("keypoints", "pose-associated", "pose-sync", "pose", "poses", "openpose", "json", ".")
-_IMAGES = ("rgbs", "images", "imgs", "images_lr", "hdImgs", "frames", ".")
-_MASKS = ("masks", "mask", "fmask_lr", "fmask", "mattes")
+_IMAGES = ("rgbs", "images", "imgs", "images_lr", "hdImgs", "kinect_color", "frames", ".")
+_MASKS = ("masks", "mask", "fmask_lr", "fmask", "kinect_mask", "mattes")
 _VIDEOS = ("videos", "video", "recordings", "synchronized_videos", "hdVideos", ".")
 _PARENTS = 2  # folders above in which a session's calibration is looked for
 # The last number of a name is the frame: `cam01_000012.jpg`, `0005_img.jpg`.
