@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from pipelines.commands.options import OptionalFloat, OptionalPath, OptionalText
+from pipelines.commands.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText
 from pipelines.commands.terminal import stage_progress
 from pipelines.runs.folders import keep_out_of_capture
 from pipelines.runs.layout import (
@@ -27,7 +28,9 @@ from smplxpp.body import Whose
 from smplxpp.build.config import BuildConfig
 from smplxpp.build.inputs import BuildPlan, plan_build
 from smplxpp.build.request import BuildRequest
+from smplxpp.capture import open_capture
 from smplxpp.clean.remesh import require_remesher
+from smplxpp.core import InputError
 from smplxpp.core.files.json_file import read_json
 from smplxpp.detect import load_detector
 
@@ -71,8 +74,9 @@ class Build:
     auto: the first of views, scan and body that there is. A photographed person has no such labels."""
     protocol: OptionalText = None
     """With --capture: the protocol whose parameters and labels are used; later commands on the run keep to it."""
-    frame: int = 0
-    """Reference frame, near T-pose."""
+    frame: OptionalInt = None
+    """Reference frame, near T-pose; by default 0, or the first training frame of a capture that counts from another
+    number."""
     body: OptionalPath = None
     """SMPL-X-layout body file; the open body by default."""
     register: Literal["auto", "on", "off"] = "auto"
@@ -200,10 +204,19 @@ class Build:
             labels=self.labels,
             body=self.body,
             config=self.config(),
-            surface=self.run_folder / reconstructed_scan(self.frame),
+            surface=self.run_folder / reconstructed_scan(self.reference_frame()),
             registration=load_register(self.run_folder) if registered else None,
             reconstruction=load_reconstruct(self.run_folder),
         )
+
+    def reference_frame(self) -> int:
+        """Return the frame of the option, else 0, or the first that a capture without a frame 0 trains on."""
+        if self.frame is not None or self.capture is None:
+            return self.frame or 0
+        with suppress(InputError):  # the plan says what is wrong with the capture
+            frames = open_capture(self.capture).splits.train_frames
+            return frames[0] if frames and 0 not in frames else 0
+        return 0
 
     def config(self) -> BuildConfig:
         """Collect the choices of this build.
@@ -221,6 +234,7 @@ class Build:
             # Landmarks and corrections lie in the run, where every stage finds them.
             "landmarks": None,
             "corrections": None,
+            "frame": self.reference_frame(),
         }
         names = {f.name for f in dataclasses.fields(BuildConfig)} - set(changed)
         return BuildConfig(**{n: getattr(self, n) for n in names}, **changed)

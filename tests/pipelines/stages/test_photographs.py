@@ -17,6 +17,8 @@ from pipelines.stages.build_config import BuildConfig, BuildInputs, load_build, 
 from smplxpp.build.completeness import photograph_checks
 from smplxpp.core.mesh import TriangleMesh
 from smplxpp.template.template import Template
+from tests.capture.scene import make_scene
+from tests.capture.writers import write_simple
 
 FIXTURE = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
 
@@ -31,6 +33,20 @@ def built(person_run):
 @pytest.fixture
 def inputs(tmp_path) -> BuildInputs:
     return Build(run_folder=tmp_path, capture=FIXTURE).plan().inputs
+
+
+def test_a_capture_that_counts_from_one_has_its_first_frame_for_a_reference(tmp_path):
+    """Recorders and ffmpeg number from 1; the build asked for frame 0 of a capture that has frames 1 and 3."""
+    root = write_simple(make_scene(), tmp_path / "set")
+    (root / "capture.json").unlink(missing_ok=True)
+    for path in sorted([*(root / "rgbs").glob("*/*"), *(root / "masks").glob("*/*")], reverse=True):
+        number = int(path.stem[-6:])
+        path.rename(path.with_name(f"{path.stem[:-6]}{2 * number + 1:06d}{path.suffix}"))
+    build = Build(run_folder=tmp_path / "run", capture=root)
+    assert build.config().frame == 1 and replace(build, frame=3).config().frame == 3
+    assert Build(run_folder=tmp_path / "run", capture=FIXTURE).config().frame == 0
+    assert Build(run_folder=tmp_path / "run", capture=tmp_path / "none").config().frame == 0
+    assert Build(run_folder=tmp_path / "run", scan=tmp_path / "me.ply").config().frame == 0
 
 
 def test_a_build_of_a_capture_looks_at_its_photographs(person_run):
