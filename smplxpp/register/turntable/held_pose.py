@@ -7,8 +7,8 @@ and the logarithm of the focal length f. With R_tj the rotation of joint j in fr
     upright trunk   |R_t M^T y - u|^2 / s^2                              R_t, M of the root, y = (0, 1, 0)
     pelvis          (u . p_t - h)^2 / (15 mm)^2, and its place on the floor within 30 cm of the mean
     vertical        |u - u_0|^2 / s_u^2
-    mean pose       |log M_j|^2 / s^2 and joint limits                   as `priors.Anatomy` has them
-    shape, focal    |b|^2; (log f - log f_0)^2 / s_f^2; stature as it was told
+    mean pose       n (|log M_j|^2 / s^2 and joint limits)               as `priors.Anatomy` has them
+    shape, focal    n |b|^2; (log f - log f_0)^2 / s_f^2; stature as it was told, n = max(1, frames / 8)
 
 One view does not tell a step towards the camera from a bent knee. All views together do, because the same pose is seen
 from all sides; so the mean pose takes what the frames agree on, and a frame departs from it by some degrees alone.
@@ -154,6 +154,9 @@ class HeldPose:
         anatomy = Anatomy.of(kinematics.body.joint_count)
         self.anatomy = tuple(getattr(anatomy, name)[columns.joints] for name in ("spread", "lowest", "highest"))
         self.rest_height, self.height_dirs = stature_of(kinematics.body)
+        # Observations grow with the frames, but a detector errs alike in all of them. Eight views of one pose are what
+        # the priors of mean pose and shape were weighed against; more count as repetitions of these.
+        self.repeats = max(1.0, float(tells.sum()) / 8.0)
 
     def add(self, equations: NormalEquations, state: BodyState, shared: Shared) -> None:
         """Add all terms to the normal equations."""
@@ -211,8 +214,7 @@ class HeldPose:
         spread, lowest, highest = self.anatomy
         vectors = rotvec_from_matrix(shared.mean[c.joints])
         inverse = left_jacobian_inverse(vectors)
-        # Observations grow with the frames; eight views of one pose are what the prior was weighed against.
-        prior = max(1.0, float(self.tells.sum()) / 8.0)
+        prior = self.repeats
         over = np.maximum(vectors - highest, 0.0) + np.minimum(vectors - lowest, 0.0)
         weight = prior / spread**2 + prior * (over != 0) / soft**2
         gradient = prior * vectors / spread**2 + prior * over / soft**2
@@ -237,8 +239,8 @@ class HeldPose:
         equations.shape[c.vertical, c.vertical] += turned.T @ turned
         equations.shape_gradient[c.vertical] += turned.T @ off
         index = np.arange(c.shape)
-        equations.shape[index, index] += 1.0
-        equations.shape_gradient[index] += state.betas
+        equations.shape[index, index] += self.repeats
+        equations.shape_gradient[index] += self.repeats * state.betas
         if self.priors.stature is not None:
             deviation = 0.01  # metres: shoes and posture
             off = self.rest_height + self.height_dirs @ state.betas - self.priors.stature
