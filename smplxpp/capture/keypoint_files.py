@@ -59,13 +59,14 @@ def read_keypoints(path: str | Path, options: KeypointOptions | None = None) -> 
     """Read the keypoints of one camera, in pixels of the images on disk (distorted if they are), centres at +0.5.
 
     Args:
-        path: one file of all frames, or a folder with a JSON file for each frame, whose last number is the frame.
+        path: one file of all frames, or a folder with a JSON file for each frame, whose last number is the frame; or a
+            capture's folder of keypoints, if these are of one camera.
         options: format, person and image size.
 
     Raises:
         InputError: no file, a damaged file, an unknown layout, or another number of points than the layout has.
     """
-    path, options = Path(path), options or KeypointOptions()
+    path, options = _of_one_camera(Path(path)), options or KeypointOptions()
     return _named_errors(path, lambda: _read(path, options))
 
 
@@ -132,6 +133,14 @@ def _people(path: Path, options: KeypointOptions) -> dict[int, list[Person]]:
             received="nothing of the kind" if path.exists() else "no such file",
         )
     return frames
+
+
+def _of_one_camera(path: Path) -> Path:
+    """Return the only file or folder of a camera in a folder without files of frames, else the path itself."""
+    if not path.is_dir() or frame_files(path):
+        return path
+    cameras = [p for p in sorted(path.iterdir()) if p.suffix.lower() == ".npz" or (p.is_dir() and frame_files(p))]
+    return cameras[0] if len(cameras) == 1 else path
 
 
 def frame_files(folder: Path) -> dict[int, Path]:

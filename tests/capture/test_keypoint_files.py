@@ -324,3 +324,19 @@ def test_places_of_cameras(tmp_path):
     found = find_places(tmp_path, ["Cam1", "Cam10", "Cam2", "Cam3", "Cam4"])
     assert {camera: path.name for camera, path in found.items()} == expected
     assert {camera: path.name for camera, path in find_places(tmp_path).items()} == expected
+
+
+@pytest.mark.parametrize("place", ["cam.npz", "cam/0007_keypoints.json"])
+def test_a_captures_folder_with_the_keypoints_of_one_camera(tmp_path, place):
+    """`keypoints detect --out CAPTURE/keypoints` writes it, and `capture turntable --keypoints` refused it."""
+    path = tmp_path / place
+    path.parent.mkdir(exist_ok=True)
+    if place.endswith("npz"):
+        np.savez(path, keypoints=np.ones((1, 1, 3)), joint_names=np.array(["nose"]), frames=np.array([7]))
+    else:
+        path.write_text(json.dumps({"people": [{"pose_keypoints_2d": rows(BODY_25).ravel().tolist()}]}))
+    found = read_keypoints(tmp_path)
+    assert found.frames.tolist() == [7] and "nose" in found.names
+    (tmp_path / "other.npz").write_bytes(b"")
+    with pytest.raises(InputError, match="expected an npz or JSON file"):
+        read_keypoints(tmp_path)
