@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from smplxpp.assemble.fill_holes import LEG_CUT
-from smplxpp.build.parts import _long_stretches
+from smplxpp.build.parts import _long_stretches, cut_check
 from smplxpp.core import TriangleMesh, concatenate_meshes
 
 
@@ -28,3 +28,10 @@ def test_legs_are_parted_where_they_are_fused_for_long_alone():
     assert not _long_stretches(both, np.zeros(both.face_count, dtype=bool)).any()
     half = np.arange(both.face_count) % 2 == 0
     assert not (_long_stretches(both, half) & ~half).any()
+
+
+def test_sleeves_that_hung_against_the_trunk_are_named():
+    """A real man before eleven cameras, his arms at his sides: a third of his shirt was cut, and nothing told why."""
+    fused, apart = cut_check("upper", 0.302), cut_check("upper", 0.103)
+    assert (fused.status, apart.status) == ("warn", "pass") and "arms and legs held apart" in fused.explanation
+    assert cut_check("upper", 1.0).status == "warn"

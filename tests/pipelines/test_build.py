@@ -113,6 +113,8 @@ def test_the_scans_webs_under_the_arms_are_cut_and_nothing_is_torn(person_run):
     cut = {name: numbers["web_faces"] for name, numbers in metrics["stages"]["40_transfer"].items()}
     assert cut.pop("upper") > 20 and not any(cut.values())
     assert 0.0 < metrics["stages"]["40_transfer"]["upper"]["web_area_share"] < 0.01
+    (share,) = (c for c in metrics["checks"] if c["name"] == "upper: share of the surface cut between limbs")
+    assert share["status"] == "pass"
     assert [c for c in metrics["checks"] if "stretch" in c["name"] and c["status"] != "pass"] == []
 
 
