@@ -91,7 +91,7 @@ class RationalDistortion(Distortion):
 
     @property
     def fold(self) -> float:
-        """Radius on the plane z = 1 from which the distorted radius decreases; infinity where it never does.
+        """Radius on the plane z = 1 from which the distorted radius decreases; infinity where there is none.
 
         Coefficients are fitted to a pattern that rarely reaches a picture's edges. Outside of it a pinhole would show
         parts of the picture a second time, mirrored.
@@ -99,9 +99,13 @@ class RationalDistortion(Distortion):
         k1, k2, k3, k4, k5, k6 = self.radial
         # With s = r^2, r q(s) increases while N D + 2 s (N' D - N D') > 0, and has a pole where D = 0.
         above, below = (np.polynomial.Polynomial([1.0, *k]) for k in ((k1, k2, k3), (k4, k5, k6)))
-        slope = above * below + 2.0 * np.polynomial.Polynomial([0.0, 1.0]) * (
-            above.deriv() * below - above * below.deriv()
-        )
+        with np.errstate(invalid="ignore", over="ignore"):
+            slope = above * below + 2.0 * np.polynomial.Polynomial([0.0, 1.0]) * (
+                above.deriv() * below - above * below.deriv()
+            )
+        # Coefficients that are not finite, or whose products are not, have no radius at which they turn.
+        if not all(np.isfinite(p.coef).all() for p in (slope, below)):
+            return float("inf")
         roots = np.concatenate([np.asarray(p.trim(1e-15).roots(), dtype=np.complex128) for p in (slope, below)])
         turns = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
         return float(np.sqrt(turns.min(initial=np.inf)))

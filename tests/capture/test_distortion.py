@@ -113,6 +113,7 @@ def test_beyond_the_fold_of_a_polynomial_nothing_is_shown_twice(tmp_path):
     # d/dr (r - 1.6 r^5) = 0 at r^4 = 1 / 8.
     assert lens.fold == pytest.approx(8**-0.25)
     assert Distortion.from_opencv((0.3, 0.1, 0.0, 0.0, 0.0), subject="lens").fold == np.inf
+    assert RationalDistortion((np.inf, 0.0, 0.0, 1e300, 1e300, 0.0), (0.0, 0.0)).fold == np.inf
     # A pole of the rational model is a fold, too: 1 - 2 r^2 = 0 below.
     assert Distortion.from_opencv((0, 0, 0, 0, 0, -2.0, 0, 0), subject="lens").fold <= 2**-0.5
     K = np.array([[100.0, 0, 100], [0, 100, 10], [0, 0, 1]])
