@@ -1,4 +1,5 @@
-// Edges and hinges of cloth, solved in the order of their arrays (Gauss-Seidel), in batches of four that share no particle.
+// What a garment is (Model, Forces), and its edges and hinges, which are solved in the order of their arrays (Gauss-Seidel), in
+// batches of four that share no particle.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -154,9 +155,9 @@ public:
     }
 
     // One sweep over the edges that are too long, from what holds the cloth downwards or back; says whether there was none.
-    // The ends share the correction by their inverse masses, of which one that follows its place has `pins` of the other end's.
+    // The ends share the correction by their inverse masses: one that follows its place, whose inverse mass is 0, stays there.
     // Where it is led, the end that hangs deeper takes nine tenths: a taut sheet then needs few sweeps (Mueller et al. 2012).
-    // What slides counts all particles alike. `over` times the correction: rings shrink by little a sweep, and an edge that
+    // Where it slides, free ends count alike and an end that follows its place moves half as much. `over` times the correction: rings shrink by little a sweep, and an edge that
     // comes out too short is no harm.
     bool limit(std::vector<Vec4>& x, bool back, Sharing sharing, float over) {
         bool within = true;
@@ -190,7 +191,7 @@ public:
     }
 
 private:
-    static constexpr float kGives = 0.5f;                        // inverse mass that it has then, where others have 1
+    static constexpr float kGives = 0.5f;  // inverse mass of an end that follows its place, where it slides; others have 1
 
     // Four edges or hinges that share no particle, a lane each.
     struct Edges {
@@ -207,8 +208,7 @@ private:
     };
 
     // From the second end of four edges to the first.
-    template <class Four>
-    static void along(const std::vector<Vec4>& x, const Four& e, Vec4* d) {
+    static void along(const std::vector<Vec4>& x, const Edges& e, Vec4* d) {
         for (int lane = 0; lane < kLanes; ++lane) d[lane] = x[size_t(e.i[lane])] - x[size_t(e.j[lane])];
     }
 
@@ -217,7 +217,7 @@ private:
     const Model& m_;
     std::vector<Edges> edges_;
     std::vector<int32_t> first_edge_, edge_of_;  // of particles: where theirs begin among the batches of edges
-    Waiting waiting_;                   // batches of edges that may be too long
+    Waiting waiting_;                            // batches of edges that may be too long
     std::vector<Hinges> hinges_;
 };
 

@@ -95,7 +95,7 @@ public:
         std::vector<int32_t> next(first_.begin(), first_.end() - 1);
         for (size_t i = 0; i < at_.size(); ++i) at_[size_t(next[size_t(face[i])]++)] = int32_t(i / 3);
     }
-    // Take the vertices as they are now; find() looks among these.
+    // Take the vertices as they are now; nearest() and find_from() look among these.
     void look(const Vec3* vertex) {
         vertex_ = vertex;
         normals(vertex, face_, faces_, normal_);
@@ -132,7 +132,6 @@ public:
         const float height = dot(d, normal_[size_t(near)]);
         return height > kClear && 2.0f * height * height > dot(d, d);
     }
-    Contact find(Vec3 p, Vec3 cloth_normal) { return find_from(nearest(p, cloth_normal), p, cloth_normal); }
     Contact find_from(int32_t near, Vec3 p, Vec3 cloth_normal) const {
         Contact found = {-1, {0, 0, 0}};
         if (near < 0) return found;
