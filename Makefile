@@ -5,22 +5,37 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RUN ?= runs/demo
+NATIVE := $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
 # Where torch comes from; empty: PyPI, whose build for Linux brings CUDA. Without a GPU:
 # make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 TORCH_INDEX ?=
 
+# Bytecode is written when a module is first imported, even where the environment says otherwise: of 20,000 files a run needs
+# a tenth, and every process would compile it again.
+export PYTHONDONTWRITEBYTECODE :=
+
 # Packages with the hashes of their files, so that what is installed is what was tested.
-LOCKED := $(BIN)/pip install --quiet --require-hashes --no-deps -r
+PIP := $(BIN)/pip install --quiet --no-compile
+LOCKED := $(PIP) --require-hashes --no-deps -r
 
 .PHONY: demo test test-slow test-fuzz sanitize coverage lint lock bench fixture wheel docs clean
 
-# torch alone has no hash, nor what its builds for CUDA bring: there is a build for every index.
-$(STAMP): pyproject.toml locks/test.lock CMakeLists.txt $(wildcard smplxpp/native/*/*.cpp smplxpp/native/*/*.hpp)
+# What compiles the native library comes first, so that it is compiled while the other packages are unpacked.
+$(STAMP): pyproject.toml locks/build.lock locks/test.lock CMakeLists.txt $(NATIVE)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
-	$(LOCKED) locks/test.lock
-	$(BIN)/pip install --quiet $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(grep '^torch==' constraints.txt)"
-	$(BIN)/pip install --quiet --no-deps --no-build-isolation -e .
+	$(LOCKED) locks/build.lock
+	$(MAKE) --no-print-directory -j2 $(VENV)/.packages $(VENV)/.native
 	touch $(STAMP)
+
+# torch alone has no hash, nor what its builds for CUDA bring: there is a build for every index.
+$(VENV)/.packages: locks/test.lock
+	$(LOCKED) locks/test.lock
+	$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(grep '^torch==' constraints.txt)"
+	touch $@
+
+$(VENV)/.native: pyproject.toml CMakeLists.txt $(NATIVE)
+	$(PIP) --no-deps --no-build-isolation -e .
+	touch $@
 
 # Writes locks/ anew: the versions of constraints.txt, the newest of what these need, and the hashes of all their files.
 LOCK = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
@@ -29,18 +44,17 @@ lock: $(STAMP)
 	$(BIN)/pip install --quiet -c constraints.txt uv
 	mkdir -p locks build
 	$(LOCK) pyproject.toml --extra avatar --extra video --extra chat --extra dev --group build -o build/test.lock
-	for name in fixture docs wheel; do $(LOCK) -c build/test.lock --group $$name -o build/$$name.lock; done
-	for name in test fixture docs wheel; do \
+	for name in build fixture docs wheel; do $(LOCK) -c build/test.lock --group $$name -o build/$$name.lock; done
+	for name in test build fixture docs wheel; do \
 		awk '/^[a-z]/ { kept = !/^(torch|triton|nvidia-|cuda-)/ } kept' build/$$name.lock > locks/$$name.lock; done
 
 demo: $(STAMP)
 	$(BIN)/smplxpp demo $(RUN)
 
 # One thread a process: two processes of two threads each take twice as long on two cores. A third process fills the time in
-# which tests wait for a browser or a server; a fourth costs more in caches than it fills. Bytecode is kept even where the
-# environment says otherwise, because every process would compile a thousand files.
+# which tests wait for a browser or a server; a fourth costs more in caches than it fills.
 test: $(STAMP)
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
