@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -200,9 +201,12 @@ def read_record(path: Path) -> dict[str, Any]:
     return content
 
 
+_type_hints = cache(get_type_hints)  # annotations are text, which is compiled at each question
+
+
 def require_plain_fields(cls: type[DataclassInstance], values: Mapping[str, Any], *, subject: str) -> None:
     """Raise `InputError` unless values are of the kinds that a dataclass's annotations name, where these are plain."""
-    hints = get_type_hints(cls)
+    hints = _type_hints(cls)
     for field in fields(cls):
         value, place = values.get(field.name), f"{subject}: {field.name}"
         optional = str(field.type).endswith(" | None")

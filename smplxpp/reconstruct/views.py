@@ -200,9 +200,18 @@ class Silhouette:
 
     def depth(self, points: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
         """Return the depth of points inside the silhouette's cone, metres; `UNSEEN` where the image ends."""
-        # Project; points behind the camera or outside the image are not shown.
+        block = 1 << 14  # points whose intermediate results the processor's cache holds
         m = self.projection.astype(np.float32)
         x, y, z = (points @ row[:3] + row[3] for row in m)
+        out = np.empty(len(points), np.float32)
+        for start in range(0, len(points), block):
+            some = slice(start, start + block)
+            out[some] = self._depth_on_screen(x[some], y[some], z[some])
+        return out
+
+    def _depth_on_screen(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Float32[np.ndarray, " N"]:
+        """Return the depth of points from their homogeneous pixels."""
+        # Points behind the camera or outside the image are not shown.
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = x / z, y / z
             shown = (z > 0) & (x >= 0) & (y >= 0) & (x <= self.camera.width) & (y <= self.camera.height)

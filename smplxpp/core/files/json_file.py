@@ -219,6 +219,9 @@ def _number_array(value: Any) -> np.ndarray | None:
 
 def jsonable(value: Any) -> Any:
     """Convert configs, paths and numpy values to JSON values; non-finite numbers become null."""
+    # Most of a file is plain values, for which the questions below take longer than all else.
+    if type(value) in (str, int, bool, type(None)):
+        return value
     # Dataclasses first: their fields may hold any of the types below.
     if is_dataclass(value) and not isinstance(value, type):
         return jsonable(asdict(value))
