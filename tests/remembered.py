@@ -25,6 +25,7 @@ def install() -> None:
 
     raster.outer_visible_faces = zbuffer.outer_visible_faces = of_a_mesh(zbuffer.outer_visible_faces)
     raster.outer_visible_points = zbuffer.outer_visible_points = of_a_mesh(zbuffer.outer_visible_points)
+    raster.hiding_parts = zbuffer.hiding_parts = of_a_mesh(zbuffer.hiding_parts)
 
 
 def of_a_mesh(function: Any) -> Any:

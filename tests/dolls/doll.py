@@ -87,7 +87,7 @@ class Doll:
                 for folder, tag, image in zip(("rgbs", "masks"), ("rgb", "mask"), seen, strict=True):
                     path = root / folder / name / f"{name}_{tag}{frame:06d}.png"
                     path.parent.mkdir(parents=True, exist_ok=True)
-                    Image.fromarray(image).save(path)
+                    Image.fromarray(image).save(path, compress_level=1)
         (root / "cameras.json").write_text(json.dumps({"cameras": [_entry(one) for one in self.cameras.values()]}))
         about = {"name": self.name, "novel_views": list(self.held_out)}
         if self.novel_frames:

@@ -20,9 +20,9 @@ def found():
 
 def test_the_surface_is_nearer_to_the_truth_than_the_hull(found):
     hull, mesh = (np.abs(inside_dented(one.vertices)).mean() for one in (found.hull, found.mesh))
-    assert mesh < 0.6 * hull
-    assert mesh < 0.008
-    assert found.numbers["moved_mm"] > 1
+    assert mesh < 0.4 * hull  # 0.59 where the sweep moves it half of the distance, 0.25 where it moves it all
+    assert mesh < 0.001
+    assert found.numbers["moved_mm"] > 2
 
 
 def test_it_is_closed_and_fills_its_masks(found):
