@@ -23,6 +23,7 @@ def install() -> None:
 
     SignedDistanceField._unburied = of_a_solid(SignedDistanceField._unburied)
 
+    zbuffer._outside_depths = of_two_meshes(zbuffer._outside_depths)
     raster.outer_visible_faces = zbuffer.outer_visible_faces = of_a_mesh(zbuffer.outer_visible_faces)
     raster.outer_visible_points = zbuffer.outer_visible_points = of_a_mesh(zbuffer.outer_visible_points)
     raster.hiding_parts = zbuffer.hiding_parts = of_a_mesh(zbuffer.hiding_parts)
@@ -41,6 +42,21 @@ def of_a_mesh(function: Any) -> Any:
         if key not in known:
             known[key] = function(mesh, *arrays, **options)
         return known[key].copy()
+
+    return call
+
+
+def of_two_meshes(function: Any) -> Any:
+    """What a function of a mesh and plain options yields, kept for the last two meshes: depths are 50 MB each."""
+    known: dict[tuple[Any, ...], list[Any]] = {}
+
+    @functools.wraps(function)
+    def call(mesh: TriangleMesh, **options: Any) -> list[Any]:
+        key = (hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).digest(), *sorted(options.items()))
+        known[key] = known.pop(key, None) or list(function(mesh, **options))
+        for oldest in list(known)[:-2]:
+            del known[oldest]
+        return known[key]
 
     return call
 

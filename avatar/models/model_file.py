@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -246,7 +246,7 @@ def _check_version(about: Mapping[str, Any], subject: str) -> None:
 def _teacher(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> TeacherAvatar:
     config = stored.config("config", TeacherConfig)
     assert config is not None, "a teacher has a configuration"
-    stored.require_networks({"networks": lambda: Teacher(config)})
+    require_like(stored.tensors, _networks_of(config), subject=stored.subject)
     teacher = TeacherAvatar(config, rig, gaussians)
     if "track_controls" in stored.tensors:
         frames, controls = stored.track(rig.template.vertex_count)
@@ -255,6 +255,13 @@ def _teacher(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Teache
         errors = stored.track_errors(*controls.shape[:2])
         teacher.remember(Track(row, controls, ControlCage(rig, controls.shape[1]), **errors))
     return teacher
+
+
+@lru_cache(maxsize=4)
+def _networks_of(config: TeacherConfig) -> Mapping[str, Tensor]:
+    """Return the tensors of a teacher's networks, without memory: steps of a training open the same teacher again."""
+    with torch.device("meta"):
+        return Teacher(config).state_dict(prefix="networks.", keep_vars=True)
 
 
 def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Student:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -146,6 +147,14 @@ def outer_visible_faces(mesh: TriangleMesh, *, views: int = 32, resolution: int 
     return seen
 
 
+def _outside_depths(
+    mesh: TriangleMesh, *, views: int, resolution: int
+) -> Iterable[tuple[Camera, Float32[np.ndarray, "H W"]]]:
+    """Yield the views of a mesh from outside with its depth in each."""
+    for camera in outside_views(mesh, views=views, resolution=resolution):
+        yield camera, rasterize_mesh(mesh, camera).depth
+
+
 def outer_visible_points(
     mesh: TriangleMesh, points: Float[np.ndarray, "P 3"], *, tolerance: float, views: int = 32, resolution: int = 640
 ) -> Bool[np.ndarray, " P"]:
@@ -155,8 +164,7 @@ def outer_visible_points(
     """
     points = np.asarray(points, dtype=np.float64)
     seen = np.zeros(len(points), dtype=bool)
-    for camera in outside_views(mesh, views=views, resolution=resolution):
-        depth = rasterize_mesh(mesh, camera).depth
+    for camera, depth in _outside_depths(mesh, views=views, resolution=resolution):
         # Project the points that no view has seen yet, and compare their depth with the mesh's at their pixel.
         todo = np.flatnonzero(~seen)
         x, y, z = camera.screen_from_world(points[todo]).T[:3]

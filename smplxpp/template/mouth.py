@@ -97,4 +97,4 @@ def _seen_from_ahead(naked: Template, posed: Float[np.ndarray, "V 3"]) -> Bool[n
 
 
 def _weight(naked: Template, *joints: str) -> Float64[np.ndarray, " V"]:
-    return naked.weights.dense()[:, [naked.body.joint_names.index(joint) for joint in joints]].sum(axis=1)
+    return naked.body.weights[:, [naked.body.joint_names.index(joint) for joint in joints]].sum(axis=1)
