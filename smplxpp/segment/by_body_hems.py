@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.body import BodyModel
 from smplxpp.core import BodyParams, TriangleMesh
+from smplxpp.core.mesh import cross_rows
 from smplxpp.segment.by_body_chart import FOOT, HEAD, LEG, BodyChart, chart_of_body
 from smplxpp.segment.by_body_rings import STEP
 
@@ -185,9 +186,10 @@ def roughness(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"], *, most: int = 
         if len(around) < 12:
             continue
         # Height over the tangent plane as a quadric of the two coordinates within it.
-        across = np.cross(normals[i], np.eye(3)[np.abs(normals[i]).argmin()])
+        across = cross_rows(normals[i : i + 1], np.eye(3)[np.abs(normals[i]).argmin()])[0]
+        upward = cross_rows(normals[i : i + 1], across)[0]
         offset = points[around] - points[i]
-        x, y, z = offset @ across, offset @ np.cross(normals[i], across), offset @ normals[i]
+        x, y, z = offset @ across, offset @ upward, offset @ normals[i]
         design = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
         left = z - design @ np.linalg.lstsq(design, z, rcond=None)[0]
         out.append(np.sqrt(np.mean(left**2)))
