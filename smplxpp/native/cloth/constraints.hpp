@@ -126,10 +126,10 @@ public:
             for (int j = 0; j < 4; ++j) curvature = curvature + at[j] * hinge.curvature[j];
             Soa step = unit * ((dot(curvature, unit) - hinge.rest) / hinge.stiff);
             step = {select(bends, step.x, zero), select(bends, step.y, zero), select(bends, step.z, zero)};
-            for (int lane = 0; lane < kLanes; ++lane) {
-                const Vec4 own = row(step, lane);
-                for (int j = 0; j < 4; ++j) x[size_t(hinge.corner[j][lane])] -= own * hinge.moves[j][lane];
-            }
+            Vec4 own[kLanes];
+            rows(step, own);
+            for (int lane = 0; lane < kLanes; ++lane)
+                for (int j = 0; j < 4; ++j) x[size_t(hinge.corner[j][lane])] -= own[lane] * hinge.moves[j][lane];
         }
     }
 

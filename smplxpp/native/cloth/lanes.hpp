@@ -36,11 +36,44 @@ inline bool any(Mask4 mask) {
 }
 inline Vec4 select(Mask4 mask, Vec4 yes, Vec4 no) { return (Vec4)((mask & (Mask4)yes) | (~mask & (Mask4)no)); }
 
-// Rows of places to columns of coordinates, and back.
+// Rows of places to columns of coordinates, and back, by pairs: what processors have instructions for.
+inline Vec4 lower(Vec4 a, Vec4 b) { return Vec4{a[0], b[0], a[1], b[1]}; }
+inline Vec4 upper(Vec4 a, Vec4 b) { return Vec4{a[2], b[2], a[3], b[3]}; }
+inline Vec4 first_halves(Vec4 a, Vec4 b) { return Vec4{a[0], a[1], b[0], b[1]}; }
+inline Vec4 second_halves(Vec4 a, Vec4 b) { return Vec4{a[2], a[3], b[2], b[3]}; }
 inline Soa columns(Vec4 a, Vec4 b, Vec4 c, Vec4 d) {
-    return {Vec4{a[0], b[0], c[0], d[0]}, Vec4{a[1], b[1], c[1], d[1]}, Vec4{a[2], b[2], c[2], d[2]}};
+    const Vec4 ab = lower(a, b), cd = lower(c, d);
+    return {first_halves(ab, cd), second_halves(ab, cd), first_halves(upper(a, b), upper(c, d))};
 }
-inline Vec4 row(Soa a, int k) { return Vec4{a.x[k], a.y[k], a.z[k], 0}; }
+inline void rows(Soa a, Vec4* out) {
+    const Vec4 zero = all_lanes(0);
+    const Vec4 xy = lower(a.x, a.y), z = lower(a.z, zero), xy_on = upper(a.x, a.y), z_on = upper(a.z, zero);
+    out[0] = first_halves(xy, z), out[1] = second_halves(xy, z);
+    out[2] = first_halves(xy_on, z_on), out[3] = second_halves(xy_on, z_on);
+}
+
+// The points of four triangles that are nearest to p, and their barycentric weights (Ericson 2004, chapter 5.1.5): near a
+// corner, an edge, or within; of the cases that hold the first counts.
+inline Soa closest_on_triangles(Soa p, Soa a, Soa b, Soa c, Vec4* weight) {
+    const Vec4 zero = all_lanes(0), one = all_lanes(1);
+    const Soa ab = b - a, ac = c - a, ap = p - a, bp = p - b, cp = p - c;
+    const Vec4 d1 = dot(ab, ap), d2 = dot(ac, ap), d3 = dot(ab, bp), d4 = dot(ac, bp), d5 = dot(ab, cp), d6 = dot(ac, cp);
+    const Vec4 vc = d1 * d4 - d3 * d2, vb = d5 * d2 - d1 * d6, va = d3 * d6 - d5 * d4, to_c = d4 - d3, to_b = d5 - d6;
+    const Mask4 at_a = (d1 <= 0) & (d2 <= 0), at_b = (d3 >= 0) & (d4 <= d3), at_c = (d6 >= 0) & (d5 <= d6);
+    const Mask4 on_ab = (vc <= 0) & (d1 >= 0) & (d3 <= 0), on_ac = (vb <= 0) & (d2 >= 0) & (d6 <= 0);
+    const Mask4 on_bc = (va <= 0) & (to_c >= 0) & (to_b >= 0), on_edge = on_ab | on_ac | on_bc;
+    // A place on an edge divides it, one within the triangle has the areas across from b and c: a division for all.
+    const Vec4 part = select(on_ab, d1, select(on_ac, d2, to_c));
+    const Vec4 whole = select(on_ab, d1 - d3, select(on_ac, d2 - d6, to_c + to_b));
+    const Vec4 share = select(on_edge, part, one) / select(on_edge, whole, va + vb + vc), rest = one - share;
+    const Vec4 v = select(on_edge, select(on_ab, share, select(on_ac, zero, rest)), vb * share);
+    const Vec4 w = select(on_edge, select(on_ab, zero, share), vc * share);
+    const Vec4 u = select(on_edge, select(on_ab | on_ac, rest, zero), one - v - w);
+    weight[0] = select(at_a, one, select(at_b, zero, select(on_ab, u, select(at_c, zero, u))));
+    weight[1] = select(at_a, zero, select(at_b, one, select(on_ab, v, select(at_c, zero, v))));
+    weight[2] = select(at_a | at_b, zero, select(on_ab, w, select(at_c, one, w)));
+    return a * weight[0] + b * weight[1] + c * weight[2];
+}
 
 // Constraints of Corners particles each in batches of four that share none; -1 in lanes that stay empty. Each constraint comes
 // in a later batch than all before it in the array that share a particle with it. Since it reads and writes its own particles

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "cloth/lanes.hpp"
@@ -34,23 +35,28 @@ public:
     };
     Block block(Vec3 p) const { return {first(p.x), first(p.y), first(p.z)}; }
 
+    // The points, cell by cell.
+    const std::vector<int32_t>& order() const { return order_; }
     // Calls visit with the points within the reach of a place, and with others about it; some of those twice.
     template <class Visit>
     void around(Vec3 p, Visit&& visit) const {
-        in(block(p), visit);
+        in(block(p), [&](int32_t begin, int32_t end) {
+            for (int32_t q = begin; q < end; ++q) visit(order_[size_t(q)]);
+        });
     }
+    // The same with ranges of the order.
     template <class Visit>
     void in(Block b, Visit&& visit) const {
         for (int32_t i = b.x; i <= b.x + 1; ++i)
             for (int32_t j = b.y; j <= b.y + 1; ++j)
                 for (int32_t k = b.z; k <= b.z + 1; ++k) {
                     const uint32_t at = key(i, j, k);
-                    for (int32_t q = first_[at]; q < first_[at + 1]; ++q) visit(order_[size_t(q)]);
+                    if (first_[at] < first_[at + 1]) visit(first_[at], first_[at + 1]);
                 }
     }
 
 private:
-    static constexpr uint32_t kCells = 1u << 14;
+    static constexpr uint32_t kCells = 1u << 12;
     static uint32_t key(int32_t i, int32_t j, int32_t k) { return Block{i, j, k}.hash() & (kCells - 1); }
     static int32_t whole(float x) {  // far and broken points share a cell: a cast of them has no value
         const float down = std::floor(x);
@@ -101,28 +107,50 @@ public:
         normals(vertex, face_, faces_, normal_);
         grid_.fill(vertex, int64_t(normal_.size()), kReach);
         gathered_.assign(kGathered, {{0, 0, 0}, 0, -1});
-        candidates_.clear();
+        used_ = 0;
+        // In the order of the grid, a coordinate a row: vertices of a cell are copied by fours.
+        const size_t count = normal_.size(), row = count + kLanes;
+        wide_.resize(count), sorted_.resize(kRows * row);
+        for (size_t i = 0; i < count; ++i) {
+            const size_t j = size_t(grid_.order()[i]);
+            const Vec3 p = vertex[j], n = normal_[j];
+            const float values[kRows] = {p.x, p.y, p.z, n.x, n.y, n.z};
+            for (size_t k = 0; k < kRows; ++k) sorted_[k * row + i] = values[k];
+            wide_[i] = widened(vertex[i]);
+        }
     }
     Vec3 normal(int32_t i) const { return normal_[size_t(i)]; }
 
-    // The nearest vertex within reach that faces as the cloth does, -1: none. `other`: among those that face against this
-    // normal, the other side of a fold.
-    int32_t nearest(Vec3 p, Vec3 cloth_normal, Vec3 other = {0, 0, 0}) {
-        const Gathered& about = gather(grid_.block(p));
+    // The nearest vertex within reach that faces as the cloth does, -1: none.
+    int32_t nearest(Vec3 p, Vec3 cloth_normal) {
+        const Gathered about = gather(grid_.block(p));
         int32_t near = -1;
         float best = kReach * kReach;
-        const Soa place = broadcast(p), along = broadcast(cloth_normal), against = broadcast(other);
+        const Soa place = broadcast(p), along = broadcast(cloth_normal);
         const Vec4 far = all_lanes(best);
+        within_.clear();
         for (int32_t k = about.begin; k < about.end; ++k) {
             const Candidates& c = candidates_[size_t(k)];
-            const Soa d = place - c.place;
-            // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact with cloth that lies in it;
-            // cloth before it stays there, whichever way its folds look.
-            const Mask4 touches = (dot(c.normal, along) > kCovers) | (dot(c.normal, d) > -kShallow);
-            const Vec4 squared = select(touches & (dot(c.normal, against) <= 0), dot(d, d), far);
-            if (!any(squared < best)) continue;
-            for (int lane = 0; lane < kLanes; ++lane)
-                if (squared[lane] < best) best = squared[lane], near = c.vertex[lane];
+            const Soa d = place - c.place();
+            const Vec4 squared = dot(d, d);
+            if (!any(squared < far)) continue;
+            within_.push_back(k);
+            if (any(squared < best)) take(c, select(touched(c, along, d), squared, far), best, near);
+        }
+        return near;
+    }
+    // The same of the place that was last asked for, among vertices that face against a normal: the other side of a fold.
+    int32_t nearest_against(Vec3 normal, Vec3 p, Vec3 cloth_normal) const {
+        int32_t near = -1;
+        float best = kReach * kReach;
+        const Soa place = broadcast(p), along = broadcast(cloth_normal), against = broadcast(normal);
+        const Vec4 far = all_lanes(best);
+        for (const int32_t k : within_) {
+            const Candidates& c = candidates_[size_t(k)];
+            const Mask4 faces = dot(c.normal(), against) <= 0;
+            if (!any(faces)) continue;
+            const Soa d = place - c.place();
+            take(c, select(touched(c, along, d) & faces, dot(d, d), far), best, near);
         }
         return near;
     }
@@ -154,10 +182,18 @@ public:
     }
 
 private:
+    static constexpr size_t kRows = 6;  // of a place and a normal
     // Four vertices of a block of the grid side by side; lanes that stay empty are infinitely far.
     struct Candidates {
-        Soa place, normal;
+        alignas(16) float at[kRows][kLanes];
         int32_t vertex[kLanes];
+        Soa place() const { return {load(0), load(1), load(2)}; }
+        Soa normal() const { return {load(3), load(4), load(5)}; }
+        Vec4 load(size_t k) const {
+            Vec4 out;
+            std::memcpy(&out, at[k], sizeof out);
+            return out;
+        }
     };
     struct Gathered {
         Grid::Block block;
@@ -167,33 +203,57 @@ private:
     const Gathered& gather(Grid::Block block) {
         Gathered& known = gathered_[block.hash() & (kGathered - 1)];
         if (known.end >= 0 && known.block == block) return known;
-        const int32_t begin = int32_t(candidates_.size());
+        const int32_t begin = used_;
         int lane = kLanes;
-        grid_.in(block, [&](int32_t j) {
-            if (lane == kLanes) {
-                candidates_.emplace_back().place.x = all_lanes(INFINITY);
-                lane = 0;
+        const size_t row = normal_.size() + kLanes;
+        grid_.in(block, [&](int32_t first, int32_t last) {
+            for (int32_t i = first; i < last; ++i) {
+                if (lane == kLanes) {
+                    if (size_t(++used_) > candidates_.size()) candidates_.emplace_back();
+                    std::fill_n(candidates_[size_t(used_ - 1)].at[0], kLanes, INFINITY);
+                    lane = 0;
+                }
+                Candidates& c = candidates_[size_t(used_ - 1)];
+                for (size_t k = 0; k < kRows; ++k) c.at[k][lane] = sorted_[k * row + size_t(i)];
+                c.vertex[lane] = grid_.order()[size_t(i)];
+                ++lane;
             }
-            Candidates& c = candidates_.back();
-            const Vec3 at = vertex_[j], n = normal_[size_t(j)];
-            c.place.x[lane] = at.x, c.place.y[lane] = at.y, c.place.z[lane] = at.z, c.vertex[lane] = j;
-            c.normal.x[lane] = n.x, c.normal.y[lane] = n.y, c.normal.z[lane] = n.z;
-            ++lane;
         });
-        return known = {block, begin, int32_t(candidates_.size())};
+        return known = {block, begin, used_};
+    }
+
+    // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact with cloth that lies in it; cloth
+    // before it stays there, whichever way its folds look.
+    static Mask4 touched(const Candidates& c, Soa along, Soa d) {
+        return (dot(c.normal(), along) > kCovers) | (dot(c.normal(), d) > -kShallow);
+    }
+    static void take(const Candidates& c, Vec4 squared, float& best, int32_t& near) {
+        for (int lane = 0; lane < kLanes; ++lane)
+            if (squared[lane] < best) best = squared[lane], near = c.vertex[lane];
     }
 
     // Looks for a place nearer than the best on the faces of a vertex; says whether there is one.
     bool scan(Vec3 p, int32_t vertex, float& best, Contact& found) const {
         bool nearer = false;
-        for (int32_t k = first_[size_t(vertex)]; k < first_[size_t(vertex) + 1]; ++k) {
-            const int32_t* q = face_ + 3 * int64_t(at_[size_t(k)]);
-            float weight[3];
-            const Vec3 d = p - closest_on_triangle(p, vertex_[q[0]], vertex_[q[1]], vertex_[q[2]], weight);
-            if (!(dot(d, d) < best)) continue;  // nor a triangle without area
-            best = dot(d, d), nearer = true;
-            found.face = at_[size_t(k)];
-            std::copy(weight, weight + 3, found.weight);
+        const Soa place = broadcast(p);
+        const int32_t begin = first_[size_t(vertex)], end = first_[size_t(vertex) + 1];
+        for (int32_t k = begin; k < end; k += kLanes) {
+            int32_t face[kLanes];  // the last one again where there are no more
+            Soa corner[3];
+            for (int lane = 0; lane < kLanes; ++lane) face[lane] = at_[size_t(std::min(k + lane, end - 1))];
+            for (int j = 0; j < 3; ++j) {
+                Vec4 at[kLanes];
+                for (int lane = 0; lane < kLanes; ++lane) at[lane] = wide_[size_t(face_[3 * int64_t(face[lane]) + j])];
+                corner[j] = columns(at[0], at[1], at[2], at[3]);
+            }
+            Vec4 weight[3];
+            const Soa d = place - closest_on_triangles(place, corner[0], corner[1], corner[2], weight);
+            const Vec4 squared = dot(d, d);
+            for (int lane = 0; lane < kLanes; ++lane) {
+                if (!(squared[lane] < best)) continue;  // nor a triangle without area
+                best = squared[lane], nearer = true;
+                found = {face[lane], {weight[0][lane], weight[1][lane], weight[2][lane]}};
+            }
         }
         return nearer;
     }
@@ -210,8 +270,12 @@ private:
     std::vector<Vec3> normal_;
     std::vector<int32_t> first_, at_;
     Grid grid_;
+    std::vector<float> sorted_;  // kRows of the vertices in the grid's order
+    std::vector<Vec4> wide_;     // the vertices
     std::vector<Gathered> gathered_;
     std::vector<Candidates> candidates_;
+    int32_t used_ = 0;             // of the candidates
+    std::vector<int32_t> within_;  // candidates of whom one was within reach of the place that was last asked for
 };
 
 }  // namespace smplxpp

@@ -188,7 +188,7 @@ private:
             if (near < 0) continue;
             keep(i, surface_.find_from(near, p, normal), touches_);
             // A lap, an armpit, a bent knee: cloth lies between two sides of the body that come together.
-            keep(i, surface_.find_from(surface_.nearest(p, normal, surface_.normal(near)), p, normal), folds_);
+            keep(i, surface_.find_from(surface_.nearest_against(surface_.normal(near), p, normal), p, normal), folds_);
         }
         sides_ = touches_.size();
         touches_.insert(touches_.end(), folds_.begin(), folds_.end());

@@ -106,7 +106,7 @@ export class ClothDriver {
   /** Goes on to a pose; the first one, and one that cloth could not have followed to, start cold. */
   step(pose: Pose, seconds: number): Displaced {
     this.move(pose, seconds);
-    return this.shaped(pose);
+    return this.laid();
   }
 
   private move(pose: Pose, seconds: number): void {
@@ -182,24 +182,28 @@ export class ClothDriver {
   /** Brings the skeleton to a pose, measured from the origin. */
   private joints(pose: Pose): void {
     this.deformer.joints({ ...pose, translation: pose.translation.map((value, k) => value - this.origin[k]) });
+    const { skin } = this, from = this.deformer.rest.view, to = this.shapedRest.view;
+    for (let i = 0; i < skin.length; ++i) for (let k = 3 * skin[i]; k < 3 * skin[i] + 3; ++k) to[k] = from[k];
   }
 
   /** Where skinning has some vertices, (R, 3) metres from the origin; the parts know no expression. */
   private places(rows: SkinnedRows): Float32Array {
-    const from = this.deformer.rest.view, to = this.shapedRest.view;
-    for (const v of this.skin) for (let k = 3 * v; k < 3 * v + 3; ++k) to[k] = from[k];
     return rows.pose(this.shapedRest).slice();
   }
 
   /** Takes the cloth as it is back to the T-pose. */
   private shaped(pose: Pose): Displaced {
     this.joints(pose);
+    return this.laid();
+  }
+
+  /** The same where the skeleton is in the pose. */
+  private laid(): Displaced {
     for (const thread of this.threads) thread.carry();
     this.threads.forEach(({ garment, carried }, k) => {
       const found = this.rows[k].carried.unpose(this.still, carried), out = this.displaced.displacements.view;
-      garment.vertices.forEach((v, i) => {
-        for (let c = 0; c < 3; ++c) out[3 * v + c] = found[3 * i + c];
-      });
+      const { vertices } = garment;
+      for (let i = 0; i < vertices.length; ++i) for (let c = 0; c < 3; ++c) out[3 * vertices[i] + c] = found[3 * i + c];
     });
     return this.displaced;
   }

@@ -177,11 +177,12 @@ export class GarmentThread {
   }
 
   private sound(): boolean {
-    const x = this.position.view, { edges, mostSquared } = this;
-    if (!x.every(Number.isFinite) || !this.velocity.view.every(Number.isFinite)) return false;
-    return mostSquared.every((most, e) => {
+    const x = this.position.view, v = this.velocity.view, { edges, mostSquared } = this;
+    for (let i = 0; i < x.length; ++i) if (!Number.isFinite(x[i]) || !Number.isFinite(v[i])) return false;
+    for (let e = 0; e < mostSquared.length; ++e) {
       const a = 3 * edges[2 * e], b = 3 * edges[2 * e + 1];
-      return (x[a] - x[b]) ** 2 + (x[a + 1] - x[b + 1]) ** 2 + (x[a + 2] - x[b + 2]) ** 2 <= most;
-    });
+      if (!((x[a] - x[b]) ** 2 + (x[a + 1] - x[b + 1]) ** 2 + (x[a + 2] - x[b + 2]) ** 2 <= mostSquared[e])) return false;
+    }
+    return true;
   }
 }
