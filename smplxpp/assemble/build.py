@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
-from smplxpp.assemble.body_inside import feet_in_shoes
+from smplxpp.assemble.body_inside import feet_in_shoes, part_lips
 from smplxpp.assemble.layers import (
     Obstacle,
     Penetration,
@@ -188,7 +188,8 @@ def assemble_template(
     neutral = BodyParams.rest(betas=params.betas[0], expressions=0, v_shape=params.v_shape)
     # Without the mean hand, because its pose correctives are not part of the T-pose.
     rest = body.forward(neutral, flat_hand_mean=True).rest_vertices[0]
-    # Feet yield to shoes, everything else to the body.
+    # Feet yield to shoes, everything else to the body; lips part where a jaw opens.
+    body = part_lips(body)
     shoes = [(part.mesh, part.weights) for part in parts.values() if is_shoe(config.labels[part.label])]
     rest, body = feet_in_shoes(body, rest, shoes)
     body_mesh = body.mesh(rest)

@@ -116,10 +116,11 @@ def export_template(
         template = template.on_floor()
     if suffix in (".glb", ".fbx", *_USD):
         template = replace(template, body=with_arkit_names(template.body))
+    # Unreal takes the skeleton's node for the root bone.
+    root = {".glb": "skeleton"}.get(suffix, ROOT) if options.joint_names != "unreal" else _UNREAL_ROOT
     if suffix == ".glb":
-        write_glb(path, template, animation=animation)
+        write_glb(path, template, animation=animation, root=root)
     elif suffix == ".fbx":
-        root = _UNREAL_ROOT if options.joint_names == "unreal" else ROOT
         write_fbx(path, template, animation=animation, root=root, blender=options.blender)
     elif suffix == ".vrm":
         write_vrm(path, template, meta=options.meta, joint_names=options.joint_names)

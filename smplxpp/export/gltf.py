@@ -161,7 +161,12 @@ def _material(
 
 
 def write_glb(
-    path: str | Path, template: Template, *, animation: BodyParams | None = None, morph_targets: bool = True
+    path: str | Path,
+    template: Template,
+    *,
+    animation: BodyParams | None = None,
+    morph_targets: bool = True,
+    root: str = "skeleton",
 ) -> None:
     """Write the template as a GLB file, whole or not at all; the same template gives the same bytes.
 
@@ -176,6 +181,7 @@ def write_glb(
         template: body and parts in the T-pose.
         animation: T frames, played at their `fps` or `DEFAULT_FPS`.
         morph_targets: write the expressions, sparsely, as morph targets of the body.
+        root: name of the skeleton's node at the origin, which Unreal takes for the root bone.
 
     Raises:
         InputError: an animation that the template cannot play: more expressions than it has, a skeleton outside the
@@ -188,6 +194,7 @@ def write_glb(
         >>> smplxpp.write_glb("anna.glb", template, animation=params)  # doctest: +SKIP
     """
     gltf, buffers, joint_nodes, part_nodes = rigged_gltf(template, morph_targets=morph_targets)
+    gltf.nodes[gltf.skins[0].skeleton].name = root
     if animation is not None:
         morph_node = next(
             (n for n in part_nodes if gltf.nodes[n].name == BODY_PART and gltf.meshes[gltf.nodes[n].mesh].weights), None

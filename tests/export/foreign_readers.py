@@ -2,8 +2,9 @@
 
     python tests/export/foreign_readers.py READER FILE
 
-READER is assimp (assimp_py), ufbx, bpy, usd (usd-core) or trimesh, or a validator, which tells its remarks: usd-rules
-or vrm-schema (jsonschema). Exit 3: it is not installed. `load_three.mjs` reads with the loaders of three.js.
+READER is assimp (assimp_py), ufbx, bpy, usd (usd-core) or trimesh, or a validator, which tells its remarks: usd-rules,
+vrm-schema (jsonschema) or vrm-addon (bpy-vrm-format). Exit 3: it is not installed. `load_three.mjs` reads with the
+loaders of three.js.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -198,6 +200,33 @@ def by_vrm_schema(path: Path) -> dict:
     return {"remarks": [one.message for one in whole.iter_errors(document["extensions"]["VRMC_vrm"])]}
 
 
+def by_vrm_addon(path: Path) -> dict:
+    """Hold a VRM against the validator of Blender's VRM add-on (PyPI `bpy-vrm-format`, `io_scene_vrm`), as it opens it.
+
+    Beside its remarks: how many of a human's bones it found.
+    """
+    import bpy
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    import addon_utils
+    import io_scene_vrm.editor.validation as of_addon
+
+    addon_utils.enable("io_scene_vrm", default_set=True)
+    bpy.ops.import_scene.vrm(filepath=str(path))
+    (rig,) = (thing for thing in bpy.data.objects if thing.type == "ARMATURE")
+
+    class Remarks(list):  # what its operator would fill, a Blender collection
+        def add(self) -> SimpleNamespace:
+            self.append(SimpleNamespace(message="", severity=0))
+            return self[-1]
+
+    remarks = Remarks()
+    of_addon.WM_OT_vrm_validator.detect_errors(bpy.context, remarks, rig.name, execute_migration=True)
+    bones = rig.data.vrm_addon_extension.vrm1.humanoid.human_bones.human_bone_name_to_human_bone().values()
+    found = sum(bool(bone.node.bone_name) for bone in bones)
+    return {"remarks": [one.message for one in remarks] + ([] if found == 55 else [f"{found} of 55 bones"])}
+
+
 READERS: dict[str, Callable[[Path], dict]] = {
     "assimp": by_assimp,
     "ufbx": by_ufbx,
@@ -206,6 +235,7 @@ READERS: dict[str, Callable[[Path], dict]] = {
     "trimesh": by_trimesh,
     "usd-rules": by_usd_rules,
     "vrm-schema": by_vrm_schema,
+    "vrm-addon": by_vrm_addon,
 }
 
 if __name__ == "__main__":

@@ -36,7 +36,12 @@ READERS = {
     "usd": (".usdc", ".usdz"),
     "trimesh": (".glb", ".vrm", ".obj"),
 }
-VALIDATORS = {"khronos": (".glb", ".vrm"), "vrm-schema": (".vrm",), "usd-rules": (".usdc", ".usdz")}
+VALIDATORS = {
+    "khronos": (".glb", ".vrm"),
+    "vrm-schema": (".vrm",),
+    "vrm-addon": (".vrm",),
+    "usd-rules": (".usdc", ".usdz"),
+}
 pytestmark = pytest.mark.slow
 
 

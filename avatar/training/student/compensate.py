@@ -28,7 +28,7 @@ from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.engine.unseen import color_clothed_skin, hold_colors
 from avatar.training.student.prune import pruned_to
-from avatar.training.student.unseen_motion import with_held_face
+from avatar.training.student.unseen_motion import on_drawn_face, with_held_face
 from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core import InputError, require_at_least, require_between
 from smplxpp.core.spread import spread_inside
@@ -252,6 +252,7 @@ def compensate(
         # One pose at a time, because each holds all vertices.
         shown = ((pose.body_pose, pose.expression, pose.jaw) for pose in map(sequence.pose, sequence.train_frames))
         known, expressions, jaws = (torch.stack(rows) for rows in zip(*shown, strict=True))
+        student = on_drawn_face(student)
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
@@ -260,7 +261,8 @@ def compensate(
     tracked = teacher.track if config.surface_normals and teacher is not None else None
     context = with_surface_normals(session.context, sequence, tracked)
     progress = session.run(lambda: CompensateTask(sequence, made, config, context, held=held), config)
-    return with_held_face(made, expressions, jaws).eval(), progress
+    # Gaussians have moved on since.
+    return with_held_face(on_drawn_face(made), expressions, jaws).eval(), progress
 
 
 def write_student(

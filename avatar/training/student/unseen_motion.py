@@ -8,9 +8,11 @@ nothing hangs before an open mouth.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import igl
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
@@ -18,12 +20,15 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from avatar.gaussians.binding import world_from_frames
+from avatar.gaussians.binding import BoundGaussians, on_triangles, world_from_frames
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import head_faces
+from avatar.gaussians.tensor_operations import multiply_quats, quat_from_matrix
+from avatar.models.learned_gaussians import LearnedGaussians
 from avatar.models.networks.blend_shapes import BlendShapes
 from avatar.models.student import Student
 from smplxpp.core import BodyParams, Camera, TriangleMesh
+from smplxpp.core.spherical_harmonics import rotate_sh
 from smplxpp.raster import rasterize_mesh
 from smplxpp.template.mouth import inside_of_mouth
 from smplxpp.template.template import BODY_PART, Template
@@ -69,6 +74,78 @@ def with_held_face(student: Student, expressions: Float[Tensor, "T E"], jaws: Fl
     return student.with_blend_shapes(_extended(shapes, found)) if found else student
 
 
+@torch.no_grad()
+def on_drawn_face(student: Student) -> Student:
+    """Return the student whose Gaussians of the head hang on the faces that they draw; at rest it looks the same.
+
+    Training moves Gaussians by centimetres, so that one that draws a lip may hang on the chin and stay there when the
+    mouth opens. Those within a centimetre of a face that shows at rest are bound to its nearest point: places, axes,
+    sizes, harmonics and blend shapes are expressed in its frame. Those inside the mouth stay.
+    """
+    farthest, rig, template = 0.01, student.rig, student.rig.template
+    shown = _shown_faces(template)
+    if not shown.any():
+        return student
+    rest = rig.pose(_rest(template))
+    frames, bound = triangle_frames(rig.skin(rest), rig.faces), student.gaussians()
+    world = world_from_frames(student.compensated(rest), frames)
+    before = bound.face_index.cpu().numpy()
+    # Inside the mouth only those that left it.
+    slid = bound.offset.square().sum(dim=1).add(bound.normal_offset.square()).sqrt().cpu().numpy()
+    inside = inside_of_mouth(template)[template.faces[before]].all(axis=1)
+    free = np.flatnonzero(_head(template)[before] & ~(inside & (slid < 0.003)))
+    # The nearest point of what shows, for each Gaussian of the head.
+    tree, faces, vertices = igl.AABB(), template.faces[shown], rig.skin(rest).double().cpu().numpy()
+    tree.init(vertices, faces)
+    means = world.means.double().cpu().numpy()
+    squared, nearest, at = tree.squared_distance(vertices, faces, means[free])
+    close = np.asarray(squared).reshape(-1) < farthest**2
+    rows, now = free[close], np.flatnonzero(shown)[np.asarray(nearest).reshape(-1)[close]]
+    corners = vertices[template.faces[now]]
+    share = np.asarray(igl.barycentric_coordinates(at[close], *(np.ascontiguousarray(corners[:, k]) for k in range(3))))
+    # From the old triangle's frame to the new one's.
+    device = bound.dc.device
+    chosen = torch.tensor(rows, device=device)
+    new, old = torch.tensor(now, device=device), bound.face_index[chosen]
+    turn = frames.rotations[new].transpose(1, 2) @ frames.rotations[old]
+    uncompensated = world_from_frames(bound, frames).means[chosen]
+    values = dict(bound.tensors)
+    place = on_triangles(frames.corners[new], torch.tensor(share[:, :2]).to(bound.dc))
+    values["face_index"] = bound.face_index.index_copy(0, chosen, new)
+    values["barycentric"] = bound.barycentric.index_copy(0, chosen, torch.tensor(share[:, :2]).to(bound.dc))
+    moved = (frames.rotations[new].transpose(1, 2) @ (uncompensated - place)[..., None])[..., 0]
+    values["offset"] = bound.offset.index_copy(0, chosen, moved)
+    values["normal_offset"] = bound.normal_offset.index_fill(0, chosen, 0.0)
+    longer = torch.log(frames.lengths[old] / frames.lengths[new])[:, None]
+    values["log_scales"] = bound.log_scales.index_add(0, chosen, longer.expand(-1, 2).contiguous())
+    values["quats"] = bound.quats.index_copy(0, chosen, multiply_quats(quat_from_matrix(turn), bound.quats[chosen]))
+    values["sh"] = bound.sh.index_copy(0, chosen, rotate_sh(bound.sh[chosen], turn))
+    out = student.with_blend_shapes(copy.deepcopy(student.blend_shapes))
+    out.gaussians = LearnedGaussians(BoundGaussians(**values, face_count=bound.face_count, topology=bound.topology))
+    if out.blend_shapes is not None:
+        every = torch.eye(3).to(turn).repeat(len(bound), 1, 1).index_copy(0, chosen, turn)
+        out.blend_shapes.U.copy_(every[out.blend_shapes.active] @ out.blend_shapes.U)
+    return out
+
+
+def _shown_faces(template: Template) -> Bool[np.ndarray, " F"]:
+    """Mark the faces of the head's own surface that views from around it show at rest, as if it had no hair."""
+    head = _head(template)
+    shown = np.zeros(len(template.faces) + 1, dtype=bool)
+    if not head.any():
+        return shown[:-1]
+    naked = np.flatnonzero(template.vertex_part[template.faces[:, 0]] == 0)
+    mesh = TriangleMesh(template.vertices, template.faces[naked])
+    used = template.vertices[np.unique(template.faces[head])]
+    center, extent, size = used.mean(axis=0), float(np.ptp(used, axis=0).max()), 800
+    for angle in np.deg2rad([0, 40, -40, 90, -90, 140, -140, 180]):
+        direction = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        camera = Camera.orthographic_view(center=center, direction=direction, half_extent=0.6 * extent, size=size)
+        ids = rasterize_mesh(mesh, camera).face_id
+        shown[naked[ids[ids >= 0]]] = True
+    return shown[:-1] & head
+
+
 def _unseen_motions(
     student: Student, expressions: Float[Tensor, "T E"], jaws: Float[Tensor, "T 3"]
 ) -> list[UnseenMotion]:
@@ -83,7 +160,7 @@ def _unseen_motions(
         weights = np.zeros(seen.shape[1])
         if (name := f"eyeBlink{side.title()}") in names:
             weights[names.index(name)] = 1.0
-            wanted.append((side, weights, 0.7, 0.3))
+            wanted.append((side, weights, 0.7, 0.5))
     weights = np.zeros(seen.shape[1])
     weights[size : size + 1] = 1.0
     if "jawOpen" in names:
@@ -93,7 +170,8 @@ def _unseen_motions(
     for kind, weights, enough, more in wanted:
         most = max(0.0, float((seen @ weights).max()))
         if weights.any() and most < enough:
-            out.append(UnseenMotion(kind, weights, most, most + more))
+            begin = most if kind == "jaw" else max(most, 0.4)
+            out.append(UnseenMotion(kind, weights, begin, begin + more))
     return out
 
 
@@ -113,7 +191,7 @@ def _closed_lids(student: Student, side: str) -> tuple[Tensor, Tensor] | None:
     head = _head(template)[bound.face_index.cpu().numpy()]
     sides = {one: _lid_share(template, faces, head, one) for one in ("left", "right")}
     total = sum(share for share, _ in sides.values())
-    share, ball = sides[side][0] / np.maximum(total, 1.0), sides[side][1]
+    share, ball = sides[side][0] / np.maximum(total, 1.0), sides["left"][1] | sides["right"][1]
     places = template.vertices[faces].mean(axis=1)
     still = head & (total == 0.0) & ~inside_of_mouth(template)[faces].any(axis=1)
     held, around = np.flatnonzero(share > 0.0), 48
@@ -122,12 +200,15 @@ def _closed_lids(student: Student, side: str) -> tuple[Tensor, Tensor] | None:
     colors = bound.dc.double().cpu().numpy()
     skin = colors[still][cKDTree(places[still]).query(places[held], k=around)[1]]
     light = np.argsort(skin.sum(axis=2), axis=1)[:, around // 2 :, None]
+    skin = np.median(np.take_along_axis(skin, light, axis=1), axis=1)
+    # Lashes and the shade between lids keep some of their darkness, which draws the line of a closed eye.
+    line = 0.3 * (~ball[held] & (colors[held].sum(axis=1) < skin.sum(axis=1)))[:, None]
     target = colors.copy()
-    target[held] = np.median(np.take_along_axis(skin, light, axis=1), axis=1)
+    target[held] = line * colors[held] + (1.0 - line) * skin
     # Lids within half a millimetre of their surface, the eye a millimetre behind its own.
     offset = bound.offset.clone()
     offset[:, 0] += bound.normal_offset
-    goal = torch.zeros_like(offset)
+    goal = offset.clone()
     goal[:, 0] = torch.where(torch.tensor(ball, device=offset.device), -1e-3, offset[:, 0].clamp(-5e-4, 5e-4))
     weight = torch.tensor(share).to(offset)[:, None]
     return weight * (goal - offset), weight * torch.tensor(target - colors).to(offset)
@@ -186,14 +267,17 @@ def _open_mouth(student: Student) -> tuple[Tensor, Tensor] | None:
         return None
     at = camera.screen_from_world(world.means.double().cpu().numpy())[:, 1::-1]
     away = cKDTree(opening + 0.5).query(at)[0] * pixel
-    # A Gaussian of standard deviation s veils what is within 1.2 s of it.
-    reach, small = 1.2, 2.5e-3
+    # A Gaussian of standard deviation s veils what is within 1.2 s of it; those that reach in by less than half a
+    # centimetre are the lips themselves.
+    reach, lips = 1.2, 0.005
     sigma = world.scales[:, 1:].amax(dim=1).double().cpu().numpy()
     skin = _head(template)[bound.face_index.cpu().numpy()] & ~inside[faces].all(axis=1)
-    veil = torch.tensor(skin & (away < reach * sigma) & ((sigma > small) | (away <= 0.0)), device=rig.device)
+    veil = torch.tensor(skin & ((reach * sigma - away > lips) | (away <= 0.0)), device=rig.device)
     back = frames.rotations[bound.face_index].transpose(1, 2) @ torch.tensor([0.0, 0.0, -0.03], device=rig.device)
     dark = torch.tensor(template.vertex_colors[faces].mean(axis=1) / 255.0).to(bound.dc) - bound.dc
-    within = torch.tensor(inside[faces].all(axis=1), device=rig.device)
+    # Others inside show through the skin before them, whose colour they have.
+    open_at = cKDTree(np.argwhere(shown) + 0.5).query(at)[0] * pixel < 0.001
+    within = torch.tensor(inside[faces].all(axis=1) & open_at, device=rig.device)
     return veil[:, None] * back, within[:, None] * dark
 
 
