@@ -60,6 +60,7 @@ class Option:
         words: its description.
         default: its default as text; empty where there is none worth showing.
         group: one of `GROUPS`.
+        choices: the values that it takes; empty where any goes.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Option:
     words: str
     default: str
     group: str
+    choices: tuple[str, ...] = ()
 
 
 def options_of(command: type) -> list[Option]:
@@ -100,7 +102,8 @@ def options_of(command: type) -> list[Option]:
                 text = f"Leave out what is done otherwise: {text[0].lower()}{text[1:]}"
             if value == _MANY:
                 text += f" One of {', '.join(map(str, _choices(hint)))}."
-            out.append(Option(name, value, text, _default(one, hint), NEED if positional or required else group))
+            asked, taken = NEED if positional or required else group, tuple(map(str, _choices(hint)))
+            out.append(Option(name, value, text, _default(one, hint), asked, taken if value else ()))
     return out
 
 
@@ -132,12 +135,17 @@ def checked_arguments(name: str, command: type, args: Sequence[str]) -> list[str
     """Return the arguments of a command with `-o` written out.
 
     Raises:
-        InputError: an option that the command does not have; the error names those that are written alike.
+        InputError: an option that the command does not have, whose error names those that are written alike; a value
+            that is missing, no number or none of the choices.
     """
-    known = known_options(command)
+    options = {option.name: option for option in options_of(command)}
+    known = [option for option in options if option.startswith("--")]
     out = ["--out" if arg == "-o" and "--out" in known else arg for arg in args]
-    for arg in out:
-        option = arg.partition("=")[0].replace("_", "-")
+    for arg, following in zip(out, [*out[1:], None], strict=True):
+        option, equals, given = arg.partition("=")
+        option = option.replace("_", "-")
+        if option in known and options[option].value:
+            _check_value(name, options[option], given if equals else following)
         if option.startswith("--") and len(option) > 2 and option not in known:
             meant = alike(option, known)
             raise InputError(
@@ -147,6 +155,35 @@ def checked_arguments(name: str, command: type, args: Sequence[str]) -> list[str
                 remedy=f"`smplxpp {name} --help` lists them",
             )
     return out
+
+
+def _check_value(name: str, option: Option, given: str | None) -> None:
+    """Raise InputError where what follows an option is none of its values; of several the first is looked at."""
+    kind, several, numbers = (
+        option.value.removesuffix(" ..."),
+        option.value.endswith(" ..."),
+        {"INT": int, "FLOAT": float},
+    )
+    expected = {"INT": "a whole number", "FLOAT": "a number"}.get(kind, "a value")
+    if option.choices:
+        expected = f"one of {', '.join(option.choices)}"
+    missing = given is None or given.startswith("--")
+    if missing and several:
+        return
+    wrong = missing or (bool(option.choices) and given not in option.choices)
+    if not missing and kind in numbers and given != "None":
+        try:
+            numbers[kind](given)
+        except ValueError:
+            wrong = True
+    if wrong:
+        meant = "" if missing else alike(str(given), option.choices, most=1)
+        raise InputError(
+            f"option {option.name} of `smplxpp {name}`",
+            expected=expected + (f", perhaps {meant}" if meant else ""),
+            received="none" if missing else repr(given),
+            remedy=f"`smplxpp {name} --help` describes it",
+        )
 
 
 def alike(word: str, known: Iterable[str], *, most: int = 2) -> str:

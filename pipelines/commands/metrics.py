@@ -320,7 +320,7 @@ def _print(report: dict[str, Any], console: Console) -> None:
 
     def add(name: str, values: dict[str, Any], *, style: str | None = None, end_section: bool = False) -> None:
         for table, group in zip(tables, groups, strict=True):
-            cells = ["-" if (value := values.get(columns[key])) is None else f"{value:.4g}" for key in group]
+            cells = ["-" if (value := values.get(columns[key])) is None else _short(value) for key in group]
             table.add_row(name, *cells, style=style, end_section=end_section)
 
     # A single pair also lists its labels; many frames list them under the mean.
@@ -348,3 +348,9 @@ def _print(report: dict[str, Any], console: Console) -> None:
     )
     for entry in report["skipped"]:
         console.print(f"[yellow]skipped[/] {escape(str(entry['frame']))}: {escape(entry['reason'])}", soft_wrap=True)
+
+
+def _short(value: float) -> str:
+    """Return a number in four digits, whole below a million, else in two digits with an exponent: seven characters."""
+    text = f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
+    return f"{value:.1e}" if "e" in text else text

@@ -26,7 +26,7 @@ def load_run_template(run: Path) -> Template:
         raise InputError(
             f"run {run}",
             expected=f"a finished template in {TEMPLATE}",
-            received="no such folder" if not run.is_dir() else "a run without it",
+            received="a file" if run.is_file() else "a run without it" if run.is_dir() else "no such folder",
             remedy="make it with `smplxpp build`; `smplxpp inspect RUN` tells which stages stand",
         )
     return Template.load(path)

@@ -152,3 +152,16 @@ def test_pairs_that_hardly_belong_together_are_named(tmp_path, plane, factor, of
     assert (words in str(caught[0].message)) if words else not caught
     assert frame["hausdorff"] <= frame["hausdorff_upper"] <= frame["hausdorff"] + 0.02
     assert [scores["threshold_mm"] for scores in frame["scores"]] == [1.0, 5.0]
+
+
+@pytest.mark.filterwarnings("ignore")  # for a kilometre
+@pytest.mark.parametrize("height", [1.954e-8, 965.4, 96540.0])
+def test_no_number_of_a_narrow_table_is_broken_in_two_lines(tmp_path, plane, height, capsys, monkeypatch):
+    """Distances of 1.954e-05 and 9.654e+05 mm ended on a line of their own."""
+    monkeypatch.setenv("COLUMNS", "80")
+    a, b = tmp_path / "a.ply", tmp_path / "b.ply"
+    write_ply(a, plane(height))
+    write_ply(b, plane(0.0))
+    Metrics(a=a, b=b, samples=100).run()
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    assert len(rows) == 2 and all(line.split("│")[1].strip() == "a" for line in rows), rows

@@ -44,6 +44,9 @@ class GltfDocument:
         # GLB (glTF 2.0, section 4.4): magic, version, total length, then chunks.
         if data[:4] == b"glTF":
             data, self._binary = self._chunks(data)
+        elif b"{" not in data[:64]:
+            expected = "glTF: JSON, or binary, which begins with `glTF`"
+            raise InputError(self.subject, expected=expected, received=repr(data[:8])[1:], remedy=_DAMAGED)
         self.json = as_object(parse_json(data, subject=self.subject), subject=self.subject)
         version = as_text(self.part(self.json, "asset").get("version", ""), subject=f"{self.subject}: asset.version")
         if not version.startswith("2."):
