@@ -49,7 +49,8 @@ def find_carriers(
     A garment hangs on its upper openings, a waistband or a neckline, on tight ones, and on what it covers from above,
     shoulders and the crown. A hem is an opening too, but looks down and is not tight; the median of an opening's
     distances decides. An apron, and a garment that is torn from one opening to another, have a single border: where
-    nothing else holds it, its upper half does, as far as it is tight or looks up and is near.
+    nothing else holds it, its upper half does, as far as it is tight or looks up and is near. Where there is no such
+    border either, the underside of a roll, as of a scarf, holds it on skin that looks up.
 
     Args:
         cloth: N vertices, without bridges.
@@ -60,7 +61,8 @@ def find_carriers(
     # Signed distance to the body, metres; unreferenced vertices stay infinitely far.
     distance = np.full(cloth.vertex_count, np.inf)
     used = cloth.referenced
-    distance[used] = SignedDistanceField(body, solid=True).query(cloth.vertices[used]).distance
+    found = SignedDistanceField(body, solid=True).query(cloth.vertices[used])
+    distance[used] = found.distance
     if head is not None:
         skin = body.referenced
         grows = head[skin][cKDTree(body.vertices[skin]).query(cloth.vertices)[1]]
@@ -83,6 +85,11 @@ def find_carriers(
         middle = 0.5 * (height[used].min() + height[used].max())
         near = np.where(_border_looks_up(cloth), WORN, TIGHT)
         out[border] = (distance[border] < near[border]) & (height[border] > middle)
+    # A roll about the neck has an underside, which faces the shoulders and lies there; a sheet faces as its skin does.
+    if not out.any():
+        facing = np.einsum("ni,ni->n", cloth.vertex_normals[used], found.normal)
+        lies[used] = (found.distance < TIGHT) & (found.normal[:, 1] > LIES) & (facing < -LIES)
+        out[cloth.faces[lies[cloth.faces].all(axis=1)]] = True
     return out
 
 

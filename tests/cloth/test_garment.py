@@ -14,10 +14,12 @@ from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garm
 from smplxpp.cloth.cloth_mesh import find_opening_bridges
 from smplxpp.cloth.garment import find_carriers, usual_config
 from smplxpp.core import HAIR, GeometryWarning, InputError, TriangleMesh
+from smplxpp.people.garments.cut import tube_along
 from smplxpp.people.garments.hair import hairstyles
 from smplxpp.people.garments.mannequin import Mannequin
 from smplxpp.template.template import BODY_PART
 from tests.cloth.persons import HEM, PART, WAIST, person, standing
+from tests.dolls.doll import ball
 
 COARSE = GarmentConfig(spacing=0.06, collider_spacing=0.04)
 
@@ -174,6 +176,26 @@ def test_an_apron_that_is_tied_in_the_back_hangs_from_its_upper_edge():
     carriers = find_carriers(front, template.part_mesh(BODY_PART))
     assert carriers.sum() == 25
     np.testing.assert_allclose(front.vertices[carriers][:, 1], WAIST)
+
+
+def test_a_roll_hangs_from_its_underside_on_skin_that_looks_up():
+    """The scarf of the stress bench had lost what held it: nothing of its upper side touches the body."""
+    skin = ball((0.2, 0.2, 0.2), 1.0, {"pelvis": 1.0}, subdivisions=4)
+    angle, tilt = np.linspace(0.0, 2.0 * np.pi, 61), np.radians(35.0)
+    away = 0.2 + 0.004 + 0.02  # metres: the sphere's radius, a gap, the roll's radius
+    middle = away * np.stack([np.sin(tilt) * np.cos(angle), np.full(61, np.cos(tilt)), np.sin(tilt) * np.sin(angle)], 1)
+    middle += [0.0, 1.0, 0.0]
+    points, faces = tube_along(middle, np.full(61, 0.02))
+    out = ((points - np.repeat(middle, 24, axis=0)) * TriangleMesh(points, faces).vertex_normals).sum(axis=1).mean()
+    roll = TriangleMesh(points, faces if out > 0 else faces[:, ::-1])
+    body = TriangleMesh(skin.vertices, skin.faces)
+    carriers = find_carriers(roll, body)
+    assert 61 * 4 <= carriers.sum() <= 61 * 10
+    away = np.linalg.norm(points[carriers] - [0.0, 1.0, 0.0], axis=1) - 0.2
+    assert away.max() < 0.012
+    assert not find_carriers(roll.with_vertices(points + [0.0, 0.05, 0.0]), body).any()
+    sheet = roll.submesh(((points - np.repeat(middle, 24, axis=0))[:, 1] > 0.005)[faces].all(axis=1))[0]
+    assert not find_carriers(sheet, body).any()
 
 
 def test_a_garment_that_nothing_holds_is_refused_with_what_to_do():
