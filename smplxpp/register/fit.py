@@ -22,7 +22,7 @@ from smplxpp.register.observations import BodyFit, Observations, RegisterConfig,
 from smplxpp.register.priors import Anatomy, Priors
 from smplxpp.register.scan_term import ScanTerm
 from smplxpp.register.silhouette_term import Outline, SilhouetteTerm, Surface
-from smplxpp.register.solver import Terms, gauss_newton, joint_confidence
+from smplxpp.register.solver import Terms, explains_as_well, gauss_newton, joint_confidence, unlikely_shape
 from smplxpp.register.start import joined_points, start_of, state_from_points
 
 
@@ -91,6 +91,7 @@ class _Registration:
         self.columns = self._columns()
         # No vertex counts as bare before labels were looked up on an approximate body.
         self.bare = np.zeros(body.vertex_count, dtype=bool)
+        self.labelled_only = False
 
     def fit(self) -> BodyFit:
         """Run the schedule and return the result with its residuals and confidence."""
@@ -223,6 +224,30 @@ class _Registration:
         return BodyState(rotations, transl, state.betas, expression), confidence
 
     def _solve(self, state: BodyState, window: _Window, solve_shape: bool) -> tuple[BodyState, NormalEquations]:
+        """Solve one window, and again where the shape is that of no person: without scans that are not labelled.
+
+        Dents of a rough scan push the body inwards, and nothing but the prior pulls it out below clothes, whose
+        distance grows with it. If the shape stays unlikely, its prior gets heavier. A person who really is so has
+        keypoints, contours and skin that no likelier shape explains.
+        """
+        solved = self._solved(state, window, solve_shape)
+        if not solve_shape or not unlikely_shape(solved[0]):
+            return solved
+        # `_measure` compares with all scans, labelled or not.
+        config, before = self.config, self._measure(solved[0], window.rows)
+        self.labelled_only = True
+        for weight in (1.0, 4.0, 16.0):
+            self.config = replace(config, shape_prior=weight * config.shape_prior)
+            other = self._solved(state, window, solve_shape)
+            if not explains_as_well(self._measure(other[0], window.rows), before):
+                break
+            solved = other
+            if not unlikely_shape(solved[0]):
+                break
+        self.config, self.labelled_only = config, False
+        return solved
+
+    def _solved(self, state: BodyState, window: _Window, solve_shape: bool) -> tuple[BodyState, NormalEquations]:
         """Solve one window: named points first, then all terms with the vertices that are now known to be bare."""
         config, rows = self.config, window.rows
         terms = self._terms(state, rows)
@@ -322,14 +347,16 @@ class _Registration:
         """Return the term of scans for some rows; None if they have no scans."""
         frames = self.frames[rows].tolist()
         scans = {k: self.observed.scans[frame] for k, frame in enumerate(frames) if frame in self.observed.scans}
+        if self.labelled_only:
+            scans = {k: scan for k, scan in scans.items() if scan.labels is not None}
         return ScanTerm(self.kinematics, self.points, self.bare, scans, self.config) if scans else None
 
     # -- results
 
-    def _measure(self, state: BodyState) -> dict[str, Float64[np.ndarray, " T"]]:
-        """Return the residuals of a state in all frames; gaps are not known, so all cloth counts as it is."""
+    def _measure(self, state: BodyState, rows: np.ndarray | None = None) -> dict[str, Float64[np.ndarray, " T"]]:
+        """Return the residuals of a state in all or some frames; gaps are not known, so all cloth counts as it is."""
         # All frames at once, because residuals need no linear system and windows would only divide the result.
-        rows = np.arange(len(self.frames))
+        rows = np.arange(len(self.frames)) if rows is None else rows
         terms = replace(self._terms(state, rows), silhouettes=self._silhouettes(state, rows), scans=self._scans(rows))
         return terms.residuals(self.kinematics, state)
 

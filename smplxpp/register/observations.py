@@ -104,6 +104,7 @@ class RegisterConfig:
         acceleration: scale of a joint's angular acceleration, rad/s^2; beyond it the Cauchy kernel flattens the cost.
         transl_acceleration: scale of the acceleration of the whole body, m/s^2.
         pose_prior: weight of the Gaussian pose prior; 0 leaves the joint limits alone.
+        shape_prior: weight of the Gaussian prior of the shape, at which a fit begins.
         scan_samples: vertices drawn from a scan.
         rim_samples: vertices of the body that are tested for lying at a rim.
         joint_steps: Gauss-Newton steps on keypoints and landmarks alone.
@@ -124,6 +125,7 @@ class RegisterConfig:
     acceleration: float = 6.0
     transl_acceleration: float = 1.5
     pose_prior: float = 1.0
+    shape_prior: float = 1.0
     scan_samples: int = 4000
     rim_samples: int = 4000
     joint_steps: int = 15
@@ -148,7 +150,7 @@ class RegisterConfig:
             require_positive(f"registration: {name}", getattr(self, name))
         for name in ("scan_samples", "rim_samples", "joint_steps", "shape_frames", "window"):
             require_at_least(f"registration: {name}", getattr(self, name), 1)
-        for name in ("pose_prior", "surface_steps", "seed"):
+        for name in ("pose_prior", "shape_prior", "surface_steps", "seed"):
             require_at_least(f"registration: {name}", getattr(self, name), 0)
 
 

@@ -196,9 +196,9 @@ class Priors:
         mean, spread = np.zeros_like(betas), 1.0
         if self.start is not None and np.isfinite(self.start.shape):
             mean, spread = self.start.state.betas, self.start.shape
-        index = np.arange(len(betas))
-        equations.shape[index, index] += 1.0 / spread**2
-        equations.shape_gradient += (betas - mean) / spread**2
+        index, weight = np.arange(len(betas)), self.config.shape_prior / spread**2
+        equations.shape[index, index] += weight
+        equations.shape_gradient += weight * (betas - mean)
 
     def _add_smoothness(self, equations: NormalEquations, state: BodyState) -> None:
         """Add the accelerations of rotations, translation and expression, over triples of equidistant frames."""

@@ -7,7 +7,7 @@ instead of being tested for descent. After a step the gaps between body and clot
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,3 +151,20 @@ def joint_confidence(
         variance = np.einsum("jxp,pq,jxq->j", jacobian, covariance, jacobian, optimize=True)
         out[k] = 1.0 / (1.0 + np.maximum(variance, 0.0) / _HALF_KNOWN**2)
     return out
+
+
+def unlikely_shape(state: BodyState) -> bool:
+    """Return whether a shape is that of no person: of 20 standard normal betas 1 in 200 has a mean square of 2."""
+    return len(state.betas) > 0 and float((state.betas**2).mean()) > 2.0
+
+
+def explains_as_well(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> bool:
+    """Return whether one body explains keypoints, contours and skin as well as another, to a sixth of the medians."""
+    seen = {
+        name: np.isfinite(one[name]) & np.isfinite(other[name])
+        for name in ("keypoints_px", "landmarks_mm", "silhouette_px", "skin_mm")
+        if name in one
+    }
+    return all(
+        np.median(one[name][rows]) <= 1.15 * np.median(other[name][rows]) for name, rows in seen.items() if rows.any()
+    )

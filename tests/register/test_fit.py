@@ -155,6 +155,22 @@ def test_a_body_does_not_stand_out_of_its_clothes(person):
     assert fit.residuals["inside_mm"][0] <= fit.initial_residuals["inside_mm"][0]
 
 
+def test_dents_of_a_rough_scan_starve_nobody(person, cameras):
+    """Eleven cameras on a real man in a wide shirt: his rough surface, without labels, left skin and bones of him.
+
+    Here betas reached a mean square of 8 and the body was 23 mm off.
+    """
+    one = person.select([0])
+    mesh = BODY.mesh(BODY.forward(one).vertices[0])
+    bumps = np.prod(np.sin(mesh.vertices @ np.random.default_rng(3).normal(size=(3, 2)) * 40.0), axis=1)
+    rough = mesh.with_vertices(mesh.vertices + (0.015 + 0.06 * bumps)[:, None] * mesh.vertex_normals)
+    seen = keypoints(BODY, one, cameras, px=2.0)
+    observed = Observations((0,), cameras, keypoints=seen, scans={0: ScanObservation(rough)})
+    found = register(BODY, observed, replace(SMALL, scan_samples=1000, surface_steps=4)).params
+    assert (found.betas**2).mean() < 2.0
+    assert vertex_error_mm(BODY, found, one) < 12.0
+
+
 def test_a_missing_mask_is_named_and_the_rest_goes_on(person, cameras):
     mask = masks(BODY, person.select([0, 1]), cameras)
     observed = Observations(
