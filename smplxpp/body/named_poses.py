@@ -83,6 +83,16 @@ _RARE: Mapping[str, tuple[_Rotations, _Rotations, _Rotations]] = {
     ),
 }
 _RARE_ARMS = ("lowered", "spread", "raised", "forwards")
+# Legs of people near the floor, the left one and its mirror image: kneeling upright, on the heels, squatting, and
+# sitting with legs stretched out, drawn up or crossed.
+_LOW: Mapping[str, _Rotations] = {
+    "kneeling": {"hip": ((-3, 0, 5),), "knee": ((92, 0, 0),), "ankle": ((38, 0, 0),)},
+    "on the heels": {"hip": ((-62, 0, 8),), "knee": ((148, 0, 0),), "ankle": ((45, 0, 0),)},
+    "squatting": {"hip": ((-105, 0, 14),), "knee": ((122, 0, 0),), "ankle": ((-20, 0, 0),)},
+    "legs stretched out": {"hip": ((-88, 0, 6),), "knee": ((8, 0, 0),)},
+    "legs drawn up": {"hip": ((-102, 0, 5),), "knee": ((112, 0, 0),)},
+    "legs crossed": {"hip": ((0, 40, 0), (-82, 0, 0), (0, 60, 0)), "knee": ((122, 0, 0),)},
+}
 
 
 def standing_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, "J 3"]]]:
@@ -123,6 +133,17 @@ def rare_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, "J 3
                     f"{name}, arms {arm}, the other way",
                     _pose_of(joint_count, _ARMS[arm], _ARMS[arm], other, one, trunk=turned),
                 )
+
+
+def low_poses(joint_count: int) -> Iterator[tuple[str, Float64[np.ndarray, "J 3"]]]:
+    """Yield names and axis-angle vectors, radians, of poses of people who kneel, squat or sit on the floor.
+
+    Args:
+        joint_count: of a body of the SMPL family.
+    """
+    for arm in ("hanging", "forwards"):
+        for name, legs in _LOW.items():
+            yield f"{name}, arms {arm}", _pose_of(joint_count, _ARMS[arm], _ARMS[arm], legs, legs)
 
 
 def _pose_of(joint_count: int, *parts: _Rotations, trunk: _Rotations | None = None) -> Float64[np.ndarray, "J 3"]:

@@ -93,7 +93,7 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", h
     else:
         path, raw = None, _raw_of(scan)
     name = "in memory" if path is None else path.name
-    note = ""
+    note, axes = "", True
     # A search for units and axis needs faces; a cloud gets a coarse surface for it, because the full one needs
     # metres.
     scale: str | float = units
@@ -106,6 +106,7 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", h
             frame = find_scan_frame(vertices, faces, units=stated, up=up, height=height, usual=usual)
         except InputError as error:
             raise _named(error, name) from None
+        axes = not (up == AUTO and frame.unambiguous)
         scale, up, note = frame.units, frame.up, frame.note
     # From here on metres and +Y up; faces keep their orientation, since the change of axes is a rotation.
     vertices = convert_points(raw.vertices, units=scale, up=up)
@@ -114,7 +115,7 @@ def read_scan(scan: str | Path | MeshLike, *, units: str = "m", up: str = "y", h
     except InputError as error:
         raise _named(error, name) from None
     # The last guard of the units: a scan in centimetres, inches or millimetres that was read as metres fails here.
-    check_human_scale(clean.mesh.vertices, subject=f"scan {name}")
+    check_human_scale(clean.mesh.vertices, subject=f"scan {name}", axes=axes)
     return ScanFile(raw, clean, scale if isinstance(scale, str) else f"{1000.0 * scale:.4g} mm", up, note)
 
 

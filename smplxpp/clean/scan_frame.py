@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from smplxpp.body import load_body
-from smplxpp.body.named_poses import standing_poses
+from smplxpp.body.named_poses import low_poses, standing_poses
 from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec, require_choice
 from smplxpp.core.foreign import METRES_PER_UNIT, PointsLike, mesh_arrays, point_arrays
 from smplxpp.core.surface_points import SurfacePoints, truncated_distance
@@ -57,7 +57,7 @@ def sizes_by_unit(size: float) -> str:
     )
 
 
-def check_human_scale(vertices: PointsLike, *, subject: str = "scan") -> None:
+def check_human_scale(vertices: PointsLike, *, subject: str = "scan", axes: bool = True) -> None:
     """Refuse a person that is not in metres or does not stand along Y.
 
     The largest extent shows the unit. An extent more than 1.3 times the vertical one shows swapped axes, because a
@@ -66,6 +66,8 @@ def check_human_scale(vertices: PointsLike, *, subject: str = "scan") -> None:
     Args:
         vertices: (N, 3) of the surface, without unreferenced and non-finite vertices.
         subject: name of the scan in messages.
+        axes: whether the extents are compared. Who sits on the floor is 1.35 times as long as high; where the upward
+            axis was found without another one that fits, it is that.
 
     Raises:
         InputError: the message names the option that repairs it.
@@ -87,7 +89,7 @@ def check_human_scale(vertices: PointsLike, *, subject: str = "scan") -> None:
         )
     # Swapped axes: the longest extent is not the vertical one.
     widest = int(np.argmax(extent))
-    if widest != 1 and size > 1.3 * extent[1]:
+    if axes and widest != 1 and size > 1.3 * extent[1]:
         axis = "xyz"[widest]
         raise InputError(
             f"{subject}: axes",
@@ -126,8 +128,9 @@ def find_scan_frame(
 ) -> ScanFrame:
     """Find the units and the upward axis of a person's scan.
 
-    The mean body in standing poses is compared with the scan turned to each of six upward axes and eight headings. The
-    axis of the smallest distance is up, and the height along it gives the units. A scan may lean by some 20 degrees.
+    The mean body in standing, kneeling and sitting poses is compared with the scan turned to each of six upward axes
+    and eight headings. The axis of the smallest distance is up, and the height along it gives the units. A scan may
+    lean by some 20 degrees.
 
     Args:
         vertices: vertices of the scan, or a mesh of any library.
@@ -232,7 +235,7 @@ def _no_size(received: str, size: float) -> InputError:
         expected=f"a person {_LOW} to {_HIGH} m high in {', '.join(METRES_PER_UNIT)}",
         received=received,
         remedy=f"{sizes_by_unit(size)}: state which it is with --units, or the person's stature in metres with "
-        "--height 1.75; check for stray geometry, half a person, an animal",
+        "--height 1.75 (people who kneel or sit: --units); check for stray geometry, half a person, an animal",
     )
 
 
@@ -257,11 +260,13 @@ def _cost(surface: SurfacePoints, bodies: _Bodies, up: str) -> float:
 
 @cache
 def _bodies() -> _Bodies:
-    """Return 250 points with normals of the open body in standing poses, centred on the vertical axis."""
+    """Return 250 points with normals of the open body in standing and low poses, centred on the vertical axis."""
     # Three poses of the legs suffice: more do not change which axis is up.
     body = load_body()
     legs = ("apart", "close", "knees bent")
     vectors = [v for name, v in standing_poses(body.joint_count) if name.rpartition("legs ")[2] in legs]
+    # Who sits with legs stretched out is nearer to somebody who lies than to any standing pose.
+    vectors += [v for _, v in low_poses(body.joint_count)]
     params = BodyParams.from_full_pose(
         np.stack(vectors), betas=np.zeros((1, 0)), expression=np.zeros((1, 0)), transl=np.zeros((1, 3))
     )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body
-from smplxpp.body.named_poses import standing_poses
-from smplxpp.clean.scan_frame import METRES_PER_UNIT, convert_points, find_scan_frame
+from smplxpp.body.named_poses import low_poses, standing_poses
+from smplxpp.clean.scan_frame import METRES_PER_UNIT, check_human_scale, convert_points, find_scan_frame
 from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec
 
 
@@ -32,6 +32,22 @@ def test_units_and_axis_are_found_back(person, units, up):
     assert (found.units, found.up, found.unambiguous) == (units, up, True)
     assert units in found.note
     assert up in found.note
+
+
+@pytest.mark.parametrize("name", ["legs stretched out, arms hanging", "on the heels, arms forwards"])
+def test_who_sits_on_the_floor_does_not_lie(name):
+    """Legs along z and a trunk along y: standing poses had z up, and the size then forbade every other axis."""
+    body, rng = load_body(), np.random.default_rng(1)
+    pose = dict(low_poses(body.joint_count))[name] + np.radians(4.0) * rng.normal(size=(body.joint_count, 3))
+    pose[0] = [0.0, 1.1, 0.0]
+    params = BodyParams.from_full_pose(
+        pose[None], betas=np.zeros((1, 1)), expression=np.zeros((1, 1)), transl=np.zeros((1, 3))
+    )
+    vertices = body.forward(params).vertices[0]
+    filed = vertices @ convert_points(np.eye(3), up="z").T
+    found = find_scan_frame(filed, body.faces, units="m")
+    assert (found.up, found.unambiguous) == ("z", True)
+    check_human_scale(vertices, axes=False)
 
 
 def test_what_is_stated_is_kept(person):

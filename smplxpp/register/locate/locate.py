@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
 from smplxpp.body import BodyModel
-from smplxpp.body.named_poses import rare_poses, standing_poses
+from smplxpp.body.named_poses import low_poses, rare_poses, standing_poses
 from smplxpp.core import HAIR, SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.register.kinematics import Kinematics
@@ -141,11 +141,13 @@ def locate_body(
     _refuse_convex(body, mesh, config)
     pinned = PinnedLandmarks.of(body, landmarks) if landmarks else None
     search = Search(Kinematics(body), mesh, config, pinned, progress)
-    # Standing poses first; rare ones where none of these explains the surface, and then they have to explain it better.
+    # Standing poses first; rare ones, then low ones, where none explains the surface: these have to explain it better.
     found = search.candidates(standing_poses(body.joint_count))
     best, moved = _settled(search, found[0], hints)
-    if is_doubtful(best):
-        rare = search.candidates(rare_poses(body.joint_count))
+    for poses in (rare_poses, low_poses):
+        if not is_doubtful(best):
+            break
+        rare = search.candidates(poses(body.joint_count))
         other, its = _settled(search, rare[0], hints)
         if other.cost < best.cost - _RARER:
             best, moved, found = other, its, [*rare, *found]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from smplxpp.body import load_body, load_params
-from smplxpp.body.named_poses import rare_poses
+from smplxpp.body.named_poses import low_poses, rare_poses
 from smplxpp.clean import Simplified, simplify
-from smplxpp.core import BodyParams, InputError, TriangleMesh, matrix_from_rotvec
+from smplxpp.core import BodyParams, InputError, TriangleMesh, ignore_progress, matrix_from_rotvec
 from smplxpp.core.mesh_files.mesh_io import read_mesh
-from smplxpp.register.kinematics import BodyState
+from smplxpp.register.kinematics import BodyState, Kinematics
 from smplxpp.register.landmarks import visible_vertices
 from smplxpp.register.locate import BodyNotFoundError, LocateConfig, locate, locate_body
 from smplxpp.register.locate.decision import (
@@ -26,7 +26,7 @@ from smplxpp.register.locate.decision import (
 )
 from smplxpp.register.locate.dressed import PARTS, Misfit
 from smplxpp.register.locate.proxy import Region, regions
-from smplxpp.register.locate.search import Found
+from smplxpp.register.locate.search import Found, Search
 
 PERSON = Path(__file__).resolve().parents[3] / "data" / "fixtures" / "person"
 QUICK = LocateConfig(
@@ -155,6 +155,23 @@ def test_a_body_that_no_standing_pose_explains_is_found_among_rare_poses(body, b
     assert found.candidates[0].pose in dict(rare_poses(body.joint_count))
     assert np.linalg.norm(posed.vertices[0] - truth.vertices[0], axis=1).mean() < 0.025
     assert np.linalg.norm(posed.joints[0, :22] - truth.joints[0, :22], axis=1).max() < 0.08
+
+
+def test_low_poses_find_a_person_on_the_heels(body):
+    """Thighs on calves: from poses on the feet a search ended with the feet in front, and was not believed."""
+    pose = dict(low_poses(body.joint_count))["on the heels, arms hanging"].copy()
+    pose[1:22] += np.radians(4.0) * np.random.default_rng(0).normal(size=(21, 3))
+    params = BodyParams.from_full_pose(
+        pose[None], betas=np.zeros(body.num_betas), expression=np.zeros(body.num_expressions), transl=np.zeros(3)
+    )
+    outer = np.isin(body.faces, visible_vertices(body)).all(axis=1)
+    mesh = body.mesh(body.forward(params).vertices[0]).submesh(outer)[0]
+    config = replace(LEAST, limbs_tried=1, candidates=1)
+    search = Search(Kinematics(body), mesh, config, None, ignore_progress)
+    best = search.candidates(low_poses(body.joint_count))[0]
+    found = body.forward(best.state.to_params(body)).vertices[0]
+    assert best.name.startswith("on the heels")
+    assert np.linalg.norm(found - body.forward(params).vertices[0], axis=1).mean() < 0.03
 
 
 def test_rare_poses_are_tried_only_where_standing_ones_leave_something_unexplained(located):
