@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,26 @@ class SlurmExecutor:
         cancel_queued(runs)  # those of a driver that was killed
 
     def check(self, job: Job) -> None:
-        """Leave it to Slurm, which knows its partitions."""
+        """Refuse a job that asks for GPUs of a partition without any; Slurm would refuse it when its build is done."""
+        trains = any(STEPS[step].on_gpu for step in job.steps)
+        if trains and job.needs.gpus and not self._has_gpus:
+            raise too_many_gpus(job, f"0 in a partition without GPUs ({self.partition or 'the default one'})")
+
+    @cached_property
+    def _has_gpus(self) -> bool:
+        """Whether a node of the partition lists GPUs among its generic resources; True where Slurm does not tell."""
+        if self.cluster != "slurm":
+            return True
+        chosen = [f"--partition={self.partition}"] if self.partition else []
+        try:
+            words = ["sinfo", "--noheader", "--format=%P %G", *chosen]
+            done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+        except (OSError, subprocess.TimeoutExpired):
+            return True
+        # A line a group of nodes; the default partition's name ends with a star.
+        lines = [line.split(maxsplit=1) for line in done.stdout.splitlines() if len(line.split()) > 1]
+        own = lines if self.partition else [line for line in lines if line[0].endswith("*")]
+        return done.returncode != 0 or not own or any("gpu" in resources for _, resources in own)
 
     def room(self, task: Task) -> bool:
         """Return True, as Slurm queues what does not fit, unless a killed driver's worker is still at the subject."""

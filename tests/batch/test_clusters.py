@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from pipelines.batch.hold import JOB_HOLD, Hold, read_holder
 from pipelines.batch.jobs import Job, read_jobs
 from pipelines.batch.records import read_batch, read_job, records_of
 from pipelines.batch.run_job import Resources
+from pipelines.batch.steps import Needs
 from smplxpp import InputError
 
 STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in.py")))
@@ -235,6 +237,7 @@ class Queue:
             'grep -h "array=" "$1" >> arrays; echo "Submitted batch job $n"',
             "squeue": "cat queue",
             "scancel": 'echo "$@" >> cancelled; : > queue',
+            "sinfo": "cat nodes 2>/dev/null",
         }
         for name, words in scripts.items():
             (folder / name).write_text(f"#!/bin/sh\ncd {folder}\n{words}\n")
@@ -270,6 +273,22 @@ def test_slurm_without_accounting_loses_no_task_that_leaves_its_queue(tmp_path, 
     (runs / "anna").mkdir()
     with Hold(runs / "anna" / JOB_HOLD, subject="anna"):
         assert not executor.room(tasks[0]) and executor.room(tasks[1])
+
+
+def test_gpus_of_a_partition_that_has_none_are_refused_before_the_work(tmp_path, monkeypatch):
+    """Slurm refused the training an hour later, when the build was done, and waited for others to end."""
+    pytest.importorskip("submitit")
+    queue = Queue(tmp_path / "bin", monkeypatch)
+    nodes, job = queue.folder / "nodes", Job("anna", "capture", ("build", "train"))
+    nodes.write_text("main* (null)\ngpu gpu:h100:8(S:0-1)\n")
+    with pytest.raises(InputError, match=r"partition without GPUs \(the default one\).*gpus: 0"):
+        SlurmExecutor(tmp_path / "runs", Resources()).check(job)
+    SlurmExecutor(tmp_path / "runs", Resources()).check(Job("anna", "capture", ("build",)))
+    SlurmExecutor(tmp_path / "runs", Resources()).check(replace(job, needs=Needs(gpus=0.0)))
+    # Nodes that have GPUs, and a Slurm that says nothing.
+    for words in ("main* gpu:2\n", "main* (null)\nmain* gpu:a100:4\n", ""):
+        nodes.write_text(words)
+        SlurmExecutor(tmp_path / "runs", Resources()).check(job)
 
 
 def test_more_tasks_than_an_array_may_have_become_two(tmp_path, monkeypatch):
