@@ -6,10 +6,12 @@ import base64
 import io
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 from pipelines.report.model import Picture
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.image_file import decode_image
+from smplxpp.native import map_in_threads
 
 PAGE_BYTES = 4_000_000
 """Largest size of a page, bytes. Mail servers refuse messages from 10 MB on, and base64 adds a third to a file."""
@@ -49,7 +51,7 @@ def embed_pictures(pictures: Iterable[Picture], *, room: int) -> dict[Picture, E
     out: dict[Picture, Embedded] = {}
     # One level serves all pictures, so that two that are compared with each other lose the same.
     for quality, side in _LEVELS:
-        out = {picture: _embedded(picture, quality, side) for picture in shown}
+        out = dict(zip(shown, map_in_threads(partial(_embedded, quality=quality, side=side), shown), strict=True))
         if sum(len(one.uri) for one in out.values()) <= room:
             break
     return out

@@ -26,6 +26,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from smplxpp.core import Camera, TriangleMesh
+from smplxpp.native import map_in_threads
 from smplxpp.raster import rasterize_mesh
 from smplxpp.register.clothing import Gaps
 from smplxpp.register.keypoint_term import projected
@@ -217,12 +218,19 @@ class SilhouetteTerm:
         points, normals = self.surface.posed(kinematics, posture)
         grown = points + normals * (np.where(self.bare, 0.0, self.gaps.median)[self._nearest])[:, None]
         clothed = TriangleMesh(grown, self.surface.faces)
-        found: list[tuple[np.ndarray, ...]] = []
-        for name, camera in self.cameras.items():
-            outline = self.outlines.get((name, row))
-            if outline is not None:
-                view = points[self.index], normals[self.index], _rasterised(clothed, camera)
-                found.append(self._of_camera(camera, outline, *view, collect=collect, in_pixels=in_pixels))
+        # Small images, each drawn by one thread, and several at a time.
+        seen = [name for name in self.cameras if (name, row) in self.outlines]
+        drawn = map_in_threads(lambda name: _rasterised(clothed, self.cameras[name]), seen)
+        found = [
+            self._of_camera(
+                self.cameras[name],
+                self.outlines[name, row],
+                *(points[self.index], normals[self.index], view),
+                collect=collect,
+                in_pixels=in_pixels,
+            )
+            for name, view in zip(seen, drawn, strict=True)
+        ]
         if not found:
             none = np.zeros(0)
             return none.astype(np.int64), np.zeros((0, 3)), none, none
