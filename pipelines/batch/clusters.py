@@ -22,7 +22,8 @@ from pipelines.batch.hold import JOB_HOLD, at_work
 from pipelines.batch.jobs import Job
 from pipelines.batch.run_job import Resources, run_job
 from pipelines.batch.steps import STEPS
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError
+from smplxpp.core.lazy import import_extra
 
 log = logging.getLogger(__name__)
 
@@ -331,17 +332,10 @@ def _name(runs: Path) -> str:
 
 
 def _ray() -> Any:
-    try:
-        import ray
-        import ray.exceptions
-    except ImportError:
-        raise MissingExtraError("ray", extra="cluster", purpose="a batch on Ray") from None
+    ray = import_extra("ray", extra="cluster", purpose="a batch on Ray")
+    import_extra("ray.exceptions", extra="cluster", purpose="a batch on Ray")
     return ray
 
 
 def _submitit() -> Any:
-    try:
-        import submitit
-    except ImportError:
-        raise MissingExtraError("submitit", extra="cluster", purpose="a batch on Slurm") from None
-    return submitit
+    return import_extra("submitit", extra="cluster", purpose="a batch on Slurm")

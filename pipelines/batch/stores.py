@@ -19,6 +19,7 @@ from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.atomic import atomic_write_text
 from smplxpp.core.files.json_file import read_json
 from smplxpp.core.files.paths import path_inside
+from smplxpp.core.lazy import import_extra
 
 _LISTING = ".fetched.json"
 _LEFT_OUT = ("capture", ".job.lock")
@@ -125,10 +126,7 @@ def open_address(address: str, *, purpose: str) -> tuple[Any, str]:
         MissingExtraError: no fsspec.
         InputError: a kind of address without a package, or no credentials.
     """
-    try:
-        import fsspec
-    except ImportError:
-        raise MissingExtraError("fsspec", extra="cluster", purpose=purpose) from None
+    fsspec = import_extra("fsspec", extra="cluster", purpose=purpose)
     try:
         return fsspec.core.url_to_fs(address)
     except (ImportError, ValueError) as error:
