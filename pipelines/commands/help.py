@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -141,7 +141,7 @@ def checked_arguments(name: str, command: type, args: Sequence[str]) -> list[str
     options = {option.name: option for option in options_of(command)}
     known = [option for option in options if option.startswith("--")]
     out = ["--out" if arg == "-o" and "--out" in known else arg for arg in args]
-    for arg, following in zip(out, [*out[1:], None], strict=True):
+    for arg, following in zip_longest(out, out[1:]):
         option, equals, given = arg.partition("=")
         option = option.replace("_", "-")
         if option in known and options[option].value:
