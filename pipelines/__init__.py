@@ -13,7 +13,7 @@ def main() -> int:
         The exit status of `pipelines.cli.main`; 130 after an interrupt.
     """
     # Matrices here have a few hundred columns, over which threads of OpenBLAS wait for each other longer than they
-    # compute: a registration takes 1.1 to 2.6 times its CPU time with two. It reads this when numpy is loaded.
+    # compute, most of all beside other processes. OpenBLAS reads this when numpy is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Nothing of the package is imported before the guard: its modules take half a second. What Python does before them
     # (`site`, 20 ms) is not guarded.

@@ -159,11 +159,8 @@ def checked_arguments(name: str, command: type, args: Sequence[str]) -> list[str
 
 def _check_value(name: str, option: Option, given: str | None) -> None:
     """Raise InputError where what follows an option is none of its values; of several the first is looked at."""
-    kind, several, numbers = (
-        option.value.removesuffix(" ..."),
-        option.value.endswith(" ..."),
-        {"INT": int, "FLOAT": float},
-    )
+    kind, several = option.value.removesuffix(" ..."), option.value.endswith(" ...")
+    numbers = {"INT": int, "FLOAT": float}
     expected = {"INT": "a whole number", "FLOAT": "a number"}.get(kind, "a value")
     if option.choices:
         expected = f"one of {', '.join(option.choices)}"

@@ -228,12 +228,12 @@ class _Registration:
 
         Dents of a rough scan push the body inwards, and nothing but the prior pulls it out below clothes, whose
         distance grows with it. If the shape stays unlikely, its prior gets heavier. A person who really is so has
-        keypoints, contours and skin that no likelier shape explains.
+        keypoints, contours and labelled skin that no likelier shape explains.
         """
         solved = self._solved(state, window, solve_shape)
         if not solve_shape or not unlikely_shape(solved[0]):
             return solved
-        # `_measure` compares with all scans, labelled or not.
+        # What is left out of a solution takes no part in the comparison either, see `_scans`.
         config, before = self.config, self._measure(solved[0], window.rows)
         self.labelled_only = True
         for weight in (1.0, 4.0, 16.0):

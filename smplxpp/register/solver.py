@@ -159,7 +159,7 @@ def unlikely_shape(state: BodyState) -> bool:
 
 
 def explains_as_well(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> bool:
-    """Return whether one body explains keypoints, contours and skin as well as another, to a sixth of the medians."""
+    """Return whether one body explains keypoints, contours and skin as well as another, within 15 % of the medians."""
     seen = {
         name: np.isfinite(one[name]) & np.isfinite(other[name])
         for name in ("keypoints_px", "landmarks_mm", "silhouette_px", "skin_mm")

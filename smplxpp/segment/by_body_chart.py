@@ -78,13 +78,9 @@ class BodyChart:
         return (self.region == HEAD) & (back | (self.face_height > 0.9))
 
 
+@lru_cache(maxsize=1)  # five steps of one labelling ask for the same
 def chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
     """Return the places of a body's own vertices, from its joints and weights in the rest pose of one frame's shape."""
-    return _chart_of_body(body, params)
-
-
-@lru_cache(maxsize=1)  # five steps of one labelling ask for the same
-def _chart_of_body(body: BodyModel, params: BodyParams) -> BodyChart:
     # The region of a vertex is that of the joints with the largest sum of skin weights.
     rest = body.forward(params)
     vertices, joints = rest.rest_vertices[0], rest.rest_joints[0]

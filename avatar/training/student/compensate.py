@@ -261,7 +261,7 @@ def compensate(
     tracked = teacher.track if config.surface_normals and teacher is not None else None
     context = with_surface_normals(session.context, sequence, tracked)
     progress = session.run(lambda: CompensateTask(sequence, made, config, context, held=held), config)
-    # Gaussians have moved on since. Modules that are made take random numbers, which they then give up.
+    # Gaussians have moved on since. New modules draw random numbers before they get their values.
     with fixed_seed(config.seed):
         return with_held_face(on_drawn_face(made), expressions, jaws).eval(), progress
 

@@ -101,8 +101,11 @@ def on_drawn_face(student: Student) -> Student:
     squared, nearest, at = tree.squared_distance(vertices, faces, means[free])
     close = np.asarray(squared).reshape(-1) < farthest**2
     rows, now = free[close], np.flatnonzero(shown)[np.asarray(nearest).reshape(-1)[close]]
+    if not len(rows):
+        return student
     corners = vertices[template.faces[now]]
     share = np.asarray(igl.barycentric_coordinates(at[close], *(np.ascontiguousarray(corners[:, k]) for k in range(3))))
+    barycentric = torch.tensor(share[:, :2]).to(bound.dc)
     # From the old triangle's frame to the new one's.
     device = bound.dc.device
     chosen = torch.tensor(rows, device=device)
@@ -110,9 +113,9 @@ def on_drawn_face(student: Student) -> Student:
     turn = frames.rotations[new].transpose(1, 2) @ frames.rotations[old]
     uncompensated = world_from_frames(bound, frames).means[chosen]
     values = dict(bound.tensors)
-    place = on_triangles(frames.corners[new], torch.tensor(share[:, :2]).to(bound.dc))
+    place = on_triangles(frames.corners[new], barycentric)
     values["face_index"] = bound.face_index.index_copy(0, chosen, new)
-    values["barycentric"] = bound.barycentric.index_copy(0, chosen, torch.tensor(share[:, :2]).to(bound.dc))
+    values["barycentric"] = bound.barycentric.index_copy(0, chosen, barycentric)
     moved = (frames.rotations[new].transpose(1, 2) @ (uncompensated - place)[..., None])[..., 0]
     values["offset"] = bound.offset.index_copy(0, chosen, moved)
     values["normal_offset"] = bound.normal_offset.index_fill(0, chosen, 0.0)
