@@ -70,12 +70,12 @@ class ArrayCache:
             # Another thread may have stored the same key in the meantime. An array above the bound is returned, but
             # never kept.
             if size <= self.max_bytes and key not in self._items:
-                self._items[key] = arrays
-                self._bytes += size
-                # Drop the least recently used items first.
-                while self._bytes > self.max_bytes:
+                # Drop the least recently used items before the new one is added, so that the bound holds at any time.
+                while self._bytes + size > self.max_bytes:
                     _, dropped = self._items.popitem(last=False)
                     self._bytes -= sum(array.nbytes for array in dropped)
+                self._items[key] = arrays
+                self._bytes += size
         return arrays
 
     def __getstate__(self) -> dict[str, int]:
