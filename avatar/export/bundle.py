@@ -12,7 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
+from avatar.export.bare_skin import bare_skin
 from avatar.export.bundle_numbers import Tensors, blended, halves, rounded, signed, unsigned, usual_coefficients
+from avatar.gaussians import BoundGaussians
 from avatar.models.networks.blend_shapes import BlendShapes
 from avatar.models.networks.pose_dependence import BODY_JOINTS
 from avatar.models.student import Student
@@ -21,7 +23,6 @@ from smplxpp.cloth.driver import DriverConfig
 from smplxpp.cloth.garment import Garment
 from smplxpp.cloth.garment_file import garments_to_arrays
 from smplxpp.core import BodyParams, require_positive
-from smplxpp.raster import hiding_parts
 from smplxpp.template.template import Template
 
 
@@ -103,7 +104,7 @@ def write_bundle(
     pieces: dict[str, tuple[Tensors, Mapping[str, Any]]] = {
         "skeleton": (_skeleton(template), {}),
         "surface": (_surface(template, cut, config), {}),
-        "gaussians": (_gaussians(bound.tensors, per_face, config) | _covered(template, bound.face_index.numpy()), {}),
+        "gaussians": (_gaussians(bound.tensors, per_face, config) | _bare(template, bound, config), {}),
     }
     # Optional pieces follow the parts that the student was trained with.
     if student.field is not None and student.codes is not None:
@@ -227,10 +228,20 @@ def _gaussians(tensors: Mapping[str, Tensor], per_face: Int64[np.ndarray, " F"],
     )
 
 
-def _covered(template: Template, face: Int64[np.ndarray, " N"]) -> Tensors:
-    """Return which part hides each Gaussian of the skin: players lay these on the skin where that part is taken off."""
-    parts = hiding_parts(template.mesh, template.vertex_part[template.faces[:, 0]].astype(np.int64))[face]
-    return {"covered": parts.astype(np.uint8 if parts.max(initial=0) < 256 else np.uint32)} if parts.any() else {}
+def _bare(template: Template, bound: BoundGaussians, config: BundleConfig) -> Tensors:
+    """Return how Gaussians of the skin lie where a player takes off the part that hides them."""
+    own = {name: value.numpy() for name, value in bound.tensors.items()} | {"face_index": bound.face_index.numpy()}
+    own["offset"] = own["offset"] + np.eye(3, dtype=np.float32)[0] * own["normal_offset"][:, None]
+    bare = bare_skin(template, {**own, "opacities": torch.sigmoid(bound.opacity_logits).numpy()})
+    if not bare:
+        return {}
+    part = bare.pop("covered")
+    out = {"covered": part.astype(np.uint8 if part.max(initial=0) < 256 else np.uint32)}
+    if config.exact:
+        return out | {name: value.astype(np.float32) for name, value in bare.items()}
+    out |= halves({name: bare.pop(name) for name in ("bare_offset", "bare_scale")})
+    out |= signed("bare_quats", bare.pop("bare_quats"), np.float32(1.0))
+    return out | unsigned("bare_dc", np.clip(bare.pop("bare_dc"), 0.0, 1.0), 8)
 
 
 def _largest(sh: Float[np.ndarray, "N K 3"]) -> Float[np.ndarray, "K 3"]:

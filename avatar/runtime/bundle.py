@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avatar.runtime.layout import NEEDED, PIECES, REMEDY, check_consistency, check_shapes, decode
+from avatar.runtime.layout import BARE, NEEDED, PIECES, REMEDY, check_consistency, check_shapes, decode
 from smplxpp.body.layout import HAND_WIDTH, SMPL_JOINTS
 from smplxpp.core import BodyParams, InputError
 from smplxpp.core.errors import one_line
@@ -157,6 +157,35 @@ def read_motion(bundle: AvatarBundle, *, subject: str = "motion of the bundle") 
         fits = width == HAND_WIDTH or (components is not None and width <= len(components))
         require(f"{hand}_pose", fits, f"{HAND_WIDTH} angles, or as many components as the avatar has")
     return replace(motion, expression=motion.expression[:, :E])
+
+
+def undressed(bundle: AvatarBundle, hidden: Collection[int]) -> AvatarBundle:
+    """Return a bundle with parts taken off: their Gaussians are transparent, and the skin under them lies bare.
+
+    Skin whose `gaussians.covered` names a hidden part takes offsets, rotations, scales and colours of `BARE`, and is
+    opaque; harmonics and blend shapes, which were learned under clothes, do not count there. Everything else keeps its
+    bits; without hidden parts the bundle itself is returned. Bundles without `BARE` lose the hidden parts alone.
+
+    Args:
+        bundle: the avatar.
+        hidden: indices of parts, of `about.part_names`.
+    """
+    if not hidden:
+        return bundle
+    t = dict(bundle.tensors)
+    off = np.isin(t["surface.parts"][t["surface.faces"][:, 0]], list(hidden)).repeat(t["gaussians.per_face"])
+    t["gaussians.opacities"] = np.where(off, np.float32(0.0), t["gaussians.opacities"])
+    if all(f"gaussians.{name}" in t for name in BARE):
+        bare = np.isin(t["gaussians.covered"], [part for part in hidden if part > 0]) & ~off
+        offset, quats, scale, dc = (t[f"gaussians.{name}"][bare] for name in BARE)
+        laid = {"offset": offset, "quats": quats, "dc": dc, "log_scales": np.log(scale)[:, None]}
+        for name, value in {**laid, "opacities": 1.0, "sh": 0.0}.items():
+            t[f"gaussians.{name}"] = t[f"gaussians.{name}"].copy()
+            t[f"gaussians.{name}"][bare] = value
+        for side in (f"blend.{side}" for side in ("head", "body") if "blend" in bundle):
+            t[f"{side}.values"] = t[f"{side}.values"].copy()
+            t[f"{side}.values"][:, :, bare[t.get(f"{side}.rows", slice(None))]] = 0
+    return replace(bundle, tensors=t)
 
 
 def _manifest(model: Mapping[str, Any], data: Mapping[str, bytes]) -> bytes:

@@ -81,6 +81,10 @@ PIECES: Mapping[str, Mapping[str, str]] = {
         "dc": "f N 3",
         "sh": "f N K 3",
         "covered": "i? N",
+        "bare_offset": "f? N 3",
+        "bare_quats": "f? N 4",
+        "bare_scale": "f? N",
+        "bare_dc": "f? N 3",
     },
     "field": {
         "points": "f C 3",
@@ -104,6 +108,8 @@ PIECES: Mapping[str, Mapping[str, str]] = {
     "poses": {"known": "f D 63", "scale": "f"},
 }
 """Tensors of all pieces; `garments` and `motion` have their own readers."""
+BARE = ("bare_offset", "bare_quats", "bare_scale", "bare_dc")
+"""Tensors of the piece `gaussians` that say how skin lies bare whose clothes a player takes off."""
 NEEDED = ("skeleton", "surface", "gaussians")
 MAX_GAUSSIANS = 1 << 22
 
@@ -236,12 +242,18 @@ def check_consistency(
     # Spherical harmonics of degree 1 to d have (d + 1)^2 - 1 coefficients.
     require(sizes["K"] in (0, 3, 8, 15), "gaussians.sh", "0, 3, 8 or 15 coefficients", sizes["K"])
     # Rotations are normalised, for which a length needs a square in float32.
-    lengths = np.sqrt(np.square(tensors["gaussians.quats"], dtype=np.float64).sum(1))
-    usable = bool(((lengths > 1e-3) & (lengths < 1e3)).all())
-    require(usable, "gaussians.quats", "lengths from 0.001 to 1000", "others")
+    for name in ("gaussians.quats", "gaussians.bare_quats"):
+        lengths = np.sqrt(np.square(tensors.get(name, np.ones((1, 4))), dtype=np.float64).sum(1))
+        usable = bool(((lengths > 1e-3) & (lengths < 1e3)).all())
+        require(usable, name, "lengths from 0.001 to 1000", "others")
     covered = tensors.get("gaussians.covered", np.zeros(1, np.int32))
     within = bool(((covered >= 0) & (covered < max(1, len(about.part_names)))).all())
     require(within, "gaussians.covered", f"parts in [0, {len(about.part_names)})", "others")
+    # Older bundles name the part that hides a Gaussian, but not how it lies bare.
+    bare = [f"gaussians.{name}" in tensors for name in BARE]
+    require(not any(bare) or all((*bare, "gaussians.covered" in tensors)), "gaussians.bare_*", "all or none", "some")
+    positive = bool((tensors.get("gaussians.bare_scale", np.ones(1)) > 0.0).all())
+    require(positive, "gaussians.bare_scale", "positive numbers", "others")
     # Weights are stored in 16 bits, and may miss a sum of 1 by rounding.
     opacity, weights = tensors["gaussians.opacities"], tensors["surface.joint_weights"]
     require(bool((opacity >= 0).all() and (opacity <= 1).all()), "gaussians.opacities", "values in [0, 1]", "others")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from avatar.runtime.bundle import AvatarBundle, load_bundle, read_motion
+from avatar.runtime.bundle import AvatarBundle, load_bundle, read_motion, undressed
 from avatar.runtime.kernels import SurfaceKernel, WorldKernel, add_basis, joint_transforms
 from avatar.runtime.networks import BlendShapes, DisplacementField
 from avatar.runtime.skeleton import LooseClothes, skeleton_body
@@ -72,18 +72,38 @@ class AvatarPlayer:
         self._clothes = LooseClothes(self.bundle, cloth) if self.bundle.garments else None
         self._rest = t["surface.vertices"]
         self._face_of = np.repeat(np.arange(self.bundle.sizes["F"]), t["gaussians.per_face"])
-        self._device = None
-        if device == "cpu":
-            self._prepare()
-        else:
+        # What poses and pictures are written into, and where; parts that are hidden change none of it.
+        N, F = self.bundle.sizes["N"], self.bundle.sizes["F"]
+        shapes = ((N, 3), (N, 4), (N, 3), (N, 3), (F, 3, 3))
+        self._posed, self._arrays = np.empty_like(self._rest), [np.empty(shape, np.float32) for shape in shapes]
+        self._splatter, self._eps2d = Splatter(), self.bundle.about.eps2d
+        self._place, self._device = device, None
+        self._prepare(self.bundle)
+
+    def hide(self, parts: Collection[str]) -> None:
+        """Take parts off from the next pose on, and put all others on; skin under them lies bare (`undressed`).
+
+        Args:
+            parts: names, of `bundle.about.part_names`; none: everything is shown, bit for bit as before.
+
+        Raises:
+            InputError: a name that the avatar has no part of.
+        """
+        names = self.bundle.about.part_names
+        for part in parts:
+            if part not in names:
+                raise InputError("part to hide", expected=f"one of {', '.join(names)}", received=repr(part)[:80])
+        self._prepare(undressed(self.bundle, [names.index(part) for part in parts]))
+
+    def _prepare(self, shown: AvatarBundle) -> None:
+        """Make the kernels of the CPU and the arrays that they write, or the avatar on a GPU."""
+        if self._place != "cpu":
             import avatar  # what needs torch lies above this room; the front door knows where
 
-            self._device = avatar.BundleOnDevice(self.bundle, device)
-
-    def _prepare(self) -> None:
-        """Make the kernels of the CPU and the arrays that they write, once."""
-        about, t, sizes = self.bundle.about, self.bundle.tensors, self.bundle.sizes
-        self._sides = [BlendShapes(self.bundle, side) for side in ("head", "body")] if "blend" in self.bundle else []
+            self._device = avatar.BundleOnDevice(shown, self._place)
+            return
+        t, sizes = shown.tensors, shown.sizes
+        self._sides = [BlendShapes(shown, side) for side in ("head", "body")] if "blend" in shown else []
         # Kernels: skinning, and Gaussians to the world.
         # Rounded to 16 bits, skinning weights may miss a sum of
         # 1, and the surface would then be scaled about the origin.
@@ -97,7 +117,6 @@ class AvatarPlayer:
             shares,
             sizes.get("C", 0),
         )
-        self._posed = np.empty_like(self._rest)
         # Gaussians are sorted by face, so that `first[f] .. first[f + 1]` are those of face f.
         first = np.concatenate([[0], np.cumsum(t["gaussians.per_face"])]).astype(np.int32)
         own = {name: t[f"gaussians.{name}"] for name in ("barycentric", "offset", "quats", "dc")}
@@ -109,20 +128,9 @@ class AvatarPlayer:
             thickness=THICKNESS,
         )
         # Output arrays, reused for every pose.
-        count = sizes["N"]
-        means, quats, scales, dc = (np.empty((count, width), np.float32) for width in (3, 4, 3, 3))
-        self._splats = WorldSplats(
-            means,
-            quats,
-            scales,
-            np.ascontiguousarray(t["gaussians.opacities"]),
-            dc,
-            np.ascontiguousarray(t["gaussians.sh"]),
-            self._face_of,
-            np.empty((sizes["F"], 3, 3), np.float32),
-        )
-        self._splatter = Splatter()
-        self._eps2d = about.eps2d
+        means, quats, scales, dc, rotations = self._arrays
+        opacities, sh = (np.ascontiguousarray(t[f"gaussians.{name}"]) for name in ("opacities", "sh"))
+        self._splats = WorldSplats(means, quats, scales, opacities, dc, sh, self._face_of, rotations)
 
     @property
     def motion(self) -> BodyParams | None:

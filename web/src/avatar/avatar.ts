@@ -138,8 +138,18 @@ export interface Gaussians {
   harmonics: Float32Array;
   harmonicCount: number;
   part: Uint8Array;
-  /** (N,) the part that hides each, 0 for one that shows; null: not told. */
-  covered: Int32Array | null;
+  bare: BareSkin | null;
+}
+
+/** How skin lies bare whose clothes are taken off (`avatar.runtime.bundle.undressed`). */
+export interface BareSkin {
+  /** (N,) the part that hides each Gaussian, 0 for one that shows. */
+  covered: Int32Array;
+  /** (N, 3), (N, 4), (N,) and (N, 3) as those of `Gaussians`; one scale, because they are discs. */
+  offset: Float32Array;
+  quats: Float32Array;
+  scale: Float32Array;
+  color: Float32Array;
 }
 
 /** Poses in turn. */

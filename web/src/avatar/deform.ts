@@ -11,8 +11,6 @@ import { RegressionEvaluator } from "./regression.ts";
  * the normal that the eye sees, where it was asked for (folded by `web/splats.cpp`). */
 export const RECORD = 14;
 const BODY_JOINTS = 21;
-/** Standard deviation of skin that is laid bare: in its triangle's mean edge, and in the mean distance of Gaussians, which many triangles lack. */
-const BARE_EDGES = 0.5, BARE_SPACING = 1.35;
 /** What a pose takes time for, as `avatar.runtime.player` counts it. */
 export const PARTS = ["pose", "field", "blend", "world"] as const;
 
@@ -48,7 +46,7 @@ export class Deformer {
   private readonly blend: BlendAdder | null;
   private readonly surface: Block<Uint8Array>;
   private readonly bound: Block<Uint8Array>;
-  private readonly placed: Record<"offset" | "scales" | "quats" | "opacity", Block<Float32Array>>;
+  private readonly placed: Record<"offset" | "scales" | "quats" | "opacity" | "color" | "harmonics", Block<Float32Array>>;
   /** Gaussians of skin whose clothes are off, and the parts that are. */
   private bare: { rows: number[]; parts: string } = { rows: [], parts: "" };
   private readonly world: Record<"means" | "quats" | "scales" | "colors" | "rotations", Block<Float32Array>>;
@@ -85,11 +83,13 @@ export class Deformer {
     this.surface = native.struct([V, J, mesh.influences, field ? field.setOf.length : 0, field ? field.neighbourCount : 0], [
       this.skinning.joints, this.skinning.weights, field && native.keep(field.neighbours), field && native.keep(field.weights),
     ]);
-    const faces = native.keep(mesh.faces), dc = native.keep(g.color);
-    this.placed = { offset: native.keep(g.offset), scales: native.keep(g.scales), quats: native.keep(g.quats), opacity: native.keep(g.opacity) };
-    const own = this.placed;
+    const faces = native.keep(mesh.faces);
+    const own = this.placed = {
+      offset: native.keep(g.offset), scales: native.keep(g.scales), quats: native.keep(g.quats), opacity: native.keep(g.opacity),
+      color: native.keep(g.color), harmonics: native.keep(g.harmonics),
+    };
     this.bound = native.struct([F, N, V], [
-      faces, native.keep(g.first), native.keep(g.barycentric), own.offset, own.scales, own.quats, dc, [g.thickness],
+      faces, native.keep(g.first), native.keep(g.barycentric), own.offset, own.scales, own.quats, own.color, [g.thickness],
     ]);
     this.world = {
       means: native.floats(3 * N), quats: native.floats(4 * N), scales: native.floats(3 * N), colors: native.floats(3 * N),
@@ -97,7 +97,7 @@ export class Deformer {
     };
     const { means, quats, scales, colors, rotations } = this.world;
     this.splats = native.struct([N, g.harmonicCount], [
-      means, quats, scales, own.opacity, colors, native.keep(g.harmonics), native.keep(g.face), rotations,
+      means, quats, scales, own.opacity, colors, own.harmonics, native.keep(g.face), rotations,
     ]);
     this.sorting = {
       row: native.floats(4), part: native.keep(g.part), hidden: native.room(Uint8Array, 256), order: native.room(Uint32Array, N),
@@ -152,7 +152,7 @@ export class Deformer {
     lap();
     blend?.pose(pose, theta, cloth && cloth.keep);
     this.undress(hidden);
-    for (const row of blend ? this.bare.rows : []) blend!.added.view.fill(0, 6 * row, 6 * row + 3);
+    for (const row of blend ? this.bare.rows : []) blend!.added.view.fill(0, 6 * row, 6 * row + 6);
     lap();
     native.run("runtime_surface", this.surface, rest, field && field.moved, cloth && cloth.displacements, cloth && cloth.share,
       transforms, posed, native.slices);
@@ -204,28 +204,20 @@ export class Deformer {
     return own.normals;
   }
 
-  /** Lays skin whose clothes are off flat on its triangles: trained under clothes, it fills the gaps between their Gaussians. */
+  /** Lays skin bare whose clothes are off: trained under clothes, it fills the gaps between their Gaussians, in their colours. */
   private undress(hidden: Iterable<number>): void {
-    const { placed: { offset, scales, quats, opacity }, avatar: { mesh, gaussians: g } } = this, { covered } = g, off = new Set(hidden);
-    const parts = [...off].sort().join();
-    if (!covered || parts === this.bare.parts) return;
-    const rows = Array.from(covered.keys()).filter((i) => covered[i] && off.has(covered[i]));
+    const { placed, avatar: { gaussians: g } } = this, { bare } = g, off = new Set(hidden), parts = [...off].sort().join();
+    if (!bare || parts === this.bare.parts) return;
+    const { offset, scales, quats, opacity, color, harmonics } = placed, K = 3 * g.harmonicCount;
+    const rows = Array.from(bare.covered.keys()).filter((i) => bare.covered[i] && !off.has(g.part[i]) && off.has(bare.covered[i]));
     this.bare = { rows, parts };
-    for (const [block, values] of [[offset, g.offset], [scales, g.scales], [quats, g.quats], [opacity, g.opacity]] as const) block.view.set(values);
-    const side = (a: number, b: number) => Math.hypot(...[0, 1, 2].map((k) => mesh.vertices[3 * a + k] - mesh.vertices[3 * b + k]));
-    const sides = ([a, b, c]: Int32Array) => [side(a, b), side(b, c), side(c, a)];
-    // Heron's formula gives the area, over all triangles that carry Gaussians, of which each has a share.
-    let area = 0;
-    for (let f = 0; rows.length && f < mesh.faces.length; f += 3) {
-      const [a, b, c] = sides(mesh.faces.subarray(f, f + 3)), half = (a + b + c) / 2;
-      area += Math.sqrt(Math.max(0, half * (half - a) * (half - b) * (half - c)));
-    }
-    const spacing = Math.sqrt(area / g.count);
+    for (const name of ["offset", "scales", "quats", "opacity", "color", "harmonics"] as const) placed[name].view.set(g[name]);
     for (const i of rows) {
-      const face = 3 * g.face[i], [a, b, c] = sides(mesh.faces.subarray(face, face + 3));
-      offset.view.fill(0, 3 * i, 3 * i + 3);
-      quats.view.set([1, 0, 0, 0], 4 * i);
-      scales.view.fill(Math.max(BARE_EDGES, (BARE_SPACING * spacing * 3) / Math.max(a + b + c, 1e-6)), 2 * i, 2 * i + 2);
+      offset.view.set(bare.offset.subarray(3 * i, 3 * i + 3), 3 * i);
+      quats.view.set(bare.quats.subarray(4 * i, 4 * i + 4), 4 * i);
+      color.view.set(bare.color.subarray(3 * i, 3 * i + 3), 3 * i);
+      scales.view.fill(bare.scale[i], 2 * i, 2 * i + 2);
+      harmonics.view.fill(0, K * i, K * (i + 1));
       opacity.view[i] = 1;
     }
   }

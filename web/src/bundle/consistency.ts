@@ -2,7 +2,7 @@
 
 import { BundleError, EXPORT_AGAIN } from "./errors.ts";
 import { asBoolean, asInteger, asList, asNumber, asObject, asText } from "./json.ts";
-import type { Tensors } from "./layout.ts";
+import { BARE, type Tensors } from "./layout.ts";
 
 /** Numbers of joints of SMPL-X, SMPL+H and SMPL. */
 const JOINTS = [55, 52, 24];
@@ -68,11 +68,16 @@ export function checkConsistency(about: About, t: Tensors): void {
   require(perFace.every((count) => count >= 0) && sum(perFace) === N, "gaussians.per_face", `counts of ${N}`);
   require(HARMONICS.includes(K), "gaussians.sh", `${HARMONICS.join(", ")} coefficients`, K);
   const usable = (row: Float32Array) => Math.hypot(...row) > LEAST_LENGTH && Math.hypot(...row) < MOST_LENGTH;
-  require(everyRow(t.floats("gaussians.quats"), 4, usable), "gaussians.quats", `lengths from ${LEAST_LENGTH} to ${MOST_LENGTH}`);
+  for (const name of ["gaussians.quats", "gaussians.bare_quats"].filter((name) => t.has(name))) {
+    require(everyRow(t.floats(name), 4, usable), name, `lengths from ${LEAST_LENGTH} to ${MOST_LENGTH}`);
+  }
   require(t.floats("gaussians.opacities").every((value) => value >= 0 && value <= 1), "gaussians.opacities", "values in [0, 1]");
   const covered = t.has("gaussians.covered") ? t.ints("gaussians.covered") : Int32Array.of();
   const most = Math.max(1, about.partNames.length);
   require(covered.every((part) => part >= 0 && part < most), "gaussians.covered", `parts in [0, ${about.partNames.length})`);
+  const bare = BARE.filter((name) => t.has(`gaussians.${name}`)).length;
+  require(!bare || (bare === BARE.length && t.has("gaussians.covered")), "gaussians.bare_*", "all or none");
+  if (bare) require(t.floats("gaussians.bare_scale").every((value) => value > 0), "gaussians.bare_scale", "positive numbers");
   // The surface: the skin first, because expressions and correctives index it alone.
   const weights = t.floats("surface.joint_weights"), parts = t.ints("surface.parts");
   const summed = (row: Float32Array) => Math.abs(sum(row) - 1) < SUM_TOLERANCE;

@@ -30,7 +30,7 @@ export const PIECES: Record<string, Record<string, string>> = {
   },
   gaussians: {
     per_face: "i F", barycentric: "f N 2", offset: "f N 3", log_scales: "f N 2", quats: "f N 4", opacities: "f N",
-    dc: "f N 3", sh: "f N K 3", covered: "i? N",
+    dc: "f N 3", sh: "f N K 3", covered: "i? N", bare_offset: "f? N 3", bare_quats: "f? N 4", bare_scale: "f? N", bare_dc: "f? N 3",
   },
   field: {
     points: "f C 3", neighbours: "i V n <C", weights: "f V n", cloth: "i c <C", sets: "i S 21", member: "i C <S",
@@ -40,6 +40,8 @@ export const PIECES: Record<string, Record<string, string>> = {
   blend: { ...shapes("head"), ...shapes("body"), part: "i? N" },
   poses: { known: "f D 63", scale: "f" },
 };
+/** How skin lies bare whose clothes are taken off; older bundles have none of it. */
+export const BARE = ["bare_offset", "bare_quats", "bare_scale", "bare_dc"] as const;
 const NEEDED = ["skeleton", "surface", "gaussians"];
 
 function prefixed(side: string, specs: Record<string, string>): Record<string, string> {

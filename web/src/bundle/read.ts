@@ -187,7 +187,12 @@ function gaussians(t: Tensors, faces: Int32Array, parts: Int32Array): Gaussians 
     color: t.floats("gaussians.dc"),
     harmonics: t.floats("gaussians.sh"),
     harmonicCount: K,
-    covered: t.has("gaussians.covered") ? t.ints("gaussians.covered") : null,
+    bare: t.has("gaussians.bare_offset")
+      ? {
+          covered: t.ints("gaussians.covered"), offset: t.floats("gaussians.bare_offset"), quats: t.floats("gaussians.bare_quats"),
+          scale: t.floats("gaussians.bare_scale"), color: t.floats("gaussians.bare_dc"),
+        }
+      : null,
   };
 }
 
