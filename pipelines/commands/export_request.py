@@ -201,10 +201,13 @@ def export_file(request: FileRequest) -> dict[str, Any]:
     # Find the module that writes this format; OBJ, FBX, VRM and USDZ hold the template, splats are the student's.
     model = "template" if request.out.suffix.lower() in (".obj", ".fbx", ".vrm", ".usdz") else request.model
     model = "template" if request.format == "obj" else model  # a series
+    either: list[str] = []
     if model == "auto":
         of_either = ("template", request.format) in _BY_MODEL
         trained = request.source.is_file() or (request.source / STUDENT).is_file()
         model = "template" if of_either and not trained else "student"
+        if of_either and trained and request.source.is_dir():
+            either = ["the student's splats in a pose; `--model template` writes the rigged, textured mesh"]
     request = replace(request, model=model)
     writers = _FOR_ANY_MODEL.get(request.format) or _BY_MODEL.get((model, request.format))
     if writers is None:
@@ -240,7 +243,7 @@ def export_file(request: FileRequest) -> dict[str, Any]:
         "frames": count,
         "fps": fps,
         "bytes": sum(path.stat().st_size for path in (request.out.iterdir() if request.is_series else request.files)),
-        "notes": notes,
+        "notes": either + list(notes),
     }
 
 

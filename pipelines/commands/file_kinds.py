@@ -14,6 +14,7 @@ from rich.text import Text
 from pipelines.report.model import Step
 from smplxpp.core.errors import InputError, MissingExtraError
 from smplxpp.core.files.json_file import as_object, read_json
+from smplxpp.core.files.paths import read_bytes
 
 
 def print_kind(path: Path, *, console: Console | None) -> dict[str, Any]:
@@ -41,6 +42,7 @@ def what_it_is(path: Path) -> dict[str, Any]:
     kinds: dict[str, tuple[Callable[[Path], list[str]], tuple[Step, ...]]] = {
         "avatar": (_avatar_facts, (Step("play it in the browser", f"smplxpp web {here} --serve"),)),
         "template": (_template_facts, (Step("test it", f"smplxpp check {here}"),)),
+        "splats of a pose, for other programs": (_splat_facts, ()),
         "mesh": (
             _mesh_facts,
             (Step("test it", f"smplxpp check {here}"), Step("build on it", f"smplxpp build RUN --scan {here}")),
@@ -83,7 +85,8 @@ _OTHERS = {
     ".mp4": "film",
     ".html": "page, for a browser",
     ".safetensors": "weights of a model or Gaussians: a stage of a run holds them",
-    ".spz": "splats of a pose, for other programs",
+    **dict.fromkeys((".spz", ".sog"), "splats of a pose, for other programs"),
+    ".onnx": "step from pose to splats, for other programs",
     ".usdc": "scene, for other programs",
     **dict.fromkeys((".bvh", ".vrma"), "motion of a skeleton: give it to `smplxpp animate RUN --params`"),
     ".wav": "sound",
@@ -104,6 +107,14 @@ def _template_facts(path: Path) -> list[str]:
     template = Template.load(path)
     parts = ", ".join(f"{name} {int(template.part_faces(name).sum()):,}" for name in template.part_names)
     return [f"{len(template.vertices):,} vertices, {len(template.faces):,} faces", f"parts by faces: {parts}"]
+
+
+def _splat_facts(path: Path) -> list[str]:
+    # The header of a PLY names their colours, the JSON of a glTF file its extension; 64 kB hold both.
+    head = read_bytes(path)[: 1 << 16] if path.suffix.lower() in (".ply", ".glb") else b""
+    if not (head.startswith(b"ply") and b" f_dc_0" in head) and b"KHR_gaussian_splatting" not in head:
+        raise InputError(f"splats {path}", expected="a PLY or GLB of Gaussians", received="another file")
+    return [f"Gaussians without a surface, {shown_bytes(path.stat().st_size)}"]
 
 
 def _mesh_facts(path: Path) -> list[str]:

@@ -37,7 +37,7 @@ def test_what_is_larger_than_the_bound_is_not_kept():
 
 def test_threads_share_one_cache():
     cache, wrong = ArrayCache(50_000), []
-    # Threads take turns a thousand times as often as they do by default (5 ms), so that one reads amid another's change.
+    # Threads take turns a thousand times as often as by default (5 ms), so that one reads amid another's change.
     interval = sys.getswitchinterval()
     sys.setswitchinterval(5e-6)
 

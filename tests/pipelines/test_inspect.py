@@ -3,8 +3,12 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from avatar.formats.ply import write_splat_ply
+from avatar.formats.splat_scenes import write_splat_glb
+from avatar.formats.splats import Splats
 from pipelines.cli import main
 from pipelines.commands.inspect import Inspect, summarise_run
 from pipelines.runs.layout import BUILD_STAGES, TEMPLATE_STAGES
@@ -162,6 +166,11 @@ def test_any_file_is_said_what_it_is(tmp_path, capsys):
     """Every file was answered with a folder "which does not exist"."""
     fixture = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
     (tmp_path / "broken.glb").write_text("hello")
+    rows, ones = np.zeros((2, 3)), np.ones((2, 4))
+    same = dict.fromkeys(("means", "normals", "f_dc", "log_scales"), rows)
+    splats = Splats(**same, f_rest=np.zeros((2, 0, 3)), opacity_logits=np.zeros(2), quats=ones)
+    write_splat_glb(tmp_path / "splats.glb", splats=splats)
+    write_splat_ply(tmp_path / "splats.ply", splats=splats)
     (tmp_path / "film.mp4").write_bytes(b"....ftyp")
     (tmp_path / "words.json").write_text('{"a": 1}')
     dressed().save(tmp_path / "smplxpp.npz")
@@ -172,6 +181,8 @@ def test_any_file_is_said_what_it_is(tmp_path, capsys):
         (tmp_path / "smplxpp.npz", "template", "parts by faces: body"),
         (tmp_path / "words.json", "JSON", "keys: a"),
         (tmp_path / "film.mp4", "film", "0.0 kB"),
+        (tmp_path / "splats.glb", "splats of a pose, for other programs", "Gaussians without a surface"),
+        (tmp_path / "splats.ply", "splats of a pose, for other programs", "Gaussians without a surface"),
         (tmp_path / "broken.glb", "nothing that is known here", "damaged: mesh file"),
     ):
         assert main(["inspect", str(path), "--json"]) == 0

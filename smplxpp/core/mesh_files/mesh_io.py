@@ -81,7 +81,7 @@ def read_raw_mesh(path: str | Path, *, clouds: bool = False) -> RawMesh:
             f"mesh file {path}",
             expected="a triangle mesh",
             received=f"{len(raw.vertices)} vertices, {len(raw.faces)} faces",
-            remedy="export the surface, not the point cloud",
+            remedy="export the surface, not the point cloud: of a run `smplxpp export RUN --model template --out FILE`",
         )
     require_coordinate_range(raw.vertices, subject=f"mesh file {path}")
     return raw

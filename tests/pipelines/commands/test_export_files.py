@@ -138,6 +138,10 @@ def test_the_template_moves_as_glb_and_stands_as_obj(folder, tmp_path, capsys):
         assert report["frames"] == 4 and report["bytes"] > 1000
     report = export(capsys, folder / "run", "--out", tmp_path / "still.glb", "--model", "template")
     assert report["frames"] == 1 and "animations" not in GlbReader(tmp_path / "still.glb").json
+    # Where both are there, a GLB without --model holds splats, which an artist's program shows as points: it is noted.
+    assert report["notes"] == []
+    report = export(capsys, folder / "run", "--out", tmp_path / "splats.glb")
+    assert ["--model template" in note for note in report["notes"]] == [True]
     template = Template.load(folder / "run" / TEMPLATE)
     report = export(capsys, folder / "run", "--out", tmp_path / "objs", "--format", "obj", *shown, "--step", 5)
     assert report["frames"] == 2
