@@ -18,7 +18,7 @@ from smplxpp.core import Camera, Keypoints2D
 from smplxpp.register.keypoint_faults import exchanged, sides_are_exchanged
 from smplxpp.register.kinematics import Kinematics, Posture
 from smplxpp.register.landmarks import LandmarkModel, LandmarkPoints
-from smplxpp.register.normal_equations import NormalEquations
+from smplxpp.register.normal_equations import Equations
 from smplxpp.register.observations import Observations, RegisterConfig
 from smplxpp.register.triangulate import Reprojection, triangulate
 
@@ -124,9 +124,7 @@ class KeypointTerm:
         """Return whether a frame has any keypoint."""
         return bool((self.confidence[:, row] > 0).any())
 
-    def add(
-        self, equations: NormalEquations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool
-    ) -> None:
+    def add(self, equations: Equations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool) -> None:
         """Add the keypoints of one frame to the normal equations."""
         if not self.used(row):
             return

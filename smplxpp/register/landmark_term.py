@@ -17,7 +17,7 @@ from smplxpp.body import BodyModel
 from smplxpp.register.keypoint_faults import other_side, sides_are_exchanged
 from smplxpp.register.kinematics import Kinematics, Posture
 from smplxpp.register.landmarks import LandmarkModel, LandmarkPoints
-from smplxpp.register.normal_equations import NormalEquations, geman_mcclure
+from smplxpp.register.normal_equations import Equations, geman_mcclure
 
 PlacedPoints = Mapping[int, Mapping[str, Float[np.ndarray, " 3"]]]
 """Points in world coordinates, metres, by frame and name."""
@@ -99,9 +99,7 @@ class LandmarkTerm:
         self.sigma = sigma * np.where(within, 3.0, 1.0)
         self.scale = 1.0
 
-    def add(
-        self, equations: NormalEquations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool
-    ) -> None:
+    def add(self, equations: Equations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool) -> None:
         """Add the landmarks of one frame to the normal equations."""
         there = np.flatnonzero(np.isfinite(self.points[row]).all(axis=1))
         if not len(there):

@@ -112,6 +112,41 @@ class Step:
         )
 
 
+class Products:
+    """Products of the rows that terms add for a frame, kept one by one.
+
+    Args:
+        columns: order of the P unknowns of a frame and of the B of the shape.
+
+    Attributes:
+        terms: of each added term `g = J^T r` (P) and `J^T J` (P, P) of the frame; and where it may change the shape,
+            the coupling of frame and shape (P, B), the shape's own block (B, B) and its gradient (B).
+    """
+
+    def __init__(self, columns: Columns) -> None:
+        self.columns = columns
+        self.terms: list[tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray] | None]] = []
+
+    def add(
+        self, frame: int, rows: Float[np.ndarray, "M _"], residuals: Float[np.ndarray, " M"], *, shape: bool = True
+    ) -> None:
+        """Add `|residuals + rows x|^2`, whose rows are already weighted and end with the columns of the shape.
+
+        Args:
+            frame: whose rows they are.
+            rows: derivatives of the residuals.
+            residuals: the residuals.
+            shape: whether the term may change the shape; else the columns of the shape are ignored.
+        """
+        # H += J^T J and g += J^T r, split into the frame's own block, the coupling C of frame and shape, and the block
+        # of the shape. A frame that must not tell the shape contributes only the first.
+        P = self.columns.count
+        of_shape = None
+        if shape:
+            of_shape = rows[:, :P].T @ rows[:, P:], rows[:, P:].T @ rows[:, P:], rows[:, P:].T @ residuals
+        self.terms.append((rows[:, :P].T @ residuals, rows[:, :P].T @ rows[:, :P], of_shape))
+
+
 class NormalEquations:
     """The matrix and gradient of a sum of squares over T frames, to which terms are added row by row.
 
@@ -132,20 +167,21 @@ class NormalEquations:
     def add(
         self, frame: int, rows: Float[np.ndarray, "M _"], residuals: Float[np.ndarray, " M"], *, shape: bool = True
     ) -> None:
-        """Add `|residuals + rows x|^2`, whose rows are already weighted and end with the columns of the shape.
+        """Add `|residuals + rows x|^2`, see `Products.add`."""
+        products = Products(self.columns)
+        products.add(frame, rows, residuals, shape=shape)
+        self.add_products(frame, products)
 
-        Args:
-            shape: whether the term may change the shape; else the columns of the shape are ignored.
-        """
-        # H += J^T J and g += J^T r, split into the frame's own block, the coupling C of frame and shape, and the block
-        # of the shape. A frame that must not tell the shape contributes only the first.
-        P = self.columns.count
-        self.gradient[frame] += rows[:, :P].T @ residuals
-        self.blocks[frame] += rows[:, :P].T @ rows[:, :P]
-        if shape:
-            self.shape_blocks[frame] += rows[:, :P].T @ rows[:, P:]
-            self.shape += rows[:, P:].T @ rows[:, P:]
-            self.shape_gradient += rows[:, P:].T @ residuals
+    def add_products(self, frame: int, products: Products) -> None:
+        """Add the terms of a frame, in the order in which they were added to `products`."""
+        for gradient, block, of_shape in products.terms:
+            self.gradient[frame] += gradient
+            self.blocks[frame] += block
+            if of_shape is not None:
+                coupling, both, shape_gradient = of_shape
+                self.shape_blocks[frame] += coupling
+                self.shape += both
+                self.shape_gradient += shape_gradient
 
     def add_smoothness(
         self, first: int, weight: Float[np.ndarray, " P"], second_difference: Float[np.ndarray, " P"]
@@ -219,3 +255,7 @@ def geman_mcclure(
     cutoff c, and 1 everywhere for c = inf.
     """
     return 1.0 / (1.0 + (residual / cutoff) ** 2) ** 2
+
+
+Equations = Products | NormalEquations
+"""What a term of a frame is added to."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -27,7 +28,7 @@ from smplxpp.core import OBJECT, SKIN, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
 from smplxpp.register.clothing import Gaps
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
-from smplxpp.register.normal_equations import NormalEquations, geman_mcclure
+from smplxpp.register.normal_equations import Equations, geman_mcclure
 from smplxpp.register.observations import RegisterConfig, ScanObservation
 
 # Labels are grouped for their gaps: 0 is unknown, label k is group k + 1, and the last group takes all further labels.
@@ -104,11 +105,9 @@ class ScanTerm:
         self.limb = np.argmax(self.body.weights, axis=1)
         self.gaps = Gaps.unknown(_GROUPS * self.body.joint_count)
         self.reach = self.first_reach = config.scan_reach_m
-        self._distances: list[tuple[np.ndarray, np.ndarray]] = []
+        self._distances: list[tuple[int, np.ndarray, np.ndarray]] = []  # by row
 
-    def add(
-        self, equations: NormalEquations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool
-    ) -> None:
+    def add(self, equations: Equations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool) -> None:
         """Add the scan of one frame, if there is one, to the normal equations."""
         if row not in self.samples:
             return
@@ -123,7 +122,10 @@ class ScanTerm:
     def estimate_gaps(self) -> None:
         """Estimate the gaps from the distances of the last step; a place needs 20 of them."""
         if self._distances:
-            place, distance = (np.concatenate(parts) for parts in zip(*self._distances, strict=True))
+            # Frames may be added in any order, by several threads.
+            ordered = sorted(self._distances, key=itemgetter(0))
+            _, places, distances = zip(*ordered, strict=True)
+            place, distance = np.concatenate(places), np.concatenate(distances)
             self.gaps = Gaps.estimated(place, distance, len(self.gaps.median), least=20, tight=self.config.tight_m)
         self._distances = []
 
@@ -168,7 +170,7 @@ class ScanTerm:
         weight = np.where(skin, of_skin, np.where(inside, of_inside, facing * of_gap))
         # Distances from -2 cm to 15 cm enter the next estimate of the gaps; farther ones belong to other things.
         usable = ~skin & facing & (d > -0.02) & (d < 0.15)
-        self._distances.append((place[usable], d[usable]))
+        self._distances.append((row, place[usable], d[usable]))
         # The reverse direction: bare vertices of the body to the scan.
         rows: list[tuple[np.ndarray, ...]] = [(corners, bary, direction, residual, weight / self._crowding(sample))]
         if sample.skin is not None and len(self.bare_index):

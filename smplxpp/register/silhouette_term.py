@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64, UInt8
@@ -31,7 +32,7 @@ from smplxpp.raster import rasterize_mesh
 from smplxpp.register.clothing import Gaps
 from smplxpp.register.keypoint_term import projected
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
-from smplxpp.register.normal_equations import NormalEquations, geman_mcclure
+from smplxpp.register.normal_equations import Equations, geman_mcclure
 from smplxpp.register.observations import RegisterConfig
 
 # An outline is a signed distance field of a reduced image, stored in eight bits: quarters of a reduced pixel, up to
@@ -178,13 +179,11 @@ class SilhouetteTerm:
         _, self._nearest = cKDTree(surface.points.rest[index]).query(surface.points.rest)
         self.reach = self.first_reach = config.silhouette_reach_m
         self.least_sightings = 8
-        self._distances: list[tuple[np.ndarray, np.ndarray]] = []
+        self._distances: list[tuple[int, np.ndarray, np.ndarray]] = []  # by row
 
-    def add(
-        self, equations: NormalEquations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool
-    ) -> None:
+    def add(self, equations: Equations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool) -> None:
         """Add the masks of one frame to the normal equations."""
-        index, direction, residual, weight = self._residuals(row, kinematics, posture, collect=True)
+        index, direction, residual, weight = self._residuals(row, kinematics, posture, collect=row)
         if not len(index):
             return
         # A vertex may be at the rim of several cameras; its derivative by the pose is the same and computed once.
@@ -198,7 +197,10 @@ class SilhouetteTerm:
     def estimate_gaps(self) -> None:
         """Estimate the gaps from the distances of the last step; a vertex needs `least_sightings` of them."""
         if self._distances:
-            place, distance = (np.concatenate(parts) for parts in zip(*self._distances, strict=True))
+            # Frames may be added in any order, by several threads.
+            ordered = sorted(self._distances, key=itemgetter(0))
+            _, places, distances = zip(*ordered, strict=True)
+            place, distance = np.concatenate(places), np.concatenate(distances)
             self.gaps = Gaps.estimated(
                 place, distance, len(self.index), least=self.least_sightings, tight=self.config.tight_m
             )
@@ -206,14 +208,22 @@ class SilhouetteTerm:
 
     def residual_px(self, row: int, kinematics: Kinematics, posture: Posture) -> float:
         """Return the mean absolute residual of a frame's rim vertices, pixels; NaN without any."""
-        _, _, residual, weight = self._residuals(row, kinematics, posture, collect=False, in_pixels=True)
+        _, _, residual, weight = self._residuals(row, kinematics, posture, in_pixels=True)
         use = weight > 0
         return float(np.mean(np.abs(residual[use]))) if use.any() else float("nan")
 
     def _residuals(
-        self, row: int, kinematics: Kinematics, posture: Posture, *, collect: bool, in_pixels: bool = False
+        self, row: int, kinematics: Kinematics, posture: Posture, *, collect: int | None = None, in_pixels: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return index (M,), direction (M, 3), residual (M,) and weight (M,) of the rim vertices of all cameras."""
+        """Return index (M,), direction (M, 3), residual (M,) and weight (M,) of the rim vertices of all cameras.
+
+        Args:
+            row: of the frame.
+            kinematics: of the body.
+            posture: of the frame.
+            collect: row under which distances are kept for the next estimate of the gaps; None: they are not.
+            in_pixels: return residuals in pixels.
+        """
         # The body with its clothes: every vertex moved out by the gap of its nearest sample.
         points, normals = self.surface.posed(kinematics, posture)
         grown = points + normals * (np.where(self.bare, 0.0, self.gaps.median)[self._nearest])[:, None]
@@ -245,7 +255,7 @@ class SilhouetteTerm:
         normals: np.ndarray,
         clothed: _Rasterised,
         *,
-        collect: bool,
+        collect: int | None,
         in_pixels: bool,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the same arrays for one camera."""
@@ -283,10 +293,10 @@ class SilhouetteTerm:
         one_sided = geman_mcclure(length, np.maximum(2 * self.reach, 6 * sigma)) / (2 * sigma) ** 2
         stronger = outside & ~bare & (one_sided > weight)
         residual, weight = np.where(stronger, length, residual), np.where(stronger, one_sided, weight)
-        if collect:
+        if collect is not None:
             # Gaps from -2 cm to 12 cm enter the next estimate; larger ones belong to another limb.
             usable = ~bare & (length > -0.12) & (length < 0.02)
-            self._distances.append((index[usable], -length[usable]))
+            self._distances.append((collect, index[usable], -length[usable]))
         if in_pixels:
             residual = residual / metres
         return index, direction, residual, weight

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from smplxpp.native import map_in_threads
 from smplxpp.register.keypoint_term import KeypointTerm
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics
 from smplxpp.register.landmark_term import LandmarkTerm
-from smplxpp.register.normal_equations import Columns, NormalEquations
+from smplxpp.register.normal_equations import Columns, NormalEquations, Products
 from smplxpp.register.priors import Priors
 from smplxpp.register.scan_term import ScanTerm
 from smplxpp.register.silhouette_term import SilhouetteTerm
@@ -122,11 +123,20 @@ def assemble(
     """Return the normal equations of all terms at a state."""
     equations = NormalEquations(columns, len(state))
     used = [*terms.points(), *terms.surfaces()]
-    # A frame that may not tell the shape, such as a held-out one, still determines its own pose.
-    for row in range(len(state)):
-        posture = kinematics.posture(state, row)
+
+    def of_frame(row: int) -> Products:
+        # A frame that may not tell the shape, such as a held-out one, still determines its own pose.
+        posture, products = kinematics.posture(state, row), Products(columns)
         for term in used:
-            term.add(equations, row, kinematics, posture, shape=bool(terms.tells_shape[row]) and solve_shape)
+            term.add(products, row, kinematics, posture, shape=bool(terms.tells_shape[row]) and solve_shape)
+        return products
+
+    # Frames are independent. Their products are summed in their order, so that threads change no bit.
+    at_once = 64  # frames whose products are kept, about a megabyte each
+    for first in range(0, len(state), at_once):
+        rows = range(first, min(first + at_once, len(state)))
+        for row, products in zip(rows, map_in_threads(of_frame, rows), strict=True):
+            equations.add_products(row, products)
     terms.priors.add(equations, state, shape=solve_shape)
     return equations
 

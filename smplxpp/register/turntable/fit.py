@@ -26,7 +26,7 @@ from smplxpp.register.clothing import hand_vertices
 from smplxpp.register.keypoint_term import KeypointTerm, prepare_keypoints, projected
 from smplxpp.register.kinematics import BodyPoints, BodyState, Kinematics, Posture
 from smplxpp.register.landmarks import is_finger, visible_vertices
-from smplxpp.register.normal_equations import NormalEquations
+from smplxpp.register.normal_equations import Equations, NormalEquations
 from smplxpp.register.observations import BodyFit, Observations, RegisterConfig
 from smplxpp.register.silhouette_term import Outline, SilhouetteTerm, Surface
 from smplxpp.register.solver import joint_confidence
@@ -160,9 +160,7 @@ class FocalKeypoints(KeypointTerm):
         K[:2, :2] *= np.exp(log_focal) / K[0, 0]
         self.cameras = [replace(camera, K=K)]
 
-    def add(
-        self, equations: NormalEquations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool
-    ) -> None:
+    def add(self, equations: Equations, row: int, kinematics: Kinematics, posture: Posture, *, shape: bool) -> None:
         """Add the keypoints of one frame, with the column of the focal length."""
         if not self.used(row):
             return
