@@ -365,7 +365,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             averaged=0.6,
             # Seven cameras of 250 pixels show less of folds than the tracked surface.
             surface_normals=True,
-            evaluations=2,
+            evaluations=1,
         ),
     ),
 }

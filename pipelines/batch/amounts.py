@@ -158,6 +158,7 @@ def recipe_of(options: Mapping[str, Any], *, tracked: bool = True) -> Recipe:
         batch=_number(options.get("batch")),
         gaussians=_number(options.get("gaussians")),
         refine_frames=int(options.get("refine_frames", 200)),
+        refine_gaussians=_number(options.get("refine_gaussians")),
         loose_parts=tuple(options.get("loose_parts") or ()),
         teacher=not options.get("no_teacher", False),
         perceptual="none",

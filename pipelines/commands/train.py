@@ -62,6 +62,9 @@ class Train:
     cameras stay fixed. For slightly wrong calibrations of many cameras."""
     refine_frames: int = 200
     """Frames of a chunk of the refinement, which several processes share (docs/batch.md)."""
+    refine_gaussians: OptionalInt = None
+    """Number of Gaussians that carry the colours of the refinement, by default 30,000. Photographs of few pixels need
+    fewer, and the refinement is faster; the head keeps its 4,500."""
     refine_help: bool = False
     """Help other processes with the refinement of the same run, chunk by chunk, and leave its end to one without this
     option."""
@@ -286,6 +289,7 @@ class Train:
         return TrainConfig(
             refine_cameras=self.refine_cameras,
             refine_frames=self.refine_frames,
+            refine_gaussians=self.refine_gaussians,
             max_minutes=self.max_minutes,
             iterations_share=1.0 if self.iterations_share is None else self.iterations_share,
             iterations={step: count for step, count in given.items() if count is not None},

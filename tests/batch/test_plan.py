@@ -192,10 +192,10 @@ def test_the_work_of_a_training_follows_from_frames_cameras_pixels_and_options()
     # without derivatives; six cameras, 50 frames, and the reference frame alone.
     passes = 3 / 64 + 3 / 16 + 3 / 4 + 4 + 0.8
     assert one["refine"] == pytest.approx(0.5 * 6 * (50 * passes + 4 / 64 + 3 / 16 + 3 / 4))
-    # 40 tracked frames of 12 + 12 steps, four views each, half of them halved once; 250 steps of three views; two
-    # evaluations of a camera and two held-out ones in two frames.
+    # 40 tracked frames of 12 + 12 steps, four views each, half of them halved once; 250 steps of three views; an
+    # evaluation of a camera and two held-out ones in two frames.
     tracked = 40 * 4 * 12 * (1 + 1 / 4)
-    assert one["teacher"] == pytest.approx(0.5 * (tracked + 250 * 3 + 0.4 * 2 * (2 + 4)))
+    assert one["teacher"] == pytest.approx(0.5 * (tracked + 250 * 3 + 0.4 * (2 + 4)))
     bigger = seconds(replace(facts, megapixels=1.0))
     assert all(bigger[step] == pytest.approx(2 * one[step]) for step in one)
     assert seconds(iterations_share=0.5)["bake"] < 0.6 * one["bake"]

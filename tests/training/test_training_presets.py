@@ -152,3 +152,13 @@ def test_several_processes_see_no_more_poses_than_one():
     shapes = with_processes(replace(one, compensate=replace(one.compensate, poses_per_step=1)), 4).compensate
     assert (shapes.position_lr, shapes.color_lr) == (2.0 * one.compensate.position_lr, 2.0 * one.compensate.color_lr)
     assert with_processes(one, 1) == one and with_processes(with_batch(one, 4), 4) == with_batch(one, 4)
+
+
+def test_fewer_gaussians_of_a_refinement_leave_the_head_its_own():
+    usual = TrainConfig().refinement(wanted=True).sampling
+    fewer, more = (TrainConfig(refine_gaussians=count).refinement(wanted=True).sampling for count in (15_000, 60_000))
+    assert fewer.count == 15_000 and fewer.head_share * fewer.count == pytest.approx(usual.head_share * usual.count)
+    assert more == replace(usual, count=60_000)
+    assert TrainConfig(refine_gaussians=3000).refinement(wanted=True).sampling.head_share == 0.5
+    with pytest.raises(InputError, match="refine-gaussians"):
+        TrainConfig(refine_gaussians=0)
