@@ -102,8 +102,8 @@ def run_process(
     )
 
 
-def own_program() -> tuple[tuple[str, ...], dict[str, str]]:
-    """Return the words that start `smplxpp` in this Python, and the variables that make it run the same code.
+def own_program(module: str = "pipelines.cli") -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the words that start `smplxpp`, or another module, in this Python, and variables for the same code.
 
     The working directory is left out of Python's path, because captures lie there, and files of any name.
     """
@@ -111,7 +111,7 @@ def own_program() -> tuple[tuple[str, ...], dict[str, str]]:
     paths = [root, *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     installed = Path(root).name in ("site-packages", "dist-packages")
     variables = {} if installed else {"PYTHONPATH": os.pathsep.join(filter(None, dict.fromkeys(paths)))}
-    return (sys.executable, "-P", "-m", "pipelines.cli"), variables
+    return (sys.executable, "-P", "-m", module), variables
 
 
 def meaning_of(ended: Ended, *, log: Path, answer: Path, judged: bool) -> tuple[Meaning, dict[str, Any] | None]:

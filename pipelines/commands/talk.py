@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,6 +24,7 @@ from smplxpp.core.files.sound_file import Sound, wave_bytes
 from smplxpp.figures.film import write_film
 
 if TYPE_CHECKING:
+    from avatar.driving import Heard
     from avatar.runtime import AvatarBundle
     from avatar.speech import Speech
 
@@ -78,8 +81,12 @@ class Talk:
     json: bool = False
     """Print what was written and heard as JSON."""
 
-    def run(self) -> dict[str, Any]:
-        """Make sound and phonemes, the motion that speaks them, and write each file whole or not at all."""
+    def run(self, heard_before: Callable[[], Heard] | None = None) -> dict[str, Any]:
+        """Make sound and phonemes, the motion that speaks them, and write each file whole or not at all.
+
+        Args:
+            heard_before: returns sound and phonemes where they have been made already.
+        """
         suffix = self._check()
         import avatar
         from avatar.driving import hear, person_of_bundle
@@ -96,7 +103,8 @@ class Talk:
                 fps=self.fps, seed=self.seed, strength=self.strength, lively=self.lively, gestures=self.gestures
             )
             # Text, recording or curves give sound and timed phonemes, from which the motion is made.
-            heard = hear(
+            make = heard_before or partial(
+                hear,
                 text=self.text,
                 audio=self.audio,
                 curves=self.curves,
@@ -104,6 +112,7 @@ class Talk:
                 voice=self.voice,
                 follow=self.hear,
             )
+            heard = make()
             sound, speech, notes = heard.sound, heard.speech, heard.notes
             motion = talking_motion(speech, face, stance, config, curves=heard.curves)
             # Write the requested files.
