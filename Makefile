@@ -18,7 +18,7 @@ export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/pip install --quiet --no-compile
 LOCKED := $(PIP) --require-hashes --no-deps -r
 
-.PHONY: demo test test-slow test-fuzz sanitize coverage lint lock bench fixture wheel docs clean
+.PHONY: demo test test-long test-slow test-fuzz sanitize coverage lint lock bench fixture wheel docs clean
 
 # What compiles the native library comes first, so that it is compiled while the other packages are unpacked.
 $(STAMP): pyproject.toml locks/build.lock locks/test.lock CMakeLists.txt $(NATIVE)
@@ -53,8 +53,13 @@ demo: $(STAMP)
 
 # One thread a process: two processes of two threads each take twice as long on two cores. A third process fills the time in
 # which tests wait for a browser or a server; a fourth costs more in caches than it fills.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
+
+# One test in twenty takes nearly half of the time: those of two seconds and more. `.ci/run` runs them after the others.
+test-long: $(STAMP)
+	$(PYTEST) -m "long and not slow and not fuzz"
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
@@ -70,7 +75,7 @@ sanitize: $(STAMP)
 
 # Counting lines costs a third more CPU time and up, so that `make test` does without.
 coverage: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --cov --cov-report=term
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow and not fuzz" --cov --cov-report=term
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -70,6 +70,7 @@ def test_table_figures_and_pictures(finished, capsys, capture, monkeypatch):
         assert np.array_equal(np.asarray(sheet)[:HEIGHT, :WIDTH], shown)
 
 
+@pytest.mark.long
 def test_held_out_poses_that_a_run_refined_are_measured_beside_the_given_ones(tmp_path, capture):
     run = write_moving_run(tmp_path / "run")
     assert ablate(run, capture) == 0

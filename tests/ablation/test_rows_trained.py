@@ -26,6 +26,8 @@ from pipelines.stages.train import train
 from tests.dolls.swaying import write_moving_capture, write_moving_run
 from tests.dolls.tiny import tiny_preset
 
+pytestmark = pytest.mark.long
+
 MEASURED = EvaluationConfig(
     protocol=ProtocolConfig(every=2, sets=("novel_view", "novel_pose")),
     metric="none",

@@ -54,6 +54,7 @@ def test_a_round_hole_is_filled_flat_with_faces_as_small_as_those_around():
     waves=st.lists(st.tuples(st.floats(0, 0.03), st.integers(1, 4)), max_size=2),
     seed=st.integers(0, 9),
 )
+@pytest.mark.long
 def test_any_wavy_hole_is_closed_manifold_and_within_its_rim(count, waves, seed):
     angle = 2.0 * np.pi * np.arange(count) / count
     wave = sum((size * np.cos(times * angle + seed) for size, times in waves), np.zeros(count))

@@ -53,6 +53,7 @@ def test_a_viewer_sees_the_colours_that_we_render(degree):
 
 
 @torch.no_grad()
+@pytest.mark.long
 def test_a_students_texture_shows_its_colours_where_pictures_see_it_and_the_templates_elsewhere():
     pytest.importorskip("xatlas")
     template = open_body_template()

@@ -88,6 +88,7 @@ def test_rays_go_through_their_pixels_and_know_where_the_hull_begins(ball):
         rays_of([view], TriangleMesh(ball.vertices + 100.0, ball.faces), "cpu")
 
 
+@pytest.mark.long
 def test_a_sphere_is_found_under_a_hull_that_is_too_large(ball):
     views = [photograph(ball, camera, str(k), plain=True) for k, camera in enumerate(ring(6, size=40))]
     found = fit_surface(views, large(ball), TINY, device="cpu")

@@ -203,6 +203,7 @@ def test_the_work_of_a_training_follows_from_frames_cameras_pixels_and_options()
     assert "teacher" not in seconds(no_teacher=True)
 
 
+@pytest.mark.long
 def test_a_training_tells_its_cost_before_it_begins(tmp_path, capsys):
     from tests.dolls.gesturing import doll, write_gestures
 

@@ -111,6 +111,7 @@ def test_the_terminal_shows_the_worst_and_counts_the_rest(tmp_path):
 
 
 @pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+@pytest.mark.long
 def test_the_page_sorts_filters_and_searches_in_a_browser(tmp_path):
     runs = write_batch(tmp_path / "made", 240)
     rows = write_index(runs, every=3600.0)

@@ -47,12 +47,14 @@ def test_every_part_has_a_share_of_the_time():
     assert gpu._seconds("nccl", ["nccl"], 42.0) == gpu._seconds("template", ["template", "nccl"], 42.0) == 42.0
 
 
+@pytest.mark.long
 def test_the_demo_is_trained_and_measured(job):
     found = found_by("demo", job)
     assert list(found["stages"]) == ["fit", "teacher", "cloth", "bake", "compensate"]
     assert found["counts"]["novel_view"]["images"] >= 1 and found["views"]["novel_pose"]["psnr"] > 0
 
 
+@pytest.mark.long
 def test_the_preset_of_a_gpu_is_trained_and_measured(job):
     found = found_by("gpu", job)
     for stages in (found["short"]["stages"], found["longer"]["stages"]):
@@ -120,6 +122,7 @@ def test_a_part_of_another_name_is_refused(capsys):
     assert "no such part: everything" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_what_fails_is_stored_and_the_next_part_runs(job, tmp_path, capsys):
     work = tmp_path / "work"
     options = {"capture": job.capture, "run_folder": tmp_path / "none", "work": work, "dry_run": True}
@@ -131,6 +134,7 @@ def test_what_fails_is_stored_and_the_next_part_runs(job, tmp_path, capsys):
     assert stored["parts"]["nccl"]["state"] == "done" and stored["parts"]["nccl"]["found"]["right"]
 
 
+@pytest.mark.long
 def test_a_part_in_a_process_of_its_own_finds_all_that_it_calls(job, tmp_path):
     """Parts called what their module had not yet defined when it ran as a program; in a test's process it was there."""
     result = run_part("loader", Job(tmp_path, job.run, job.capture, 900.0, "cpu"))
@@ -138,6 +142,7 @@ def test_a_part_in_a_process_of_its_own_finds_all_that_it_calls(job, tmp_path):
     assert set(result["found"]["images_a_second"]) == {"1", "2"}
 
 
+@pytest.mark.long
 def test_a_part_that_crashes_or_takes_too_long_leaves_its_words(job, tmp_path):
     lost = Job(tmp_path, job.run, tmp_path / "no capture", 900.0, "cpu")
     result = run_part("gpu", lost)

@@ -105,6 +105,7 @@ def test_sources_that_are_not_there_are_told_from_those_that_are(folder, source,
         chosen_sources(folder, ("dool",))
 
 
+@pytest.mark.long
 def test_a_failed_command_is_told_in_its_own_words(tmp_path):
     """The error's three parts reach the row, and time and memory are those of the command alone."""
     ran = run_command(["build", str(tmp_path / "run"), "--scan", str(tmp_path / "none.obj")], tmp_path / "log.txt")
@@ -141,6 +142,7 @@ def test_a_known_body_is_measured_in_the_units_that_were_found(folder, source, b
     assert distances(tmp_path / "none", folder, source.truth, body) is None
 
 
+@pytest.mark.long
 def test_a_run_is_measured_drawn_and_stored(folder, source, body, tmp_path, capsys):
     out, results = tmp_path / "out", tmp_path / "results"
     write_located_run(out / "doll" / "run", body)

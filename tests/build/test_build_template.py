@@ -27,7 +27,7 @@ from smplxpp.register.locate import BodyNotFoundError
 PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 SCAN, PARAMS = PERSON / "scans" / "scan_000000.ply", PERSON / "params" / "params.npz"
 FEW = {"hair": 400, "shoe": 400, "upper": 1500, "lower": 1500, "outer": 400}
-pytestmark = pytest.mark.filterwarnings("ignore::smplxpp.core.errors.GeometryWarning")
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::smplxpp.core.errors.GeometryWarning")]
 
 
 @pytest.fixture(scope="module")

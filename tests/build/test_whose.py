@@ -83,6 +83,7 @@ def test_the_start_proposes_limbs_to_the_search(smpl_file, body, monkeypatch):
     assert {"coco_right_ankle", "nose"} <= hints.keys()
 
 
+@pytest.mark.long
 def test_names_that_tell_nothing_are_told_by_the_scan(body):
     """SMPL-X's names are ours: its parameters stood half a metre too high, and the build failed on 0 % or went on."""
     pose = BodyParams.rest(betas=10)

@@ -40,6 +40,7 @@ def worn(mannequin: Mannequin, cloth, weights: np.ndarray) -> Template:
     )
 
 
+@pytest.mark.long
 def test_a_hakama_that_stays_with_the_waist_fails_and_one_that_sits_down_passes(hakama):
     mannequin, cloth = hakama
     right, _ = worn_checks(worn(mannequin, cloth, cloth.weights), mannequin.params)

@@ -71,6 +71,7 @@ def test_a_scan_much_finer_than_its_features_keeps_edges_with_a_length():
 
 
 @pytest.mark.parametrize("budget", [8000, 9000, 9500])
+@pytest.mark.long
 def test_no_two_vertices_of_a_simplified_person_share_a_place(budget: int):
     # Fingers that collapse touch in single vertices, which were doubled in place: reading the mesh welded them again.
     mesh = simplify(read_mesh(FIXTURE / "scans" / "scan_000000.ply").mesh, budget).mesh

@@ -74,6 +74,7 @@ def test_cloth_thicker_than_its_folds_cuts_itself_as_an_offset_and_not_as_a_leve
 
 
 @pytest.mark.parametrize("thickness", [0.001, 0.01])
+@pytest.mark.long
 def test_a_ball_with_a_hat_is_one_piece_of_the_known_volume(thickness: float):
     gap = 0.004
     hat = bowl(RADIUS + gap, 0.1)
@@ -97,6 +98,7 @@ def test_a_part_farther_than_the_gap_is_joined_and_one_far_away_refused():
         quiet(ball(), {"hair": bowl(0.1, 0.0, at=(0, 1.0, 0))}, thickness=0.001, gap=0.01)
 
 
+@pytest.mark.long
 def test_walls_are_measured_straight_inward():
     plate = trimesh.creation.box((1.0, 0.02, 1.0)).subdivide().subdivide()
     walls = wall_thickness(TriangleMesh(plate.vertices, plate.faces))

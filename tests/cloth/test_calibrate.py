@@ -36,6 +36,7 @@ def skinned() -> np.ndarray:
     return np.stack([person().pose(swaying().frame(k))[0][garment().particles] for k in range(len(swaying()))])
 
 
+@pytest.mark.long
 def test_the_drag_and_the_pins_of_a_motion_are_found_again():
     for drag, pin in ((0.5, 0.1), (8.0, 0.01)):
         truth = with_values(garment(), drag=drag, pin_depth=pin)

@@ -89,6 +89,7 @@ def test_a_skirt_touches_all_of_the_leg_that_it_can_fall_over():
     assert height.max() < WAIST + 0.3
 
 
+@pytest.mark.long
 def test_hair_hangs_from_the_head_alone():
     """Where it lay on shoulders it was pinned to them, and tore from the head that turns."""
     body = load_body()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from smplxpp.cloth import ClothDriver, DriverConfig, Garment, GarmentConfig, cut_garment
 from smplxpp.core import BodyParams, TriangleMesh
@@ -37,6 +38,7 @@ def depths(inner: ClothDriver, outer: ClothDriver, *, seconds: float = 1.2) -> n
     return np.array(found)
 
 
+@pytest.mark.long
 def test_an_outer_garment_stays_outside_an_inner_one():
     template, both = person(layers=2), garments()
     together = ClothDriver(template, both, QUICK)

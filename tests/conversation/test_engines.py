@@ -45,6 +45,7 @@ def test_a_question_that_is_spoken_is_answered(voice, tmp_path):
 
 
 @pytest.mark.skipif(not all(map(find_spec, ENGINES)), reason="extra talk")
+@pytest.mark.long
 def test_an_utterance_of_no_english_is_doubted_and_the_next_is_heard_again(voice):
     """Speech played backwards was answered like a question."""
     sound = voice.say("Please bring my umbrella before the big storm.").sound.at_rate(RATE).integers()

@@ -139,6 +139,7 @@ def changed_at(values: dict, path: tuple, wrong: object) -> dict:
 
 
 @pytest.mark.parametrize("wrong", ["words", [1], {"a": 1}, {"a": {"b": []}}, True, 1e400, None])
+@pytest.mark.long
 def test_reports_with_values_of_another_kind_are_refused_or_can_be_used(wrong, found):
     values = json.loads(json.dumps(found.report.as_dict()))
     refused = 0

@@ -295,6 +295,7 @@ FULL = ("tracked", "centred", "student", "pruned")
     ("kind", "compact"),
     [("tracked", False), ("centred", True), *((kind, compact) for kind in FULL[2:] for compact in (False, True))],
 )
+@pytest.mark.long
 def test_every_tensor_is_needed_in_its_shape_finite_and_of_its_kind(kind, compact, rig, tmp_path, monkeypatch):
     monkeypatch.setattr(model_file, "Teacher", cache(model_file.Teacher))
     path = tmp_path / "good"

@@ -7,10 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 ENTRY_POINTS = ("draw_mesh", "draw_maps", "splat", "splat_unchecked", "compare", "bind", "straighten")
 
 
+@pytest.mark.long
 def test_entry_points_draw_or_refuse_whatever_comes():
     # In a process of its own, where a signal would be seen.
     done = subprocess.run(

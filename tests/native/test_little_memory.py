@@ -23,6 +23,7 @@ ENVIRONMENT = {
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of the address space are Linux's")
 @pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.long
 def test_every_entry_point_ends_in_a_memory_error(threads):
     done = subprocess.run(
         [sys.executable, "-m", "tests.native.little_memory", str(threads)],

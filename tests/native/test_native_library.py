@@ -129,6 +129,7 @@ def work():
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.long
 def test_a_fork_after_a_native_call_works_with_one_thread():
     program = WORK + (
         """
@@ -146,5 +147,6 @@ print(os.waitpid(child, 0)[1])
     assert run(program) == "0\n"
 
 
+@pytest.mark.long
 def test_torch_may_ask_for_more_threads_than_any_machine_has():
     assert run(WORK + "torch.set_num_threads(1000)\nwork()\nprint('drawn')") == "drawn\n"

@@ -35,6 +35,7 @@ def test_workers_sleep_once_a_package_is_imported(package):
     assert spins(f"import {package}; {LIBRARIES}") == 0
 
 
+@pytest.mark.long
 def test_torchs_workers_sleep_too():
     assert spins("import avatar.training.student.bake, torch; torch.ones(200_000).exp()") == 0
 

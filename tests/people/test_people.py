@@ -20,6 +20,8 @@ from smplxpp.people.paint import DYES, HAIR_COLORS, PATTERNS, SKIN_TONES
 from smplxpp.people.scan_simulation import ScanConfig
 from smplxpp.skinning import skin
 
+pytestmark = pytest.mark.long
+
 NAME = "man shirt trousers short hair, arms down"
 COARSE = ScanConfig(cell=0.012, views=24, resolution=384, faces=12_000)
 

@@ -123,6 +123,7 @@ def test_the_report_shows_what_else_it_might_have_been(alone):
     assert [row[0].startswith("chosen") for row in section.tables[0].rows][:2] == [True, False]
 
 
+@pytest.mark.long
 def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, monkeypatch):
     shown, scan = [], tmp_path / "coarse.ply"
     write_ply(scan, simplify(read_mesh(PERSON / "scans" / "scan_000000.ply").mesh, 9500).mesh)
@@ -154,6 +155,7 @@ def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, monkeypatch):
     assert shown[0] is None and set(shown[1]) == {"nose"} and len(shown) == 2
 
 
+@pytest.mark.long
 def test_nothing_is_built_on_what_is_no_person(tmp_path, monkeypatch):
     monkeypatch.setattr(locate, "locate_body", partial(locate.locate_body, config=FEW))
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)

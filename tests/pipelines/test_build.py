@@ -191,6 +191,7 @@ def test_corrections_of_another_run_are_copied(small, capsys):
     assert b"hair" in (run / "labels_corrections.json").read_bytes()
 
 
+@pytest.mark.long
 def test_bridges_stay_where_the_user_wants_them(built):
     small = built
     kept = small.build("run", small.inputs(), last="40_transfer", bridges=BridgeConfig(rounds=0))
@@ -241,6 +242,7 @@ def test_the_report_stands_alone(person_run):
     assert "<script src" not in text
 
 
+@pytest.mark.long
 def test_the_template_is_drawn_once_for_the_reports_of_a_process_until_a_stage_changes(person_run, monkeypatch):
     """The demo drew the same pictures for five seconds at each of its reports."""
     drawn = []
@@ -286,6 +288,7 @@ def test_a_second_call_runs_nothing_and_keeps_the_report(person_run, capsys):
 # --- resuming -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_only_what_is_damaged_or_changed_runs_again(built, monkeypatch):
     small, inputs = built, built.inputs()
     run = small.folder / "run"
@@ -351,6 +354,7 @@ def test_a_build_from_a_late_stage_needs_the_earlier_ones(small):
 # --- invariance -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_units_and_axes_of_the_scan_do_not_matter(small, built_once):
     truth = template_of(built_once / "run")
     x, y, z = 100 * small.vertices.T

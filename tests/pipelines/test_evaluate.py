@@ -161,6 +161,7 @@ def test_an_evaluation_that_stands_is_not_run_again(evaluated, capture, tmp_path
     assert list(answer["models"]["student"]["views"]) == ["novel_pose"]
 
 
+@pytest.mark.long
 def test_numbers_of_another_program_are_told_in_the_place_of_the_sections(evaluated):
     record = standing_evaluation(evaluated, sha256_file(evaluated / "60_assemble" / "smplxpp.npz"))
     for make in (evaluation_figures, evaluation_views):

@@ -55,6 +55,7 @@ def measured(run, capture, capsys, *options: str) -> dict:
     return {"ran": answer["ran"], "p2s": mean["labels"][PART]["p2s"]}
 
 
+@pytest.mark.long
 def test_a_simulated_skirt_is_nearer_to_the_true_one_than_a_skinned_one(trained, capture, tmp_path, capsys):
     run = shutil.copytree(trained, tmp_path / "run")
     simulated = measured(run, capture, capsys)
@@ -103,6 +104,7 @@ def test_a_damaged_file_of_garments_is_refused(trained, capture, tmp_path, capsy
     assert "Train again" in refused(capsys, run, capture, *FEW)
 
 
+@pytest.mark.long
 def test_a_student_shown_as_new_is_itself_in_new_poses_and_simulated_in_those_of_the_training(trained, capture):
     opened = open_capture(capture)
     motions = ClothMotions(

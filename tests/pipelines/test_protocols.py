@@ -294,6 +294,7 @@ def test_covered_vertices_are_those_that_the_clothes_hide():
     assert not covered_vertices(template).any()  # the doll's dress is its own surface
 
 
+@pytest.mark.long
 def test_an_evaluation_prints_poses_against_exact_ones_and_refined_ones(root, tmp_path, capsys, caplog, monkeypatch):
     draw_no_surfaces(monkeypatch)
     caplog.set_level(logging.WARNING)

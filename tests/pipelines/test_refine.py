@@ -179,6 +179,7 @@ def test_the_report_shows_it(refined):
     assert seen["cameras"] == ["Ring0", "Ring1", "Ring2", "Ring3"] and NOVEL_POSES[0] not in seen["frames"]
 
 
+@pytest.mark.long
 def test_a_process_that_helps_leaves_the_end_to_another_one(capture, tmp_path, capsys):
     run, alone = (doll().write_run(tmp_path / name) for name in ("run", "alone"))
     chunks, helps = ("--refine-frames", "3"), ("--stage", "refine", "--refine-help")

@@ -115,6 +115,7 @@ def test_a_template_without_loose_clothes_simulates_nothing_and_has_nothing_to_s
     assert load_garments(trained / "83_cloth" / "garments.npz", template()) == []
 
 
+@pytest.mark.long
 def test_a_run_that_does_not_know_its_scans_pose_simulates_nothing_and_says_so_first(tmp_path, caplog):
     run, capture = tmp_path / "run", write_skirted(tmp_path / "skirted")
     (run / TEMPLATE).parent.mkdir(parents=True)
@@ -163,6 +164,7 @@ def test_pruned_blend_shapes_fit_the_compact_file_into_its_size(own, capture, ca
     assert len(whole.blend_shapes.active) == 300
 
 
+@pytest.mark.long
 def test_a_limit_of_time_gives_a_model_and_the_same_command_goes_on(trained, fitted, capture, capsys):
     assert train(fitted, capture, "--stage", "teacher", "--max-minutes", "1e-9") == 0
     first = json.loads(capsys.readouterr().out)
@@ -176,6 +178,7 @@ def test_a_limit_of_time_gives_a_model_and_the_same_command_goes_on(trained, fit
     assert same_models(fitted, trained) and not list(fitted.glob("*_work"))
 
 
+@pytest.mark.long
 def test_a_killed_training_goes_on(trained, fitted, capture, monkeypatch):
     step = BakeTask.step
 

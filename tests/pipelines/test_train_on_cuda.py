@@ -74,6 +74,7 @@ def smiling() -> Template:
 
 # A skirt that few steps have tracked hangs on edges at the limit of what holds.
 @pytest.mark.filterwarnings("ignore:simulated clothes:smplxpp.core.errors.GeometryWarning")
+@pytest.mark.long
 def test_every_stage_with_loose_clothes_and_their_evaluation(tmp_path, monkeypatch):
     run, capture = tmp_path / "run", write_skirted(tmp_path / "skirted")
     for path in (TEMPLATE, PARAMS):
@@ -130,6 +131,7 @@ def test_a_surface_is_followed_without_simulation_and_trainings_go_on(dance, tmp
     assert read_manifest(run / "80_teacher")["numbers"]["finished"]
 
 
+@pytest.mark.long
 def test_baselines_are_trained_and_measured(dance, tmp_path):
     run, rows = write_dance_run(tmp_path / "run"), ("mlp", "uv", "mesh")
     with pretended_cuda():

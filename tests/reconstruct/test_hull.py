@@ -96,6 +96,7 @@ def test_a_pixel_takes_as_many_metres_as_it_is_far():
     assert pixel_footprint(silhouettes, np.zeros(3)) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.long
 def test_teeth_and_slits_of_a_field_vanish_and_its_surface_stays():
     """Sheets as thin as a cell stood between thighs where the field jumps from one leg's to the other's."""
 

@@ -29,6 +29,7 @@ def cut(view):
     return replace(view, opacity=opacity)
 
 
+@pytest.mark.long
 def test_good_masks_are_all_trusted_and_the_box_holds_the_body():
     found = consensus(dented_views(plain=True))
     assert found.trusted.all() and not found.reasons
@@ -38,6 +39,7 @@ def test_good_masks_are_all_trusted_and_the_box_holds_the_body():
 
 
 @pytest.mark.parametrize("spoil", [turned, cut, lambda view: shifted(view, 30)], ids=["turned", "cut", "shifted"])
+@pytest.mark.long
 def test_bad_masks_are_named_and_no_others(spoil):
     which = (3, 8)
     views = list(dented_views(plain=True))
@@ -48,6 +50,7 @@ def test_bad_masks_are_named_and_no_others(spoil):
     assert not found.trusted[list(which)].any()
 
 
+@pytest.mark.long
 def test_the_order_of_the_views_does_not_matter():
     views = list(dented_views(plain=True))
     views[5] = cut(views[5])
@@ -57,6 +60,7 @@ def test_the_order_of_the_views_does_not_matter():
     assert other.explained == pytest.approx(one.explained[order], abs=1e-9)
 
 
+@pytest.mark.long
 def test_masks_a_pixel_or_two_off_are_trusted():
     from scipy import ndimage
 
@@ -67,6 +71,7 @@ def test_masks_a_pixel_or_two_off_are_trusted():
     assert consensus(views).trusted.all()
 
 
+@pytest.mark.long
 def test_masks_that_contradict_each_other_are_refused():
     views = [shifted(view, (-1) ** k * 35) for k, view in enumerate(dented_views(plain=True))]
     with pytest.raises(InputError, match="silhouettes of one body"):

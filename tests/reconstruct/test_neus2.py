@@ -26,6 +26,7 @@ def test_the_cube_is_left_as_it_was_entered(cube, turned):
     assert world_from_space(in_cube(points, cube, turned=turned), space, cube) == pytest.approx(points, abs=1e-12)
 
 
+@pytest.mark.long
 def test_the_masks_tell_the_space(truth):
     views = dented_views()
     moved = [camera_shift(view) for view in views]

@@ -44,11 +44,13 @@ def test_confidence_is_high_where_it_is_right_and_none_where_nobody_looks():
     assert result.confidence[result.seen > 3].mean() > 0.6
 
 
+@pytest.mark.long
 def test_the_same_photographs_give_the_same_bits(found):
     again = reconstruct(few_views(), CONFIG)
     assert (again.mesh.vertices == found.mesh.vertices).all() and (again.colors == found.colors).all()
 
 
+@pytest.mark.long
 def test_a_scene_of_another_size_and_place_gives_the_same_surface(found):
     """Twice the size, turned and moved: everything in metres follows."""
     from smplxpp.core.rotations import matrix_from_rotvec

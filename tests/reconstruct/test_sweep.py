@@ -60,6 +60,7 @@ def test_an_exposure_changes_no_agreement(ball, photographs):
     assert found[1] == pytest.approx(found[0], abs=0.02)
 
 
+@pytest.mark.long
 def test_the_search_finds_a_dent_that_no_silhouette_shows():
     ball = zero_surface(inside_ball, BOX, cell=0.02)
     truth = zero_surface(inside_dented, BOX, cell=0.0125)

@@ -48,6 +48,7 @@ def forearms(turn) -> np.ndarray:
     return np.asarray(BODY.forward(turn.params.frame(0)).vertices[0])[near]
 
 
+@pytest.mark.long
 def test_limbs_that_sway_are_not_cut_off(turn, views):
     person = posed_person(BODY, turn.params)
     found = reconstruct_turntable(views, person, COARSE)
@@ -64,6 +65,7 @@ def test_limbs_that_sway_are_not_cut_off(turn, views):
     assert found.colors[top, 0].mean() > found.colors[bottom, 0].mean() + 50
 
 
+@pytest.mark.long
 def test_a_frame_of_another_pose_is_left_out_and_named(turn, views):
     person = posed_person(BODY, turn.params)
     moved = views[3]
@@ -79,6 +81,7 @@ def test_masks_of_nobody_are_refused(turn, views):
         reconstruct_turntable(empty, posed_person(BODY, turn.params), COARSE)
 
 
+@pytest.mark.long
 def test_legs_in_trousers_that_touch_stay_two(monkeypatch):
     for side, sign in (("left", -1.0), ("right", 1.0)):
         monkeypatch.setitem(turns.HELD, f"{side}_hip", (0, 0, sign * 2.5))

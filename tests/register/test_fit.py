@@ -56,6 +56,7 @@ def test_exact_keypoints_give_the_pose(person, of_exact):
     assert not fit.initial_residuals and not fit.notes
 
 
+@pytest.mark.long
 def test_noisy_keypoints_and_masks(person, cameras, noisy, of_noisy):
     mask = masks(BODY, person, cameras)
     start = disturbed(person, degrees=2.0, metres=0.01, betas=0.3)
@@ -72,6 +73,7 @@ def degrees_away(fitted, true):
     return np.degrees(np.linalg.norm(rotvec_from_matrix(a.transpose(0, 1, 3, 2) @ b), axis=2)).mean()
 
 
+@pytest.mark.long
 def test_a_fit_beside_keypoints_tells_the_turns_that_they_do_not(person, noisy, of_noisy):
     starts = (disturbed(person, degrees=d, metres=0.01, betas=0.3) for d in (1.0, 15.0))
     helped, misled = (register(BODY, replace(noisy, initial=start), SMALL).params for start in starts)
@@ -79,12 +81,14 @@ def test_a_fit_beside_keypoints_tells_the_turns_that_they_do_not(person, noisy, 
     assert vertex_error_mm(BODY, misled, person) < 1.5 * vertex_error_mm(BODY, of_noisy, person)
 
 
+@pytest.mark.long
 def test_windows_join(exact, of_exact):
     """A take longer than the window is solved piece by piece and comes to the same."""
     pieces = register(BODY, exact, RegisterConfig(window=2, shape_frames=4))
     assert vertex_error_mm(BODY, pieces.params, of_exact.params) < 2.0
 
 
+@pytest.mark.long
 def test_chunks_of_one_shape_join(person, cameras):
     """Chunks of a take that get its shape need no shape of their own, and meet in the frames that both have."""
     seen = keypoints(BODY, person, cameras, px=1.0)
@@ -140,6 +144,7 @@ def _of_trunk(name: str) -> bool:
     return name == "pelvis" or name.startswith("spine") or name.endswith(("collar", "hip"))
 
 
+@pytest.mark.long
 def test_clothes_do_not_fatten_the_body(person):
     """Attracted both ways, a wide shirt pulls the body onto itself (ETCH, Li et al. 2025); kept off, it does not."""
     one = person.select([0])
@@ -159,6 +164,7 @@ def test_clothes_do_not_fatten_the_body(person):
     assert ours.residuals["skin_mm"][0] < 2.0
 
 
+@pytest.mark.long
 def test_a_body_does_not_stand_out_of_its_clothes(person):
     one = person.select([0])
     scan = dressed(one, 0.01)

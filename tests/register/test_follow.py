@@ -29,6 +29,7 @@ def observed(person):
     return Observations(tuple(range(FRAMES)), cameras, mask=lambda name, frame: seen[name, frame], fps=20.0, bare=bare)
 
 
+@pytest.mark.long
 def test_from_the_middle_to_both_ends(person, observed):
     told = []
     found = follow(BODY, observed, person.frame(2), at=2, config=SMALL, progress=lambda what, share: told.append(share))

@@ -47,6 +47,7 @@ def test_many_exact_landmarks_give_the_pose(person):
     assert fit.residuals["landmarks_mm"][0] < 4.0 and not fit.notes
 
 
+@pytest.mark.long
 def test_eight_landmarks_and_a_scan_need_no_parameters(person):
     points, scan = placed(person, EIGHT, metres=0.008), dressed(person, 0.01)
     alone = fitted(points)

@@ -129,6 +129,7 @@ def test_cpu_tensors_do_not_reach_gsplat():
         rasterize(**vars(scene), backend="gsplat")
 
 
+@pytest.mark.long
 def test_importing_the_renderer_imports_no_backend():
     code = (
         "import sys, avatar.rendering, avatar.rendering.gsplat_backend;"

@@ -240,6 +240,7 @@ for (const name of given.names) {
 }"""
 
 
+@pytest.mark.long
 def test_both_players_take_and_refuse_the_same_bundles(good, tmp_path):
     """The page played 67 of 154 bundles that the runtime refuses: names of joints, versions, holes, float indices."""
     write_dressed(tmp_path)

@@ -69,6 +69,7 @@ def test_a_case_in_the_hand_is_found_and_nothing_else(open_body, stance, scan):
 
 
 @pytest.mark.parametrize("kind", ["shoulder bag", "belt bag", "backpack"])
+@pytest.mark.long
 def test_a_bag_that_no_hand_touches_is_found(open_body, stance, kind):
     """A bag on a strap was shirt and trousers, which swung with a thigh."""
     params, posed = stance
@@ -324,6 +325,7 @@ def test_frames_without_lenses_are_glasses(open_body, stance, head):
     assert mesh.face_areas[found.faces & truth].sum() > 0.5 * mesh.face_areas[truth].sum()
 
 
+@pytest.mark.long
 def test_hair_hoods_and_bare_heads_wear_nothing(open_body, stance, head):
     """A bun, a ponytail behind, two buns over the ears, one beside a bulge, long hair and a hood round the face."""
     at = dict(zip(open_body.joint_names, stance[1].joints[0], strict=True))
@@ -358,6 +360,7 @@ def convex_ball() -> tuple[np.ndarray, np.ndarray]:
     return points / np.linalg.norm(points, axis=1, keepdims=True), faces
 
 
+@pytest.mark.long
 def test_glasses_outlive_the_removal_of_fragments_and_pull_no_body(open_body, stance, with_things):
     """They are smaller than any garment; a hat pulled the body that is moved onto the scan 15 mm off the face."""
     mesh, _, shown = with_things("glasses", "cap")
@@ -368,6 +371,7 @@ def test_glasses_outlive_the_removal_of_fragments_and_pull_no_body(open_body, st
     assert not any("misses face and hands" in note for note in result.notes)
 
 
+@pytest.mark.long
 def test_under_a_hat_the_face_is_found_and_a_bag_on_a_strap_is_told(open_body, stance, with_things, monkeypatch):
     """A brim was taken for the face, so that no label was trusted; a bag was clothes in silence."""
     monkeypatch.setattr(by_body, "find_headwear", lambda mesh, *_, **__: FoundObjects.none(mesh.face_count))

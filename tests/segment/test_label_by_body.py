@@ -55,6 +55,7 @@ def accuracy(mesh: TriangleMesh, labels: np.ndarray, truth: np.ndarray) -> float
     return float(mesh.face_areas @ (labels == truth) / mesh.face_areas.sum())
 
 
+@pytest.mark.long
 def test_a_clothed_scan_is_labelled_though_the_body_is_a_little_wrong(body, scanned):
     mesh, colors, truth, params = scanned
     wrong = tracker_noise(params, seed=3, degrees=2.5, transl=0.01, betas=0.4)
@@ -79,6 +80,7 @@ def test_the_direction_she_faces_does_not_matter(body, scanned, labelled):
     assert accuracy(mesh, after.face_labels, labelled.face_labels) > 0.999
 
 
+@pytest.mark.long
 def test_without_colours_it_says_so(body, scanned):
     mesh, colors, _, params = scanned
     for given in (None, np.full_like(colors, 128)):
@@ -86,6 +88,7 @@ def test_without_colours_it_says_so(body, scanned):
         assert any("no colours" in note for note in result.notes)
 
 
+@pytest.mark.long
 def test_nothing_tells_a_closed_jacket_from_a_shirt(body, scanned):
     whole = read_mesh(PERSON / "scans/scan_000000.ply")  # with all of its faces, on which confidences lean
     result = label_by_body(whole.mesh, body, scanned[3], colors=whole.vertex_colors)

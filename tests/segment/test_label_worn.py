@@ -50,6 +50,7 @@ def test_a_bald_person_with_bare_feet_has_neither_hair_nor_shoes(body):
     assert share[UPPER.id] > 0.2 and share[LOWER.id] > 0.2 and share[SKIN.id] > 0.15
 
 
+@pytest.mark.long
 def test_a_garment_that_may_be_one_or_two_is_not_sure(body):
     """Shirt and trousers of two colours, and the same of one: what is upper and what lower is a guess then."""
     sure = []
@@ -96,6 +97,7 @@ def test_calves_that_no_shape_of_the_body_has_are_no_trousers(body, calves):
         assert area[own] @ (labels[own] == label.id) > 0.85 * area[own].sum(), name
 
 
+@pytest.mark.long
 def test_who_wears_nothing_wears_no_shirt(body):
     """Without colours the bare body was labelled shirt, shoes and hair; as leggings look the same, it is not sure."""
     params = BodyParams.rest()
@@ -112,6 +114,7 @@ def test_who_wears_nothing_wears_no_shirt(body):
 
 
 @pytest.mark.parametrize("open_by", [0.0, 0.12])
+@pytest.mark.long
 def test_a_jacket_ends_at_its_hem_and_not_at_the_waist(body, open_by):
     """A jacket's lower half was labelled trousers, closed by a hem at the hips or open over the waist of trousers."""
     params = BodyParams.rest()
@@ -136,6 +139,7 @@ def test_a_jacket_ends_at_its_hem_and_not_at_the_waist(body, open_by):
         assert area @ (labels.face_labels[own] == label.id) > 0.9 * area.sum(), label.name
 
 
+@pytest.mark.long
 def test_boots_in_the_colour_of_dust_are_no_bare_feet_of_a_dark_person(body):
     """Tan boots are little lighter than dark skin in changing light: they became feet."""
     mesh, colors, params = painted(body, {"shirt": _BLUE, "trousers": _BLUE, "hair": (20, 18, 16)})
@@ -176,6 +180,7 @@ def test_a_suit_of_one_colour_is_cut_at_the_jackets_hem(body):
 
 
 @pytest.mark.parametrize("half", [0.0, 0.05])
+@pytest.mark.long
 def test_an_open_jacket_is_told_from_a_closed_one_by_its_lips(body, half):
     """Without colours every open jacket was a shirt, and a coat's tails were trousers."""
     params = BodyParams.rest()
@@ -211,6 +216,7 @@ def test_a_front_in_the_colour_of_the_trousers_is_a_waistcoat_where_it_ends_over
 
 
 @pytest.mark.parametrize("heels", [False, True])
+@pytest.mark.long
 def test_shoes_in_the_colour_of_skin_are_told_by_their_heels(body, heels):
     """Pumps in the colour of skin became bare feet; a person on tiptoe has them."""
     _, colors, params = painted(body, {"shirt": _BLUE, "trousers": _GREY, "hair": _GREY})

@@ -30,6 +30,7 @@ def closures(speech) -> np.ndarray:
     return np.array([0.5 * (one.start + one.end) for one in speech.spoken if one.name in BILABIALS])
 
 
+@pytest.mark.long
 def test_a_voice_says_a_sentence_with_its_stresses(spoken):
     names = [one.name for one in spoken.speech.spoken]
     assert [name for name in names if name in BILABIALS] == ["P", "B", "M", "M", "B", "B", "B", "M"]
@@ -56,6 +57,7 @@ def test_the_voice_is_quiet_where_its_phonemes_say_so(spoken):
     assert level(vowel.start, vowel.end) > 10.0 * level(last + 0.05, spoken.speech.seconds)
 
 
+@pytest.mark.long
 def test_what_a_voice_said_is_aligned_at_any_rate_and_in_stereo(spoken, recogniser, tmp_path):
     truth = closures(spoken.speech)
     found = align(spoken.sound, TEXT)
@@ -152,6 +154,7 @@ def test_words_come_with_their_times(spoken, recogniser):
     assert abs(storm.start - truth) < 0.06 and storm.end <= found.seconds
 
 
+@pytest.mark.long
 def test_another_language_is_said_and_followed_by_its_sounds(spoken, recogniser, tmp_path):
     """Speech played backwards has sounds and no words of English; words were laid over it without a remark."""
     backwards = Sound(spoken.sound.samples[::-1].copy(), spoken.sound.rate)
@@ -192,6 +195,7 @@ def test_a_text_without_an_english_word_is_not_laid_over_a_recording(spoken, rec
         align(spoken.sound, "Привет")
 
 
+@pytest.mark.long
 def test_tones_that_are_taken_for_noises_alone_are_no_speech(recogniser):
     """They gave a motion with a still mouth, and nothing was said."""
     t = np.arange(2 * 16_000) / 16_000
@@ -207,6 +211,7 @@ def test_sounds_that_a_voice_does_not_have_are_refused(voice):
         voice.read("¤ ¤")
 
 
+@pytest.mark.long
 def test_music_is_refused_or_heard_as_few_words(recogniser):
     """Chords with a beat: no words, or as few as a recogniser takes for them; in the sound's bounds at any rate."""
     t = np.arange(3 * 16_000) / 16_000

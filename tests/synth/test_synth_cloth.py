@@ -99,6 +99,7 @@ def person():
     return load_person(TOPOLOGY)
 
 
+@pytest.mark.long
 def test_a_take_starts_settled_swings_keeps_its_length_and_repeats(person):
     motion = Performance(person.betas, person.body.expression_names, seconds=0.2, seed=1)
     config = SimulationConfig(settle=0.3)

@@ -26,6 +26,8 @@ from smplxpp.synth.talking import GESTURES, Talking
 from smplxpp.synth.views import Atlas, LitFrame, _cell_centers, paint_atlas, render_view
 from smplxpp.synth.write_capture import make_capture
 
+pytestmark = pytest.mark.long
+
 FIXTURE = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 TOPOLOGY = FIXTURE / "geometry" / "topology.npz"
 LONG, STEP = 39.9, 1 / 60

@@ -87,6 +87,7 @@ def test_a_picture_a_part_has_that_parts_colours_and_the_body_lies_as_in_its_fil
         assert np.percentile(np.abs(found.astype(int) - color).max(axis=1), 99) < 8
 
 
+@pytest.mark.long
 def test_a_level_of_detail_is_painted_anew_from_its_source(person, atlas):
     bands = replace(person, vertex_colors=painted(person.vertices))
     scan = PaintedScan(bands.mesh, bands.vertex_colors, np.full(len(bands.faces), SKIN.id))

@@ -72,6 +72,7 @@ def test_a_finished_training_is_opened_and_not_repeated(run, capture, folder):
     assert not list(folder.glob("*_work"))
 
 
+@pytest.mark.long
 def test_what_the_limit_of_time_ended_continues(run, capture, folder, tmp_path):
     for _ in range(40):  # each call takes a step at least
         try:
@@ -84,6 +85,7 @@ def test_what_the_limit_of_time_ended_continues(run, capture, folder, tmp_path):
     assert student.frames == avatar.load(folder).frames
 
 
+@pytest.mark.long
 def test_another_seed_trains_again(run, capture, folder, tmp_path):
     train_in_python(run, capture, tmp_path, seed=3)
     assert not same_bits(folder / "bake/student.safetensors", tmp_path / "bake/student.safetensors")

@@ -67,6 +67,7 @@ def test_wide_trousers_sit_down(mannequin, worn, name):
     assert np.percentile(error, 95) < 80
 
 
+@pytest.mark.long
 def test_a_wide_skirt_leaves_the_pelvis_its_share_and_trousers_and_close_skirts_stay_as_they_are(mannequin, worn):
     """All weight of a skirt that stood 8 cm off the thighs was theirs, so that its back came along when she sat."""
 
@@ -92,6 +93,7 @@ def test_a_wide_skirt_leaves_the_pelvis_its_share_and_trousers_and_close_skirts_
         assert np.percentile(changed, 99) < 0.02, name
 
 
+@pytest.mark.long
 def test_aprons_and_capes_are_pushed_by_the_legs_and_not_drawn_along(mannequin, worn):
     """Close to the legs all of their weight was the thighs': a simulated cape was 174 mm off where she sat."""
 
@@ -268,6 +270,7 @@ def test_joints_with_other_names_have_no_axes(mannequin, worn):
     assert limb_axes(case.source, mannequin.body.weights, 1.9, TransferConfig(joint_names=names)) == []
 
 
+@pytest.mark.long
 def test_a_coat_over_the_shoulders_does_not_follow_the_arms_under_it(mannequin, worn):
     """Its empty sleeves hang beside the arms, which took them and the coat along: 100 mm off in the mean."""
     case = worn("coat with empty sleeves")

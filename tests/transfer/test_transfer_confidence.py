@@ -51,6 +51,7 @@ def test_what_lies_on_the_skin_is_not_overruled_by_its_label(mannequin, wardrobe
 
 
 @pytest.mark.parametrize("name", ["bob on the shoulders", "hair over chest and shoulders"])
+@pytest.mark.long
 def test_hair_keeps_the_weights_of_the_skin_it_lies_on(mannequin, wardrobe, name):
     """Shoulders and jaw included, which a label hair leaves out."""
     case = scan(mannequin, wardrobe[name], "mean", "A", seed=0)
@@ -70,6 +71,7 @@ def test_hair_keeps_the_weights_of_the_skin_it_lies_on(mannequin, wardrobe, name
 
 
 @pytest.mark.parametrize("name", ["full circle skirt", "dress labelled lower"])
+@pytest.mark.long
 def test_cloth_beside_a_hand_does_not_follow_it(mannequin, wardrobe, name):
     """No label says so here: the hand faces against the cloth, and what lies on the skin leads to no arm."""
     case = scan(mannequin, wardrobe[name], "mean", "hands", seed=0)
@@ -81,6 +83,7 @@ def test_cloth_beside_a_hand_does_not_follow_it(mannequin, wardrobe, name):
     assert shares(mannequin.body, old[below], ARM).max() > 0.5
 
 
+@pytest.mark.long
 def test_the_back_of_a_hand_is_no_match_for_the_cloth_before_its_palm():
     """On a heavy person the back of the hand lay within the reach of a confident match and faced as the dress does."""
     body = load_body()
@@ -99,6 +102,7 @@ def test_a_wide_sleeve_before_the_hip_follows_the_arm(mannequin, wardrobe):
     assert error(mannequin, case, TransferConfig.for_label("upper", base=TransferConfig.restricted()))["mean"] > 4.0
 
 
+@pytest.mark.long
 def test_every_garment_is_a_mesh_with_weights_that_are_some(wardrobe):
     assert len(wardrobe) >= 16
     for garment in wardrobe.values():

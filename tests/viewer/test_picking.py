@@ -72,6 +72,7 @@ def test_a_pointer_that_lingers_leaves_no_more_points(surface):
     assert 4 <= len(points) < 20 and np.linalg.norm(np.diff(points, axis=0), axis=1).min() > 0.004
 
 
+@pytest.mark.long
 def test_a_very_long_drag_is_cut_into_lines_that_a_file_takes(surface):
     up = np.linspace(0.1, 0.9, 60)
     places = np.stack(

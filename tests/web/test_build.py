@@ -92,6 +92,7 @@ def test_a_build_gives_the_same_bytes(tmp_path):
 @pytest.mark.skipif(
     shutil.which("node") is None or not (TOOLS / "tsc").exists(), reason="no node with web/'s tools: npm ci in web/"
 )
+@pytest.mark.long
 def test_types_fit():
     done = subprocess.run([str(TOOLS / "tsc"), "--noEmit"], cwd=WEB, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout

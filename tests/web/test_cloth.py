@@ -112,6 +112,7 @@ def test_the_skirt_moves_as_with_the_runtime(dressed, config):
         np.testing.assert_allclose(np.reshape(one["means"], (-1, 3)), other["means"], atol=5e-3)
 
 
+@pytest.mark.long
 def test_the_outer_of_two_skirts_lies_on_the_inner_one(tmp_path):
     motion = BodyParams.concatenate([swaying(k / FPS) for k in range(10)])
     path = write_dressed(tmp_path / "two.avatar", motion, layers=2)
@@ -131,6 +132,7 @@ def test_cuts_start_anew_and_far_away_is_as_near(tmp_path):
     assert differences(ours[2:3], arrays(cold)).max() == 0.0
 
 
+@pytest.mark.long
 def test_pictures_far_apart_are_followed_by_poses_between(dressed):
     """Pictures two a second move the skirt about as pictures twenty a second do; a second and more is a cut."""
     often = played(dressed, QUICK, [(k, 1.0 / FPS) for k in range(21)])
@@ -143,6 +145,7 @@ def test_pictures_far_apart_are_followed_by_poses_between(dressed):
     assert differences(still[1:], arrays(still[:1])).max() == 0.0
 
 
+@pytest.mark.long
 def test_a_motion_in_a_loop_starts_again_from_its_first_start(dressed):
     """Near the pose of the last cold start one step leads there; farther away the start is a cold one, to the bit."""
     looped = played(dressed, QUICK, [(0, 0.0), *((k, 1.0 / FPS) for k in range(1, 13)), (0, 99.0)])

@@ -113,6 +113,7 @@ def test_texts_of_code_points_that_are_none_are_refused(tmp_path, point):
         read_array(tmp_path / "x.npy")
 
 
+@pytest.mark.long
 def test_an_archive_that_unpacks_to_thousands_of_times_its_size_is_refused(tmp_path):
     count = 700 << 20
     header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': ({count},), }}"

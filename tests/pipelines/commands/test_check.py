@@ -104,6 +104,7 @@ def in_a_shirt(template: Template) -> Template:
     )
 
 
+@pytest.mark.long
 def test_a_template_is_driven_and_its_parts_held_against_the_body(tmp_path):
     worn = in_a_shirt(open_body_template())
     worn.save(tmp_path / "smplxpp.npz")
@@ -130,6 +131,7 @@ def accessor_bytes(gltf: pygltflib.GLTF2, index: int, dtype: str) -> np.ndarray:
     return np.frombuffer(gltf._glb_data, dtype, accessor.count * width, start).reshape(-1, width)
 
 
+@pytest.mark.long
 def test_a_rigged_file_is_driven_by_its_own_joints_and_its_planted_faults_are_found(tmp_path):
     worn = in_a_shirt(open_body_template())
     path, names = tmp_path / "worn.glb", worn.body.joint_names

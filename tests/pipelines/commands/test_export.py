@@ -56,6 +56,7 @@ def answer(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, dict
     return status, json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.long
 def test_a_print_is_one_watertight_piece_of_the_height_asked_for(run: Path, tmp_path: Path, capsys):
     status, report = answer(capsys, run, "--solid", tmp_path / "a.stl", "--height-mm", 90, "--thickness-mm", 1.5)
     assert status == 0 and report["components"] == 1
@@ -67,6 +68,7 @@ def test_a_print_is_one_watertight_piece_of_the_height_asked_for(run: Path, tmp_
     assert 5 < report["wall_mm_median"] < 20
 
 
+@pytest.mark.long
 def test_it_takes_the_pose_and_names_what_is_wrong(run: Path, tmp_path: Path, capsys):
     params = BodyParams.rest(betas=2, expressions=0)
     params.save(tmp_path / "p.npz")

@@ -40,6 +40,7 @@ def test_the_command_prints_its_numbers_and_a_table(tmp_path, solver, capsys):
     assert len(solver.shown) == 1
 
 
+@pytest.mark.long
 def test_the_page_stands_alone(tmp_path, solver, capsys):
     assert main(["register", str(tmp_path), *ASKED, "--json"]) == 0
     page = Path(json.loads(capsys.readouterr().out)["report"])
@@ -118,6 +119,7 @@ def test_a_build_registers_to_keypoints_where_there_are_no_parameters(tmp_path):
     assert registration_of(tmp_path, capture=capture).start
 
 
+@pytest.mark.long
 def test_a_build_takes_up_what_register_has_made(tmp_path, solver, capsys):
     assert main(["register", str(tmp_path), *ASKED, "--seed", "3", "--json", "--no-report"]) == 0
     options = [str(tmp_path), "--capture", str(FIXTURE), "--until-stage", "10_body", "--json"]

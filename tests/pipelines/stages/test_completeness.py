@@ -106,6 +106,7 @@ def test_a_skirt_labelled_skin_looks_like_cloth(whole):
     assert "leg" in checks[PATCH].explanation or "torso" in checks[PATCH].explanation
 
 
+@pytest.mark.long
 def test_a_mirrored_scan_fails_where_the_pose_tells_left_from_right(whole):
     template, params, _, _ = whole
     pose = params.body_pose.copy()

@@ -59,6 +59,7 @@ def test_a_build_of_a_capture_looks_at_its_photographs(person_run):
     assert seen["unread"] == []
 
 
+@pytest.mark.long
 def test_a_mirrored_scan_in_a_symmetric_pose_is_told(built, inputs):
     template, params, scan, colors = built
     mirrored = TriangleMesh(scan.vertices * [-1, 1, 1], np.ascontiguousarray(scan.faces[:, ::-1]))
@@ -72,6 +73,7 @@ def test_a_scan_without_colours_or_a_build_without_photographs_has_no_check(buil
     assert photograph_checks(template, params, scan, colors, replace(inputs, photographs={})) == ([], {})
 
 
+@pytest.mark.long
 def test_photographs_that_cannot_be_read_are_left_out_and_counted(built, inputs, tmp_path):
     template, params, scan, colors = built
     broken = tmp_path / "broken.jpg"

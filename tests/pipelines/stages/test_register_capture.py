@@ -313,6 +313,7 @@ def build_inputs(**changes) -> BuildInputs:
     )
 
 
+@pytest.mark.long
 def test_a_build_takes_the_reference_frame_of_its_registration(tmp_path, solver):
     records = build(tmp_path, build_inputs(), BuildConfig(), registration=inputs_of(), last="10_body")
     assert list(records) == ["05_register", "08_capture", "10_body"]

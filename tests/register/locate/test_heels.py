@@ -48,6 +48,7 @@ def test_feet_on_the_floor_stay(flat):
     assert lift_heels(flat, found) is found
 
 
+@pytest.mark.long
 def test_legs_that_came_out_too_long_are_lifted_on_their_heels(flat):
     """A woman in pumps: her feet lay flat below the floor, and her legs were as long as without heels."""
     truth = on_heel(flat, on_heel(flat, FLAT, "left", (0.10, 35.0, -25.0)), "right", (0.10, 35.0, -25.0))
@@ -58,6 +59,7 @@ def test_legs_that_came_out_too_long_are_lifted_on_their_heels(flat):
     assert _off(search, found.state, truth) < 0.5 * _off(search, lost.state, truth) < 0.08
 
 
+@pytest.mark.long
 def test_toes_of_a_lifted_foot_are_bent_as_its_shoe_is(flat):
     """The pose prior kept toes straight, so that they came out below the shoe's tip."""
     truth = on_heel(flat, FLAT, "left", (0.08, 40.0, -45.0))
@@ -73,6 +75,7 @@ def test_toes_of_a_lifted_foot_are_bent_as_its_shoe_is(flat):
     assert settle_feet(flat, flat.polished("flat", FLAT, None, steps=0)).state is FLAT
 
 
+@pytest.mark.long
 def test_a_foot_that_ends_below_its_sole_gets_a_shorter_leg(flat):
     """A walking woman's front foot lay 30 mm below the sole of her pump, where no turn of it could lift it."""
     heel = (0.0, 35.0, -25.0)

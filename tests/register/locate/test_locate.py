@@ -91,24 +91,28 @@ def test_both_facings_were_followed_and_the_best_comes_first(located):
     assert located.candidates[0].cost == min(one.cost for one in located.candidates)
 
 
+@pytest.mark.long
 def test_she_is_found_as_well_after_she_has_turned_and_moved_and_her_faces_point_inward(body, scan, truth):
     turn, move = matrix_from_rotvec(np.array([0.0, 2.4, 0.0])), np.array([3.0, 0.5, -2.0])
     found = locate_body(body, TriangleMesh(scan.vertices @ turn.T + move, scan.faces[:, ::-1]), config=QUICK)
     assert _error(body, found, truth @ turn.T + move) < 0.015
 
 
+@pytest.mark.long
 def test_the_same_seed_finds_the_same_body(body, scan, located):
     again = locate_body(body, scan, config=QUICK)
     assert np.array_equal(again.params.full_pose, located.params.full_pose)
     assert np.array_equal(again.params.betas, located.params.betas)
 
 
+@pytest.mark.long
 def test_a_heavier_prior_of_poses_turns_joints_less(body, scan, located):
     stiff = locate_body(body, scan, config=replace(QUICK, pose_prior=300.0))
     assert np.abs(stiff.params.body_pose).sum() < 0.8 * np.abs(located.params.body_pose).sum()
 
 
 @pytest.mark.parametrize("later", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.long
 def test_landmarks_overrule_the_surface(body, whole, monkeypatch, later):
     """Somebody says that she faces backwards: that is believed. What is searched later moves single limbs."""
     if not later:
@@ -148,6 +152,7 @@ def bent(body) -> tuple[TriangleMesh, BodyParams]:
     return mesh.with_vertices(mesh.vertices + 0.015 * worn[:, None] * mesh.vertex_normals).submesh(outer)[0], params
 
 
+@pytest.mark.long
 def test_a_body_that_no_standing_pose_explains_is_found_among_rare_poses(body, bent):
     mesh, params = bent
     found = locate_body(body, mesh, config=LEAST)
@@ -189,6 +194,7 @@ def test_a_landmark_that_no_body_has_is_refused(body, scan):
         locate_body(body, scan, landmarks={"third_elbow": np.zeros(3)}, config=QUICK)
 
 
+@pytest.mark.long
 def test_labels_of_a_labeller_are_asked_for_until_they_stay(body, coarse, scan, truth):
     labels = np.load(PERSON / "scans" / "scan_000000_labels.npz")["label"].astype(int)[coarse.source_vertex] - 1
     asked = []
@@ -204,6 +210,7 @@ def test_labels_of_a_labeller_are_asked_for_until_they_stay(body, coarse, scan, 
     assert _error(body, found, truth) < 0.010
 
 
+@pytest.mark.long
 def test_an_arm_that_is_cut_off_is_named_and_believed_less(body, scan, located):
     arm = scan.face_centers[:, 0] > 0.27
     found = locate_body(body, scan.submesh(~arm)[0], config=QUICK)

@@ -134,6 +134,7 @@ def _judged(mesh: TriangleMesh, **turns: tuple[float, float, float]) -> tuple[fl
     return trust * confidence_of(best, []), "; ".join(findings)
 
 
+@pytest.mark.long
 def test_a_child_in_arms_and_a_part_of_a_person_are_refused(person):
     """A child of half of a person's size at the chest had a confidence of .94, somebody without a head .12."""
     low, high = person.vertices[:, 1].min(), person.vertices[:, 1].max()

@@ -59,6 +59,7 @@ def test_limbs_that_the_surface_shows_stay_where_they_are(search, truth):
     assert same.cost <= found.cost and moved == ()
 
 
+@pytest.mark.long
 def test_an_arm_that_lies_across_the_belly_is_found_where_it_hangs(search, truth):
     """A woman who walks lost her arm so, although it hangs in the open and costs less there."""
     lost = search.polished("lost", _with(truth, ACROSS_THE_BELLY), None, steps=4)
@@ -69,6 +70,7 @@ def test_an_arm_that_lies_across_the_belly_is_found_where_it_hangs(search, truth
     assert found.cost < lost.cost
 
 
+@pytest.mark.long
 def test_a_detector_that_sees_an_arm_elsewhere_makes_it_doubtful_and_the_surface_decides(search, truth):
     """Keypoints of a raised arm propose it; the surface shows it lowered, and there it stays."""
     found = search.polished("truth", truth, None, steps=1)
@@ -81,6 +83,7 @@ def test_a_detector_that_sees_an_arm_elsewhere_makes_it_doubtful_and_the_surface
     assert _off(search, same.state, truth, "left_wrist") < 0.02
 
 
+@pytest.mark.long
 def test_a_head_that_started_in_the_collar_is_raised(search, truth):
     """A head bowed into a turned-up collar showed no face, and the collar was labelled skin."""
     low = _with(truth, {"neck": ((28, 0, 0),), "head": ((23, 0, 0),)})

@@ -386,6 +386,7 @@ def test_the_functions_train_from_the_seed_and_hand_the_avatar_on(frames, tmp_pa
     assert same_state(*found) and not student.training
 
 
+@pytest.mark.long
 def test_coherent_blend_shapes_learn_to_move_neighbours_alike(frames):
     left = []
     for weight in (0.0, 1e4):

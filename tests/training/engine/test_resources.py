@@ -53,6 +53,7 @@ print(before, of_five())
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator alone can be told")
+@pytest.mark.long
 def test_freed_memory_is_kept_for_the_next_step():
     done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, check=True, timeout=900)
     usual, kept = map(int, done.stdout.split())

@@ -79,6 +79,7 @@ def test_frames_are_shared_among_threads_and_give_the_bits_of_one(frames):
 
 
 @pytest.mark.parametrize("cameras", [False, True])
+@pytest.mark.long
 def test_a_killed_refinement_goes_on_to_the_same_bits(frames, tmp_path, cameras):
     """In the first pass of the second level, after the passes of the first one."""
     config = replace(QUICK, levels=(Level(1, 1), Level(1, 1)), cameras=cameras)
@@ -123,6 +124,7 @@ def test_frames_whose_photographs_like_the_start_better_keep_it(frames, found, s
     np.testing.assert_allclose(kept.params.body_pose, given.body_pose, atol=1e-9)
 
 
+@pytest.mark.long
 def test_right_poses_stay(capture, tmp_path):
     exact = refine_poses(sequence(capture, gestures(), tmp_path), CONFIG)
     assert error(exact.params, exact.frames) < 2.0

@@ -177,6 +177,7 @@ def test_without_a_reference_nothing_is_simulated(skirted):
     assert task(skirted, reference=None).prediction.simulated is None
 
 
+@pytest.mark.long
 def test_resumed_with_simulated_clothes_bit_for_bit(skirted):
     whole, parts = task(skirted), task(skirted)
     for k in range(9):

@@ -209,6 +209,7 @@ def test_resumed_in_the_middle_of_a_frame_bit_for_bit(frames):
     assert same_state(whole.state(), parts.state())
 
 
+@pytest.mark.long
 def test_networks_learn_what_was_followed_before_they_render(frames, track):
     torch.manual_seed(0)
     teacher = TeacherAvatar(TINY_TEACHER, frames.rig, gaussians())

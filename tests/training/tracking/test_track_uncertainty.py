@@ -122,6 +122,7 @@ def test_structure_tensors_of_hidden_points_are_near_zero(dances):
     assert hidden.min() < 0.01 * shown.min()
 
 
+@pytest.mark.long
 def test_expected_errors_of_a_plain_skirt_are_larger_and_rank_its_true_errors(tmp_path):
     """Compare expected and true errors of a swinging hem, striped and plain."""
     from scipy.stats import spearmanr  # importing it takes half a second
