@@ -68,6 +68,12 @@ def test_clothes_are_simulated_as_on_the_cpu(tmp_path):
         same_splats(there.step(swaying(k / 20.0), 0.05), here.step(swaying(k / 20.0), 0.05))
     same_splats(there.pose(swaying(0.0)), here.pose(swaying(0.0)))  # without clothes, after them
     assert there.cloth_quality == here.cloth_quality
+    # Parts that are taken off, and the skin that lies bare then, in pictures too.
+    for one in (there, here):
+        one.hide(["lower"])
+    same_splats(there.pose(swaying(0.0)), here.pose(swaying(0.0)))
+    (image, alpha), (wanted, _) = (one.draw(cameras()["Held0"]) for one in (there, here))
+    assert alpha.max() > 0.9 and np.square(image - wanted).mean() < 10**-8.0
 
 
 @pytest.mark.usefixtures("device")
