@@ -62,7 +62,8 @@ VARIANTS = {
     "default": _DEFAULT,
     "published 0.35": replace(_DEFAULT, published=0.35),
     "published 0.65": replace(_DEFAULT, published=0.65),
-    "hanging from 0.16": replace(_DEFAULT, hanging=(0.16, 0.28)),
+    "wide from 0.2": replace(_DEFAULT, hanging=(0.2, 0.3)),
+    "wide from 0.3": replace(_DEFAULT, hanging=(0.3, 0.4)),
     "nothing hangs": replace(_DEFAULT, hanging=None),
 }
 FAMILIES = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int32
+from jaxtyping import Bool, Float, Float64, Int, Int32
 from scipy.sparse import csr_matrix
 
 from smplxpp.core.mesh import TriangleMesh
@@ -11,6 +11,8 @@ from smplxpp.transfer.inpaint import Operators, fit_smoothly
 
 LEAST_ADMISSIBILITY = 1e-6
 """Floor of every admissibility: where nothing admissible is near, all points of the body count alike."""
+_TOUCHES = 0.01
+"""Distance within which cloth touches the skin, as a share of the body's extent (2 cm)."""
 
 
 def anchor_weights(
@@ -91,6 +93,29 @@ def anchor_share(
     contradicted = facing_away * smooth_step(admissible_share, 0.5, 0.1)
     near = 1.0 - smooth_step(distance, *far)
     return 1.0 - near * (1.0 - smooth_step(admissible_share, 0.01, 0.001)) * (1.0 - contradicted)
+
+
+def hung_from_top(
+    vertices: Float[np.ndarray, "N 3"],
+    component: Int[np.ndarray, " N"],
+    distance: Float[np.ndarray, " N"],
+    up: Float[np.ndarray, " 3"],
+    size: float,
+) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """Return the top tenth of components that touch the skin nowhere, and all of their vertices.
+
+    A beard stands off the chest by less than off the jaw from which it hangs, so that the nearest skin is not what
+    carries it. `up` is from the pelvis to the head.
+    """
+    nearest = np.full(component.max() + 1, np.inf)
+    np.minimum.at(nearest, component, distance)
+    hangs = nearest[component] > _TOUCHES * size
+    height = vertices @ up
+    low, high = np.full((2, len(nearest)), np.inf)
+    np.minimum.at(low, component, height)
+    np.minimum.at(high, component, -height)
+    top = 0.1  # share of a component's height from which it hangs
+    return hangs & (height >= (-high - top * (-high - low))[component]), hangs
 
 
 def turned_away(angle: Float[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:

@@ -33,6 +33,7 @@ class Enclosure:
         limb: index of the limb, -1 where `share` is 0.
         centre: the point of the limb's axis at its place, metres; zero where `share` is.
         about_legs: whether a closed ring about one leg or both cuts a face of the vertex.
+        slack: what folds hide of the radius of rings about both legs there, metres; NaN where there is none.
     """
 
     share: Float64[np.ndarray, " N"]
@@ -40,11 +41,11 @@ class Enclosure:
     limb: Int[np.ndarray, " N"]
     centre: Float64[np.ndarray, "N 3"]
     about_legs: Bool[np.ndarray, " N"]
+    slack: Float64[np.ndarray, " N"]
 
     def of(self, rows: Int[np.ndarray, " n"]) -> Enclosure:
         """Return the enclosure of some of the vertices."""
-        about_legs = self.about_legs[rows]
-        return Enclosure(self.share[rows], self.weights[rows], self.limb[rows], self.centre[rows], about_legs)
+        return Enclosure(**{name: values[rows] for name, values in vars(self).items()})
 
     def joining_legs(self, faces: Int[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
         """Return the faces from one leg to the other, where a scan has fused trousers."""
@@ -103,6 +104,7 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
     n = mesh.vertex_count
     alone, other = np.zeros((len(axes), n)), np.zeros((len(axes), n))
     place = np.zeros((len(axes), n))
+    slack, about_both = np.zeros((2, n))
     # Each limb's rings.
     rings = [rings_around(mesh, axis, [a for a in axes if a is not axis]) for axis in axes[:-1]]
     # Where one leg is distinguished from the other, so is that from it.
@@ -121,6 +123,9 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         tube = k > 1 or len({plane for plane, ring in rings[k] if not ring.holds}) > most
         tube |= not any(ring.holds for _, ring in rings[k])
         for plane, ring in rings[k]:
+            if k < 2 and ring.holds:
+                slack[ring.corners] += ring.slack
+                about_both[ring.corners] += 1.0
             corners, single = ring.corners, not ring.holds and tube
             if wall is not None and plane >= wall.first and ring.neck is not None and ring.neck.width < 1.0:
                 # This limb's are the vertices on its axis' side of the wall.
@@ -150,7 +155,8 @@ def enclosed_by_one(mesh: TriangleMesh, axes: list[LimbAxis], joint_count: int) 
         places = np.arange(len(axis.points))
         for out, values in ((weights, axis.weights), (centre, axis.points)):
             out[rows] = np.stack([np.interp(at[rows], places, column) for column in values.T], axis=1)
-    return Enclosure(share, weights, limb, centre, np.asarray((alone[:2] + other[:2]).any(axis=0)))
+    slack = np.where(about_both > 0, slack / np.maximum(about_both, 1.0), np.nan)
+    return Enclosure(share, weights, limb, centre, np.asarray((alone[:2] + other[:2]).any(axis=0)), slack)
 
 
 def _continue_to_hems(

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import igl
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Float, Float64, Int
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
-from smplxpp.core import TriangleMesh, normalize_rows, row_lengths
+from smplxpp.core import TriangleMesh
 from smplxpp.transfer.anchors import smooth_step
 from smplxpp.transfer.checks import extent
 from smplxpp.transfer.enclosed import Enclosure
-from smplxpp.transfer.rings import LimbAxis
+from smplxpp.transfer.rings import LimbAxis, body_directions
 
 _RAMP = (-0.05, 0.1)
 """From how far above the hip joints (negative) to how far below them the bound grows from 0 on, as shares of the body's
@@ -29,33 +31,8 @@ _HALF = 1.2
 of loose garments on three persons)."""
 _RING = 0.02
 """Height of the bins over which distances are averaged, as a share of the body's extent (4 cm)."""
-_TOUCHES = 0.01
-"""Distance within which cloth touches the skin, as a share of the body's extent (2 cm)."""
 _LEG_SHARE = 0.05
 """Share of a component that rings about one leg alone hold from which on it counts as trousers."""
-
-
-def hung_from_top(
-    vertices: Float[np.ndarray, "N 3"],
-    component: Int[np.ndarray, " N"],
-    distance: Float[np.ndarray, " N"],
-    trunk: LimbAxis,
-    size: float,
-) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """Return the top tenth of components that touch the skin nowhere, and all of their vertices.
-
-    A beard stands off the chest by less than off the jaw from which it hangs, so that the nearest skin is not what
-    carries it. Up is from the pelvis to the head.
-    """
-    nearest = np.full(component.max() + 1, np.inf)
-    np.minimum.at(nearest, component, distance)
-    hangs = nearest[component] > _TOUCHES * size
-    height = vertices @ (trunk.points[-1] - trunk.points[0])
-    low, high = np.full((2, len(nearest)), np.inf)
-    np.minimum.at(low, component, height)
-    np.minimum.at(high, component, -height)
-    top = 0.1  # share of a component's height from which it hangs
-    return hangs & (height >= (-high - top * (-high - low))[component]), hangs
 
 
 def beside_trunk(
@@ -97,7 +74,22 @@ def beside_trunk(
     return weights + smooth_step(lower, 0.0, lower_joints)[:, None] * (out - weights)
 
 
-def leg_bound(
+@dataclass(frozen=True, eq=False)
+class HangingCloth:
+    """How cloth hangs before both legs, at each of N vertices.
+
+    Attributes:
+        free: 0 to 1, how far the vertex hangs off the skin, before both legs.
+        wide: 0 to 1, how far that is a wide skirt, or cloth that is open, as a coat is.
+        bound: how much of the vertex's weight the legs can have.
+    """
+
+    free: Float64[np.ndarray, " N"]
+    wide: Float64[np.ndarray, " N"]
+    bound: Float64[np.ndarray, " N"]
+
+
+def cloth_before_legs(
     depth: Float[np.ndarray, " N"],
     component: Int[np.ndarray, " N"],
     distance: Float[np.ndarray, " N"],
@@ -106,19 +98,22 @@ def leg_bound(
     *,
     size: float,
     cone: tuple[float, float],
-) -> Float64[np.ndarray, " N"]:
-    """Return how much of each vertex's weight the legs can have: 1 for cloth on the skin and for trousers.
+) -> HangingCloth:
+    """Return how cloth hangs before both legs, and how much of its weight they can have: 1 on the skin, for trousers.
 
-    A skirt hangs from the waist. The wider it falls, the less of a thigh's turn reaches it. With u the height below the
+    A skirt hangs from the waist. The wider it is, the less of a thigh's turn reaches it. Let u be the height below the
     hip joints along the legs, and r the mean distance of the cloth at that height by that height (the tangent of half
-    the cone's angle; above u = 0.03 E its value there), the bound is
+    the cone's angle; above u = 0.03 E its value there). The distance is that of the cloth with its folds smoothed out,
+    because a circle skirt that has settled hangs as close as a narrow one. The bound is the lesser of
 
-        1 - hung (1 - ramp(u) / (1 + r / 1.2)) ,   ramp from 0.1 at u = -0.05 E to 1 at 0.1 E
+        1 - hung (1 - ramp(u)) ,   1 - hung wide (1 - ramp(u) / (1 + r / 1.2))
 
-    where `hung` is 1 off the skin (from 0.005 E to 0.015 E) where r is above `cone` or the cloth is open, no ring goes
-    around one limb alone and, in a component with trouser legs, below the crotch. A shirt ends before there are legs
-    below it; its r is 0. Open is what goes around the legs at few heights, as an apron, a coat and a cape: a leg pushes
-    it and does not draw it along, so that behind the legs, which turn forwards, the bound of open cloth is halved.
+    where `ramp` grows from 0.1 at u = -0.05 E to 1 at 0.1 E; `hung` is 1 off the skin (from 0.005 E to 0.015 E) where
+    no ring goes around one limb alone and, in a component with trouser legs, below the crotch; `wide` is 1 where r is
+    above `cone` or the cloth is open. The first holds for what reaches the middle of the thighs: cloth that hangs from
+    the waist follows a leg from farther down than skin does. A shirt ends before there are legs below it; its r is 0.
+    Open is what goes around the legs at few heights, as an apron, a coat and a cape: a leg pushes it and does not draw
+    it along, so that behind the legs, which turn forwards, the bound of open cloth is halved.
 
     Args:
         depth: of N vertices, by `depth_below_hips`.
@@ -127,34 +122,90 @@ def leg_bound(
         limbs: of `enclosed_by_one`.
         behind: of `behind_legs`.
         size: E, the body's extent, metres.
-        cone: r up to which there is no bound, and from which on it is full.
+        cone: r up to which cloth is narrow, and from which on it is wide.
     """
     depth = depth / size
     open_cloth = _open_below_hips(depth, component, limbs)
     free = (1.0 - limbs.share) * _below_crotch(component, depth, limbs)
-    known = np.isfinite(distance)
-    off = np.where(known, distance, 0.0) / size
-    wide = np.zeros(len(depth))
+    # The mean distance at every height, and what folds hide of it.
+    known, folded = np.isfinite(distance), np.isfinite(limbs.slack)
+    off, slack = (np.where(seen, d, 0.0) / size for seen, d in ((known, distance), (folded, limbs.slack)))
+    out_to, long = np.zeros(len(depth)), np.zeros(len(depth), dtype=bool)
     for k in np.unique(component):
         rows = component == k
-        wide[rows] = _mean_at_depth(depth[rows], off[rows], (free * known)[rows])
-    r = wide / (np.maximum(depth, _LEGS) - _RAMP[0])
-    wide_or_open = np.maximum(smooth_step(r, *cone), open_cloth)
-    hung = free * smooth_step(distance / size, 0.005, 0.015) * wide_or_open
+        out_to[rows] = _mean_at_depth(depth[rows], off[rows], (free * known)[rows])
+        out_to[rows] += _mean_at_depth(depth[rows], slack[rows], (free * folded)[rows])
+        long[rows] = depth[rows].max() > _THIGHS
+    r = out_to / (np.maximum(depth, _LEGS) - _RAMP[0])
+    # The bound of narrow cloth and of wide.
+    wide = np.maximum(smooth_step(r, *cone), open_cloth)
+    hung = free * smooth_step(distance / size, 0.005, 0.015)
     ramp = _LEAST + (1.0 - _LEAST) * smooth_step(depth, *_RAMP)
     pushed = 1.0 - 0.5 * open_cloth * behind
-    return 1.0 - hung * (1.0 - pushed * ramp / (1.0 + r / _HALF))
+    bound = 1.0 - hung * np.maximum(long * (1.0 - ramp), wide * (1.0 - pushed * ramp / (1.0 + r / _HALF)))
+    return HangingCloth(hung, wide, bound)
 
 
-def behind_legs(vertices: Float[np.ndarray, "N 3"], axes: list[LimbAxis]) -> Float64[np.ndarray, " N"]:
-    """Return how far behind its nearest leg a vertex lies: 1 straight behind it, 0 from beside it forwards."""
-    offset, nearest = np.zeros((len(vertices), 3)), np.full(len(vertices), np.inf)
+def with_own_legs(
+    mixed: Float[np.ndarray, "N J"],
+    own: Float[np.ndarray, "N J"],
+    cloth: HangingCloth,
+    axes: list[LimbAxis],
+) -> Float64[np.ndarray, "N J"]:
+    """Return mixed weights in which the joints of the legs share what these have as in `own`, where cloth hangs free.
+
+    The published method's weights run on into what hangs off the skin, so that both legs draw a skirt's sides along. In
+    narrow cloth the legs together have their own total, too; in wide cloth the mixed one.
+
+    Args:
+        mixed: the mean of two methods' weights.
+        own: of the method whose division counts.
+        cloth: of `cloth_before_legs`.
+        axes: of `limb_axes`.
+    """
+    legs = [joint for axis in axes[:2] for joint in axis.joints]
+    before, after = own[:, legs].sum(axis=1), mixed[:, legs].sum(axis=1)
+    total = before + cloth.wide * (after - before)
+    # Without any weight there is nothing to go by.
+    least = 1e-6
+    rows = (before > least) & ((after < 1.0 - least) | (before > 1.0 - least))
+    rest = (1.0 - total) / np.maximum(1.0 - after, 1e-9)
+    out = np.array(mixed, dtype=np.float64)
+    out[rows] *= rest[rows, None]
+    out[np.ix_(rows, legs)] = own[np.ix_(rows, legs)] * (total / np.maximum(before, least))[rows, None]
+    return mixed + cloth.free[:, None] * (out - mixed)
+
+
+def bounded_shins(
+    weights: Float[np.ndarray, "N J"],
+    depth: Float[np.ndarray, " N"],
+    free: Float[np.ndarray, " N"],
+    axes: list[LimbAxis],
+    size: float,
+) -> Float64[np.ndarray, "N J"]:
+    """Return weights in which what hangs before both legs follows a shin below the knee alone, and the thigh above.
+
+    Skin turns with the shin from above the knee on, behind it from farther up; cloth there hangs from the thigh.
+    """
+    # Heights over and under the knee between which cloth that hangs turns from thigh to shin, shares of the body's
+    # extent (7 and 9 cm; both judges of `benchmarks transfer_garments`: later the simulated one is worse, earlier the
+    # painted one).
+    turn = (-0.04, 0.05)
+    knees = []
     for axis in axes[:2]:
-        own, index = cKDTree(axis.points).query(vertices)
-        closer = own < nearest
-        offset[closer], nearest[closer] = (vertices - axis.points[index])[closer], own[closer]
-    back = -normalize_rows(offset) @ _directions(axes)[2]
-    return smooth_step(back, 0.0, 0.7)
+        shares = axis.weights[:, list(axis.joints)]
+        past = shares[:, 1:].sum(axis=1) > shares[:, 0]
+        knees.append(past.argmax() * np.linalg.norm(axis.points[1] - axis.points[0]))
+    most = 1.0 - free * (1.0 - smooth_step((depth - np.mean(knees)) / size, *turn))
+    shins = np.array([joint for axis in axes[:2] for joint in axis.joints[1:]])
+    both = weights[:, [joint for axis in axes[:2] for joint in axis.joints]].sum(axis=1)
+    kept = np.minimum(1.0, most * both / np.maximum(weights[:, shins].sum(axis=1), 1e-9))
+    out = np.array(weights, dtype=np.float64)
+    out[:, shins] *= kept[:, None]
+    for axis in axes[:2]:
+        own = list(axis.joints)
+        out[:, own[0]] += (weights[:, own[1:]] * (1.0 - kept[:, None])).sum(axis=1)
+    return out
 
 
 def _open_below_hips(depth: np.ndarray, component: np.ndarray, limbs: Enclosure) -> Float64[np.ndarray, " N"]:
@@ -194,7 +245,7 @@ def lifted_by_thighs(
     Args:
         mesh: the part, N vertices.
         weights: of all J joints, before they are bounded.
-        bound: of `leg_bound`.
+        bound: of `cloth_before_legs`.
         depth: of the vertices, by `depth_below_hips`.
         component: of each vertex.
         source: the body.
@@ -211,7 +262,7 @@ def lifted_by_thighs(
     if not len(held):
         return bound
     # The turn about the line from hip to hip.
-    side, up, front = _directions(axes)
+    side, up, front = body_directions(axes)
     turn = np.outer(side, side) + np.outer(up, front) - np.outer(front, up)
 
     def raised(points: np.ndarray, shares: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
@@ -252,15 +303,6 @@ def lifted_by_thighs(
     return bound + step * np.maximum(total - bound, 0.0)
 
 
-def _directions(axes: list[LimbAxis]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return unit vectors to the body's left, upwards and forwards, across the line from hip to hip."""
-    side, up = axes[0].points[0] - axes[1].points[0], axes[-1].points[-1] - axes[-1].points[0]
-    side /= np.linalg.norm(side)
-    front = np.cross(side, up)
-    front /= np.linalg.norm(front)
-    return side, np.cross(front, side), front
-
-
 def bounded_legs(
     weights: Float[np.ndarray, "N J"], bound: Float[np.ndarray, " N"], axes: list[LimbAxis], pelvis: int
 ) -> Float64[np.ndarray, "N J"]:
@@ -272,20 +314,6 @@ def bounded_legs(
     out[:, legs] *= scale[:, None]
     out[:, pelvis] += total * (1.0 - scale)
     return out
-
-
-def depth_below_hips(vertices: Float[np.ndarray, "N 3"], legs: list[LimbAxis]) -> Float64[np.ndarray, " N"]:
-    """Return the height of vertices below the hip joints, along the nearest leg, metres; negative above them."""
-    depth, nearest = np.zeros(len(vertices)), np.full(len(vertices), np.inf)
-    for axis in legs:
-        own, index = cKDTree(axis.points).query(vertices)
-        along = np.einsum("ij,ij->i", vertices - axis.points[index], axis.tangents[index])
-        # Between the axis' ends its nearest point says the height, outside them the continued line.
-        outside = (index == 0) | (index == len(axis.points) - 1)
-        height = index * row_lengths(axis.points[1:2] - axis.points[:1]) + np.where(outside, along, 0.0)
-        depth = np.where(own < nearest, height, depth)
-        nearest = np.minimum(own, nearest)
-    return depth
 
 
 def _below_crotch(component: np.ndarray, depth: np.ndarray, limbs: Enclosure) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Cut a garment by planes across a limb into rings, and tell two tubes that a scan has fused by their necks."""
+"""Place a garment along limbs: cut it by planes across one into rings, and tell tubes that a scan has fused apart."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
+from scipy.spatial import cKDTree
 
-from smplxpp.core import TriangleMesh, normalize_rows
+from smplxpp.core import TriangleMesh, normalize_rows, row_lengths
 from smplxpp.core.topology import component_labels
+from smplxpp.transfer.anchors import smooth_step
 
 _CLOSED = 0.99
 """Least share of a turn about the axis that a ring has to make: a plane that leaves through a hem makes no ring."""
@@ -57,11 +59,16 @@ class Neck:
 
 @dataclass(frozen=True, eq=False)
 class Ring:
-    """A ring around a limb's axis: the vertices of its faces, which others it goes around, too, and its neck."""
+    """A ring around a limb's axis: the vertices of its faces, which others it goes around, too, and its neck.
+
+    `slack` is what folds hide of its radius: that of a circle as long as the ring less that of one as long as its hull,
+    metres.
+    """
 
     corners: np.ndarray
     holds: tuple[int, ...]
     neck: Neck | None
+    slack: float
 
 
 def rings_around(
@@ -124,13 +131,59 @@ def rings_around(
         i, neck = int(plane[own[0]]), None
         if len(inside) == 1:
             neck = _neck(np.concatenate([start[own], end[own]]), axis.points[i], inside[0][1], axis.tangents[i])
-        out.append((i, Ring(np.unique(faces[own]), tuple(number for number, _ in inside), neck)))
+        slack = _slack(start[own], end[own], axis.tangents[i])
+        out.append((i, Ring(np.unique(faces[own]), tuple(number for number, _ in inside), neck, slack)))
     return sorted(out, key=lambda pair: pair[0])
 
 
 def heights(axis: LimbAxis, mesh: TriangleMesh) -> Float64[np.ndarray, "K N"]:
     """Return the height of each vertex over each of a limb's planes, metres."""
     return axis.tangents @ mesh.vertices.T - np.einsum("ij,ij->i", axis.tangents, axis.points)[:, None]
+
+
+def depth_below_hips(vertices: Float[np.ndarray, "N 3"], legs: list[LimbAxis]) -> Float64[np.ndarray, " N"]:
+    """Return the height of vertices below the hip joints, along the nearest leg, metres; negative above them."""
+    depth, nearest = np.zeros(len(vertices)), np.full(len(vertices), np.inf)
+    for axis in legs:
+        own, index = cKDTree(axis.points).query(vertices)
+        along = np.einsum("ij,ij->i", vertices - axis.points[index], axis.tangents[index])
+        # Between the axis' ends its nearest point says the height, outside them the continued line.
+        outside = (index == 0) | (index == len(axis.points) - 1)
+        height = index * row_lengths(axis.points[1:2] - axis.points[:1]) + np.where(outside, along, 0.0)
+        depth = np.where(own < nearest, height, depth)
+        nearest = np.minimum(own, nearest)
+    return depth
+
+
+def behind_legs(vertices: Float[np.ndarray, "N 3"], axes: list[LimbAxis]) -> Float64[np.ndarray, " N"]:
+    """Return how far behind its nearest leg a vertex lies: 1 straight behind it, 0 from beside it forwards."""
+    offset, nearest = np.zeros((len(vertices), 3)), np.full(len(vertices), np.inf)
+    for axis in axes[:2]:
+        own, index = cKDTree(axis.points).query(vertices)
+        closer = own < nearest
+        offset[closer], nearest[closer] = (vertices - axis.points[index])[closer], own[closer]
+    back = -normalize_rows(offset) @ body_directions(axes)[2]
+    return smooth_step(back, 0.0, 0.7)
+
+
+def body_directions(axes: list[LimbAxis]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return unit vectors to the body's left, upwards and forwards, by the axes of legs and trunk."""
+    side, up = axes[0].points[0] - axes[1].points[0], axes[-1].points[-1] - axes[-1].points[0]
+    side /= np.linalg.norm(side)
+    front = np.cross(side, up)
+    front /= np.linalg.norm(front)
+    return side, np.cross(front, side), front
+
+
+def _slack(start: np.ndarray, end: np.ndarray, tangent: np.ndarray) -> float:
+    """Return how much larger a circle as long as a ring of segments is than one as long as its convex hull, metres."""
+    # The hull is as long as the integral of its support function over all directions.
+    count = 64
+    across = np.cross(tangent, np.eye(3)[np.abs(tangent).argmin()])
+    across /= np.linalg.norm(across)
+    turn = 2.0 * np.pi * np.arange(count) / count
+    directions = np.outer(np.cos(turn), across) + np.outer(np.sin(turn), np.cross(tangent, across))
+    return float(row_lengths(end - start).sum() / (2.0 * np.pi) - (start @ directions.T).max(axis=0).mean())
 
 
 def _neck(points: np.ndarray, own: np.ndarray, other: np.ndarray, tangent: np.ndarray) -> Neck | None:

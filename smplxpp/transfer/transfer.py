@@ -13,6 +13,7 @@ from smplxpp.transfer.anchors import (
     anchor_share,
     anchor_weights,
     components_without,
+    hung_from_top,
     joint_admissibility,
     neighbouring_joints,
     smooth_step,
@@ -39,16 +40,16 @@ from smplxpp.transfer.correspond import (
 from smplxpp.transfer.enclosed import Enclosure, enclosed_by_one, limb_axes
 from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.hanging import (
-    behind_legs,
     beside_trunk,
     bounded_legs,
-    depth_below_hips,
-    hung_from_top,
-    leg_bound,
+    bounded_shins,
+    cloth_before_legs,
     lifted_by_thighs,
+    with_own_legs,
 )
 from smplxpp.transfer.inpaint import Operators, average_neighbours, fit_smoothly, shared_operators
 from smplxpp.transfer.rigid import rigid_weights
+from smplxpp.transfer.rings import behind_legs, depth_below_hips
 from smplxpp.transfer.unfollowed import PassedHand, passed_hands, unfollowed_arms
 
 _PUBLISHED_FAR = 0.4
@@ -260,7 +261,8 @@ def _transferred(
     hangs = np.zeros(target.vertex_count, dtype=bool)
     if axes:
         # What touches the skin nowhere hangs from its top.
-        tops, hangs = hung_from_top(target.vertices, component, found.distance, axes[-1], size)
+        up = axes[-1].points[-1] - axes[-1].points[0]
+        tops, hangs = hung_from_top(target.vertices, component, found.distance, up, size)
         confident |= tops
     # Compute each vertex's own value, then smooth the values over the surface.
     surface, used = target.submesh(np.ones(target.face_count, dtype=bool))
@@ -284,6 +286,13 @@ def _transferred(
     angles = np.where(closed, 0.0, found.angle)
     closer = replace(found, distance=found.distance * (1.0 - 0.7 * far_off), angle=angles)
     dense[:, occurring] = _smooth(at, closer, values[:, occurring], matched, settled, size, config)
+    # Find what hangs free before both legs, and how wide it is.
+    hanging = None
+    if whole and limbs is not None and config.hanging is not None:
+        arms = [joint for axis in axes[2:4] for joint in axis.joints]
+        off = np.where(copied[:, arms].sum(axis=1) > 0.5, np.inf, found.distance)
+        depth, behind = depth_below_hips(target.vertices, axes[:2]), behind_legs(target.vertices, axes)
+        hanging = cloth_before_legs(depth, component, off, limbs, behind, size=size, cone=config.hanging)
     if config.published:
         # Mix in the published method's weights. Their share rises from 1 % to 2.5 % of the source's extent off the
         # skin.
@@ -309,7 +318,8 @@ def _transferred(
             total = answer.sum(axis=1)
             share[total <= _LEAST_SUM] = 0.0
             answer /= np.maximum(total, _LEAST_SUM)[:, None]
-        dense += share[:, None] * (answer - dense)
+        mixed = dense + share[:, None] * (answer - dense)
+        dense = mixed if hanging is None else with_own_legs(mixed, dense, hanging, axes)
     if whole and unfollowed is not None and config.hanging is not None:
         # Divide what follows the trunk by height. Empty sleeves hang from their armholes.
         off = smooth_step(found.distance, *(k * size for k in (0.01, 0.025))) * (1.0 - far_off)
@@ -321,14 +331,10 @@ def _transferred(
         collars = tuple(config.joint_index(f"{side}_collar", joint_count) for side in ("left", "right"))
         lower = beside_trunk(target.vertices, dense, copied, beside, axes[-1], collars + unfollowed.shoulders)
         dense += off[:, None] * (lower - dense)
-    if whole and limbs is not None and config.hanging is not None:
-        # Leave the pelvis its share of cloth that hangs free before both legs.
-        arms = [joint for axis in axes[2:4] for joint in axis.joints]
-        off = np.where(copied[:, arms].sum(axis=1) > 0.5, np.inf, found.distance)
-        depth = depth_below_hips(target.vertices, axes[:2])
-        behind = behind_legs(target.vertices, axes)
-        bound = leg_bound(depth, component, off, limbs, behind, size=size, cone=config.hanging)
-        bound = lifted_by_thighs(target, dense, bound, depth, component, source, weights, axes)
+    if hanging is not None:
+        # Leave the thighs and the pelvis their shares of cloth that hangs free before both legs.
+        dense = bounded_shins(dense, depth, hanging.free, axes, size)
+        bound = lifted_by_thighs(target, dense, hanging.bound, depth, component, source, weights, axes)
         dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
     return _Weighted(dense, matched, found.distance, found.angle, policies)
 
