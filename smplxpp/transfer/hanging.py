@@ -106,14 +106,15 @@ def cloth_before_legs(
     the cone's angle; above u = 0.03 E its value there). The distance is that of the cloth with its folds smoothed out,
     because a circle skirt that has settled hangs as close as a narrow one. The bound is the lesser of
 
-        1 - hung (1 - ramp(u)) ,   1 - hung wide (1 - ramp(u) / (1 + r / 1.2))
+        1 - hung (1 - ramp'(u)) ,   1 - hung wide (1 - ramp(u) / (1 + r / 1.2))
 
-    where `ramp` grows from 0.1 at u = -0.05 E to 1 at 0.1 E; `hung` is 1 off the skin (from 0.005 E to 0.015 E) where
-    no ring goes around one limb alone and, in a component with trouser legs, below the crotch; `wide` is 1 where r is
-    above `cone` or the cloth is open. The first holds for what reaches the middle of the thighs: cloth that hangs from
-    the waist follows a leg from farther down than skin does. A shirt ends before there are legs below it; its r is 0.
-    Open is what goes around the legs at few heights, as an apron, a coat and a cape: a leg pushes it and does not draw
-    it along, so that behind the legs, which turn forwards, the bound of open cloth is halved.
+    where `ramp` grows from 0.1 at u = -0.05 E to 1 at 0.1 E, `ramp'` from -0.11 E to 0.11 E; `hung` is 1 off the skin
+    (from 0.005 E to 0.015 E) where no ring goes around one limb alone and, in a component with trouser legs, below the
+    crotch; `wide` is 1 where r is above `cone` or the cloth is open. The first holds for what reaches the middle of the
+    thighs: cloth that hangs from the waist follows a leg from farther down than skin does. A shirt ends before there
+    are legs below it; its r is 0. Open is what goes around the legs at few heights, as an apron, a coat and a cape: a
+    leg pushes it and does not draw it along, so that behind the legs, which turn forwards, the bound of open cloth is
+    halved.
 
     Args:
         depth: of N vertices, by `depth_below_hips`.
@@ -133,16 +134,19 @@ def cloth_before_legs(
     out_to, long = np.zeros(len(depth)), np.zeros(len(depth), dtype=bool)
     for k in np.unique(component):
         rows = component == k
+        long[rows] = depth[rows].max() > _THIGHS
         out_to[rows] = _mean_at_depth(depth[rows], off[rows], (free * known)[rows])
         out_to[rows] += _mean_at_depth(depth[rows], slack[rows], (free * folded)[rows])
-        long[rows] = depth[rows].max() > _THIGHS
     r = out_to / (np.maximum(depth, _LEGS) - _RAMP[0])
     # The bound of narrow cloth and of wide.
     wide = np.maximum(smooth_step(r, *cone), open_cloth)
     hung = free * smooth_step(distance / size, 0.005, 0.015)
     ramp = _LEAST + (1.0 - _LEAST) * smooth_step(depth, *_RAMP)
     pushed = 1.0 - 0.5 * open_cloth * behind
-    bound = 1.0 - hung * np.maximum(long * (1.0 - ramp), wide * (1.0 - pushed * ramp / (1.0 + r / _HALF)))
+    # Narrow cloth turns with the legs over a longer way: over a shorter one seats tear where they bend, over a longer
+    # one hems lag (stretch of the embedded person's skirt in a squat, mini skirts of `benchmarks transfer_garments`).
+    narrow_ramp = _LEAST + (1.0 - _LEAST) * smooth_step(depth, -0.11, 0.11)
+    bound = 1.0 - hung * np.maximum(long * (1.0 - narrow_ramp), wide * (1.0 - pushed * ramp / (1.0 + r / _HALF)))
     return HangingCloth(hung, wide, bound)
 
 
@@ -174,38 +178,6 @@ def with_own_legs(
     out[rows] *= rest[rows, None]
     out[np.ix_(rows, legs)] = own[np.ix_(rows, legs)] * (total / np.maximum(before, least))[rows, None]
     return mixed + cloth.free[:, None] * (out - mixed)
-
-
-def bounded_shins(
-    weights: Float[np.ndarray, "N J"],
-    depth: Float[np.ndarray, " N"],
-    free: Float[np.ndarray, " N"],
-    axes: list[LimbAxis],
-    size: float,
-) -> Float64[np.ndarray, "N J"]:
-    """Return weights in which what hangs before both legs follows a shin below the knee alone, and the thigh above.
-
-    Skin turns with the shin from above the knee on, behind it from farther up; cloth there hangs from the thigh.
-    """
-    # Heights over and under the knee between which cloth that hangs turns from thigh to shin, shares of the body's
-    # extent (7 and 9 cm; both judges of `benchmarks transfer_garments`: later the simulated one is worse, earlier the
-    # painted one).
-    turn = (-0.04, 0.05)
-    knees = []
-    for axis in axes[:2]:
-        shares = axis.weights[:, list(axis.joints)]
-        past = shares[:, 1:].sum(axis=1) > shares[:, 0]
-        knees.append(past.argmax() * np.linalg.norm(axis.points[1] - axis.points[0]))
-    most = 1.0 - free * (1.0 - smooth_step((depth - np.mean(knees)) / size, *turn))
-    shins = np.array([joint for axis in axes[:2] for joint in axis.joints[1:]])
-    both = weights[:, [joint for axis in axes[:2] for joint in axis.joints]].sum(axis=1)
-    kept = np.minimum(1.0, most * both / np.maximum(weights[:, shins].sum(axis=1), 1e-9))
-    out = np.array(weights, dtype=np.float64)
-    out[:, shins] *= kept[:, None]
-    for axis in axes[:2]:
-        own = list(axis.joints)
-        out[:, own[0]] += (weights[:, own[1:]] * (1.0 - kept[:, None])).sum(axis=1)
-    return out
 
 
 def _open_below_hips(depth: np.ndarray, component: np.ndarray, limbs: Enclosure) -> Float64[np.ndarray, " N"]:

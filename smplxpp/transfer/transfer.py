@@ -42,7 +42,6 @@ from smplxpp.transfer.extend import extend_weights, sample_weights
 from smplxpp.transfer.hanging import (
     beside_trunk,
     bounded_legs,
-    bounded_shins,
     cloth_before_legs,
     lifted_by_thighs,
     with_own_legs,
@@ -332,8 +331,7 @@ def _transferred(
         lower = beside_trunk(target.vertices, dense, copied, beside, axes[-1], collars + unfollowed.shoulders)
         dense += off[:, None] * (lower - dense)
     if hanging is not None:
-        # Leave the thighs and the pelvis their shares of cloth that hangs free before both legs.
-        dense = bounded_shins(dense, depth, hanging.free, axes, size)
+        # Leave the pelvis its share of cloth that hangs free before both legs.
         bound = lifted_by_thighs(target, dense, hanging.bound, depth, component, source, weights, axes)
         dense = bounded_legs(dense, bound, axes, config.joint_index("pelvis", joint_count))
     return _Weighted(dense, matched, found.distance, found.angle, policies)

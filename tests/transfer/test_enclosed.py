@@ -19,7 +19,7 @@ from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.checks import extent
 from smplxpp.transfer.correspond import closest_points
 from smplxpp.transfer.enclosed import LimbAxis, enclosed_by_one, limb_axes
-from smplxpp.transfer.hanging import beside_trunk, bounded_shins, cloth_before_legs
+from smplxpp.transfer.hanging import beside_trunk, cloth_before_legs
 from smplxpp.transfer.rings import depth_below_hips
 from smplxpp.transfer.unfollowed import empty_tubes, webs_to_hands
 
@@ -70,7 +70,7 @@ def test_wide_trousers_sit_down(mannequin, worn, name):
 
 
 @pytest.mark.long
-def test_a_wide_skirt_leaves_the_pelvis_its_share_a_close_one_a_little_and_trousers_none(mannequin, worn):
+def test_a_wide_skirt_leaves_the_pelvis_its_share_close_ones_and_trousers_hardly_any(mannequin, worn):
     """All weight of a skirt that stood 8 cm off the thighs was theirs, so that its back came along when she sat."""
 
     def transferred(name: str, config: TransferConfig | None) -> tuple[Case, np.ndarray]:
@@ -92,12 +92,30 @@ def test_a_wide_skirt_leaves_the_pelvis_its_share_a_close_one_a_little_and_trous
     assert inside.mean() < 0.025
     changed = np.abs(transferred("hakama", TransferConfig())[1] - transferred("hakama", without)[1]).sum(axis=1)
     assert np.percentile(changed, 99) < 0.02
-    # What hangs close follows a leg from farther down than the skin there does, which its author has, too.
+    # What hangs close stays as near to what its author drew.
     mini = worn("mini skirt")
     before, after = (
         sitting_error(mannequin, mini, transferred("mini skirt", one)[1]).mean() for one in (without, None)
     )
-    assert after < 0.95 * before
+    assert after < 1.01 * before
+
+
+@pytest.mark.parametrize("name", ["mini skirt", "long skirt"])
+def test_close_skirts_bend_without_tearing(mannequin, worn, name):
+    """Edges of a long skirt were drawn to eight times their length where she sat, though the mean error fell."""
+    case = worn(name)
+    config = TransferConfig.for_label("lower")
+    dense = transfer_weights(case.source, mannequin.body.weights, case.mesh, config=config).dense()
+    reference = mannequin.body.forward(case.params).posed_from_rest[0]
+    rest = unpose(case.mesh.vertices, dense, reference).vertices
+    ends = case.mesh.edges
+
+    def longest(vertices: np.ndarray, weights: np.ndarray, moved: np.ndarray) -> float:
+        there, here = (x[ends[:, 0]] - x[ends[:, 1]] for x in (skin(vertices, weights, moved), vertices))
+        return float((np.linalg.norm(there, axis=1) / np.linalg.norm(here, axis=1)).max())
+
+    for moved in mannequin.body.forward(worn_poses(case.params)).posed_from_rest:
+        assert longest(rest, dense, moved) < 1.15 * longest(case.rest_vertices, case.weights, moved)
 
 
 def test_a_skirt_that_has_settled_into_folds_is_as_wide_as_it_is_long_around(mannequin, worn):
@@ -137,29 +155,6 @@ def test_each_side_of_a_skirt_follows_its_own_leg_whatever_the_published_method_
         of_left.append(np.where(left + right > 0.01, left / np.maximum(left + right, 0.01), 0.5))
     off = closest_points(case.source, case.mesh).distance > 0.015 * extent(case.source)
     assert np.abs(of_left[0] - of_left[1])[off].max() < 1e-6
-
-
-def test_what_hangs_above_the_knee_follows_the_thigh(mannequin, worn):
-    """A third of a skirt behind the knees followed the shins, which swung it under her in a squat: 80 mm off."""
-    case = worn("long skirt")
-    size = extent(case.source)
-    axes = limb_axes(case.source, mannequin.body.weights, size, TransferConfig())
-    depth = depth_below_hips(case.mesh.vertices, axes[:2])
-    skin_here = closest_points(case.source, case.mesh).interpolate(case.source, mannequin.body.weights)
-    free = np.arange(len(depth)) % 2.0
-    out = bounded_shins(skin_here, depth, free, axes, size)
-    shins = [joint for axis in axes[:2] for joint in axis.joints[1:]]
-    joints = mannequin.body.forward(case.params).joints[0]
-    hip, knee = (joints[mannequin.body.joint_names.index(f"left_{name}")] for name in ("hip", "knee"))
-    below = depth - np.linalg.norm(knee - hip)
-    assert np.allclose(out.sum(axis=1), 1.0) and out.min() >= 0
-    assert np.array_equal(out[free == 0], skin_here[free == 0])
-    hanging = free == 1
-    above = hanging & (below < -0.08)
-    before, after = (weights[above][:, shins].sum(axis=1) for weights in (skin_here, out))
-    assert before.max() > 0.25 and after.sum() < 0.25 * before.sum()
-    assert out[hanging & (below < -0.12)][:, shins].max() < 1e-6
-    assert np.allclose(out[hanging & (below > 0.12)], skin_here[hanging & (below > 0.12)])
 
 
 @pytest.mark.long
