@@ -64,6 +64,7 @@ def test_what_no_betas_express_is_in_the_canonical_body(body):
     np.testing.assert_allclose(template.pose(reference), template.pose(params()), atol=1e-12)
 
 
+@pytest.mark.long
 def test_a_part_within_the_body_comes_out(body):
     parts = worn_parts(body, offset=-0.003)
     template, report = assemble_template(body, params(), parts, config=AssemblyConfig(clearance=0.0015))

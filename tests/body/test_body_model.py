@@ -173,6 +173,7 @@ def test_missing_tensors_are_zero_and_single_rows_stand_for_all(open_body):
         open_body.forward({"poses": pose})
 
 
+@pytest.mark.long
 def test_importing_and_posing_do_not_import_torch():
     import subprocess
     import sys

@@ -25,7 +25,7 @@ from smplxpp.template.template import Template
 from tests.build.many_classes import CLASSES, dressed_scan, many_classes
 
 PARTS = ("dress", "coat", "socks", "glasses", "hat", "bag", "hair")
-pytestmark = pytest.mark.filterwarnings("ignore::smplxpp.core.errors.GeometryWarning")
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::smplxpp.core.errors.GeometryWarning")]
 
 
 @pytest.fixture(scope="module")

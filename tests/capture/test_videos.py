@@ -151,6 +151,7 @@ def convert(take: Path, out: Path, **options: object) -> dict:
     return CaptureConvertCommand(take, out, json=True, **options).run()
 
 
+@pytest.mark.long
 def test_frames_of_the_conversion_are_moments(take, tmp_path):
     """Images and keypoints of all cameras show the same time, at the rate of the slowest."""
     out = tmp_path / "capture"

@@ -24,6 +24,7 @@ def person() -> TriangleMesh:
 
 
 @pytest.mark.parametrize(("units", "up"), [("cm", "z"), ("mm", "-x")])
+@pytest.mark.long
 def test_units_and_axis_are_found_back(person, units, up):
     axes = convert_points(np.eye(3), up=up)
     filed = person.vertices @ axes.T / METRES_PER_UNIT[units]

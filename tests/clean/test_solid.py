@@ -45,6 +45,7 @@ def quiet(body: TriangleMesh, parts: dict[str, TriangleMesh], **options: float):
 
 
 @pytest.mark.parametrize("made_by", ["offset", "level set"])
+@pytest.mark.long
 def test_a_bowl_of_a_thickness_has_the_volume_of_a_shell(made_by: str):
     sheet, depth = bowl(RADIUS, 0.0), 0.02
     if made_by == "offset":
@@ -90,6 +91,7 @@ def test_a_ball_with_a_hat_is_one_piece_of_the_known_volume(thickness: float):
     assert solid.report.size_mm[1] == pytest.approx(1e3 * (2 * RADIUS + gap), abs=2.0)
 
 
+@pytest.mark.long
 def test_a_part_farther_than_the_gap_is_joined_and_one_far_away_refused():
     far = bowl(RADIUS + 0.03, 0.15)
     solid = quiet(ball(), {"hair": far}, thickness=0.001, gap=0.01)

@@ -57,6 +57,7 @@ def test_frames_and_particles_that_were_not_followed_are_not_looked_at():
     assert (calibration.drag, calibration.pin_depth) == (8.0, 0.1)
 
 
+@pytest.mark.long
 def test_particles_that_were_followed_badly_count_less():
     truth = simulated(with_values(garment(), drag=8.0, pin_depth=0.1))
     lost = np.arange(truth.shape[1]) % 3 == 0
@@ -69,6 +70,7 @@ def test_particles_that_were_followed_badly_count_less():
     assert (told.drag, told.pin_depth) == (8.0, 0.1) and told.simulated < 1e-6 < blind.simulated
 
 
+@pytest.mark.long
 def test_a_garment_is_as_far_from_skinning_as_in_the_frames_that_were_followed():
     truth = simulated(with_values(garment(), drag=8.0, pin_depth=0.1))
     whole, every_fourth = (

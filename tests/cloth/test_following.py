@@ -44,6 +44,7 @@ def last(motion: BodyParams, fps: float, **options) -> np.ndarray:
     return surface[garment().vertices]
 
 
+@pytest.mark.long
 def test_three_frames_a_second_swing_as_thirty_do():
     """Every one of them began anew, and said so: a third of a second was a gap."""
     notes: list[str] = []

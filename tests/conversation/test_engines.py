@@ -24,6 +24,7 @@ def voice() -> PiperVoice:
 
 
 @pytest.mark.skipif(not all(map(find_spec, ENGINES)), reason="extra talk")
+@pytest.mark.long
 def test_a_question_that_is_spoken_is_answered(voice, tmp_path):
     told, shown = [], []
     _, body = doll(tmp_path)

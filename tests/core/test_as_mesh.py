@@ -192,6 +192,7 @@ def calls(mesh) -> dict[str, object]:
 LEGS = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in ("knee", "ankle", "foot"))
 
 
+@pytest.mark.long
 def test_every_public_function_on_meshes_takes_those_of_others():
     theirs, ours = calls(BALL), calls(MINE)
     asked = set()

@@ -144,6 +144,7 @@ def test_bad_input():
     assert len(SignedDistanceField(mesh, solid=True).query(np.zeros((0, 3))).distance) == 0
 
 
+@pytest.mark.long
 def test_a_process_that_asked_of_a_solid_ends_without_a_word():
     """Bindings that outlive the interpreter are reported as leaks, below the answer of a command."""
     script = """

@@ -135,6 +135,7 @@ def test_uneven_frames_give_about_the_same_motion():
     assert max(moved) > 0.015 and np.mean(off) < 0.1 * np.mean(moved), (off, moved)
 
 
+@pytest.mark.long
 def test_uneven_frames_are_smoothed_by_their_times():
     """A tracker's shaking goes out of the cloth where frames are missing as where none are."""
     shakes = {}

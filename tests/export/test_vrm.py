@@ -131,6 +131,7 @@ def test_vowels_are_those_of_speech():
         np.testing.assert_allclose(presets[preset], moved, atol=2e-5)
 
 
+@pytest.mark.long
 def test_a_body_with_numbered_expressions_blinks_and_speaks(tmp_path):
     """SMPL-X's expressions have no names, and its file none of eyes and teeth: ARKit's are solved for.
 

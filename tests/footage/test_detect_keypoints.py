@@ -218,6 +218,7 @@ def test_the_command_detects_with_a_users_model(rig, tmp_path, capsys):
         assert words in message
 
 
+@pytest.mark.long
 def test_masks_of_empty_plates_go_into_a_folder_of_one_origin(rig, tmp_path, capsys):
     scene = make_scene()
     plates = tmp_path / "plates"

@@ -51,6 +51,7 @@ def test_the_farthest_point_lies_within_a_face_between_two_surfaces() -> None:
     assert found.a_to_b.point[0] == pytest.approx(0.03, abs=1e-3)
 
 
+@pytest.mark.long
 def test_one_vertex_that_sticks_out_of_82k_faces_counts_in_full() -> None:
     """Samples hold a part of the 50 mm."""
     ball = trimesh.creation.icosphere(subdivisions=6, radius=0.5)
@@ -77,6 +78,7 @@ def test_units_and_tolerances() -> None:
         hausdorff(ball, (ball.vertices, np.zeros((0, 3), int)))
 
 
+@pytest.mark.long
 def test_meshes_in_other_units_get_few_evaluations() -> None:
     """Metres against millimetres, of which a warning tells, kept the command busy for ten minutes."""
     ball, fine = (trimesh.creation.icosphere(subdivisions=count, radius=0.5) for count in (3, 5))

@@ -228,6 +228,7 @@ def test_any_mesh_gives_finite_numbers_or_an_input_error(vertices, faces):
     json.dumps(result.as_dict(), allow_nan=False)
 
 
+@pytest.mark.long
 def test_importing_the_metrics_imports_no_heavy_package():
     code = "import sys, smplxpp.metrics; print([m for m in ('torch', 'plotly', 'trimesh', 'rich') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

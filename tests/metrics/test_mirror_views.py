@@ -47,6 +47,7 @@ def share(scan: TriangleMesh, colors: np.ndarray, views: list, body: TriangleMes
     return mirrored_by_views(scan, colors, views, body=body, center=np.zeros(3), across=2.0 * X)
 
 
+@pytest.mark.long
 def test_a_scan_and_its_mirror_image_are_told_apart(toy):
     colors = figure_colors(toy.vertices, lopsided=True)
     views = photographs(toy, colors)
@@ -54,6 +55,7 @@ def test_a_scan_and_its_mirror_image_are_told_apart(toy):
     assert share(mirrored(toy), colors, views, toy) > 0.9
 
 
+@pytest.mark.long
 def test_a_scan_and_a_body_that_are_a_little_off_are_told_as_well(toy):
     colors = figure_colors(toy.vertices, lopsided=True)
     views = photographs(toy, colors)
@@ -63,6 +65,7 @@ def test_a_scan_and_a_body_that_are_a_little_off_are_told_as_well(toy):
     assert share(mirrored(moved), colors, views, body) > 0.8
 
 
+@pytest.mark.long
 def test_symmetric_colours_tell_nothing(toy):
     colors = figure_colors(toy.vertices, lopsided=False)
     views = photographs(toy, colors)
@@ -79,6 +82,7 @@ def test_one_colour_and_photographs_of_something_else_tell_nothing(toy):
     assert share(toy, colors, noise, toy) is None
 
 
+@pytest.mark.long
 def test_no_view_or_none_that_shows_the_scan_tells_nothing(toy):
     colors = figure_colors(toy.vertices, lopsided=True)
     away = toy.with_vertices(toy.vertices + [50.0, 0.0, 0.0])

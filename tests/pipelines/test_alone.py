@@ -25,6 +25,8 @@ from smplxpp.core.mesh_files.mesh_io import RawMesh, read_mesh, read_raw_mesh, w
 from smplxpp.register.locate import BodyNotFoundError, Candidate, LocateConfig, LocatedBody
 from smplxpp.segment import read_labels
 
+pytestmark = pytest.mark.long
+
 PERSON = Path(__file__).resolve().parents[2] / "data" / "fixtures" / "person"
 BODY = load_body()
 FACES = 20_000

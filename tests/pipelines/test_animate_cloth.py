@@ -86,6 +86,7 @@ def test_the_template_has_no_field(run, params, tmp_path):
         film(run, params, tmp_path / "film", cloth="field")
 
 
+@pytest.mark.long
 def test_parts_may_be_named_without_any_training(run, params, tmp_path, capsys):
     options = ("--params", str(params), "-o", str(tmp_path / "named"), "--height", "40", "--json")
     assert main(["animate", str(run), *options, "--loose-parts", PART]) == 0

@@ -218,6 +218,7 @@ def test_json_is_all_that_stdout_gets(capsys, tmp_path, cube):
         assert isinstance(json.loads(capsys.readouterr().out), dict)
 
 
+@pytest.mark.long
 def test_warnings_are_words_without_lines_of_code(tmp_path, cube):
     huge = tmp_path / "huge.ply"
     write_ply(huge, TriangleMesh(np.array([[0, 0, 0], [500, 0, 0], [0, 500, 0]], float), np.array([[0, 1, 2]])))
@@ -241,6 +242,7 @@ def test_options_of_earlier_versions_that_named_the_run_are_explained(capsys, co
     assert f"option {option}" in text and f"smplxpp {command} RUN" in text
 
 
+@pytest.mark.long
 def test_a_first_build_that_fails_leaves_no_folder(capsys, tmp_path, cube):
     build = ("--scan", cube, "--units", "mm")  # a person of one millimetre
     assert "a person" in fails(capsys, "build", tmp_path / "run", *build)

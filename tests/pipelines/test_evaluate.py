@@ -388,6 +388,7 @@ def test_views_that_a_model_has_seen_are_not_called_novel(trained, capture, tmp_
     assert f"--hold-out {splits.train_cameras[0]}" in refused(capsys, run, capture)
 
 
+@pytest.mark.long
 def test_a_model_without_a_record_of_what_it_saw_is_told(trained, capture, tmp_path, caplog):
     run = shutil.copytree(trained, tmp_path / "run")
     with caplog.at_level("WARNING"):
@@ -418,6 +419,7 @@ def test_weights_of_lpips_are_read_before_anything_is_measured(trained, capture,
     assert not (trained / "95_evaluate_work").exists()
 
 
+@pytest.mark.long
 def test_other_weights_of_lpips_are_measured_with(trained, capture, tmp_path, capsys):
     run, file = shutil.copytree(trained, tmp_path / "run"), tmp_path / "mine.pth"
     options = ("--sets", "novel_view", "--samples", "0", "--metric", "lpips", "--lpips-weights", str(file))

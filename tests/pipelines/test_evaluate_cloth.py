@@ -68,6 +68,7 @@ def test_a_simulated_skirt_is_nearer_to_the_true_one_than_a_skinned_one(trained,
     assert moved_by_field["p2s"] not in (simulated["p2s"], skinned["p2s"])
 
 
+@pytest.mark.long
 def test_poses_that_were_refined_have_their_skirt_simulated_too(trained, capture, tmp_path, capsys):
     """Held-out poses "refined" to what they are give the same pictures and surfaces."""
     run = shutil.copytree(trained, tmp_path / "run")
@@ -89,6 +90,7 @@ def test_other_garments_are_measured_anew_and_none_are_the_field(trained, captur
     assert read_manifest(run / "95_evaluate")["config"]["cloth"] == "field"
 
 
+@pytest.mark.long
 def test_a_capture_without_its_frame_rate_is_refused_and_says_what_to_do(trained, capture, tmp_path, capsys):
     run, silent = shutil.copytree(trained, tmp_path / "run"), shutil.copytree(capture, tmp_path / "capture")
     about = json.loads((silent / "capture.json").read_text())

@@ -332,6 +332,7 @@ def test_an_evaluation_prints_poses_against_exact_ones_and_refined_ones(root, tm
     assert "poses refined" not in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_exact_poses_are_not_compared_with_themselves(root, tmp_path):
     run = write_models(run_of(tmp_path / "run", root, "exact"), dressed())
     assert main(["evaluate", str(run), "--capture", str(root), "--device", "cpu", *QUICK, "--no-report", "--json"]) == 0

@@ -94,6 +94,7 @@ def test_every_frame_has_a_row_and_held_out_frames_keep_theirs(refined):
     assert numbers["training"]["frames"] == list(range(held_out)) and numbers["held_out"]["frames"] == [held_out]
 
 
+@pytest.mark.long
 def test_it_stands_until_something_changes(refined, capture, capsys):
     assert refine(refined, capture) == 0
     assert json.loads(capsys.readouterr().out)["stages"]["refine"]["ran"] is False
@@ -117,6 +118,7 @@ def test_what_comes_after_takes_the_refined_ones(refined, capture):
         open_scene(refined, TrainInputs(capture, noisy, hold_out=("Ring1",)))
 
 
+@pytest.mark.long
 def test_corrected_cameras_are_taken_with_the_poses(capture, tmp_path, capsys):
     run, inputs = doll().write_run(tmp_path / "run"), TrainInputs(capture, capture / "params" / "params_noisy.npz")
     assert refine(run, capture, "--refine-poses", "off", "--refine-cameras") == 2
@@ -201,6 +203,7 @@ def test_a_process_that_helps_leaves_the_end_to_another_one(capture, tmp_path, c
         np.testing.assert_array_equal(made[name], array)
 
 
+@pytest.mark.long
 def test_a_refinement_ends_within_the_limit_of_time_and_goes_on(capture, tmp_path, capsys):
     run, stops = doll().write_run(tmp_path / "run"), 0
     while True:

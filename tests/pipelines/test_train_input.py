@@ -144,6 +144,7 @@ def test_a_capture_without_images_of_training_frames(run, capture, capsys):
 
 
 @pytest.mark.filterwarnings("default::smplxpp.core.errors.GeometryWarning")
+@pytest.mark.long
 def test_a_template_without_clothes_trains(run, original, capsys):
     write_template(run, replace(template(), vertex_labels=0 * template().vertex_labels))
     with pytest.warns(GeometryWarning, match="no clothes"):

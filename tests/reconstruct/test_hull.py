@@ -28,6 +28,7 @@ def test_a_torus_has_genus_one():
     assert solid_status(zero_surface(field, BOX, cell=0.02)) == ("NoError", 1)
 
 
+@pytest.mark.long
 def test_a_field_that_jumps_gives_a_closed_surface():
     """The edge of a view's image cuts the field; cells chosen by its values alone left holes there."""
 

@@ -33,6 +33,7 @@ def test_it_is_closed_and_fills_its_masks(found):
     assert not found.notes and not found.numbers["left_out"]
 
 
+@pytest.mark.long
 def test_confidence_is_high_where_it_is_right_and_none_where_nobody_looks():
     above = [view for view in few_views() if view.camera.position[1] > 0]
     result = reconstruct(above, CONFIG)
@@ -69,6 +70,7 @@ def test_a_scene_of_another_size_and_place_gives_the_same_surface(found):
     )
 
 
+@pytest.mark.long
 def test_bad_masks_are_left_out_with_a_warning():
     views = list(few_views())
     views[2] = replace(views[2], opacity=255 - views[2].opacity)
@@ -82,6 +84,7 @@ def test_bad_masks_are_left_out_with_a_warning():
     assert np.abs(inside_dented(result.mesh.vertices)).mean() < 0.02
 
 
+@pytest.mark.long
 def test_without_refinement_it_is_the_hull():
     result = reconstruct(few_views(), replace(CONFIG, refine=False))
     assert (result.mesh.vertices == result.hull.vertices).all()

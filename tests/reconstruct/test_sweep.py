@@ -126,6 +126,7 @@ def test_taubin_keeps_a_sphere_and_removes_noise(ball):
     assert np.linalg.norm(taubin(ball, mean, steps=5).vertices, axis=1) == pytest.approx(0.5, abs=0.002)
 
 
+@pytest.mark.long
 def test_coarser_patches_are_asked_where_fine_ones_convince_nobody_and_nowhere_else(ball, monkeypatch):
     from smplxpp.reconstruct import sweep
 

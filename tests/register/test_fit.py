@@ -195,6 +195,7 @@ def test_dents_of_a_rough_scan_starve_nobody(person, cameras):
     assert vertex_error_mm(BODY, found, one) < 12.0
 
 
+@pytest.mark.long
 def test_a_missing_mask_is_named_and_the_rest_goes_on(person, cameras):
     mask = masks(BODY, person.select([0, 1]), cameras)
     observed = Observations(

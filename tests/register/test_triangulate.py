@@ -200,6 +200,7 @@ def test_everything_mirrored_cannot_be_told(joints, cameras, noisy):
     )
 
 
+@pytest.mark.long
 def test_what_a_detector_marks_elsewhere_in_every_view_is_no_fault(joints, cameras):
     """Detectors put a hip centimetres aside, depending on the side that they see: no camera is blamed for that, and
     those that are at fault are still found."""

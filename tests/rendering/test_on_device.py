@@ -60,6 +60,7 @@ def test_poses_and_pictures_are_those_of_the_cpu(kind, tmp_path):
 
 
 @pytest.mark.usefixtures("device")
+@pytest.mark.long
 def test_clothes_are_simulated_as_on_the_cpu(tmp_path):
     write_dressed(tmp_path)
     here, there = (AvatarPlayer(tmp_path / "me.avatar", threads=1, device=d, cloth=QUICK) for d in ("cpu", "cuda"))

@@ -86,6 +86,7 @@ def test_what_is_run_is_named_when_it_changes(copy, path, old, new, named):
     assert {name for name in after if after[name] != before[name]} == {named}
 
 
+@pytest.mark.long
 def test_digests_are_kept_in_a_file_and_a_damaged_one_is_made_anew(tmp_path, monkeypatch):
     """Parsing all sources took every process two seconds."""
 

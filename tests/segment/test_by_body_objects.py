@@ -87,6 +87,7 @@ def test_a_bag_that_no_hand_touches_is_found(open_body, stance, kind):
     assert carries == "pelvis" or carries.startswith("spine")
 
 
+@pytest.mark.long
 def test_the_thing_keeps_its_label_through_the_cut_and_is_no_cloth(open_body, stance, scan):
     mesh, truth = scan
     result = label_by_body(mesh, open_body, stance[0])
@@ -95,6 +96,7 @@ def test_the_thing_keeps_its_label_through_the_cut_and_is_no_cloth(open_body, st
     assert any("labelled object" in note for note in result.notes)
 
 
+@pytest.mark.long
 def test_a_folder_that_the_forearm_presses_is_found_on_both_sides_and_the_sleeve_is_no_part_of_it(open_body, stance):
     """A folder along the forearm lies nearer to the arm than cloth does: half of it stayed shirt and was torn."""
     _, posed = stance
@@ -197,6 +199,7 @@ def test_what_stands_beside_the_person_is_no_thing_in_her_hand(open_body, stance
     assert not find_objects(mesh, open_body, params).faces.any()
 
 
+@pytest.mark.long
 def test_a_skirt_that_stands_off_the_legs_all_round_is_no_thing(open_body, stance):
     """A cone from the hips to the ankles, half a metre wide at the hem, which begins at the hands."""
     params, posed = stance
@@ -217,6 +220,7 @@ def test_a_skirt_that_stands_off_the_legs_all_round_is_no_thing(open_body, stanc
     assert not find_objects(concatenate_meshes([skin, skirt]), open_body, params).faces.any()
 
 
+@pytest.mark.long
 def test_no_thing_is_sought_beside_a_body_that_is_not_at_the_face(open_body, stance, scan):
     mesh, _ = scan
     params, _ = stance
@@ -297,6 +301,7 @@ def scanned_head(head: TriangleMesh, *worn: TriangleMesh, cell: float = 0.006) -
 
 
 @pytest.mark.parametrize("kind", ["sunglasses", "goggles", "brimmed hat", "top hat", "cap", "headphones"])
+@pytest.mark.long
 def test_what_is_worn_on_the_head_is_an_object_and_stiff_on_it(open_body, stance, head, kind):
     """Glasses were skin, hats hair, and lenses that lie nearest to an eyeball turned with it."""
     worn = thing_mesh(Thing(kind), open_body, stance[1])

@@ -69,6 +69,7 @@ def test_a_clothed_scan_is_labelled_though_the_body_is_a_little_wrong(body, scan
     assert np.array_equal(again.face_labels, result.face_labels)
 
 
+@pytest.mark.long
 def test_the_direction_she_faces_does_not_matter(body, scanned, labelled):
     mesh, colors, _, params = scanned
     angle = np.radians(110.0)
@@ -114,6 +115,7 @@ def test_wrong_input_is_refused(body, scanned):
         label_by_body(mesh, body, params, colors=colors.astype(np.float64))
 
 
+@pytest.mark.long
 def test_a_body_that_is_not_in_the_scan_leaves_nothing_sure(body, scanned):
     mesh, colors, _, params = scanned
     elsewhere = replace(params, transl=params.transl + 0.5)

@@ -41,6 +41,7 @@ def painted(body: BodyModel, paint: dict[str, tuple]) -> tuple[TriangleMesh, np.
     return mesh, colors, params
 
 
+@pytest.mark.long
 def test_a_bald_person_with_bare_feet_has_neither_hair_nor_shoes(body):
     mesh, colors, params = painted(body, {"shirt": _BLUE, "trousers": _GREY})
     labels = label_by_body(mesh, body, params, colors=colors).face_labels
@@ -87,6 +88,7 @@ def thick_clothes(body: BodyModel, calves: float) -> tuple[TriangleMesh, dict[st
 
 
 @pytest.mark.parametrize("calves", [0.0, 0.004, 0.008])
+@pytest.mark.long
 def test_calves_that_no_shape_of_the_body_has_are_no_trousers(body, calves):
     """Without colours: 4 mm off the body they were skin, at 8 mm trousers, whatever the shorts above."""
     mesh, masks, params = thick_clothes(body, calves)
@@ -158,6 +160,7 @@ def test_boots_in_the_colour_of_dust_are_no_bare_feet_of_a_dark_person(body):
         assert (labels[foot] == (SHOE if shod is scan else SKIN).id).mean() > 0.9
 
 
+@pytest.mark.long
 def test_a_suit_of_one_colour_is_cut_at_the_jackets_hem(body):
     """A jacket in the colour of its trousers ended at the waist, below which the light on it fades."""
     mesh, colors, params = painted(body, {"shirt": _GREY, "trousers": _GREY, "hair": _GREY})
@@ -200,6 +203,7 @@ def test_an_open_jacket_is_told_from_a_closed_one_by_its_lips(body, half):
 
 
 @pytest.mark.parametrize("hem", [0.0, 0.015])
+@pytest.mark.long
 def test_a_front_in_the_colour_of_the_trousers_is_a_waistcoat_where_it_ends_over_them(body, hem):
     """A black waistcoat over a white shirt was labelled trousers, as a bib is that goes on above the waist."""
     mesh, colors, params = painted(body, {"shirt": (240, 240, 240), "trousers": _GREY, "hair": _GREY})
@@ -260,6 +264,7 @@ def test_shoes_in_the_colour_of_skin_are_told_by_their_heels(body, heels):
     assert (labels[toes] == (SHOE if heels else SKIN).id).mean() > 0.9
 
 
+@pytest.mark.long
 def test_a_dress_without_a_hem_at_the_waist_is_one_garment(body):
     """A dress was cut at the waist: what goes round both legs, with no hem above, is one garment, labelled upper."""
     params = BodyParams.rest()

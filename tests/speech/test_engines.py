@@ -108,6 +108,7 @@ def test_a_sound_of_the_voice_begins_with_the_pad_ahead_of_it(voice):
     assert len(late) == 4 and np.abs(late).max() < 0.03, late
 
 
+@pytest.mark.long
 def test_words_are_recognised_and_other_words_refused(spoken, recogniser):
     heard = align(spoken.sound)
     assert len(heard.spoken) > 20 and heard.seconds == spoken.sound.seconds
@@ -172,6 +173,7 @@ def test_another_language_is_said_and_followed_by_its_sounds(spoken, recogniser,
     assert plain.notes == [] and "umbrella before the big storm" in plain.speech.transcript
 
 
+@pytest.mark.long
 def test_a_quiet_recording_is_no_silence(spoken, recogniser, tmp_path):
     """Public recordings at -66 dB were refused as silence."""
     level = float(np.sqrt(np.mean(spoken.sound.samples**2)))

@@ -40,6 +40,7 @@ def atlas(person):
     return unwrap(person, load_body().uv)
 
 
+@pytest.mark.long
 def test_every_point_has_the_scans_colour_and_hidden_skin_that_of_bare_skin(person, atlas):
     posed = person.vertices + [0.3, 0.0, -0.2]  # the scan stands elsewhere, as scans do
     mesh = TriangleMesh(posed, person.faces)

@@ -26,6 +26,7 @@ def find(sequence, *, track=None, reference=None, config=CONFIG):
     return find_garments(sequence, reference, config, track)
 
 
+@pytest.mark.long
 def test_a_skirt_that_swings_is_found_and_its_drag_with_it(sequence):
     found = find(sequence, track=followed(moved()), reference=standing())
     assert [garment.part for garment in found.garments] == [PART] and found.notes == []

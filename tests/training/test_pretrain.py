@@ -83,6 +83,7 @@ def test_the_loss_falls(kind, frames, track):
 
 
 @pytest.mark.parametrize("kind", TASKS)
+@pytest.mark.long
 def test_a_restored_state_goes_on_bit_for_bit(kind, frames, track):
     whole, before = make(kind, frames, track), make(kind, frames, track)
     steps(whole, 5)
@@ -135,6 +136,7 @@ def test_one_network_for_all_keeps_its_other_residuals_at_zero(frames, track):
     assert maps.position.abs().max() > 0 and maps.shape[..., 3:].abs().max() == 0 and maps.colour.abs().max() == 0
 
 
+@pytest.mark.long
 def test_the_teacher_comes_to_what_is_known(frames, track):
     teacher = make_teacher(frames)
     steps(PretrainTeacherTask(frames, teacher, replace(CONFIG, batch=4), 0, track), 40)

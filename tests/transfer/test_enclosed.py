@@ -58,6 +58,7 @@ def sitting_error(mannequin: Mannequin, case: Case, dense: np.ndarray) -> np.nda
 
 
 @pytest.mark.parametrize("name", ["wide trousers, hem 24 cm", "hakama"])
+@pytest.mark.long
 def test_wide_trousers_sit_down(mannequin, worn, name):
     """Far from the skin they took the lead of the waist and stayed behind by 140 mm in the mean, 560 at the hem."""
     case = worn(name)
@@ -225,6 +226,7 @@ def test_each_leg_of_trousers_goes_around_its_own_leg_and_the_hips_around_none(m
 
 
 @pytest.mark.parametrize("name", ["mini skirt", "poncho", "tutu"])
+@pytest.mark.long
 def test_what_goes_around_two_limbs_follows_no_single_one(mannequin, worn, name):
     assert enclosure(mannequin, worn(name)).share.max() == 0
 
@@ -357,6 +359,7 @@ def test_a_poncho_follows_no_forearm_under_it(mannequin, worn):
     assert dense[:, names.index("left_shoulder")].max() > 0.3
 
 
+@pytest.mark.long
 def test_a_jacket_over_a_hand_follows_the_trunk_and_is_cut_from_its_sleeve(mannequin):
     """Behind a hand in a pocket the corner of a jacket lay nearest to the hand, and went up with it into the T-pose."""
     body, params = mannequin.body, lowered(mannequin, 68.0)

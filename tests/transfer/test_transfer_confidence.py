@@ -39,6 +39,7 @@ def error(mannequin: Mannequin, case, config: TransferConfig) -> dict[str, float
 
 
 @pytest.mark.parametrize("name", ["overalls with straps", "high boots", "jumpsuit", "hood up"])
+@pytest.mark.long
 def test_what_lies_on_the_skin_is_not_overruled_by_its_label(mannequin, wardrobe, name):
     """Straps over the shoulders of what is labelled `lower` followed the belly, 60 mm off in a twist."""
     case = scan(mannequin, wardrobe[name], "mean", "T", seed=0)

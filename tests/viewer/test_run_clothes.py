@@ -54,6 +54,7 @@ def shown(session: RunSession) -> np.ndarray:
     return splats.means
 
 
+@pytest.mark.long
 def test_clothes_follow_the_frames_and_begin_anew_after_a_jump_back(dressed):
     run, template, motion = dressed
     session = open_run(run, template, params=motion)

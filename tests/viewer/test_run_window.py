@@ -296,6 +296,7 @@ def test_the_command_serves_until_it_is_interrupted(trained, monkeypatch, capsys
 
 
 @pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+@pytest.mark.long
 def test_a_browser_shows_the_person(window, tmp_path):
     with Page(tmp_path, (900, 600)) as page:
         page.send("Page.navigate", url=window.address)

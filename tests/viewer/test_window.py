@@ -207,6 +207,7 @@ def test_labels_are_made_again_with_the_corrections(run):
         window.close()
 
 
+@pytest.mark.long
 def test_a_build_that_stopped_has_a_scan_to_place_landmarks_on(small: Small, tmp_path):  # noqa: F811
     run, inputs = tmp_path / "begun", small.inputs(params=None)
     run.mkdir()
@@ -266,6 +267,7 @@ def test_a_run_that_does_not_say_what_it_was_built_from_is_not_labelled_again(ru
         window.close()
 
 
+@pytest.mark.long
 def test_labels_are_made_again_in_a_run_that_registers(small: Small, monkeypatch):  # noqa: F811
     """Its registration stands, and is not asked for again."""
     use_keypoints(monkeypatch)

@@ -120,6 +120,7 @@ def test_the_outer_of_two_skirts_lies_on_the_inner_one(tmp_path):
     assert differences(played(path, QUICK, steps), followed(path, QUICK, steps)).max() < 5e-4
 
 
+@pytest.mark.long
 def test_cuts_start_anew_and_far_away_is_as_near(tmp_path):
     """A leap of ten metres, half a second without a pose, and a walk away from the origin."""
     places = [0.0, 0.05, 10.0, 10.05, 10.1, 13.0, 15.5]
@@ -216,6 +217,7 @@ def test_the_page_and_the_runtime_step_clothes_by_the_numbers_of_the_bundle(dres
         np.testing.assert_allclose(np.reshape(one["means"], (-1, 3)), other["means"], atol=5e-3)
 
 
+@pytest.mark.long
 def test_bundles_that_say_no_numbers_are_stepped_as_before(dressed, tmp_path):
     older = changed(dressed, tmp_path / "older.avatar", lambda about: about.pop("simulation"))
     empty = changed(dressed, tmp_path / "empty.avatar", told({"solver": {}}))

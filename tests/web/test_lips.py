@@ -176,6 +176,7 @@ def opened(browser: Page, avatar: Path) -> PageServer:
     return server
 
 
+@pytest.mark.long
 def test_the_microphone_moves_the_mouth_and_nothing_else(listening, avatar):
     server = opened(listening, avatar)
     try:

@@ -168,6 +168,7 @@ def test_a_folder_keeps_what_else_is_in_it(tmp_path):
 
 
 @pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+@pytest.mark.long
 def test_a_folder_opened_from_disk_says_what_it_needs(tmp_path):
     write_page_folder(tmp_path / "site", b"bundle", PageContent(name="A", sound=b"RIFF", lips=b"lips"))
     with Page(tmp_path / "profile", flags=("--disable-gpu",)) as page:

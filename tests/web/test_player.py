@@ -127,6 +127,7 @@ def test_one_file_opens_from_disk_and_asks_no_network(browser, avatar, tmp_path)
     assert all("Content Security Policy" in error for error in browser.errors), browser.errors
 
 
+@pytest.mark.long
 def test_loose_clothes_are_simulated(browser, tmp_path):
     """A cold start and steps from there are the runtime's; live, the cloth goes on when the pose stands still."""
     path = tmp_path / "dressed.avatar"

@@ -149,6 +149,7 @@ def test_damaged_materials_lose_colours_at_most(folder: Path, damage: str):
         assert (mesh.vertex_count, mesh.face_count) == (5, 4)
 
 
+@pytest.mark.long
 def test_json_values_of_other_types_in_gltf(folder: Path):
     document = json.loads(make_gltf(VERTICES, FACES))
     path = folder / "a.gltf"

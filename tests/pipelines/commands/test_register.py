@@ -26,6 +26,7 @@ def solver(monkeypatch):
     return use_solver(monkeypatch)
 
 
+@pytest.mark.long
 def test_the_command_prints_its_numbers_and_a_table(tmp_path, solver, capsys):
     assert main(["register", str(tmp_path), *ASKED, "--json", "--no-report"]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -76,6 +77,7 @@ def test_bad_options_are_refused_in_words(tmp_path, solver, capsys, options, wor
     assert not solver.shown
 
 
+@pytest.mark.long
 def test_named_landmarks_are_kept_in_the_run(tmp_path, solver, capsys):
     placed, run = tmp_path / "mine.json", tmp_path / "run"
     placed.write_text(json.dumps({"nose": [0.0, 1.5, 0.1]}))
@@ -170,6 +172,7 @@ def test_keypoints_and_masks_of_other_folders_take_the_place_of_the_captures(tmp
         Register(run_folder=tmp_path, scan=FIXTURE / "scans/scan_000000.ply", keypoints=apart).inputs()
 
 
+@pytest.mark.long
 def test_a_folder_of_scans_takes_the_place_of_the_captures(tmp_path):
     """Reconstructions of all frames are scans like any others; what is no folder of scans is refused."""
     from smplxpp.body import load_body

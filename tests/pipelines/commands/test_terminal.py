@@ -60,6 +60,7 @@ def test_the_answer_of_a_command_to_a_full_stdout(option, tmp_path, monkeypatch,
     assert capfd.readouterr().err == "error: standard output: No space left on device\n"
 
 
+@pytest.mark.long
 def test_nothing_is_left_for_the_interpreters_end(tmp_path):
     run = [sys.executable, "-m", "pipelines.cli", "--help"]
     with open("/dev/full", "w") as full:

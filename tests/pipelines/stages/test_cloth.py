@@ -18,6 +18,7 @@ from tests.runs.stages import stage_of
 from tests.training.test_loose_clothes import CONFIG
 
 
+@pytest.mark.long
 def test_the_report_says_what_was_found_and_what_was_not(tmp_path):
     sequence = AvatarSequence(open_capture(write_skirted(tmp_path / "skirt")), person())
     found = find_garments(sequence, standing(), CONFIG, followed(moved()))

@@ -47,12 +47,14 @@ def middle_of(scan: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     return scan.face_centers[:, 0], scan.face_centers[:, 1]
 
 
+@pytest.mark.long
 def test_a_whole_scan_passes(whole):
     checks, numbers = checked(whole)
     assert [c.status for c in checks] == ["pass"] * 6
     assert numbers["body_uncovered"]["all"] < 0.02 and numbers["scan_unexplained"] < 0.02
 
 
+@pytest.mark.long
 def test_a_scan_without_its_head_fails_and_the_head_is_named(whole):
     _, y = middle_of(whole[2])
     checks, _ = checked(whole, kept=y < 1.42)
@@ -70,6 +72,7 @@ def test_the_left_half_alone_fails_and_what_is_lost_is_named(whole):
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.03, 0.08])
+@pytest.mark.long
 def test_two_fifths_of_the_faces_gone_fail(whole, radius):
     scan, rng = whole[2], np.random.default_rng(0)
     gone = rng.random(scan.face_count) < (0.0 if radius else 0.4)
@@ -82,6 +85,7 @@ def test_two_fifths_of_the_faces_gone_fail(whole, radius):
     assert numbers["body_uncovered"]["all"] == pytest.approx(0.33, abs=0.1)
 
 
+@pytest.mark.long
 def test_holes_that_scanners_leave_pass(whole):
     scan = whole[2]
     x, y = middle_of(scan)
@@ -92,11 +96,13 @@ def test_holes_that_scanners_leave_pass(whole):
     assert [c.status for c in checks] == ["pass"] * 6
 
 
+@pytest.mark.long
 def test_a_skirt_cut_out_fails_and_the_legs_are_named(whole):
     checks, _ = checked(whole, kept=whole[3] != LOWER.id)
     assert checks[BODY].status == "fail" and "leg" in checks[REGION].explanation
 
 
+@pytest.mark.long
 def test_a_skirt_labelled_skin_looks_like_cloth(whole):
     labels = whole[3]
     # A build makes no skirt of such labels.

@@ -80,6 +80,7 @@ def test_it_stands_and_is_made_anew_for_other_options(run):
     assert other["ran"] and other["cell_mm"] == pytest.approx(40.0)
 
 
+@pytest.mark.long
 def test_frames_that_were_finished_before_a_kill_are_not_made_again(tmp_path, monkeypatch):
     inputs = ReconstructInputs(FIXTURE, (0, 2), refine=False, cell_mm=40.0)
     made, whole = [], stage_module._keep_frame
@@ -178,6 +179,7 @@ def test_a_neural_surface_needs_a_gpu_or_the_word(tmp_path, monkeypatch):
         ReconstructCommand(capture=FIXTURE, run_folder=tmp_path / "run", method="sdf", hull_only=True).run()
 
 
+@pytest.mark.long
 def test_a_neural_surface_on_the_cpu_is_a_stage_like_others(tmp_path):
     surface = SurfaceConfig(
         **{"iterations": 2, "rays": 32, "samples": 8, "levels": 2, "finest": 16, "log2_entries": 8},

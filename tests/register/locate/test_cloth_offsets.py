@@ -78,6 +78,7 @@ def test_cells_cover_what_clothes_cover_and_mirror_from_side_to_side(body, offse
         assert np.allclose(left, right, rtol=0.2)
 
 
+@pytest.mark.long
 def test_a_wide_shirt_and_wide_trousers_leave_the_body_where_it_is(body):
     """Hands, face, neck and feet are as they are: joints stay within millimetres under clothes 4 cm off."""
     kinematics = Kinematics(body)

@@ -171,6 +171,7 @@ def test_a_chair_that_a_person_is_scanned_with_is_refused_by_name(person):
     assert confidence < LEAST_CONFIDENCE and "furniture, which stands beside the feet" in words
 
 
+@pytest.mark.long
 def test_an_arm_in_the_air_beside_one_that_no_body_explains_is_refused(person):
     """One wrong arm had a confidence of .35 and went on to a template; an arm that is cut off is no such fault."""
     follows = [

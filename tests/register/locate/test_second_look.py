@@ -51,6 +51,7 @@ def _off(search: Search, state: BodyState, truth: BodyState, joint: str) -> floa
     return float(np.linalg.norm(one - other))
 
 
+@pytest.mark.long
 def test_limbs_that_the_surface_shows_stay_where_they_are(search, truth):
     """Legs are shown and not searched; a wide skirt leaves surface to arms, which prefer their place all the same."""
     found = search.polished("truth", truth, None, steps=1)

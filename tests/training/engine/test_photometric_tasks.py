@@ -106,6 +106,7 @@ def make_other(stage: str, frames):
         ("pretrained field", 1, 1030, 14),
     ],
 )
+@pytest.mark.long
 def test_a_step_that_logs_nothing_seldom_waits_for_the_device(root, stage, waits, calls, sent):
     """Terms of the losses as numbers, and masks as indices, made a step of these wait 14 to 27 times.
 
@@ -275,6 +276,7 @@ def test_attributes_without_a_rate_stay(stage, frames):
 
 
 @pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.long
 def test_what_hides_does_not_grow_nor_leave_its_triangle(stage, frames):
     """The torso is under the dress: large Gaussians there shrink, and such far inside come nearer."""
     sizes, ways = {}, {}

@@ -82,6 +82,7 @@ def test_images_are_whole_and_previews_show_the_held_out_views(fitted):
     assert error.mean() < 4
 
 
+@pytest.mark.long
 def test_a_fit_of_one_view_knows_one_side_and_the_frames_of_a_turn_know_all(tmp_path, fitted):
     # The photographs of a rig are those of a turn, if the doll turns and the camera stands still.
     others = [turned(name, number) for number, name in enumerate(TRAIN[1:], start=1)]

@@ -45,6 +45,7 @@ def assert_same(one: Refinement, other: Refinement) -> None:
     assert one.history == other.history
 
 
+@pytest.mark.long
 def test_chunks_are_the_whole_but_for_the_order_of_sums(frames, alone):
     whole = refine_poses(frames, replace(CHUNKS, chunk_frames=200))
     apart = 1e3 * np.abs(whole.params.transl - alone.params.transl).max()
@@ -52,6 +53,7 @@ def test_chunks_are_the_whole_but_for_the_order_of_sums(frames, alone):
     assert_same(refine_poses(frames, CHUNKS), alone)  # also without a state
 
 
+@pytest.mark.long
 def test_processes_that_share_a_folder_get_the_bits_of_one(frames, alone, tmp_path):
     found: list[Refinement] = []
     threads = [
@@ -69,6 +71,7 @@ def test_processes_that_share_a_folder_get_the_bits_of_one(frames, alone, tmp_pa
     assert_same(refine_poses(frames, CHUNKS, state=tmp_path / "state.npz"), alone)
 
 
+@pytest.mark.long
 def test_processes_that_stop_after_every_chunk_come_to_the_same_bits(frames, alone, tmp_path):
     found, stops, shares = None, 0, []
     while found is None:

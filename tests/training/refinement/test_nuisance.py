@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from avatar.training.refinement.nuisance import CameraCorrections
 from avatar.training.refinement.refine import refine_poses
@@ -13,6 +14,7 @@ from tests.dolls.gesturing import gestures, sequence, write_gestures
 from tests.training.refinement.test_refine import CONFIG
 
 
+@pytest.mark.long
 def test_a_camera_that_was_turned_comes_back_and_the_mean_stays(tmp_path):
     frames = sequence(write_gestures(tmp_path / "gestures"), gestures(), tmp_path)
     capture, off = frames.capture, np.eye(4)

@@ -61,6 +61,7 @@ def test_disturbed_poses_come_back(found, start):
     assert (found.after < found.before).all() and found.kept == ()
 
 
+@pytest.mark.long
 def test_frames_are_shared_among_threads_and_give_the_bits_of_one(frames):
     config = replace(QUICK, reference_levels=(), cameras=True)
     alone, threads, seen = refine_poses(frames, config), torch.get_num_threads(), []
@@ -130,6 +131,7 @@ def test_right_poses_stay(capture, tmp_path):
     assert error(exact.params, exact.frames) < 2.0
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bits(frames):
     one, two = (refine_poses(frames, QUICK) for _ in range(2))
     for name, array in one.params.as_dict().items():
@@ -137,6 +139,7 @@ def test_the_same_seed_gives_the_same_bits(frames):
     assert not np.array_equal(one.params.transl, refine_poses(frames, replace(QUICK, seed=1)).params.transl)
 
 
+@pytest.mark.long
 def test_a_sequence_on_cuda_has_its_pictures_drawn_there(frames, monkeypatch):
     """Poses, colours and cameras are those of the CPU up to rounding; what is kept lies on the CPU."""
     config, drawn = replace(QUICK, cameras=True), set()

@@ -121,6 +121,7 @@ def test_a_skirt_is_simulated_through_every_second_frame(skirt):
     assert not last[~of_skirt].any() and last.abs().max() > 5e-3
 
 
+@pytest.mark.long
 def test_frames_numbers_are_names():
     poses = {k: standing(lifted=0.1 * k) for k in range(3)}
     apart = {10 + 3 * k: pose for k, pose in poses.items()}
@@ -159,6 +160,7 @@ def task(sequence: AvatarSequence, **changes) -> TrackTask:
     return TrackTask(sequence, TrackedAvatar(sequence.rig, bound, config.control_points), config)
 
 
+@pytest.mark.long
 def test_frames_of_a_capture_start_nearer_to_a_skirt_that_swings(skirted):
     wrong = {}
     for simulate in (True, False):

@@ -170,6 +170,7 @@ def test_drift_is_measured_where_it_was_requested(tracks):
     assert drift.shape == (CONFIG.control_points,) and drift.isfinite().all() and drift.any()
 
 
+@pytest.mark.long
 def test_a_stopped_backward_pass_continues_bit_for_bit(dances, tracks, tmp_path):
     config, frames = replace(PRIOR, back=True), dances[STRIPED]
     stops = 0
