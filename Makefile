@@ -57,7 +57,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-lo
 test: $(STAMP)
 	$(PYTEST)
 
-# One test in twenty takes more than half of the time: those of a second and more. `.ci/run` runs them after the others.
+# One test in sixteen takes more than half of the time: those of about a second and more. `.ci/run` runs them after the others.
 test-long: $(STAMP)
 	$(PYTEST) -m "long and not slow and not fuzz"
 

@@ -24,6 +24,7 @@ def body():
     return load_body()
 
 
+@pytest.mark.long
 def test_body_first_then_parts(body):
     parts = worn_parts(body)
     template, report = assemble_template(body, params(), parts)
@@ -52,6 +53,7 @@ def test_body_first_then_parts(body):
     assert apart.max() < 0.0041
 
 
+@pytest.mark.long
 def test_what_no_betas_express_is_in_the_canonical_body(body):
     """`v_shape` of the reference frame: in the T-pose, its joints, and not a second time when the template is posed."""
     own = np.random.default_rng(4).normal(size=(1, body.vertex_count, 3)) * 0.002
@@ -76,6 +78,7 @@ def test_a_part_within_the_body_comes_out(body):
     assert np.array_equal(template.vertices[: body.vertex_count], body.forward(params()).rest_vertices[0])
 
 
+@pytest.mark.long
 def test_a_body_that_does_not_fit_is_named_and_not_pushed_through(body):
     """A tracker's body was 60 mm off: the repair pushed the garment through it, and nobody was told where."""
     parts = worn_parts(body)

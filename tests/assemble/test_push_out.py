@@ -141,6 +141,7 @@ def test_a_shared_seam_stays_closed():
     assert np.abs(push_out(outer, [obstacle]) - outer.vertices).max() < 1e-9
 
 
+@pytest.mark.long
 def test_nothing_is_pushed_beyond_the_limit_and_the_surface_stays_smooth():
     inner, outer = ball(0.1), dented(depth=0.035)
     far = push_out(outer, [solid(inner)]) - outer.vertices

@@ -56,6 +56,7 @@ def test_a_grid_without_sense_is_refused():
         SurfaceConfig(iterations=0)
 
 
+@pytest.mark.long
 def test_the_untrained_surface_is_the_hull(ball):
     grid = hull_grid(ball, BOX, 0.03)
     low, high = (torch.from_numpy(side.astype(np.float32)) for side in (BOX.low, BOX.high))

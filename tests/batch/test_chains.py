@@ -59,6 +59,7 @@ class Fleet:
         return (self.runs / subject / "ends.txt").read_text().split()
 
 
+@pytest.mark.long
 def test_each_end_is_told_and_no_other_subject_is_touched(tmp_path):
     fleet = Fleet(
         tmp_path,

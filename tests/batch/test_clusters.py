@@ -202,6 +202,7 @@ def test_what_slurm_takes_back_goes_on_in_the_next_array(tmp_path):
         signal.signal(signal.SIGTERM, before)
 
 
+@pytest.mark.long
 def test_a_worker_that_slurm_ends_costs_its_step_no_attempt(tmp_path):
     """A subject that was preempted three times failed, as if its machine had been lost so often."""
     path = job_file(tmp_path, 1, 600.0)

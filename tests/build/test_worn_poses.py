@@ -53,6 +53,7 @@ def test_a_hakama_that_stays_with_the_waist_fails_and_one_that_sits_down_passes(
     assert numbers["lower"]["reach: rings off their limb, mm"] < 5  # the legs do not move there
 
 
+@pytest.mark.long
 def test_faces_in_the_body_are_counted_by_pose(hakama):
     """A garment shrunk to the axis of the legs lies within the thighs in every pose."""
     mannequin, cloth = hakama

@@ -221,6 +221,7 @@ def test_a_users_model_writes_masks_in_our_layout(rig, tmp_path, side, logits):
         assert (inside & truth).sum() / (inside | truth).sum() > 0.95
 
 
+@pytest.mark.long
 def test_convert_takes_the_mattes_of_a_users_model(rig, tmp_path, capsys):
     pytest.importorskip("onnxruntime")
     model_file(tmp_path / "red.onnx", side="side", logits=True)
@@ -308,6 +309,7 @@ def test_models_that_give_no_matte_are_refused_when_they_run(tmp_path, operation
     assert "foreign.onnx" in str(error.value)
 
 
+@pytest.mark.long
 def test_matting_without_onnxruntime_names_the_extra(tmp_path):
     code = (
         "import sys; sys.modules['onnxruntime'] = None\n"

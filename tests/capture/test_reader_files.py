@@ -100,6 +100,7 @@ def test_numbered_files(tmp_path):
     assert unusual.path(3) == tmp_path / "später/bild 3.jpg"
 
 
+@pytest.mark.long
 def test_importing_captures_is_light():
     heavy = ("torch", "PIL", "trimesh", "onnxruntime")
     code = f"import sys, smplxpp.capture; print([m for m in {heavy} if m in sys.modules])"

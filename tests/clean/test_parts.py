@@ -52,6 +52,7 @@ def finer(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(fine.vertices, fine.faces)
 
 
+@pytest.mark.long
 def test_a_scan_much_finer_than_its_features_keeps_edges_with_a_length():
     # Sixteen flat faces in the place of each: the best place of many vertices is the same old corner, and edges of
     # 1e-16 m between them grew by a factor of millions when they were posed.

@@ -38,6 +38,7 @@ def _outer(mesh: TriangleMesh) -> np.ndarray:
 
 @pytest.mark.parametrize("arms_down", [False, True])
 @pytest.mark.parametrize(("count", "noise", "most"), [(8000, 0.0, 0.03), (30000, 0.0, 0.015), (30000, 0.002, 0.03)])
+@pytest.mark.long
 def test_few_points_face_inward(arms_down: bool, count: int, noise: float, most: float):
     samples = sample_surface(person(arms_down), count, seed=0)
     samples = samples.select(outer_visible_points(person(arms_down), samples.points, tolerance=0.004))

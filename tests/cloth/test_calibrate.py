@@ -50,6 +50,7 @@ def test_the_drag_and_the_pins_of_a_motion_are_found_again():
         assert max(calibration.drag_spread, calibration.pin_spread) < 1e-12  # every block says the same
 
 
+@pytest.mark.long
 def test_frames_and_particles_that_were_not_followed_are_not_looked_at():
     truth = simulated(with_values(garment(), drag=8.0, pin_depth=0.1))
     truth[5:9], truth[:, 3], truth[2, 7] = np.nan, np.nan, np.nan
@@ -111,6 +112,7 @@ def test_surfaces_and_choices_that_cannot_be_are_refused():
             CalibrationConfig(**{name: value})
 
 
+@pytest.mark.long
 def test_defaults_stay_where_the_surface_hardly_tells_others_and_yield_where_it_does():
     own = garment().config
     slow, fast = own.fabric.drag, 4.0 * own.fabric.drag

@@ -54,6 +54,7 @@ def test_three_frames_a_second_swing_as_thirty_do():
     assert np.linalg.norm(slow - fine, axis=1).mean() < 0.5 * np.linalg.norm(skinned - fine, axis=1).mean()
 
 
+@pytest.mark.long
 def test_a_shaken_motion_shakes_clothes_less():
     rng = np.random.default_rng(0)
     motion = swung(30.0, 1.0)

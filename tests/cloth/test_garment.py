@@ -113,6 +113,7 @@ def test_another_pin_depth_holds_more_without_cutting_anew():
     assert (deeper.share() <= garment.share()).all() and deeper.share().sum() < garment.share().sum()
 
 
+@pytest.mark.long
 def test_a_bridge_under_a_hem_is_found_and_cut_off():
     template = person(bridge=True)
     bridge = find_opening_bridges(template)

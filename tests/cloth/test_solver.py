@@ -50,6 +50,7 @@ def test_falling_cloth_comes_to_the_speed_at_which_the_air_holds_it():
     np.testing.assert_allclose(down.velocity[:, 1], -GRAVITY / 8.0, rtol=0.02)
 
 
+@pytest.mark.long
 def test_the_motion_is_that_of_an_oracle_in_double_precision():
     mesh = bent(hanging())
     fabric = Fabric(bend_stiffness=2e-5, normal_drag=2.0, slack=0.0)
@@ -204,6 +205,7 @@ def digest_of_a_fall() -> str:
     return hashlib.sha256(scene.state.position.tobytes() + scene.state.velocity.tobytes()).hexdigest()
 
 
+@pytest.mark.long
 def test_the_same_bits_every_time_and_on_every_cpu():
     best = digest_of_a_fall()
     assert digest_of_a_fall() == best

@@ -102,6 +102,7 @@ def test_few_frames_a_second_give_about_the_same_motion():
     assert max(moved) > 0.015 and np.mean(off) < 0.35 * np.mean(moved), (off, moved)
 
 
+@pytest.mark.long
 def test_smoothing_takes_the_shaking_of_a_tracker_out_of_the_cloth():
     shakes = {}
     for smoothing in (0.0, 0.03):
@@ -122,6 +123,7 @@ def test_every_second_number_is_half_the_frames_a_second():
     np.testing.assert_array_equal(skipping.shape(40).displacements, plain.shape(20).displacements)
 
 
+@pytest.mark.long
 def test_uneven_frames_give_about_the_same_motion():
     """Two frames of three, as a camera gives them that drops every third."""
     made = motions(smoothing=0.03)

@@ -180,6 +180,7 @@ def test_terms_are_restrictive_and_checked(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_khronos_validator_knows_no_fault(written):
     report = validate(written)
     assert [one["code"] for one in report["issues"]["messages"]] == ["UNSUPPORTED_EXTENSION"]  # a remark, on VRMC_vrm

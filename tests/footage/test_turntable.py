@@ -83,6 +83,7 @@ def test_a_build_reconstructs_with_the_poses_of_the_capture(made):
         (made.out / "params.away").rename(made.out / "params" / "params.npz")
 
 
+@pytest.mark.long
 def test_a_registration_fits_the_whole_turn_at_once(made, monkeypatch):
     # Parameters of the capture start it; one shape and one held pose for all frames come out.
     monkeypatch.setattr(register, "TurntableConfig", functools.partial(register.TurntableConfig, **QUICK))

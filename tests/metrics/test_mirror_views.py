@@ -74,6 +74,7 @@ def test_symmetric_colours_tell_nothing(toy):
         assert 0.35 < share(scan, noisy, views, toy) < 0.6
 
 
+@pytest.mark.long
 def test_one_colour_and_photographs_of_something_else_tell_nothing(toy):
     colors = figure_colors(toy.vertices, lopsided=True)
     views = photographs(toy, colors)

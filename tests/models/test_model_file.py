@@ -371,6 +371,7 @@ def test_a_track_says_what_it_tells_of_its_errors_or_tells_nothing(rig, tmp_path
     assert load_avatar(written(tmp_path / "older", older, kept), rig).state_dict().keys() == kept.keys()
 
 
+@pytest.mark.long
 def test_damaged_bytes_give_a_model_or_words(rig, tmp_path):
     save_avatar(tmp_path / "good", make("pruned", rig), compact=True)
     data = (tmp_path / "good").read_bytes()

@@ -31,6 +31,7 @@ def spins(program: str, **environment: str) -> int:
 
 
 @pytest.mark.parametrize("package", ["smplxpp", "avatar", "pipelines.cli"])
+@pytest.mark.long
 def test_workers_sleep_once_a_package_is_imported(package):
     assert spins(f"import {package}; {LIBRARIES}") == 0
 
@@ -40,6 +41,7 @@ def test_torchs_workers_sleep_too():
     assert spins("import avatar.training.student.bake, torch; torch.ones(200_000).exp()") == 0
 
 
+@pytest.mark.long
 def test_what_the_environment_says_stands():
     assert spins(f"import smplxpp; {LIBRARIES}", GOMP_SPINCOUNT="77") == 77
     assert spins(f"import avatar; {LIBRARIES}", OMP_WAIT_POLICY="active") > 1_000_000

@@ -84,6 +84,7 @@ def test_a_folder_of_pictures_shows_the_arm_going_up(run, params, tmp_path):
     assert again["frames"] == 2 and len(list(out.iterdir())) == 2
 
 
+@pytest.mark.long
 def test_views_and_colours(run, params, tmp_path):
     def first(name, **options):
         Animate(run, params, tmp_path / name, height=100, stop=1, json=True, **options).run()

@@ -44,6 +44,7 @@ def film(run, params, out, **options) -> tuple[dict, np.ndarray]:
     return result, np.stack([np.asarray(Image.open(path)).astype(int) for path in sorted(out.iterdir())])
 
 
+@pytest.mark.long
 def test_clothes_that_training_found_swing(run, params, tmp_path):
     simulated, moving = film(run, params, tmp_path / "simulated")
     skinned, stiff = film(run, params, tmp_path / "skinned", cloth="skin")

@@ -207,6 +207,7 @@ def test_bridges_stay_where_the_user_wants_them(built):
     assert Build(run_folder=small.folder, keep_bridges=True).config().bridges.rounds == 0
 
 
+@pytest.mark.long
 def test_holes_stay_where_the_user_wants_them(built):
     small = built
     record = small.build("run", small.inputs(), last="60_assemble", fill_holes=FillHolesConfig(width=0.0))[

@@ -82,6 +82,7 @@ def test_poses_that_were_refined_have_their_skirt_simulated_too(trained, capture
     assert refined["views"] == own["views"] and refined["surfaces"]["held_out"] == own["surfaces"]["held_out"]
 
 
+@pytest.mark.long
 def test_other_garments_are_measured_anew_and_none_are_the_field(trained, capture, tmp_path, capsys):
     run = shutil.copytree(trained, tmp_path / "run")
     by_field = measured(run, capture, capsys, "--cloth", "field")["p2s"]

@@ -147,6 +147,7 @@ def test_the_page_holds_every_number_and_picture(page):
     assert parsed.tags.count("svg") == 2
 
 
+@pytest.mark.long
 def test_pictures_are_compressed_until_the_page_can_be_mailed():
     x, y = np.meshgrid(np.arange(600), np.arange(900))
     waves = 127 * (1 + np.sin(np.stack([x / 3, y / 5, (x + y) / 7], -1)))

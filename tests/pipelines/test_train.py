@@ -131,6 +131,7 @@ def test_a_run_that_does_not_know_its_scans_pose_simulates_nothing_and_says_so_f
     assert load_garments(run / "83_cloth" / "garments.npz", person()) == []
 
 
+@pytest.mark.long
 def test_training_without_simulation_has_no_such_stage(fitted, capture, capsys):
     assert train(fitted, capture, "--cloth", "none", "--until", "teacher") == 0
     assert list(json.loads(capsys.readouterr().out)["stages"]) == ["fit", "teacher"]
@@ -196,6 +197,7 @@ def test_a_killed_training_goes_on(trained, fitted, capture, monkeypatch):
     assert same_models(fitted, trained)
 
 
+@pytest.mark.long
 def test_checkpoints_of_other_options_are_not_overwritten(fitted, capture, capsys):
     assert train(fitted, capture, "--stage", "teacher", "--max-minutes", "1e-9") == 0
     capsys.readouterr()
@@ -215,6 +217,7 @@ def test_a_later_stage_is_not_trained_on_one_that_was_made_otherwise(fitted, cap
     assert "a finished 70_fit" in message and "seed was 0, is 5" in message
 
 
+@pytest.mark.long
 def test_a_reference_fit_of_the_users_own_is_taken(tmp_path, capture, caplog):
     run = write_dance_run(tmp_path / "run")
     options = ("--gaussians", "123", "--iterations", "1", "--json", "--no-report")
@@ -244,6 +247,7 @@ def test_a_students_bake_without_a_teacher(fitted, capture, capsys):
     assert "70_fit/gaussians.safetensors" in read_manifest(fitted / "85_bake")["inputs"]
 
 
+@pytest.mark.long
 def test_held_out_cameras_and_scale_are_the_users_choice(fitted, capture):
     options = ("--until", "teacher", "--hold-out", "Ring1", "--scale", "0.5", "--teacher-iterations", "1")
     assert train(fitted, capture, *options) == 0

@@ -72,6 +72,7 @@ def test_the_search_finds_a_dent_that_no_silhouette_shows():
     assert after[~dent].mean() < 0.001
 
 
+@pytest.mark.long
 def test_without_texture_the_surface_stays(ball):
     truth = zero_surface(inside_dented, BOX, cell=0.0125)
     pyramids = Pyramids.of([photograph(truth, camera, "", plain=True) for camera in ring(8)])

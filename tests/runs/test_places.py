@@ -78,6 +78,7 @@ def test_no_command_writes_into_a_captures_own_folder(tmp_path, capsys, command)
     assert sorted(root.rglob("*")) == files
 
 
+@pytest.mark.long
 def test_a_run_in_the_captures_folder_runs_is_no_part_of_the_capture(tmp_path):
     root = tmp_path / "person"
     shutil.copytree(FIXTURE, root, ignore=shutil.ignore_patterns("geometry", "normals", "labels_estimated"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from smplxpp.body import load_body
 from smplxpp.core import BodyParams, TriangleMesh, concatenate_meshes
@@ -63,6 +64,7 @@ def test_a_hand_under_a_cape_has_no_faces_and_a_bare_one_keeps_its_own():
     assert (bare.region[hand[skin.faces].all(axis=1)] == HAND).mean() > 0.95
 
 
+@pytest.mark.long
 def test_limbs_that_a_fit_turned_lie_within_their_clothes_again():
     """With joints off by 2 degrees limbs lay 3 cm off their cloth on one side, and bare skin was taken for a shirt."""
     body, rng = load_body(), np.random.default_rng(3)

@@ -317,6 +317,7 @@ def test_what_is_worn_on_the_head_is_an_object_and_stiff_on_it(open_body, stance
     assert {open_body.joint_names[k] for k in weights.dense().argmax(axis=1)} == {"head"}
 
 
+@pytest.mark.long
 def test_frames_without_lenses_are_glasses(open_body, stance, head):
     """Two characters with clear glasses wore none: a frame covers a sixth of the surface about an eye."""
     at = dict(zip(open_body.joint_names, stance[1].joints[0], strict=True))

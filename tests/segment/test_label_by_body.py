@@ -97,6 +97,7 @@ def test_nothing_tells_a_closed_jacket_from_a_shirt(body, scanned):
     assert np.median(result.confidence[result.face_labels == LOWER.id]) > 0.95
 
 
+@pytest.mark.long
 def test_legs_alone_wear_a_lower_garment(body, scanned):
     mesh, colors, truth, params = scanned
     kept = mesh.face_centers[:, 1] < mesh.vertices[:, 1].min() + 0.5 * np.ptp(mesh.vertices[:, 1])

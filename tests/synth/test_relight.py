@@ -49,6 +49,7 @@ def test_a_relit_picture_is_near_the_one_that_the_light_would_have_made(frames, 
     assert plain < 20.0 and found > 26.0 and found > plain + 8.0
 
 
+@pytest.mark.long
 def test_a_turned_environment_shines_from_elsewhere_as_brightly_as_the_stage(frames):
     _, stage, _, panorama = frames
     mesh, config = stage.mesh, LightConfig(directions=32, resolution=64)

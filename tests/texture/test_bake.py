@@ -68,6 +68,7 @@ def test_every_point_has_the_scans_colour_and_hidden_skin_that_of_bare_skin(pers
     assert again.colors == texture.colors
 
 
+@pytest.mark.long
 def test_a_picture_a_part_has_that_parts_colours_and_the_body_lies_as_in_its_file(person):
     shirt = person.faces[(np.abs(person.mesh.face_centers[:, 1]) < 0.15)]
     worn = with_part(person, "upper", UPPER.id, shirt, 0.01)

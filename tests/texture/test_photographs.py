@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from smplxpp.body import load_body
 from smplxpp.core.surface_points import draw_on_surface
@@ -18,6 +19,7 @@ def painted(points: np.ndarray) -> np.ndarray:
     return np.array([120.0, 100.0, 80.0]) + bands * [40, -30, 20]
 
 
+@pytest.mark.long
 def test_places_have_the_colours_of_the_views_that_see_them_at_one_exposure():
     mesh = load_body().mesh()
     cameras = turntable_cameras(mesh.vertices, count=len(EXPOSURES), height=800)

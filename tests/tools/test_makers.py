@@ -117,6 +117,7 @@ def test_tracker_noise_has_the_stated_size_and_is_seeded():
     assert noisy.expression.min() >= 0 and noisy.expression.max() <= 1
 
 
+@pytest.mark.long
 def test_scan_of_a_ball_under_a_sheet_shows_the_outer_surface_only():
     core, cover = icosphere(3, 0.2), icosphere(3, 0.25)
     cap = cover.submesh(cover.triangles[..., 1].min(axis=1) > 0)[0]

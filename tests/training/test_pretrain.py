@@ -219,6 +219,7 @@ def test_networks_that_start_at_zero_need_no_pretraining_without_a_track(frames,
         assert done.finished and done.iterations == 1 and (folder / PRETRAIN).exists() != zero
 
 
+@pytest.mark.long
 def test_a_teacher_stopped_in_its_pretraining_ends_with_the_same_weights(frames, tmp_path):
     config = short(track=replace(TRACKING, levels=(Level(1, 1, 6e-3),), control_points=12))
     whole, done = fit_teacher(frames, gaussians(), APART, config, Session(tmp_path / "whole"))

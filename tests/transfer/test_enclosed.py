@@ -350,6 +350,7 @@ def test_a_coat_over_the_shoulders_does_not_follow_the_arms_under_it(mannequin, 
     assert not tubes[np.abs(case.mesh.vertices[:, 0]) < 0.2].any()
 
 
+@pytest.mark.long
 def test_a_poncho_follows_no_forearm_under_it(mannequin, worn):
     """Its sides had up to 0.6 of the forearms' weight and came along as two bags."""
     case, names = worn("poncho"), mannequin.body.joint_names
@@ -429,6 +430,7 @@ def test_a_dress_cut_along_texture_seams_stays_closed(mannequin, worn):
     assert np.abs(found - whole[source]).max() < 1e-6
 
 
+@pytest.mark.long
 def test_the_same_surface_by_other_triangles_has_about_the_same_weights(mannequin, worn):
     case = worn("mini skirt")
     config = TransferConfig.for_label("lower")

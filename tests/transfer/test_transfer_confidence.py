@@ -96,6 +96,7 @@ def test_the_back_of_a_hand_is_no_match_for_the_cloth_before_its_palm():
     assert beside["mean"] < away["mean"] + 1.0  # mm; it was twice as much
 
 
+@pytest.mark.long
 def test_a_wide_sleeve_before_the_hip_follows_the_arm(mannequin, wardrobe):
     case = scan(mannequin, wardrobe["wide sleeves"], "mean", "A", seed=0)
     ours = error(mannequin, case, TransferConfig.for_label("upper"))

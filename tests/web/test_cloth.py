@@ -100,6 +100,7 @@ def test_constraints_are_those_of_the_driver(dressed):
 
 
 @pytest.mark.parametrize("config", [replace(QUICK, ramp=0.0, hold=0.0), DriverConfig()], ids=["at once", "cold"])
+@pytest.mark.long
 def test_the_skirt_moves_as_with_the_runtime(dressed, config):
     """To the bit while the rounding is the same, and to half a millimetre after what chaos makes of it in 1.2 s."""
     steps = [(k, 1.0 / FPS) for k in range(24)]
@@ -203,6 +204,7 @@ def told(numbers: dict[str, Any]) -> Callable[[dict[str, Any]], None]:
     return lambda about: about.update(simulation=numbers)
 
 
+@pytest.mark.long
 def test_the_page_and_the_runtime_step_clothes_by_the_numbers_of_the_bundle(dressed, tmp_path):
     """Eighteen of them stood in TypeScript a second time."""
     usual_numbers, others = asdict(DriverConfig()), asdict(OTHERS)

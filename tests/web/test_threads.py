@@ -142,6 +142,7 @@ def test_without_its_threads_a_page_goes_on_alone_and_says_so(browser, server, a
 
 
 @IN_BROWSER
+@pytest.mark.long
 def test_simulated_clothes_take_no_harm(browser, tmp_path):
     """Their driver shares the kernels' memory; with threads they hang as without."""
     path = tmp_path / "dressed.avatar"

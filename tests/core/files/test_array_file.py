@@ -34,6 +34,7 @@ def stored_arrays() -> st.SearchStrategy[np.ndarray]:
 
 
 @given(stored_arrays(), st.booleans())
+@pytest.mark.long
 def test_what_numpy_writes_comes_back(tmp_path_factory, array, fortran):
     folder = tmp_path_factory.getbasetemp()
     array = np.asfortranarray(array) if fortran else array

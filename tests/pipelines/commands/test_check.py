@@ -170,6 +170,7 @@ def test_a_rigged_file_is_driven_by_its_own_joints_and_its_planted_faults_are_fo
     assert found(report, "bind matrices without an inverse")[0]["value"] == 1 and not found(report, "stretched")
 
 
+@pytest.mark.long
 def test_a_rig_that_is_no_person_is_checked_without_poses(tmp_path, capsys):
     worn = in_a_shirt(open_body_template())
     keep = ("pelvis", "spine1", "left_hip")

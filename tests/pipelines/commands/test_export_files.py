@@ -98,6 +98,7 @@ def test_a_folder_gets_a_file_a_frame_and_their_times(folder, tmp_path, capsys):
     assert "notes.txt" in export(capsys, folder / "me.avatar", *options)["error"]["received"]
 
 
+@pytest.mark.long
 def test_loose_clothes_of_a_motion_are_simulated(tmp_path, capsys):
     write_dressed(tmp_path)
     swing = BodyParams.concatenate([replace(swaying(k / 20.0), fps=None) for k in range(3)])

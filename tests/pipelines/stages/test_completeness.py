@@ -63,6 +63,7 @@ def test_a_scan_without_its_head_fails_and_the_head_is_named(whole):
     assert checks[ENDS].status == "pass" and checks[SCAN].status == "pass"
 
 
+@pytest.mark.long
 def test_the_left_half_alone_fails_and_what_is_lost_is_named(whole):
     x, _ = middle_of(whole[2])
     checks, numbers = checked(whole, kept=x > 0)

@@ -87,6 +87,7 @@ def test_label_maps_are_ours_and_255_elsewhere(tmp_path, solver, plain):
     np.testing.assert_array_equal(ours == 0, np.isin(theirs, (1, 6)))  # skin, and what is on it
 
 
+@pytest.mark.long
 def test_votes_label_the_scan_unless_a_file_is_named(tmp_path, solver):
     labels = FIXTURE / "scans" / "scan_000000_labels.npz"
     register_capture(tmp_path / "votes", inputs_of())
@@ -195,6 +196,7 @@ def test_no_frame_at_all_is_an_error(tmp_path, monkeypatch, asked, plain):
     assert not (tmp_path / REGISTER_STAGE).exists()
 
 
+@pytest.mark.long
 def test_it_is_skipped_while_nothing_changed(tmp_path, capture, solver, monkeypatch):
     run = tmp_path / "run"
     shutil.rmtree(capture / "scans")
@@ -216,6 +218,7 @@ def test_it_is_skipped_while_nothing_changed(tmp_path, capture, solver, monkeypa
 # --- what is wrong with the inputs, and the rest goes on ------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_damaged_mask_and_a_damaged_scan_are_named_and_the_rest_goes_on(tmp_path, capture, solver):
     (capture / "masks" / "Cam002" / "Cam002_mask000001.png").write_bytes(b"no picture")
     (capture / "scans" / "scan_000001.ply").write_bytes(b"no scan")

@@ -140,6 +140,7 @@ def test_a_stopped_training_resumes_bit_for_bit(stage, frames, tmp_path):
 
 
 @pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.long
 def test_the_loss_goes_down(stage, frames):
     task = (
         make(stage, frames, iterations=30, null_share=0.0) if stage != "teacher" else make(stage, frames, iterations=30)
@@ -364,6 +365,7 @@ def test_a_pixel_is_what_one_covers_at_the_person(frames):
     assert pixel_size(frames) == pytest.approx(2.2 / camera.K[0, 0], rel=0.05)
 
 
+@pytest.mark.long
 def test_the_functions_train_from_the_seed_and_hand_the_avatar_on(frames, tmp_path):
     """Whatever torch's random numbers were before, and they stay as they were."""
     found = []

@@ -64,6 +64,7 @@ def stored(name: str) -> dict:
     return json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text())["figures"]
 
 
+@pytest.mark.long
 def test_memory_is_foretold_within_a_third_of_what_was_measured():
     found = foretell_memory(TrainConfig().recipe("paper"), megapixels=3.0, images=4)
     measured = stored("gpu")["parts"]["paper_step"]["found"]["gpu_memory_gib"]
@@ -76,6 +77,7 @@ def test_memory_is_foretold_within_a_third_of_what_was_measured():
         assert found.host + found.device == pytest.approx(measured, rel=1 / 3)
 
 
+@pytest.mark.long
 def test_more_gaussians_pixels_and_views_need_more_memory():
     def most(megapixels=1.0, **options):
         found = foretell_memory(TrainConfig(**options).recipe("gpu"), megapixels=megapixels, images=100)

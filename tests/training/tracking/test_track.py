@@ -75,11 +75,13 @@ def test_the_swing_is_found(frames, track):
         assert error(frames, frame, track.displacements(frame)) < 0.5 * error(frames, frame)
 
 
+@pytest.mark.long
 def test_the_template_is_the_surface_of_its_own_frame(frames, tmp_path):
     found, _ = follow_surface(frames, painted(), replace(CONFIG, reference=2), Session(tmp_path))
     assert not found.displacements(2).any() and found.displacements(1).any()
 
 
+@pytest.mark.long
 def test_with_a_prior_the_body_stays_and_the_dress_swings(frames, track, tmp_path):
     found, _ = follow_surface(frames, painted(), replace(CONFIG, body_motion_weight=2.0), Session(tmp_path))
     body = ~torch.tensor(template().cloth_mask)
@@ -219,6 +221,7 @@ def test_networks_learn_what_was_followed_before_they_render(frames, track):
     assert np.mean(losses[-2:]) < 0.93 * np.mean(losses[:2])
 
 
+@pytest.mark.long
 def test_the_teacher_follows_first_within_its_time(frames, tmp_path):
     config = FitTeacherConfig(
         iterations=3,
