@@ -136,7 +136,10 @@ class Page:
 
     def go(self, address: str) -> None:
         """Open a page and wait until its player is there and has opened what it was given."""
+        # A page that is opened again at its own address answers for the new one until that is there.
+        self.evaluate("window.left = true")
         self.send("Page.navigate", url=address)
+        self.until("!window.left", "the page is not left")
         self.evaluate(
             "new Promise(done => { const look = () => window.smplxppPlayer || document.querySelector('.failed')"
             " ? done() : setTimeout(look, 50); look(); }).then(() => window.smplxppPlayer?.ready)"

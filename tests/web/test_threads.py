@@ -127,12 +127,11 @@ def test_an_isolated_page_shares_its_poses_among_threads(browser, server, alone)
 def test_without_its_threads_a_page_goes_on_alone_and_says_so(browser, server, alone, kind):
     opened(browser, server, _LOST[kind])
     end = time.monotonic() + PATIENCE
-    # Loss and count come from one reading, because the page may show another frame between two.
-    while (state := threads(browser))["lost"] is None:
+    while threads(browser)["lost"] is None:
         assert time.monotonic() < end, "nobody has missed the threads"
         for frame, expected in zip((0, 4), alone, strict=True):
             np.testing.assert_array_equal(browser.picture(asked(camera(), frame)), expected)
-    assert state["count"] == 1
+    assert threads(browser)["count"] == 1
     np.testing.assert_array_equal(browser.picture(asked(camera(), 4)), alone[1])
     browser.evaluate("smplxppPlayer.player.playing = true")
     while "1 thread, the others failed" not in browser.evaluate("document.querySelector('.rates').textContent"):
