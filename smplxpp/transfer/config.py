@@ -57,7 +57,7 @@ class TransferConfig:
             one arm or leg alone (`enclosed_by_one`) gradually takes the mean weights of that limb's skin at its place.
         hanging: widths of a skirt, as distance off the legs by height below the waist with its folds smoothed out,
             between which it becomes a wide one, of which the pelvis keeps a share (`cloth_before_legs`). From 0.2 on
-            the benchmark's garments are a little nearer, and the embedded person's skirt is half as far again off in a
+            the benchmark's garments are a little nearer, and the embedded person's skirt is twice as far off in a
             squat. None: whatever hangs before both legs is treated as the rest.
         anchor_length: `l` of the energy that inpaints the anchor weights, as a fraction of the source's extent. With a
             short length a skirt keeps a share of what its waist follows, a longer one continues the trend.
