@@ -8,7 +8,9 @@ pulled onto the body, and loose ones do not pull.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -72,6 +74,14 @@ class Gaps:
             spread[known] = np.hypot(0.5 * wide, tight)
         # Cloth is not inside the body.
         return Gaps(np.maximum(median, 0.0), spread)
+
+
+def in_order_of_frames(
+    distances: Sequence[tuple[int, np.ndarray, np.ndarray]],
+) -> tuple[Int64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
+    """Join places and distances of frames, which threads add in any order, by the number of the frame."""
+    _, places, values = zip(*sorted(distances, key=itemgetter(0)), strict=True)
+    return np.concatenate(places), np.concatenate(values)
 
 
 def bare_vertices(

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -26,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from smplxpp.core import OBJECT, SKIN, TriangleMesh
 from smplxpp.core.signed_distance import SignedDistanceField, barycentric_coordinates
-from smplxpp.register.clothing import Gaps
+from smplxpp.register.clothing import Gaps, in_order_of_frames
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.normal_equations import Equations, geman_mcclure
 from smplxpp.register.observations import RegisterConfig, ScanObservation
@@ -122,10 +121,7 @@ class ScanTerm:
     def estimate_gaps(self) -> None:
         """Estimate the gaps from the distances of the last step; a place needs 20 of them."""
         if self._distances:
-            # Frames may be added in any order, by several threads.
-            ordered = sorted(self._distances, key=itemgetter(0))
-            _, places, distances = zip(*ordered, strict=True)
-            place, distance = np.concatenate(places), np.concatenate(distances)
+            place, distance = in_order_of_frames(self._distances)
             self.gaps = Gaps.estimated(place, distance, len(self.gaps.median), least=20, tight=self.config.tight_m)
         self._distances = []
 

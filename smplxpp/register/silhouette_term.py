@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64, UInt8
@@ -29,7 +28,7 @@ from scipy.spatial import cKDTree
 from smplxpp.core import Camera, TriangleMesh
 from smplxpp.native import map_in_threads
 from smplxpp.raster import rasterize_mesh
-from smplxpp.register.clothing import Gaps
+from smplxpp.register.clothing import Gaps, in_order_of_frames
 from smplxpp.register.keypoint_term import projected
 from smplxpp.register.kinematics import BodyPoints, Kinematics, Posture
 from smplxpp.register.normal_equations import Equations, geman_mcclure
@@ -197,10 +196,7 @@ class SilhouetteTerm:
     def estimate_gaps(self) -> None:
         """Estimate the gaps from the distances of the last step; a vertex needs `least_sightings` of them."""
         if self._distances:
-            # Frames may be added in any order, by several threads.
-            ordered = sorted(self._distances, key=itemgetter(0))
-            _, places, distances = zip(*ordered, strict=True)
-            place, distance = np.concatenate(places), np.concatenate(distances)
+            place, distance = in_order_of_frames(self._distances)
             self.gaps = Gaps.estimated(
                 place, distance, len(self.index), least=self.least_sightings, tight=self.config.tight_m
             )
