@@ -19,12 +19,17 @@ from avatar.rig.rig import PosedAvatar
 from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import CACHE_BYTES, PretrainConfig, PretrainTask
-from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
+from avatar.training.engine.photometric_task import (
+    ALONE,
+    PhotometricConfig,
+    PhotometricTask,
+    TaskContext,
+    with_surface_normals,
+)
 from avatar.training.engine.resources import compile_networks, fixed_seed
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
 from avatar.training.tracking.config import TrackConfig
-from avatar.training.tracking.surface_normals import with_surface_normals
-from avatar.training.tracking.track import follow_surface
+from avatar.training.tracking.follow import follow_surface
 from smplxpp.core.spread import spread_inside
 
 

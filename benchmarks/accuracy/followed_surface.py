@@ -35,7 +35,7 @@ from avatar.rendering.avatar_view import render_view
 from avatar.training.engine.session import Session
 from avatar.training.presets import training_preset
 from avatar.training.tracking.config import TrackConfig
-from avatar.training.tracking.track import follow_surface
+from avatar.training.tracking.follow import follow_surface
 from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GAUSSIANS

@@ -14,6 +14,8 @@ SILHOUETTE = limits.SILHOUETTE
 DRIFT = Gate("mm", 15.0, 60.0, higher_is_better=False)
 """Round-trip drift of the tracked clothes, from the last frames back to the first. A jump of one pattern period is
 a few centimetres."""
+SEAM = Gate("mm", 10.0, 30.0, higher_is_better=False)
+"""Distance of two segments of the tracked clothes in frames that both have, 95th percentile over the vertices."""
 PSNR: Mapping[str, Gate] = {"novel_view": Gate("dB", 18.0, 16.0), "novel_pose": Gate("dB", 17.0, 15.0)}
 """PSNR over the person by kind of view; training views of a capture without held-out cameras count as novel views.
 

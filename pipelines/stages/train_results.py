@@ -18,7 +18,7 @@ from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progre
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.resources import peak_memory
 from avatar.training.engine.session import BACK, PRETRAIN, TRACK, Session
-from avatar.training.tracking.track import SIMULATED_FILE
+from avatar.training.tracking.follow import SEAMS_FILE, SIMULATED_FILE
 from pipelines.runs import gates
 from pipelines.runs.layout import KINDS, kind_name
 from pipelines.runs.stage import StageOutput
@@ -41,8 +41,9 @@ def keep_logs(work: Path, folder: Path) -> None:
         source = work / part / METRICS_FILE
         if source.is_file():
             shutil.copyfile(source, folder / name)
-    if (work / TRACK / SIMULATED_FILE).is_file():
-        shutil.copyfile(work / TRACK / SIMULATED_FILE, folder / SIMULATED_FILE)
+    for name in (SIMULATED_FILE, SEAMS_FILE):
+        if (work / TRACK / name).is_file():
+            shutil.copyfile(work / TRACK / name, folder / name)
 
 
 def write_model(path: Path, model: TeacherAvatar | Student) -> dict[str, Any]:
@@ -120,6 +121,7 @@ def _output(
         "held_out_cameras": held_out,
         "normals": _normals(sequence, folder),
         "simulated_clothes": read_json(folder / SIMULATED_FILE) if (folder / SIMULATED_FILE).is_file() else [],
+        "seams": read_json(folder / SEAMS_FILE) if (folder / SEAMS_FILE).is_file() else [],
         "convention": CONVENTION,
         "seconds_of_tracking": seconds[TRACK] + seconds[TRACK_BACK],
         **_followed(model),
@@ -160,6 +162,14 @@ def _checks(numbers: Mapping[str, Any], overlap: float) -> list[Check]:
     # Tracking forwards and back must return to the start; the distance is the drift.
     if "drift_mm" in numbers.get("followed", {}):
         checks.append(gates.DRIFT.check("clothes followed back to the first frame", numbers["followed"]["drift_mm"]))
+    # Segments that were tracked side by side must meet; those that did not were tracked again after their neighbours.
+    if numbers["seams"]:
+        again = [seam for seam in numbers["seams"] if seam["in_sequence"]]
+        widest = max([seam["p95_mm"] for seam in numbers["seams"] if not seam["in_sequence"]], default=0.0)
+        told = (
+            f"of {len(numbers['seams'])} seams, 95th percentile; {len(again)} segments tracked after their neighbours"
+        )
+        checks.append(gates.SEAM.check("clothes where segments of the tracking meet", widest, explanation=told))
     # The simulation that predicted the tracked frames must not tear.
     checks += all_checks([quality_from(one) for one in numbers["simulated_clothes"]], "prediction")
     # Check each measured kind of views: quality, gain since the start, loss by compression.

@@ -48,6 +48,12 @@ def template() -> Template:
     )
 
 
+def there_and_back(frame: int) -> int:
+    """The frame of the dance that a longer one shows: it dances back and forth."""
+    last = FRAMES - 1
+    return last - abs(frame % (2 * last) - last)
+
+
 @cache
 def dance() -> BodyParams:
     """The doll turns, walks a little, nods and smiles."""
@@ -76,22 +82,22 @@ def true_vertices(frame: int) -> np.ndarray:
 
 
 @cache
-def doll() -> Doll:
-    """Six frames; the last two and one camera are held out."""
+def doll(count: int = FRAMES) -> Doll:
+    """Six frames or more; the last two and one camera are held out."""
     return Doll(
         "dance",
         template(),
         cameras(),
         HELD_OUT,
-        params=tuple(dance().frame(frame) for frame in range(FRAMES)),
-        surfaces=tuple(true_vertices(frame) for frame in range(FRAMES)),
-        novel_frames=NOVEL_POSES,
+        params=tuple(dance().frame(there_and_back(frame)) for frame in range(count)),
+        surfaces=tuple(true_vertices(there_and_back(frame)) for frame in range(count)),
+        novel_frames=(count - 2, count - 1),
     )
 
 
-def write_dance(root: Path) -> Path:
+def write_dance(root: Path, count: int = FRAMES) -> Path:
     """Write the dance as a capture."""
-    return doll().write_capture(root)
+    return doll(count).write_capture(root)
 
 
 def write_dance_run(run: Path) -> Path:

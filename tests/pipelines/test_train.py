@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ from smplxpp.figures.drawings import read_strip
 from tests.cloth.persons import person
 from tests.dolls.dancing import HELD_OUT, template, write_dance_run
 from tests.dolls.skirted import write_skirted
+from tests.pipelines import training_runs
 from tests.pipelines.training_runs import QUICK, SMALL, STAGES, often, same_models, train
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -177,6 +179,19 @@ def test_a_limit_of_time_gives_a_model_and_the_same_command_goes_on(trained, fit
     assert "1 of 8 iterations" in json.loads(capsys.readouterr().out)["error"]["message"]
     assert train(fitted, capture) == 0
     assert same_models(fitted, trained) and not list(fitted.glob("*_work"))
+
+
+@pytest.mark.long
+def test_seams_of_a_motion_that_is_followed_in_segments_are_figures_with_a_check(fitted, capture, monkeypatch):
+    teacher = replace(QUICK.teacher, track=replace(QUICK.teacher.track, segment_frames=2))
+    monkeypatch.setattr(training_runs, "QUICK", replace(QUICK, teacher=teacher))
+    assert train(fitted, capture, "--until", "teacher") == 0
+    manifest = read_manifest(fitted / "80_teacher")
+    (seam,) = manifest["numbers"]["seams"]
+    assert seam["frame"] == 2 and seam["p95_mm"] >= seam["mean_mm"] >= 0.0
+    (check,) = [one for one in manifest["checks"] if "segments" in one["name"]]
+    assert check["value"] == (0.0 if seam["in_sequence"] else seam["p95_mm"])
+    assert manifest["numbers"]["seconds_of_tracking"] > 0.0 and (fitted / "80_teacher" / "track_seams.json").is_file()
 
 
 @pytest.mark.long

@@ -12,13 +12,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.data.sequence import FrameSequence, Item, camera_centers_of
+from avatar.data.sequence import AvatarSequence, FrameSequence, Item, camera_centers_of
 from avatar.data.views import View
 from avatar.gaussians import offset_penalty, scale_penalty, triangle_frames
 from avatar.losses.perceptual import PerceptualDistance
 from avatar.losses.reconstruction import ReconstructionWeights, Target, reconstruction_loss
 from avatar.metrics.view_quality import Box, ViewQuality, eight_bit, mean_quality, view_quality
 from avatar.models.learned_gaussians import LearnedGaussians
+from avatar.models.tracked_surface import SurfaceNormals, Track
 from avatar.rendering.avatar_view import Rendering, render_view
 from avatar.rig.rig import AvatarModel, PosedAvatar
 from avatar.training.engine.adam import LearningRates, OptimiserConfig, ParameterGroup, attribute_groups, pixel_size
@@ -294,3 +295,10 @@ class PhotometricTask(OptimizationTask[Item]):
 def photograph(view: View, background: Tensor) -> Target:
     """Return the view's own pixels as the target of a rendering."""
     return Target(view.composited(background), view.opacity(), view.normals)
+
+
+def with_surface_normals(context: TaskContext, sequence: AvatarSequence, track: Track | None) -> TaskContext:
+    """Return the context with normals of tracked clothes, if there is a track and the capture has no normal maps."""
+    if track is None or sequence.normal_maps:
+        return context
+    return replace(context, surface=SurfaceNormals(sequence, track))

@@ -76,9 +76,11 @@ class Board:
                 pause = min(1.5 * pause, 0.2)
             else:
                 pause = shortest
-                write_arrays(files[begun], compute(begun))
-                with suppress(OSError):
-                    files[begun].with_suffix(".claim").unlink()
+                try:
+                    write_arrays(files[begun], compute(begun))
+                finally:  # also after an error: the same process may continue
+                    with suppress(OSError):
+                        files[begun].with_suffix(".claim").unlink()
             if self.stop():
                 raise RefinementStoppedError(f"stopped in pass {name}")
         try:

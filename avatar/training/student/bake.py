@@ -23,13 +23,18 @@ from avatar.rig.rig import Pose, PosedAvatar
 from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.optimization_task import PretrainConfig
-from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
+from avatar.training.engine.photometric_task import (
+    ALONE,
+    PhotometricConfig,
+    PhotometricTask,
+    TaskContext,
+    with_surface_normals,
+)
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import PRETRAIN, Session
 from avatar.training.student.pretrain import DistillationTargets, PretrainFieldTask
 from avatar.training.student.regress_poses import regress_poses
-from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core.errors import require_at_least, require_between, require_choice
 
 

@@ -23,13 +23,18 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track
 from avatar.training.engine.adam import Adam, ParameterGroup, pixel_size
 from avatar.training.engine.loop import Progress
-from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
+from avatar.training.engine.photometric_task import (
+    ALONE,
+    PhotometricConfig,
+    PhotometricTask,
+    TaskContext,
+    with_surface_normals,
+)
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.engine.unseen import color_clothed_skin, hold_colors
 from avatar.training.student.prune import pruned_to
 from avatar.training.student.unseen_motion import on_drawn_face, with_held_face
-from avatar.training.tracking.surface_normals import with_surface_normals
 from smplxpp.core import InputError, require_at_least, require_between
 from smplxpp.core.spread import spread_inside
 

@@ -5,9 +5,8 @@ The loss, its terms and the schedule are described in `avatar.training.tracking`
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,23 +16,16 @@ from torch import Tensor
 
 from avatar.data.sequence import AvatarSequence, Item, camera_centers_of
 from avatar.data.views import View
-from avatar.gaussians.binding import BoundGaussians
 from avatar.gaussians.tensor_file import require_finite, require_like
 from avatar.models.tracked_surface import ControlCage, Track, TrackedAvatar
 from avatar.rendering.mesh_maps import vertex_normals
 from avatar.training.engine.adam import ParameterGroup
-from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, TaskContext
-from avatar.training.engine.processes import Distributed
-from avatar.training.engine.session import BACK, Session
 from avatar.training.tracking.cloth_prediction import ClothPrediction, Observed, simulate_controls
 from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track_uncertainty import expected_errors, structure_tensors, unobserved_weight
 from smplxpp.core import DEFAULT_FPS, InputError
-from smplxpp.core.files.atomic import atomic_write_text
 
-SIMULATED_FILE = "simulated_clothes.json"
-"""File in the session's folder: how well the clothes held whose simulation predicts the frames, part by part."""
 LEVEL_DECAY = 0.1
 """Learning rate at the end of a level, as a fraction of that at its start."""
 
@@ -55,6 +47,21 @@ class FramePriors:
     weight: Float[Tensor, "K 3 3"]
 
 
+@dataclass(frozen=True, eq=False)
+class FramesApart:
+    """Frames that one task solves apart from the others: a segment of the motion, or the backward pass.
+
+    Attributes:
+        order: the frames in the order in which they are solved.
+        prediction: of their displacements.
+        known: displacements and structure tensors of frames that were solved before, in their order.
+    """
+
+    order: Sequence[int]
+    prediction: ClothPrediction
+    known: Mapping[int, tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3 3"]]] = field(default_factory=dict)
+
+
 class TrackTask(PhotometricTask):
     """Tracks frame after frame: each starts from predictions of its nearest solved neighbours and takes all levels.
 
@@ -63,8 +70,7 @@ class TrackTask(PhotometricTask):
         avatar: the Gaussians on control points.
         config: of the tracking.
         context: of the training.
-        forward: a finished forward pass. The backward pass starts from its displacements of the first and the last
-            frame and ends in the reference frame.
+        apart: some of the frames; None: all training frames, outwards from the reference frame.
 
     Raises:
         InputError: a reference frame that is not a training frame.
@@ -79,21 +85,16 @@ class TrackTask(PhotometricTask):
         config: TrackConfig,
         context: TaskContext = ALONE,
         *,
-        forward: TrackTask | None = None,
+        apart: FramesApart | None = None,
     ) -> None:
         frames = sequence.train_frames
         if config.reference is not None and config.reference not in frames:
             raise InputError(
                 "tracking: reference", expected="a training frame, or None", received=f"frame {config.reference}"
             )
-        # Order: outwards from the reference frame; backwards from the ends to it.
-        first = frames[0] if config.reference is None else config.reference
-        self.order = sorted(frames, key=lambda frame: (abs(frame - first), frame))
-        self.ends: tuple[int, ...] = ()
-        if forward is not None:
-            self.ends = tuple(sorted({frames[0], frames[-1]} - {first}))
-            self.order = [frame for frame in reversed(self.order) if frame not in self.ends]
-        self.row = {frame: row for row, frame in enumerate(frames)}
+        self.order = outwards(frames, config) if apart is None else list(apart.order)
+        self.known = () if apart is None else tuple(apart.known)
+        self.row = {frame: row for row, frame in enumerate(sorted({*self.known, *self.order}))}
         # One optimiser run over all frames: `steps` iterations each. `lr_factor` is the rate itself, so that lr is 1.
         shared = PhotometricConfig(
             iterations=len(self.order) * config.steps,
@@ -107,19 +108,17 @@ class TrackTask(PhotometricTask):
             sequence, avatar, shared, [ParameterGroup("track", {"controls": avatar.controls}, 1.0)], context
         )
         self.avatar, self.track_config = avatar, config
-        self.prediction = _prediction(sequence, avatar.cage, config) if forward is None else forward.known_prediction()
+        self.prediction = _prediction(sequence, avatar.cage, config) if apart is None else apart.prediction
         self._priors: tuple[int, FramePriors] | None = None
         self._halved_views: tuple[int, dict[tuple[str, int], View]] = (-1, {})
         self._projections: dict[int, Tensor] = {}  # by row, see `_observed`
         # Results: displacements and structure tensors of all frames, a row each.
-        self.solved = torch.zeros(len(frames), avatar.cage.count, 3, device=sequence.device)
-        self.structure = torch.zeros(len(frames), avatar.cage.count, 3, 3, device=sequence.device)
+        self.solved = torch.zeros(len(self.row), avatar.cage.count, 3, device=sequence.device)
+        self.structure = torch.zeros(len(self.row), avatar.cage.count, 3, 3, device=sequence.device)
         self._unit = torch.eye(3, device=sequence.device)
         rig = sequence.rig
         self._normals = vertex_normals(rig.vertices, rig.faces)[avatar.cage.vertices]
-        for row in (self.row[frame] for frame in self.ends):
-            assert forward is not None
-            self.solved[row], self.structure[row] = forward.solved[row], forward.structure[row]
+        self.take({} if apart is None else apart.known)
 
     def micro_batches(self, iteration: int) -> Sequence[Item]:
         """Return the frame that is being tracked, with the cameras of this step."""
@@ -210,7 +209,7 @@ class TrackTask(PhotometricTask):
     def _compute_priors(self, frame: int) -> FramePriors:
         # Solved frames, with the directions that photographs determined there.
         solved: dict[int, tuple[Tensor, Observed | None]] = {}
-        for other in (*self.ends, *self.order[: self.order.index(frame)]):
+        for other in (*self.known, *self.order[: self.order.index(frame)]):
             row = self.row[other]
             solved[other] = (self.solved[row], partial(self._observed, row))
         # Structure tensors of this frame are taken about its predicted start, where its photographs are compared
@@ -271,12 +270,24 @@ class TrackTask(PhotometricTask):
             own.copy_(tensors[name])
         self._priors, self._projections = None, {}
 
-    def known_prediction(self) -> ClothPrediction:
-        """Return the predictor with the reference frame's displacements, for the backward pass that ends there."""
-        reference = self.track_config.reference
-        if reference is None:
-            return self.prediction
-        return replace(self.prediction, offset=self.solved[self.row[reference]])
+    def found_in(self, frames: Sequence[int]) -> dict[int, tuple[Tensor, Tensor]]:
+        """Return displacements (K, 3) and structure tensors (K, 3, 3) of frames."""
+        return {frame: (self.solved[self.row[frame]], self.structure[self.row[frame]]) for frame in frames}
+
+    def take(self, found: Mapping[int, tuple[Tensor, Tensor]]) -> None:
+        """Take up displacements and structure tensors of frames that other tasks have solved."""
+        for frame, (solved, structure) in found.items():
+            self.solved[self.row[frame]], self.structure[self.row[frame]] = solved, structure
+
+    def backward(self) -> FramesApart:
+        """Return the frames from the last ones, whose displacements are taken over, back to the reference frame."""
+        frames, first, reference = self.sequence.train_frames, self.order[0], self.track_config.reference
+        ends = tuple(sorted({frames[0], frames[-1]} - {first}))
+        # The displacements of the reference frame are known, and the backward pass ends there.
+        offset = None if reference is None else self.solved[self.row[reference]]
+        prediction = self.prediction if offset is None else replace(self.prediction, offset=offset)
+        order = [frame for frame in reversed(self.order) if frame not in ends]
+        return FramesApart(order, prediction, self.found_in(ends))
 
     def track(self) -> Track:
         """Return the tracked surface: displacements relative to the reference frame's, and their expected errors.
@@ -307,6 +318,12 @@ class TrackTask(PhotometricTask):
         return (back.solved[row] - self.solved[row]).norm(dim=-1)
 
 
+def outwards(frames: Sequence[int], config: TrackConfig) -> list[int]:
+    """Return the training frames in the order in which they are solved: outwards from the reference frame."""
+    first = frames[0] if config.reference is None else config.reference
+    return sorted(frames, key=lambda frame: (abs(frame - first), frame))
+
+
 def _prediction(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig) -> ClothPrediction:
     """Return the predictor, with simulated clothes where the configuration and the capture allow them."""
     # A simulation needs time between frames, and a reference frame in which the garment's shape is known.
@@ -316,49 +333,3 @@ def _prediction(sequence: AvatarSequence, cage: ControlCage, config: TrackConfig
         reference = poses[config.reference].without_shape()
         simulated = simulate_controls(sequence.rig.template, poses, fps, reference=reference, controls=cage.vertices)
     return ClothPrediction(config.extrapolation, simulated, config.reference, fps=fps or DEFAULT_FPS)
-
-
-def follow_surface(
-    sequence: AvatarSequence, gaussians: BoundGaussians, config: TrackConfig, session: Session
-) -> tuple[Track, Progress]:
-    """Track the surface through all training frames, and back where `TrackConfig.back` is set.
-
-    Steps have one frame each, so that the first of several processes tracks and sends its results to the others.
-
-    Args:
-        sequence: the training frames and views.
-        gaussians: on the template, fitted to the reference frame; they stay fixed.
-        config: of the tracking.
-        session: of the training; a stopped tracking continues from its checkpoint.
-
-    Returns:
-        The track and the progress of the steps.
-    """
-    # Steps on one process; its results go to the others.
-    count = min(config.control_points, len(sequence.rig.vertices))
-    avatar = TrackedAvatar(sequence.rig, gaussians, count, still_body=config.still_body)
-    context = replace(session.context, distributed=None)
-    # Forward pass.
-    task = TrackTask(sequence, avatar, config, context)
-    simulated = task.prediction.simulated
-    if simulated is not None and (session.distributed or Distributed()).first:
-        quality = [one.as_dict() for one in simulated.quality]
-        atomic_write_text(session.folder / SIMULATED_FILE, json.dumps(quality, indent=1))
-    progress = session.run_alone(lambda: task, task.config)
-    _share(task, session)
-    if not (config.back and progress.finished and len(sequence.train_frames) > 1):
-        return task.track(), progress
-    # Backward pass without the finest level, which measures drift.
-    backward = TrackTask(sequence, avatar, config.coarse(), context, forward=task)
-    after = session.after(progress).within(BACK).run_alone(lambda: backward, backward.config)
-    _share(backward, session)
-    found = replace(task.track(), drift=task.drift(backward)) if after.finished else task.track()
-    return found, replace(after, session_seconds=progress.session_seconds + after.session_seconds)
-
-
-def _share(task: TrackTask, session: Session) -> None:
-    """Send the first process's results to all processes."""
-    processes = session.distributed or Distributed()
-    first = processes.run_on_rank0(task.found)
-    for name, own in task.found().items():
-        own.copy_(first[name])

@@ -114,7 +114,8 @@ def _how(numbers: Mapping[str, Any]) -> str:
     processes, tracking, pretraining = (
         numbers[name] for name in ("processes", "seconds_of_tracking", "seconds_of_pretraining")
     )
-    before = f" The surface was followed through the frames first, in {tracking:.0f} s." if tracking else ""
+    parts = f", in {len(numbers['seams']) + 1} segments" if numbers.get("seams") else ""
+    before = f" The surface was followed through the frames first, in {tracking:.0f} s{parts}." if tracking else ""
     before += f" The networks were pretrained without rendering, in {pretraining:.0f} s." if pretraining else ""
     return (
         f"{numbers['iterations_done']:,} of {numbers['iterations']:,} iterations on "

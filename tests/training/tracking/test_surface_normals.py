@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from avatar.data.sequence import AvatarSequence
-from avatar.models.tracked_surface import ControlCage, Track
-from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask
-from avatar.training.tracking.surface_normals import SurfaceNormals, with_surface_normals
+from avatar.models.tracked_surface import ControlCage, SurfaceNormals, Track
+from avatar.training.engine.photometric_task import ALONE, PhotometricConfig, PhotometricTask, with_surface_normals
 from smplxpp.capture.files import FileSeries
 from tests.dolls.standing import opened, rig, still
 

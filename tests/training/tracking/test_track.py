@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,18 +22,21 @@ from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.optimization_task import PretrainConfig
+from avatar.training.engine.processes import join_processes
 from avatar.training.engine.session import Session
 from avatar.training.fit_teacher import FitTeacherConfig, PretrainTeacherTask, fit_teacher
 from avatar.training.tracking import track as tracking
 from avatar.training.tracking.cloth_prediction import SimulatedControls
 from avatar.training.tracking.config import Level, TrackConfig
-from avatar.training.tracking.track import TrackTask, follow_surface
+from avatar.training.tracking.follow import SEAMS_FILE, Segment, follow_surface, segments_of
+from avatar.training.tracking.track import TrackTask, outwards
 from avatar.training.tracking.track_uncertainty import unobserved_weight
 from smplxpp.core.errors import InputError
 from tests.dolls.dancing import gaussians, sequence, template, true_vertices, write_dance
 from tests.dolls.tiny import TINY_TEACHER
 from tests.dolls.toy import copied, same_state
 
+ROOT = Path(__file__).resolve().parents[3]
 CONFIG = TrackConfig(
     levels=(Level(1, 8, 1e-2), Level(0, 8, 6e-3)),
     control_points=24,
@@ -269,3 +278,110 @@ def test_without_a_frame_of_the_templates_nothing_is_subtracted(frames, tmp_path
 def test_a_reference_that_is_not_trained_on_is_refused(frames):
     with pytest.raises(InputError, match="frame 99"):
         TrackTask(frames, TrackedAvatar(frames.rig, gaussians(), 24), replace(CONFIG, reference=99))
+
+
+@pytest.fixture(scope="module")
+def long_dance(tmp_path_factory):
+    return sequence(write_dance(tmp_path_factory.mktemp("captures") / "long", 12))
+
+
+QUICK = replace(CONFIG, levels=(Level(0, 6, 6e-3),), segment_frames=5, run_in=3, seam=1.0, reference=1)
+
+
+def followed(frames, folder: Path, config: TrackConfig) -> torch.Tensor:
+    found, progress = follow_surface(frames, painted(), config, Session(folder))
+    assert progress.finished and progress.iteration == progress.iterations
+    return found.controls
+
+
+def seams(folder: Path) -> list:
+    return json.loads((folder / SEAMS_FILE).read_text())
+
+
+@pytest.fixture(scope="module")
+def in_segments(long_dance, tmp_path_factory) -> tuple[torch.Tensor, Path]:
+    """Ten frames in two segments, and the folder that one process left."""
+    folder = tmp_path_factory.mktemp("segments")
+    return followed(long_dance, folder, QUICK), folder
+
+
+@pytest.mark.parametrize("reference", [0, 37, 99])
+def test_segments_hold_every_frame_once_and_follow_each_other(reference):
+    config = TrackConfig(segment_frames=20, run_in=5, reference=reference)
+    first, *others = found = segments_of(range(100), config)
+    assert sorted(frame for one in found for frame in one.frames) == list(range(100))
+    assert first.frames == tuple(outwards(range(100), config)[:20]) and not first.run_in
+    for one in others:
+        assert len(one.frames) <= 20 and len(one.run_in) == 5
+        # The run-in ends beside the segment's first frame, within the neighbour that comes before it.
+        assert one.run_in[-1] in found[one.before].frames and abs(one.run_in[-1] - one.frames[0]) == 1
+        assert found.index(found[one.before]) < found.index(one)
+
+
+def test_a_motion_of_no_more_frames_than_a_segment_is_one():
+    assert segments_of(range(250), TrackConfig()) == [Segment(tuple(range(250)))]
+    assert len(segments_of(range(251), TrackConfig())) == 2
+
+
+@pytest.mark.long
+def test_segments_meet_at_the_seam(tmp_path, tmp_path_factory):
+    """A dress that swings by 3 cm: a segment finds it nearly where its neighbour has it, without a look at that."""
+    dance = sequence(write_dance(tmp_path_factory.mktemp("captures") / "longer", 14))
+    found = followed(dance, tmp_path, replace(CONFIG, segment_frames=7, run_in=4, seam=1.0))
+    (seam,) = seams(tmp_path)
+    assert seam["frame"] == 7 and seam["frames"] == 4 and not seam["in_sequence"]
+    assert found.any() and 0.0 < seam["mean_mm"] < seam["p95_mm"]
+    # A pixel of these cameras is 20 mm wide.
+    assert seam["mean_mm"] < 20.0
+
+
+@pytest.mark.long
+def test_a_segment_that_misses_its_neighbour_is_followed_after_it_to_the_same_bits(long_dance, in_segments, tmp_path):
+    whole = followed(long_dance, tmp_path / "whole", replace(QUICK, segment_frames=100))
+    found = followed(long_dance, tmp_path / "parts", replace(QUICK, seam=0.0))
+    assert [seam["in_sequence"] for seam in seams(tmp_path / "parts")] == [True]
+    assert torch.equal(found, whole) and not torch.equal(found, in_segments[0])
+
+
+def test_processes_share_segments_and_find_the_bits_of_one(long_dance, in_segments, tmp_path):
+    alone, folder = in_segments
+    # Another process has tracked the second segment, and this one finds it.
+    (tmp_path / "segments").mkdir()
+    for file in (folder / "segments").glob("*_0001.npz"):
+        shutil.copyfile(file, tmp_path / "segments" / file.name)
+    assert torch.equal(followed(long_dance, tmp_path, QUICK), alone)
+    assert (tmp_path / "segment_000").exists() and not (tmp_path / "segment_001").exists()
+
+
+@pytest.mark.long
+def test_segments_are_resumed_in_the_middle_of_one_bit_for_bit(long_dance, in_segments, tmp_path):
+    stops = 0
+    while not follow_surface(long_dance, painted(), QUICK, Session(tmp_path, max_seconds=0.2))[1].finished:
+        stops += 1
+    assert stops and torch.equal(followed(long_dance, tmp_path, QUICK), in_segments[0])
+
+
+@pytest.mark.slow
+def test_two_processes_follow_segments_to_the_bits_of_one(long_dance, in_segments, tmp_path):
+    """Two real ones, started by torchrun."""
+    alone, folder = in_segments
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*command, __file__, str(tmp_path)], env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    for rank in (0, 1):
+        np.testing.assert_array_equal(np.load(tmp_path / f"controls_{rank}.npy"), alone.numpy())
+    assert seams(tmp_path / "together") == seams(folder)
+
+
+if __name__ == "__main__":
+    with join_processes() as together:
+        made = Path(sys.argv[1])
+        if together.first:
+            write_dance(made / "capture", 12)
+        together.run_on_rank0(lambda: None)
+        session = Session(made / "together", distributed=together)
+        tracked, _ = follow_surface(sequence(made / "capture"), painted(), QUICK, session)
+        np.save(made / f"controls_{together.rank}.npy", tracked.controls.numpy())

@@ -16,7 +16,8 @@ from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.session import Session
 from avatar.training.tracking.cloth_prediction import CORRECTION_DECAY
 from avatar.training.tracking.config import Level
-from avatar.training.tracking.track import TrackTask, follow_surface
+from avatar.training.tracking.follow import follow_surface
+from avatar.training.tracking.track import TrackTask
 from avatar.training.tracking.track_uncertainty import (
     OBSERVED_GRADIENT,
     REFERENCE_SIGMA,
@@ -156,8 +157,8 @@ def test_the_backward_pass_starts_from_the_displacements_of_the_ends(dances, ref
     config = replace(PRIOR, reference=reference, prior_weight=0.0)
     forward = TrackTask(dances[STRIPED], avatar, config)
     forward.solved[:] = torch.randn(forward.solved.shape, generator=torch.Generator().manual_seed(1))
-    back = TrackTask(dances[STRIPED], avatar, config.coarse(), forward=forward)
-    assert (back.ends, back.order) == (ends, order) and back.config.iterations == len(order) * config.steps
+    back = TrackTask(dances[STRIPED], avatar, config.coarse(), apart=forward.backward())
+    assert (back.known, back.order) == (ends, order) and back.config.iterations == len(order) * config.steps
     nearest = min(ends, key=lambda end: abs(end - order[0]))
     torch.testing.assert_close(back.priors(order[0]).start, forward.solved[nearest])
     back.solved[reference] = forward.solved[reference] + torch.tensor([0.0, 0.03, 0.04])
