@@ -291,12 +291,16 @@ def _accepted(
         length = float(where.length[border].sum())
         dear = float(where.cost[border].sum()) / max(_LENGTH_COST * length, 1e-9)
         clamped = areas @ where.flat[own] > _CLAMPED * area and to_hand.min() < _CLAMPED_TOUCHES
-        if dear > _SMOOTH_BORDER or (length**2 > _LONG_BORDER * area and not (clamped and dear < _CLAMPED_BORDER)):
+        # Squared length of the border by area times its mean cost is 0.1 of backpacks and 0.2 of a stick that goes on
+        # smoothly into the fist about it, 1.5 and more of flaps, whose borders are long or smooth.
+        apart = dear * length**2 < 0.4 * area
+        if dear > _SMOOTH_BORDER and not apart:
+            continue
+        if length**2 > _LONG_BORDER * area and not (clamped and dear < _CLAMPED_BORDER):
             continue
         # What is off the hands is worn, from 150 cm2 on and beginning beside the body, where the other side of the
-        # person lacks two fifths of it, or where it stands 12 cm off her within folds: squared length of the border by
-        # area times its mean cost is 0.1 of backpacks, 1.5 and more of flaps, whose borders are long or smooth.
-        deep = where.distance[own].max() > 0.12 and dear * length**2 < 0.4 * area
+        # person lacks two fifths of it, or where it stands 12 cm off her.
+        deep = where.distance[own].max() > 0.12 and apart
         near = area > 150.0 and where.distance[own].min() < _WORN[0][1]
         if not held and not (near and (deep or areas @ where.lacked[own] > 0.4 * area)):
             continue

@@ -112,6 +112,19 @@ def test_a_folder_that_the_forearm_presses_is_found_on_both_sides_and_the_sleeve
     assert area[found & ~truth].sum() < 0.05 * area[truth].sum()
 
 
+@pytest.mark.long
+def test_a_stick_is_found_on_both_sides_of_the_fist_that_it_goes_on_smoothly_into(open_body, stance):
+    """One end of it was skin, because the short border at the fist lies in no fold, and no colour tells it."""
+    skin, stick = open_body.mesh(stance[1].vertices[0]), thing_mesh(Thing("stick", "left"), open_body, stance[1])
+    taken = simulate_scan(concatenate_meshes([skin, stick]), [], _COARSE)
+    mesh, area = taken.mesh, taken.mesh.face_areas
+    truth = (taken.face >= skin.face_count)[mesh.faces].sum(axis=1) >= 2
+    found = find_objects(mesh, open_body, stance[0])
+    assert area[found.faces & truth].sum() > 0.75 * area[truth].sum()
+    assert area[found.faces & ~truth].sum() < 0.05 * area[truth].sum()
+    assert len(found.notes) == 2
+
+
 @pytest.mark.parametrize("other", ["none", "of cloth", "in a hand"])
 def test_what_is_alike_at_both_arms_is_a_sleeve_unless_both_are_things(open_body, stance, other, monkeypatch):
     """One of a kimono's sleeves passed for a thing, because its border was shorter than the other's by a little."""

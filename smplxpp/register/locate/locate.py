@@ -13,7 +13,7 @@ from jaxtyping import Float, Integer, UInt8
 
 from smplxpp.body import BodyModel
 from smplxpp.body.named_poses import low_poses, rare_poses, standing_poses
-from smplxpp.core import HAIR, SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
+from smplxpp.core import HAIR, OBJECT, SKIN, BodyParams, MeshLike, TriangleMesh, as_mesh
 from smplxpp.core.errors import InputError, ProgressCallback, ignore_progress
 from smplxpp.register.kinematics import Kinematics
 from smplxpp.register.locate.decision import confidence_of, findings_of, is_doubtful, no_person, notes_of
@@ -194,7 +194,8 @@ def _settled(
 
 
 def _labelled(search: Search, best: Found, labeller: Labeller, *, colored: bool) -> Found:
-    """Fit a body with what is bare skin, and once more where the labels of the fitted body call something else skin.
+    """Fit a body with what is bare skin and without things that it holds or wears, and once more where the labels of
+    the fitted body call something else skin or a thing.
 
     A body that was fitted as clothed stays a centimetre or two within a person who is not, and what lies that far off
     it looks like clothes. Without colours it is therefore also fitted to the whole surface as skin: clothes show their
@@ -214,14 +215,17 @@ def _labelled(search: Search, best: Found, labeller: Labeller, *, colored: bool)
         known = labels[labels >= 0]
         if len(known) > _KNOWN * len(labels) and np.isin(known, (SKIN.id, HAIR.id)).all():
             return bare
-    skin = np.zeros(len(search.fine), bool)
+    skin, thing = np.zeros((2, len(search.fine)), bool)
     for _ in range(2):
         labels = labels_of(best)
-        if labels is None or np.mean((labels == SKIN.id) != skin) < _SAME:
+        if labels is None or np.mean((skin != (labels == SKIN.id)) | (thing != (labels == OBJECT.id))) < _SAME:
             break
-        skin = labels == SKIN.id
-        best = search.finished(best, skin)
-    return best
+        skin, thing = labels == SKIN.id, labels == OBJECT.id
+        # Hands and forearms were drawn onto the thing, and shape and shoulders after them.
+        rest = search.without(thing)
+        best = rest.finished(rest.measured(best.name, best.state), skin[~thing])
+    # Candidates are compared by what they explain of the whole surface.
+    return search.measured(best.name, best.state) if thing.any() else best
 
 
 _KNOWN, _SAME = 0.6, 0.03

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from smplxpp.core import ProgressCallback, TriangleMesh, require_at_least, rotvec_from_matrix
 from smplxpp.core.surface_points import SurfacePoints
@@ -172,7 +173,7 @@ class Search:
         distinct = self._distinct(tried)
         out = []
         for k, (_, name, state) in enumerate(distinct):
-            out.append(self._measured(name, self._dressed(state)))
+            out.append(self.measured(name, self._dressed(state)))
             self.progress("candidates", (k + 1) / len(distinct))
         if self.pinned is not None:
             self.pinned.make_robust()
@@ -184,7 +185,7 @@ class Search:
         rotations = np.tile(np.eye(3), (1, body.joint_count, 1, 1))
         center = center - body.v_template.mean(axis=0)
         state = BodyState(rotations, center[None], np.zeros(body.num_betas), np.zeros((1, body.num_expressions)))
-        return self._measured("rest", state)
+        return self.measured("rest", state)
 
     def finished(self, found: Found, skin: np.ndarray | None = None) -> Found:
         """Fit a candidate with its fingers to all points.
@@ -214,7 +215,21 @@ class Search:
             term.reach = float(reach)
             state = self._step(state, term, self.config.pose_prior, fingers=True)
             self.progress("fit", (k + 1) / steps)
-        return self._measured(name, state)
+        return self.measured(name, state)
+
+    def without(self, rows: Bool[np.ndarray, " N"]) -> Search:
+        """Return the search in which some of the points of `fine` do not exist, as those of a thing in a hand."""
+        rest = copy(self)
+        rest.fine = self.fine.select(np.flatnonzero(~rows)) if rows.any() else self.fine
+        return rest
+
+    def measured(self, name: str, state: BodyState) -> Found:
+        """Return a state as a candidate with its costs."""
+        posture = self.kinematics.posture(state, 0)
+        found = misfit(self.kinematics, self.outer, self.many, self.fine, posture)
+        vectors = rotvec_from_matrix(state.rotations[0, 1:_BODY_JOINTS]) / self.anatomy.spread[1:_BODY_JOINTS]
+        off = 0.0 if self.pinned is None else self.pinned.distance(self.kinematics, posture)
+        return Found(name, state, found, float((vectors**2).sum()), off)
 
     def _columns(self, joints: Sequence[int]) -> Columns:
         body = self.kinematics.body
@@ -246,14 +261,6 @@ class Search:
             term.reach = float(reach)
             state = self._step(state, term)
         return state
-
-    def _measured(self, name: str, state: BodyState) -> Found:
-        """Return a state as a candidate with its costs."""
-        posture = self.kinematics.posture(state, 0)
-        found = misfit(self.kinematics, self.outer, self.many, self.fine, posture)
-        vectors = rotvec_from_matrix(state.rotations[0, 1:_BODY_JOINTS]) / self.anatomy.spread[1:_BODY_JOINTS]
-        off = 0.0 if self.pinned is None else self.pinned.distance(self.kinematics, posture)
-        return Found(name, state, found, float((vectors**2).sum()), off)
 
     def _distance(self, state: BodyState) -> float:
         """Return the mean distance between body and surface, with that of the landmarks, metres."""

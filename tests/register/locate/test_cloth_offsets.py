@@ -94,6 +94,6 @@ def test_a_wide_shirt_and_wide_trousers_leave_the_body_where_it_is(body):
     dressed = TriangleMesh(naked.vertices + 0.04 * clothed[:, None] * naked.vertex_normals, naked.faces)
     config = LocateConfig(fine_points=2000, coarse_points=200, finish_steps=8)
     search = Search(kinematics, dressed, config, None, lambda what, share: None)
-    found = search.finished(search._measured("T", state))
+    found = search.finished(search.measured("T", state))
     moved = np.linalg.norm(kinematics.posture(found.state, 0).joints - posture.joints, axis=1)[:22]
     assert moved.mean() < 0.008
