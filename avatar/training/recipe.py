@@ -336,9 +336,10 @@ def memory_on(capture: Capture, recipe: Recipe, steps: Sequence[str]) -> dict[st
     """Return what some steps need on a capture, see `foretell_memory`."""
     cameras = [capture.cameras[name] for name in capture.splits.train_cameras]
     pixels = max(camera.width * camera.height for camera in cameras)
-    images = len(cameras) * len(capture.splits.train_frames)
-    found = foretell_memory(recipe, megapixels=1e-6 * pixels, images=images)
-    return {step: memory for step, memory in found.items() if step in steps}
+    frames = len(capture.splits.train_frames)
+    return foretell_memory(
+        recipe, megapixels=1e-6 * pixels, images=len(cameras) * frames, frames=max(frames, 1), steps=steps
+    )
 
 
 def note_missing_normals(capture: Capture, recipe: Recipe, steps: Sequence[str]) -> None:

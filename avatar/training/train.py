@@ -127,9 +127,9 @@ def train(
     # Checks that need the template, the capture and the recipe together; after them only work is left.
     steps = [step for step in STEPS if step not in ({"cloth"} if recipe.cloth is None else ())]
     check_training(scene, recipe, steps, pose_known=reference is not None)
-    if training.device.startswith("cuda"):
-        check_memory(memory_on(scene.capture, recipe, steps), training.device)
     how = config.refinement(wanted=refine == "on" or (refine == "auto" and has_estimated_params(capture)))
+    if training.device.startswith("cuda"):
+        check_memory(memory_on(scene.capture, replace(recipe, refine=how), steps), training.device)
     if how is not None:
         settings = {"refinement": how, "reference": scene.frame}
         work = lambda session, made: _refine(scene, how, session, made, training.device)  # noqa: E731

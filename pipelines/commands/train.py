@@ -227,8 +227,14 @@ class Train:
         kept = sum(cost.written_gb for cost in costs.values())
         recipe = recipe_of(options, tracked=refines)
         cached = 1.0 if self.cache_gib is None else self.cache_gib
-        memory = foretell_memory(recipe, megapixels=facts.megapixels, images=facts.images, cache_gib=cached)
-        memory = {step: one for step, one in memory.items() if step in steps}
+        memory = foretell_memory(
+            recipe,
+            megapixels=facts.megapixels,
+            images=facts.images,
+            frames=max(facts.frames, 1),
+            cache_gib=cached,
+            steps=steps,
+        )
         if not self.json:
             Console().print(cost_table(costs, "stage"))
             where = "GiB of the GPU" if gpu else "GiB more for steps"

@@ -214,7 +214,8 @@ def test_a_training_tells_its_cost_before_it_begins(tmp_path, capsys):
     facts = facts_of(capture, run=run)
     alone = training_costs(facts, Rates(), {"preset": "demo", "refine_poses": "on"}, gpu=False)
     assert answer["plan"] == {step: vars(cost) for step, cost in alone.items()} and answer["free_gb"] > 0
-    assert list(answer["memory_gib"]) == ["fit", "teacher", "bake", "compensate"]
+    # The tracking is told beside the teacher, whose stage it is a part of.
+    assert list(answer["memory_gib"]) == ["refine", "track", "fit", "teacher", "bake", "compensate"]
     assert all(0.0 < one["device"] < 2.0 and one["host"] > 1.0 for one in answer["memory_gib"].values())
     assert main([*words, "--until", "fit"]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -6,7 +6,7 @@ import ctypes
 import errno
 import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -114,8 +114,19 @@ class StageMemory:
     device: float
 
 
-def foretell_memory(recipe: Any, *, megapixels: float, images: int, cache_gib: float = 1.0) -> dict[str, StageMemory]:
+def foretell_memory(
+    recipe: Any,
+    *,
+    megapixels: float,
+    images: int,
+    frames: int = 1,
+    cache_gib: float = 1.0,
+    steps: Collection[str] | None = None,
+) -> dict[str, StageMemory]:
     """Return what the stages of a training need, by the name of their step; within a third of what was measured.
+
+    The tracking, "track", is a part of the teacher's stage. What it and the refinement of poses need are the tensors
+    that CUDA's operations were counted to hold; a CPU's losses hold fewer.
 
     Parameters take 16 bytes, with gradients and Adam's moments. What the teacher's networks keep for their backward
     pass is counted by passing shapes through them. A picture takes bytes a pixel of the person, who fills two fifths,
@@ -125,7 +136,9 @@ def foretell_memory(recipe: Any, *, megapixels: float, images: int, cache_gib: f
         recipe: a `Recipe`.
         megapixels: of an image.
         images: of all training frames.
+        frames: number of these frames.
         cache_gib: bound of the photographs in memory.
+        steps: names of the steps that are asked for; None: all.
     """
     preset, gib = recipe.preset, 2.0**30
     count = preset.fit.sampling.count
@@ -138,7 +151,7 @@ def foretell_memory(recipe: Any, *, megapixels: float, images: int, cache_gib: f
     basis = 2.0 * 3.0 * count * (shapes.head_shapes + shapes.body_shapes)
     # Known displacements of the frames; and gradients of activations beside them, measured 1.15 of what is kept.
     known = min(1.0 * gib, 16.0 * count * images)
-    device = {
+    device = _bytes_before_networks(recipe, 0.4e6 * megapixels, images=images, frames=frames) | {
         "fit": attributes + a_view,
         "teacher": 16.0 * learned + 1.15 * kept + attributes + preset.teacher.views * a_view + known,
         "bake": 4.0 * learned + attributes + preset.bake.views * a_view + known,
@@ -153,8 +166,35 @@ def foretell_memory(recipe: Any, *, megapixels: float, images: int, cache_gib: f
     return {
         step: StageMemory(host[step] / gib, own / gib)
         for step, own in device.items()
-        if step != "teacher" or recipe.teacher
+        if (step != "teacher" or recipe.teacher) and (steps is None or {"track": "teacher"}.get(step, step) in steps)
     }
+
+
+def _bytes_before_networks(recipe: Any, pixels: float, *, images: int, frames: int) -> dict[str, float]:
+    """Return the bytes of the tensors in the refinement of poses and in the tracking, where a recipe has them.
+
+    Args:
+        recipe: a `Recipe`.
+        pixels: of the person in an image.
+        images: of all training frames.
+        frames: number of these frames.
+    """
+    # Bytes a pixel: of a view whose structure tensor is taken; of a view that waits for its backward pass; of the view
+    # whose loss is computed, with SSIM; and of a photograph in 8 bits with its halved ones.
+    of_structure, of_view, of_loss, of_photograph = 210.0, 190.0, 1060.0, 4.0 * 4.0 / 3.0
+    found, a_gaussian = {}, 500.0
+    if recipe.refine is not None:
+        # One view of a frame at a time; as many frames at a time as torch has threads.
+        of_frame = of_structure * pixels + a_gaussian * recipe.refine.sampling.count
+        found["refine"] = torch.get_num_threads() * of_frame
+    if recipe.follows:
+        track, count = recipe.preset.teacher.track, recipe.preset.fit.sampling.count
+        step = of_loss * pixels + track.views * (of_view * pixels + a_gaussian * count)
+        # Displacements, structure tensors, the simulation's and the errors' covariances of all frames, in float32.
+        kept = 4.0 * (3 + 9 + 3 + 2 * 9) * track.control_points * frames
+        photographs = of_photograph * pixels * images / frames
+        found["track"] = step + kept + photographs + 100.0 * count
+    return found
 
 
 def _network_bytes(config: TeacherConfig, views: int) -> tuple[float, float]:
@@ -185,7 +225,6 @@ def check_memory(foretold: Mapping[str, StageMemory], device: str) -> None:
     Raises:
         InputError: a stage that needs half more than the GPU has. Less than that is a warning.
     """
-    # A refinement of poses alone is not foretold: it holds a picture at a time.
     if not device.startswith("cuda") or not foretold:
         return
     step, need = max(((step, one.device) for step, one in foretold.items()), key=lambda pair: pair[1])

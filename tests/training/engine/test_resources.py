@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -9,11 +10,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
+from avatar.data.views import View
 from avatar.models.networks.teacher import Teacher
+from avatar.models.tracked_surface import TrackedAvatar
 from avatar.training.engine.resources import (
     StageMemory,
     _Compiled,
@@ -22,7 +26,13 @@ from avatar.training.engine.resources import (
     foretell_memory,
 )
 from avatar.training.recipe import TrainConfig
+from avatar.training.refinement.config import RefineConfig
+from avatar.training.refinement.photometric import PhotometricLoss
+from avatar.training.tracking.config import Level
+from avatar.training.tracking.track import TrackTask
 from smplxpp.core.errors import InputError
+from tests.dolls.dancing import cameras as cameras_of_dance
+from tests.dolls.dancing import gaussians, sequence, write_dance
 from tests.dolls.tiny import TINY_TEACHER
 from tests.pretended_cuda import pretended_cuda
 
@@ -87,6 +97,61 @@ def test_more_gaussians_pixels_and_views_need_more_memory():
     assert all(more > usual[step] for step, more in most(megapixels=4.0).items())
     assert all(more > usual[step] for step, more in most(gaussians=540_000).items())
     assert list(most(teacher=False)) == ["fit", "bake", "compensate"]
+
+
+def allocated(work) -> int:
+    """The most bytes of torch's tensors that some work had at a time."""
+    with torch.profiler.profile(profile_memory=True) as profile:
+        work()
+    assert profile.profiler is not None and profile.profiler.kineto_results is not None
+    events = [(e.start_ns(), e.nbytes()) for e in profile.profiler.kineto_results.events() if e.name() == "[memory]"]
+    return max(itertools.accumulate(size for _, size in sorted(events)))
+
+
+def white_views(width: int, height: int) -> list[View]:
+    """Photographs on the pretended device by the cameras of the dance, all of them person."""
+    cameras = list(cameras_of_dance().values())[:4]
+    zoom = np.diag([width / cameras[0].width, height / cameras[0].height, 1.0])
+    sized = [replace(camera, width=width, height=height, K=zoom @ camera.K) for camera in cameras]
+    white = torch.full((height, width, 4), 255, dtype=torch.uint8).to("cuda")
+    return [View(camera, white[..., :3], white[..., 3]) for camera in sized]
+
+
+@pytest.mark.long
+def test_refinement_and_tracking_take_the_tensors_that_are_foretold(tmp_path, monkeypatch):
+    width, height = 450, 600
+    recipe = replace(TrainConfig(gaussians=2000).recipe("demo"), refine=RefineConfig())
+    track = replace(recipe.preset.teacher.track, control_points=24, levels=(Level(0, 2, 1e-3),), simulate=False)
+    preset = replace(recipe.preset, teacher=replace(recipe.preset.teacher, track=track))
+    # The person is taken to fill two fifths of an image.
+    images = {"megapixels": 2.5e-6 * width * height, "images": 16, "frames": 4}
+    found = foretell_memory(replace(recipe, preset=preset), **images, steps=("refine", "teacher"))
+    with pretended_cuda():
+        frames, views = sequence(write_dance(tmp_path / "dance"), device="cuda"), white_views(width, height)
+        # A frame of the refinement, of which there are as many at a time as threads.
+        loss = PhotometricLoss(frames.rig.faces, frames.background, recipe.refine)
+        bound, vertices = gaussians(recipe.refine.sampling.count).to(device="cuda"), frames.rig.skin(frames.pose(0))
+        one = partial(loss.linearize, bound, vertices.detach(), views, halvings=0)
+        assert found["refine"].device / torch.get_num_threads() == pytest.approx(allocated(one) / 2**30, rel=1 / 3)
+        # A step of the tracking.
+        avatar = TrackedAvatar(frames.rig, gaussians(2000).to(device="cuda"), track.control_points)
+        task = TrackTask(frames, avatar, replace(track, views=len(views)))
+        monkeypatch.setattr(task, "views", lambda item: views)
+        task.step(0)
+        assert found["track"].device == pytest.approx(allocated(partial(task.step, 1)) / 2**30, rel=1 / 3)
+
+
+def test_a_refinement_that_does_not_fit_a_gpu_is_refused_before_work():
+    recipe = replace(TrainConfig().recipe("gpu"), refine=RefineConfig())
+    large = {"images": 16, "frames": 1, "steps": ("refine",)}
+    with pretended_cuda():
+        check_memory(foretell_memory(recipe, megapixels=3.0, **large), "cuda")
+        with pytest.raises(InputError, match="for the stage refine"):
+            check_memory(foretell_memory(recipe, megapixels=1e4, **large), "cuda")
+        with pytest.raises(InputError, match="for the stage track"):
+            check_memory(
+                foretell_memory(recipe, megapixels=3.0, images=10**7, frames=10**6, steps=("teacher",)), "cuda"
+            )
 
 
 def test_a_gpu_with_too_little_memory_is_told_before_work(caplog):
