@@ -50,7 +50,9 @@ public:
     Constraints(const Model& model, const Forces& forces, float h) : m_(model) {
         const float over = 1.0f / (h * h), share = std::min(0.45f, float(forces.inner_friction) * h);
         const int32_t none = int32_t(m_.particles);
-        for (const Lanes& batch : in_batches<2>(m_.edge, m_.edges, m_.particles)) {
+        const std::vector<Lanes> of_edges = in_batches<2>(m_.edge, m_.edges, m_.particles);
+        edges_.reserve(of_edges.size());
+        for (const Lanes& batch : of_edges) {
             Edges& four = edges_.emplace_back();
             std::fill_n(four.i, kLanes, none), std::fill_n(four.j, kLanes, none);
             four.stretched = four.compressed = all_lanes(1);
@@ -74,7 +76,9 @@ public:
             for (int lane = 0; lane < kLanes; ++lane)
                 for (const int32_t end : {edges_[batch].i[lane], edges_[batch].j[lane]})
                     if (end < none) edge_of_[size_t(--first_edge_[size_t(end)])] = int32_t(batch);
-        for (const Lanes& batch : in_batches<4>(m_.hinge, m_.hinges, m_.particles)) {
+        const std::vector<Lanes> of_hinges = in_batches<4>(m_.hinge, m_.hinges, m_.particles);
+        hinges_.reserve(of_hinges.size());
+        for (const Lanes& batch : of_hinges) {
             Hinges& four = hinges_.emplace_back();
             four.stiff = all_lanes(1);
             for (int lane = 0; lane < kLanes; ++lane) {

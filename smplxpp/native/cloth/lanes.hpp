@@ -31,8 +31,14 @@ inline Vec4 all_lanes(float value) { return Vec4{value, value, value, value}; }
 inline Soa broadcast(Vec3 a) { return {all_lanes(a.x), all_lanes(a.y), all_lanes(a.z)}; }
 
 inline bool any(Mask4 mask) {
+#if defined(__wasm_simd128__)
+    return __builtin_wasm_any_true_v128((signed char __attribute__((vector_size(16))))mask);
+#elif defined(__SSE__)
+    return __builtin_ia32_movmskps((Vec4)mask) != 0;
+#else
     const auto halves = (int64_t __attribute__((vector_size(16))))mask;
     return (halves[0] | halves[1]) != 0;
+#endif
 }
 inline Vec4 select(Mask4 mask, Vec4 yes, Vec4 no) { return (Vec4)((mask & (Mask4)yes) | (~mask & (Mask4)no)); }
 

@@ -48,16 +48,22 @@ public:
     template <class Visit>
     void in(Block b, Visit&& visit) const {
         for (int32_t i = b.x; i <= b.x + 1; ++i)
-            for (int32_t j = b.y; j <= b.y + 1; ++j)
-                for (int32_t k = b.z; k <= b.z + 1; ++k) {
-                    const uint32_t at = key(i, j, k);
-                    if (first_[at] < first_[at + 1]) visit(first_[at], first_[at + 1]);
-                }
+            for (int32_t j = b.y; j <= b.y + 1; ++j) {
+                const uint32_t at = key(i, j, b.z);
+                const auto some = [&](uint32_t from, uint32_t to) {
+                    if (first_[from] < first_[to]) visit(first_[from], first_[to]);
+                };
+                if (at + 1 < kCells)
+                    some(at, at + 2);
+                else
+                    some(at, kCells), some(0, 1);
+            }
     }
 
 private:
     static constexpr uint32_t kCells = 1u << 12;
-    static uint32_t key(int32_t i, int32_t j, int32_t k) { return Block{i, j, k}.hash() & (kCells - 1); }
+    // Cells that lie one behind the other along z have keys that follow each other: their points are one range.
+    static uint32_t key(int32_t i, int32_t j, int32_t k) { return (Block{i, j, 0}.hash() + uint32_t(k)) & (kCells - 1); }
     static int32_t whole(float x) {  // far and broken points share a cell: a cast of them has no value
         const float down = std::floor(x);
         return down > -1e9f && down < 1e9f ? int32_t(down) : 0;
@@ -106,16 +112,18 @@ public:
         vertex_ = vertex;
         normals(vertex, face_, faces_, normal_);
         grid_.fill(vertex, int64_t(normal_.size()), kReach);
-        gathered_.assign(kGathered, {{0, 0, 0}, 0, -1});
-        used_ = 0;
-        // In the order of the grid, a coordinate a row: vertices of a cell are copied by fours.
-        const size_t count = normal_.size(), row = count + kLanes;
-        wide_.resize(count), sorted_.resize(kRows * row);
+        known_.assign(kKnown, {{0, 0, 0}, 0, -1});
+        ranges_.clear();
+        // In the order of the grid, a coordinate a row: vertices of a cell are read by fours. What is read behind the last one is
+        // infinitely far.
+        const size_t count = normal_.size();
+        row_ = count + kLanes;
+        wide_.resize(count), sorted_.assign(kRows * row_, INFINITY);
         for (size_t i = 0; i < count; ++i) {
             const size_t j = size_t(grid_.order()[i]);
             const Vec3 p = vertex[j], n = normal_[j];
             const float values[kRows] = {p.x, p.y, p.z, n.x, n.y, n.z};
-            for (size_t k = 0; k < kRows; ++k) sorted_[k * row + i] = values[k];
+            for (size_t k = 0; k < kRows; ++k) sorted_[k * row_ + i] = values[k];
             wide_[i] = widened(vertex[i]);
         }
     }
@@ -123,20 +131,21 @@ public:
 
     // The nearest vertex within reach that faces as the cloth does, -1: none.
     int32_t nearest(Vec3 p, Vec3 cloth_normal) {
-        const Gathered about = gather(grid_.block(p));
+        const Known about = about_block(grid_.block(p));
         int32_t near = -1;
         float best = kReach * kReach;
         const Soa place = broadcast(p), along = broadcast(cloth_normal);
         const Vec4 far = all_lanes(best);
         within_.clear();
-        for (int32_t k = about.begin; k < about.end; ++k) {
-            const Candidates& c = candidates_[size_t(k)];
-            const Soa d = place - c.place();
-            const Vec4 squared = dot(d, d);
-            if (!any(squared < far)) continue;
-            within_.push_back(k);
-            if (any(squared < best)) take(c, select(touched(c, along, d), squared, far), best, near);
-        }
+        // A four may end with vertices of a cell that comes elsewhere, or has come: they count as they do there.
+        for (int32_t r = about.begin; r < about.end; ++r)
+            for (int32_t k = ranges_[size_t(r)].begin; k < ranges_[size_t(r)].end; k += kLanes) {
+                const Soa d = place - four(0, k);
+                const Vec4 squared = dot(d, d);
+                if (!any(squared < far)) continue;
+                within_.push_back(k);
+                if (any(squared < best)) take(k, select(touched(four(3, k), along, d), squared, far), best, near);
+            }
         return near;
     }
     // The same of the place that was last asked for, among vertices that face against a normal: the other side of a fold.
@@ -146,11 +155,11 @@ public:
         const Soa place = broadcast(p), along = broadcast(cloth_normal), against = broadcast(normal);
         const Vec4 far = all_lanes(best);
         for (const int32_t k : within_) {
-            const Candidates& c = candidates_[size_t(k)];
-            const Mask4 faces = dot(c.normal(), against) <= 0;
+            const Soa normal_of = four(3, k);
+            const Mask4 faces = dot(normal_of, against) <= 0;
             if (!any(faces)) continue;
-            const Soa d = place - c.place();
-            take(c, select(touched(c, along, d) & faces, dot(d, d), far), best, near);
+            const Soa d = place - four(0, k);
+            take(k, select(touched(normal_of, along, d) & faces, dot(d, d), far), best, near);
         }
         return near;
     }
@@ -183,53 +192,39 @@ public:
 
 private:
     static constexpr size_t kRows = 6;  // of a place and a normal
-    // Four vertices of a block of the grid side by side; lanes that stay empty are infinitely far.
-    struct Candidates {
-        alignas(16) float at[kRows][kLanes];
-        int32_t vertex[kLanes];
-        Soa place() const { return {load(0), load(1), load(2)}; }
-        Soa normal() const { return {load(3), load(4), load(5)}; }
-        Vec4 load(size_t k) const {
-            Vec4 out;
-            std::memcpy(&out, at[k], sizeof out);
-            return out;
-        }
+    struct Range {
+        int32_t begin, end;
     };
-    struct Gathered {
+    // A block of the grid, and which ranges of the vertices' order are its cells; end is -1 where none is known.
+    struct Known {
         Grid::Block block;
-        int32_t begin, end;  // among the candidates; -1: nothing was gathered
+        int32_t begin, end;
     };
-    // The vertices of a block; places that lie together share them.
-    const Gathered& gather(Grid::Block block) {
-        Gathered& known = gathered_[block.hash() & (kGathered - 1)];
+    // The ranges of a block; places that lie together share them.
+    const Known& about_block(Grid::Block block) {
+        Known& known = known_[block.hash() & (kKnown - 1)];
         if (known.end >= 0 && known.block == block) return known;
-        const int32_t begin = used_;
-        int lane = kLanes;
-        const size_t row = normal_.size() + kLanes;
-        grid_.in(block, [&](int32_t first, int32_t last) {
-            for (int32_t i = first; i < last; ++i) {
-                if (lane == kLanes) {
-                    if (size_t(++used_) > candidates_.size()) candidates_.emplace_back();
-                    std::fill_n(candidates_[size_t(used_ - 1)].at[0], kLanes, INFINITY);
-                    lane = 0;
-                }
-                Candidates& c = candidates_[size_t(used_ - 1)];
-                for (size_t k = 0; k < kRows; ++k) c.at[k][lane] = sorted_[k * row + size_t(i)];
-                c.vertex[lane] = grid_.order()[size_t(i)];
-                ++lane;
-            }
-        });
-        return known = {block, begin, used_};
+        const int32_t begin = int32_t(ranges_.size());
+        grid_.in(block, [&](int32_t first, int32_t last) { ranges_.push_back({first, last}); });
+        return known = {block, begin, int32_t(ranges_.size())};
+    }
+    // Three rows of four vertices from one on in the grid's order: from 0 their places, from 3 their normals.
+    Soa four(size_t row, int32_t from) const {
+        Soa out;
+        const float* at = sorted_.data() + row * row_ + size_t(from);
+        std::memcpy(&out.x, at, sizeof out.x), std::memcpy(&out.y, at + row_, sizeof out.y);
+        std::memcpy(&out.z, at + 2 * row_, sizeof out.z);
+        return out;
     }
 
     // Skin that faces the cloth's outer side, an arm that lies on a flank, makes no contact with cloth that lies in it; cloth
     // before it stays there, whichever way its folds look.
-    static Mask4 touched(const Candidates& c, Soa along, Soa d) {
-        return (dot(c.normal(), along) > kCovers) | (dot(c.normal(), d) > -kShallow);
+    static Mask4 touched(Soa normal, Soa along, Soa d) {
+        return (dot(normal, along) > kCovers) | (dot(normal, d) > -kShallow);
     }
-    static void take(const Candidates& c, Vec4 squared, float& best, int32_t& near) {
+    void take(int32_t from, Vec4 squared, float& best, int32_t& near) const {
         for (int lane = 0; lane < kLanes; ++lane)
-            if (squared[lane] < best) best = squared[lane], near = c.vertex[lane];
+            if (squared[lane] < best) best = squared[lane], near = grid_.order()[size_t(from + lane)];
     }
 
     // Looks for a place nearer than the best on the faces of a vertex; says whether there is one.
@@ -258,7 +253,7 @@ private:
         return nearer;
     }
 
-    static constexpr uint32_t kGathered = 1u << 11;  // blocks that are remembered
+    static constexpr uint32_t kKnown = 1u << 11;  // blocks that are remembered
     static constexpr int kSteps = 8;          // from one vertex's faces to the next one's
     static constexpr float kReach = 0.035f;   // metres within which a vertex is found
     static constexpr float kClear = 0.01f;    // metres before a vertex
@@ -270,12 +265,12 @@ private:
     std::vector<Vec3> normal_;
     std::vector<int32_t> first_, at_;
     Grid grid_;
-    std::vector<float> sorted_;  // kRows of the vertices in the grid's order
+    std::vector<float> sorted_;  // kRows of the vertices in the grid's order, each of row_ floats
+    size_t row_ = 0;
     std::vector<Vec4> wide_;     // the vertices
-    std::vector<Gathered> gathered_;
-    std::vector<Candidates> candidates_;
-    int32_t used_ = 0;             // of the candidates
-    std::vector<int32_t> within_;  // candidates of whom one was within reach of the place that was last asked for
+    std::vector<Known> known_;
+    std::vector<Range> ranges_;
+    std::vector<int32_t> within_;  // fours of whom one was within reach of the place that was last asked for
 };
 
 }  // namespace smplxpp

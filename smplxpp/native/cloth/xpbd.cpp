@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "cloth/constraints.hpp"
@@ -23,8 +24,10 @@ using smplxpp::dot;
 using smplxpp::Forces;
 using smplxpp::Grid;
 using smplxpp::length;
+using smplxpp::Mask4;
 using smplxpp::Model;
 using smplxpp::narrowed;
+using smplxpp::Soa;
 using smplxpp::Surface;
 using smplxpp::Vec3;
 using smplxpp::Vec4;
@@ -47,9 +50,9 @@ void at_time(const float* const* moments, int64_t count, float t, Vec3* out) {
 class Solver {
 public:
     Solver(const Model& m, const Forces& f, Vec3* position, Vec3* velocity)
-        : m_(m), f_(f), position_(position), velocity_(velocity), n_(size_t(m.particles)), x_(n_ + 1), v_(n_ + 1), before_(n_),
+        : m_(m), f_(f), position_(position), velocity_(velocity), n_(size_t(m.particles)), x_(n_ + 1), v_(n_ + 1), before_(n_ + 1),
           place_(n_), normal_(n_),
-          skin_(size_t(m.collider_vertices)), skin_before_(skin_.size()),
+          skin_(size_t(m.collider_vertices) + 1), skin_before_(skin_.size()),
           surface_(m.collider_vertices, m.collider_face, m.collider_faces) {}
 
     void advance(const Moments& moments, float seconds, int32_t substeps, int32_t contacts_every) {
@@ -113,7 +116,7 @@ private:
             const Vec3 d = velocity_[i] * seconds - mean;
             most = std::max(most, dot(d, d));
         }
-        for (size_t i = 0; i < skin_.size(); ++i) {
+        for (size_t i = 0; i < size_t(m_.collider_vertices); ++i) {
             const Vec3 d = way(moments.collider[1], moments.collider[2], i) - mean;
             most = std::max(most, dot(d, d));
         }
@@ -152,8 +155,9 @@ private:
         }
         if (sweeps <= kFree || !f_.report) return;
         for (size_t k = 0; k < sides_; ++k) {
-            const Touch& at = touches_[k];
-            f_.report[0] += at.margin - dot(narrowed(x_[at.particle]) - place_on(skin_, at), at.normal) > kLetGo;
+            const Touches& four = touches_[k];
+            const Mask4 deep = four.margin - dot(places(x_, four) - place_on(skin_, four), four.normal) > kLetGo;
+            for (int lane = 0; lane < smplxpp::kLanes; ++lane) f_.report[0] -= deep[lane];
         }
         for (size_t i = 0; i < n_; ++i)
             f_.report[1] += w(int64_t(i)) == 0 && length(x_[i] - widened(place_[i])) > 1e-3f;
@@ -181,80 +185,117 @@ private:
     void find_contacts() {
         surface_.look(skin_.data());
         touches_.clear(), folds_.clear();
+        int side = smplxpp::kLanes, fold = smplxpp::kLanes;  // the next lane of either
         for (size_t i = 0; i < n_; ++i) {
             if (w(int64_t(i)) == 0) continue;
             const Vec3 p = narrowed(x_[i]), normal = narrowed(normal_[i]);
             const int32_t near = surface_.nearest(p, normal);
             if (near < 0) continue;
-            keep(i, surface_.find_from(near, p, normal), touches_);
+            keep(i, surface_.find_from(near, p, normal), touches_, side);
             // A lap, an armpit, a bent knee: cloth lies between two sides of the body that come together.
-            keep(i, surface_.find_from(surface_.nearest_against(surface_.normal(near), p, normal), p, normal), folds_);
+            keep(i, surface_.find_from(surface_.nearest_against(surface_.normal(near), p, normal), p, normal), folds_, fold);
         }
         sides_ = touches_.size();
         touches_.insert(touches_.end(), folds_.begin(), folds_.end());
     }
 
-    // A place of the collider that a particle touches. Corners and weights stay until contacts are looked for again, and so do
-    // the smooth normal there, the margin and the depth from which cloth is on the other side.
-    struct Touch {
-        size_t particle;
-        int32_t corner[3];
-        float weight[3];
-        Vec3 normal;
-        float margin, deepest;
+    // Places of the collider that four particles touch, a lane each. Corners and weights stay until contacts are looked for again,
+    // and so do the smooth normals there, the margins and the depths from which cloth is on the other side. Empty lanes have the
+    // particle n and a margin that nothing is within.
+    struct Touches {
+        int32_t particle[smplxpp::kLanes], corner[3][smplxpp::kLanes];
+        Vec4 weight[3];
+        Soa normal;
+        Vec4 margin, deepest;
     };
-    void keep(size_t particle, const Contact& contact, std::vector<Touch>& touches) {
+    // Puts a contact into the next lane; a particle comes once in the array, so that fours may be corrected at once.
+    void keep(size_t particle, const Contact& contact, std::vector<Touches>& touches, int& lane) {
         if (contact.face < 0) return;
-        Touch touch = {particle, {}, {}, {0, 0, 0}, 0, 0};
+        int32_t corner[3];
+        Vec3 normal = {0, 0, 0};
+        float margin = 0, deepest = 0;
         for (int j = 0; j < 3; ++j) {
-            const int32_t q = touch.corner[j] = m_.collider_face[3 * int64_t(contact.face) + j];
-            const float b = touch.weight[j] = contact.weight[j];
-            touch.normal = touch.normal + surface_.normal(q) * b;
-            touch.margin += m_.margin[q] * b;
-            touch.deepest += m_.deepest[q] * b;
+            const int32_t q = corner[j] = m_.collider_face[3 * int64_t(contact.face) + j];
+            const float b = contact.weight[j];
+            normal = normal + surface_.normal(q) * b;
+            margin += m_.margin[q] * b;
+            deepest += m_.deepest[q] * b;
         }
-        const float l = length(touch.normal);
+        const float l = length(normal);
         if (l < 1e-6f) return;
-        touch.normal = touch.normal * (1.0f / l);
-        touches.push_back(touch);
+        normal = normal * (1.0f / l);
+        if (lane == smplxpp::kLanes) {
+            Touches& none = touches.emplace_back();
+            std::fill_n(none.particle, lane, int32_t(n_));
+            none.margin = smplxpp::all_lanes(-INFINITY), lane = 0;
+        }
+        Touches& four = touches.back();
+        four.particle[lane] = int32_t(particle);
+        for (int j = 0; j < 3; ++j) four.corner[j][lane] = corner[j], four.weight[j][lane] = contact.weight[j];
+        four.normal.x[lane] = normal.x, four.normal.y[lane] = normal.y, four.normal.z[lane] = normal.z;
+        four.margin[lane] = margin, four.deepest[lane] = deepest;
+        ++lane;
     }
-    static Vec3 place_on(const std::vector<Vec3>& skin, const Touch& touch) {
-        Vec3 sum = {0, 0, 0};
-        for (int j = 0; j < 3; ++j) sum = sum + skin[size_t(touch.corner[j])] * touch.weight[j];
-        return sum;
+    // What is not a number passes comparisons that are turned around, and would move the particle of an empty lane.
+    static Mask4 taken(const Touches& four) { return four.margin > smplxpp::all_lanes(-INFINITY); }
+    static Soa places(const std::vector<Vec4>& x, const Touches& four) {
+        const int32_t* q = four.particle;
+        return smplxpp::columns(x[size_t(q[0])], x[size_t(q[1])], x[size_t(q[2])], x[size_t(q[3])]);
+    }
+    // The skin has one vertex more than there are, so that each can be read with the float behind it.
+    static Soa place_on(const std::vector<Vec3>& skin, const Touches& four) {
+        Soa corner[3];
+        for (int j = 0; j < 3; ++j) {
+            Vec4 at[smplxpp::kLanes];
+            for (int lane = 0; lane < smplxpp::kLanes; ++lane)
+                std::memcpy(&at[lane], &skin[size_t(four.corner[j][lane])], sizeof at[lane]);
+            corner[j] = smplxpp::columns(at[0], at[1], at[2], at[3]) * four.weight[j];
+        }
+        return corner[0] + corner[1] + corner[2];
     }
 
     // Out of the collider along its smooth normal; Coulomb's friction against its own motion. What lies deep comes out no faster
     // than `kOut` and the collider: at once it would fly.
     void touch() {
-        const float friction = float(f_.friction);
-        for (const Touch& at : touches_) {
-            const size_t i = at.particle;
-            Vec3 x = narrowed(x_[i]);
-            const Vec3 point = place_on(skin_, at);
-            const float height = dot(x - point, at.normal);
-            if (at.margin - height <= 0 || height < -at.deepest) continue;
-            const Vec3 skin_moved = point - place_on(skin_before_, at);
-            const float depth = std::min(at.margin - height, kOut + std::max(0.0f, dot(skin_moved, at.normal)) +
-                std::max(0.0f, dot(narrowed(before_[i]) - x, at.normal)));
-            x = x + at.normal * depth;
-            Vec3 slip = (x - narrowed(before_[i])) - skin_moved;
-            slip = slip - at.normal * dot(slip, at.normal);
-            const float way = length(slip);
-            if (way > 1e-9f) x = x - slip * std::min(1.0f, friction * depth / way);
-            x_[i] = widened(x);
+        const Vec4 friction = smplxpp::all_lanes(float(f_.friction)), zero = smplxpp::all_lanes(0), one = smplxpp::all_lanes(1);
+        const auto positive = [&](Vec4 a) { return smplxpp::select(a > zero, a, zero); };
+        const auto less = [](Vec4 a, Vec4 b) { return smplxpp::select(b < a, b, a); };
+        for (const Touches& four : touches_) {
+            const Soa x = places(x_, four), point = place_on(skin_, four), &normal = four.normal;
+            const Vec4 height = dot(x - point, normal);
+            const Mask4 touches = taken(four) & ~(four.margin - height <= zero) & ~(height < -four.deepest);
+            if (!smplxpp::any(touches)) continue;
+            const Soa before = places(before_, four), skin_moved = point - place_on(skin_before_, four);
+            const Vec4 depth = less(four.margin - height, smplxpp::all_lanes(kOut) + positive(dot(skin_moved, normal)) +
+                positive(dot(before - x, normal)));
+            Soa out = x + normal * depth, slip = (out - before) - skin_moved;
+            slip = slip - normal * dot(slip, normal);
+            const Vec4 way = smplxpp::length(slip);
+            const Mask4 slips = way > smplxpp::all_lanes(1e-9f);
+            const Vec4 stays = less(one, friction * depth / smplxpp::select(slips, way, one));
+            out = out - slip * smplxpp::select(slips, stays, zero);
+            put(out, touches, four);
         }
     }
 
     // The same without friction, between sweeps of the bound.
     void push(Constraints& constraints) {
-        for (const Touch& at : touches_) {
-            const size_t i = at.particle;
-            const float height = dot(narrowed(x_[i]) - place_on(skin_, at), at.normal);
-            if (at.margin - height <= 0 || height <= -at.deepest) continue;
-            x_[i] = x_[i] + widened(at.normal * std::min(kOut, at.margin - height));
-            constraints.moved(i);
+        const Vec4 zero = smplxpp::all_lanes(0), most = smplxpp::all_lanes(kOut);
+        for (const Touches& four : touches_) {
+            const Soa x = places(x_, four);
+            const Vec4 height = dot(x - place_on(skin_, four), four.normal), depth = four.margin - height;
+            const Mask4 touches = taken(four) & ~(depth <= zero) & ~(height <= -four.deepest);
+            if (!smplxpp::any(touches)) continue;
+            put(x + four.normal * smplxpp::select(depth < most, depth, most), touches, four);
+            for (int lane = 0; lane < smplxpp::kLanes; ++lane)
+                if (touches[lane]) constraints.moved(size_t(four.particle[lane]));
         }
+    }
+    void put(Soa out, Mask4 which, const Touches& four) {
+        Vec4 own[smplxpp::kLanes];
+        smplxpp::rows(out, own);
+        for (int lane = 0; lane < smplxpp::kLanes; ++lane)
+            if (which[lane]) x_[size_t(four.particle[lane])] = own[lane];
     }
 
     // Particles that came nearer than the margin, their own neighbours aside.
@@ -317,8 +358,8 @@ private:
     std::vector<Vec4> normal_;
     std::vector<Vec3> skin_, skin_before_;
     Surface surface_;
-    // What particles touch: first `sides_` nearest places, then those on the other side of a fold.
-    std::vector<Touch> touches_, folds_;
+    // What particles touch: first `sides_` fours of nearest places, then those on the other side of a fold.
+    std::vector<Touches> touches_, folds_;
     size_t sides_ = 0;
     std::vector<Pair> pairs_;
     std::vector<int64_t> linked_;

@@ -25,6 +25,8 @@ interface Rows {
   carried: SkinnedRows;
   /** Of each vertex of the collider the vertex that an inner garment carries: [garment, index]. */
   under: Map<number, [number, number]>;
+  /** Carried vertices that follow each other in the avatar, too: [from, to, the avatar's first]. */
+  runs: [number, number, number][];
 }
 
 export class ClothDriver {
@@ -34,8 +36,8 @@ export class ClothDriver {
   /** (V, 3) the T-pose: without expression, and with the body's shape of the moment where steps need it. */
   private readonly still: Block<Float32Array>;
   private readonly shapedRest: Block<Float32Array>;
-  /** Vertices of the body that steps need. */
-  private readonly skin: Int32Array;
+  /** How many vertices are the body's: the first ones. */
+  private readonly skin: number;
   /** What places are measured from: near the person, so that float32 knows micrometres wherever that stands. */
   private origin = [0, 0, 0];
   private last: Pose | null = null;
@@ -56,11 +58,10 @@ export class ClothDriver {
         collider.vertices.forEach((vertex, i) => place.has(vertex) && under.set(i, [inner, place.get(vertex)!]));
       });
       const [own, touched, carried] = [particles, collider.vertices, vertices].map((rows) => new SkinnedRows(deformer, rows));
-      return { particles: own, collider: touched, carried, under };
+      return { particles: own, collider: touched, carried, under, runs: runsOf(vertices) };
     });
     [this.still, this.shapedRest] = [native.keep(mesh.vertices), native.keep(mesh.vertices)];
-    const needed = new Set(garments.flatMap(({ particles, collider }) => [...particles, ...collider.vertices]));
-    this.skin = Int32Array.from([...needed].filter((vertex) => !mesh.parts[vertex]));
+    this.skin = mesh.parts.filter((part) => !part).length;
     const share = new Float32Array(V);
     this.threads.forEach(({ garment, share: own }) => garment.vertices.forEach((vertex, i) => (share[vertex] = own[i])));
     const keep = Float32Array.from(gaussians.face, (face) => {
@@ -182,8 +183,7 @@ export class ClothDriver {
   /** Brings the skeleton to a pose, measured from the origin. */
   private joints(pose: Pose): void {
     this.deformer.joints({ ...pose, translation: pose.translation.map((value, k) => value - this.origin[k]) });
-    const { skin } = this, from = this.deformer.rest.view, to = this.shapedRest.view;
-    for (let i = 0; i < skin.length; ++i) for (let k = 3 * skin[i]; k < 3 * skin[i] + 3; ++k) to[k] = from[k];
+    this.shapedRest.view.set(this.deformer.rest.view.subarray(0, 3 * this.skin));
   }
 
   /** Where skinning has some vertices, (R, 3) metres from the origin; the parts know no expression. */
@@ -200,13 +200,23 @@ export class ClothDriver {
   /** The same where the skeleton is in the pose. */
   private laid(): Displaced {
     for (const thread of this.threads) thread.carry();
-    this.threads.forEach(({ garment, carried }, k) => {
+    this.threads.forEach(({ carried }, k) => {
       const found = this.rows[k].carried.unpose(this.still, carried), out = this.displaced.displacements.view;
-      const { vertices } = garment;
-      for (let i = 0; i < vertices.length; ++i) for (let c = 0; c < 3; ++c) out[3 * vertices[i] + c] = found[3 * i + c];
+      for (const [from, to, vertex] of this.rows[k].runs) out.set(found.subarray(3 * from, 3 * to), 3 * vertex);
     });
     return this.displaced;
   }
+}
+
+/** Where vertices follow each other: copies of whole runs cost little before a page's code is compiled well. */
+function runsOf(vertices: Int32Array): [number, number, number][] {
+  const runs: [number, number, number][] = [];
+  vertices.forEach((vertex, i) => {
+    const last = runs[runs.length - 1];
+    if (last && vertex === last[2] + i - last[0]) last[1] = i + 1;
+    else runs.push([i, i + 1, vertex]);
+  });
+  return runs;
 }
 
 /** A pose where another one stands and looks: its place, turned about the vertical alone. */

@@ -29,9 +29,9 @@ class Moments {
     const [before, last, now, next] = this.blocks.map((block) => block.view);
     if (this.known > 1) before.set(last);
     last.set(now);
-    if (this.known < 2) for (let i = 0; i < now.length; ++i) before[i] = Math.fround(2 * last[i]) - places[i];
+    if (this.known < 2) for (let i = 0; i < now.length; ++i) before[i] = 2 * last[i] - places[i];
     now.set(places);
-    for (let i = 0; i < now.length; ++i) next[i] = Math.fround(2 * now[i]) - last[i];
+    for (let i = 0; i < now.length; ++i) next[i] = 2 * now[i] - last[i];
     this.known = 2;
   }
 
@@ -178,7 +178,9 @@ export class GarmentThread {
 
   private sound(): boolean {
     const x = this.position.view, v = this.velocity.view, { edges, mostSquared } = this;
-    for (let i = 0; i < x.length; ++i) if (!Number.isFinite(x[i]) || !Number.isFinite(v[i])) return false;
+    let sum = 0;  // as double: finite where all are
+    for (let i = 0; i < x.length; ++i) sum += x[i] + v[i];
+    if (!Number.isFinite(sum)) return false;
     for (let e = 0; e < mostSquared.length; ++e) {
       const a = 3 * edges[2 * e], b = 3 * edges[2 * e + 1];
       if (!((x[a] - x[b]) ** 2 + (x[a + 1] - x[b + 1]) ** 2 + (x[a + 2] - x[b + 2]) ** 2 <= mostSquared[e])) return false;
