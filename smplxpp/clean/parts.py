@@ -25,7 +25,7 @@ from smplxpp.core import (
     row_lengths,
 )
 from smplxpp.core.errors import one_line
-from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners
+from smplxpp.core.topology import border_loops, edge_groups, face_components, manifold_corners, split_faces
 
 
 def drop_specks(mesh: MeshLike, *, area_fraction: float = 1e-3) -> Bool[np.ndarray, " M"]:
@@ -128,30 +128,10 @@ def _split_once(mesh: TriangleMesh, longest: float) -> tuple[TriangleMesh, Int64
     on_border = np.zeros(mesh.vertex_count, dtype=bool)
     on_border[mesh.border_edges] = True
     turned = on_border[ends[:, 0]] & ~on_border[ends[:, 1]]
-    # The new vertex of each half edge (k, k + 1) of a face, -1 for those that stay: edges as numbers, in order.
-    key = np.sort(ends, axis=1) @ [mesh.vertex_count, 1]
-    order = np.argsort(key)
-    half = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [mesh.vertex_count, 1]
-    at = np.minimum(np.searchsorted(key[order], half), len(key) - 1)
-    middle = np.where(key[order][at] == half, mesh.vertex_count + order[at], -1)
-    # Turn each face so that its split edges are the first ones: (0, 1); (0, 1) and (1, 2); all three.
-    split = middle >= 0
-    count = split.sum(axis=1)
-    first = np.where(count == 1, split.argmax(axis=1), (~split).argmin(axis=1))
-    first = np.where(count == 2, ((~split).argmax(axis=1) + 1) % 3, first)
-    turn = (first[:, None] + np.arange(3)) % 3
-    corner, middle = np.take_along_axis(faces, turn, axis=1), np.take_along_axis(middle, turn, axis=1)
-    (a, b, c), (ab, bc, ca) = corner.T, middle.T
-    new = [faces[count == 0]]
-    for number, triangles in (
-        (1, ((a, ab, c), (ab, b, c))),
-        (2, ((ab, b, bc), (a, ab, bc), (a, bc, c))),
-        (3, ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))),
-    ):
-        new += [np.stack(triangle, axis=1)[count == number] for triangle in triangles]
+    faces = split_faces(faces, ends, mesh.vertex_count)[0]
     middles = mesh.vertices[ends].mean(axis=1)
     ends = np.where(turned[:, None], ends[:, ::-1], ends)
-    return TriangleMesh(np.concatenate([mesh.vertices, middles]), np.concatenate(new)), ends
+    return TriangleMesh(np.concatenate([mesh.vertices, middles]), faces), ends
 
 
 @dataclass(frozen=True)

@@ -131,6 +131,44 @@ def border_loops(faces: Int[np.ndarray, "M 3"]) -> list[Int[np.ndarray, " _"]]:
     return np.split(ordered, np.cumsum(length)[:-1])
 
 
+def split_faces(
+    faces: Int[np.ndarray, "M 3"], ends: Int[np.ndarray, "E 2"], count: int
+) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
+    """Split edges by a new vertex each, and their faces into two, three or four, as one, two or three edges are split.
+
+    Args:
+        faces: of a mesh of `count` vertices.
+        ends: vertices of the edges; edge i gets the vertex `count` + i.
+        count: number of vertices.
+
+    Returns:
+        The faces, those that stay first, and of each the one that it is a part of.
+    """
+    # The new vertex of each half edge (k, k + 1) of a face, -1 for those that stay: edges as numbers, in order.
+    key = np.sort(ends, axis=1) @ [count, 1]
+    order = np.argsort(key)
+    half = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [count, 1]
+    at = np.minimum(np.searchsorted(key[order], half), len(key) - 1)
+    middle = np.where(key[order][at] == half, count + order[at], -1)
+    # Turn each face so that its split edges are the first ones: (0, 1); (0, 1) and (1, 2); all three.
+    split = middle >= 0
+    pieces = split.sum(axis=1)
+    first = np.where(pieces == 1, split.argmax(axis=1), (~split).argmin(axis=1))
+    first = np.where(pieces == 2, ((~split).argmax(axis=1) + 1) % 3, first)
+    turn = (first[:, None] + np.arange(3)) % 3
+    corner, middle = np.take_along_axis(faces, turn, axis=1), np.take_along_axis(middle, turn, axis=1)
+    (a, b, c), (ab, bc, ca) = corner.T, middle.T
+    new, whole = [faces[pieces == 0]], [np.flatnonzero(pieces == 0)]
+    for number, triangles in (
+        (1, ((a, ab, c), (ab, b, c))),
+        (2, ((ab, b, bc), (a, ab, bc), (a, bc, c))),
+        (3, ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))),
+    ):
+        new += [np.stack(triangle, axis=1)[pieces == number] for triangle in triangles]
+        whole += [np.flatnonzero(pieces == number)] * len(triangles)
+    return np.concatenate(new), np.concatenate(whole)
+
+
 def mean_of_neighbours(edges: Int[np.ndarray, "E 2"], border_edges: Int[np.ndarray, "B 2"], count: int) -> csr_matrix:
     """Return (N, N) rows that average a vertex's neighbours; a border vertex has only neighbours along the border."""
     on_border = np.zeros(count, dtype=bool)

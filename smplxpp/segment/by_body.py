@@ -27,7 +27,9 @@ The terms are found one after the other:
 6. `by_body_prior`: P(label | place), the outline softened by the uncertainty of its borders.
 7. `by_body_colors.label_costs`: P(colour | label) by expectation maximisation, averaged over neighbours of like colour.
 8. `graph_cut`: alpha-expansion of the energy, with weights w that prefer concave folds and edges of colour.
-9. `by_body_confidence`: confidence of each face, at most the probability of the outline that it depends on, and notes.
+9. `by_body_shells`: of figures whose garments are surfaces of their own, each is kept to its own. Faces that are longer
+   than the rings of the outline are split before the first step.
+10. `by_body_confidence`: confidence of each face, at most the probability of the outline that it depends on, and notes.
 """
 
 from __future__ import annotations
@@ -69,6 +71,7 @@ from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
 from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.by_body_rings import ARM_END, ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 from smplxpp.segment.by_body_shape import ShapeEvidence, outfit_by_shape
+from smplxpp.segment.by_body_shells import garment_shells, of_whole_faces, split_long_faces
 from smplxpp.segment.by_body_waist import find_waist
 from smplxpp.segment.graph_cut import (
     COST_SCALE,
@@ -174,6 +177,13 @@ def label_by_body(
     lab = None if colors is None else face_colors(mesh, colors)
     if lab is not None and not has_colors(lab):
         lab = None
+    # 5 mm is the tolerance of visibility: less than the gap between layers of clothes, more than the scan's noise.
+    seen = outer_visible_points(mesh, mesh.face_centers, tolerance=0.005)
+    if lab is not None and colors is not None:
+        fine, fine_colors, whole = split_long_faces(mesh, colors)
+        if fine.face_count > mesh.face_count:
+            parts = label_by_body(fine, body, params, colors=fine_colors, config=config)
+            return of_whole_faces(parts, fine.face_areas, whole, seen)
     found = weigh_evidence(mesh, body, params, lab, config)
     # Minimise the Potts energy. Unary costs are capped at 12 nats, so that a single face can be overruled by its patch.
     cost = found.costs - found.costs.min(axis=1, keepdims=True)
@@ -188,12 +198,11 @@ def label_by_body(
     labels = absorb_islands(mesh, cut, share[rows, cut], pairs, ends, config.smoothing)
     # Glasses are smaller than any garment, and no fragment of one.
     labels = np.where(found.objects.faces & (cut == OBJECT.id), OBJECT.id, labels)
-    # Confidence is bounded by the outline's and falls with the body's misfit. 5 mm is the tolerance of visibility: less
-    # than the gap between layers of clothes, more than the scan's noise.
+    # Confidence is bounded by the outline's and falls with the body's misfit.
     bound = confidence_bound(found.chart, labels, found.outfit, found.layers, colored=lab is not None)
     own = np.minimum(share[rows, labels], bound)
     confidence = own * min(1.0, BODY_ELSEWHERE / max(found.misfit, 1e-9))
-    seen = outer_visible_points(mesh, mesh.face_centers, tolerance=0.005)
+    labels, confidence = garment_shells(mesh, labels, confidence, found.chart.height)
     notes = notes_on_labels(
         found.chart,
         mesh.face_areas,
