@@ -17,7 +17,17 @@ from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
 from smplxpp.clean.shreds import cut_borders, drawn_out, find_shreds
-from smplxpp.core import LABELS, Check, GeometryWarning, InputError, Labels, SkinWeights, StageOutput, TriangleMesh
+from smplxpp.core import (
+    LABELS,
+    Check,
+    GeometryWarning,
+    InputError,
+    Labels,
+    SkinWeights,
+    StageOutput,
+    TriangleMesh,
+    row_lengths,
+)
 from smplxpp.core.labels import PartRule
 from smplxpp.core.topology import face_components
 from smplxpp.metrics import mesh_quality, point_to_surface, stretch_report, weight_report
@@ -250,7 +260,26 @@ def _without_bridges(
         source = source[kept]
         weights = ruled.weights(fit, body, part, source)
         rest = _at_rest(part, weights, fit, limits)
+    # Weights that are computed again may tear a few faces more, of which each would be a sail in the T-pose.
+    torn = torn_specks(part, rest, config) & ~ruled.stiff(part, source)
+    if config.rounds and torn.any():
+        part, kept = cut_bridges(part, torn, config=config)
+        source, weights = source[kept], weights.of(kept)
     return part, source, weights
+
+
+def torn_specks(part: TriangleMesh, rest: TriangleMesh, config: BridgeConfig) -> Bool[np.ndarray, " M"]:
+    """Return the faces with an edge that the T-pose tears by 5 cm and more, none where they are more than a speck.
+
+    Args:
+        part: as scanned, without bridges.
+        rest: the part in the T-pose.
+        config: thresholds; `tear` and `speck_area` count.
+    """
+    sides, at_rest = (row_lengths((m.triangles - np.roll(m.triangles, 1, axis=1)).reshape(-1, 3)) for m in (part, rest))
+    torn = ((at_rest > config.tear * sides) & (at_rest - sides > 0.05)).reshape(-1, 3).any(axis=1)
+    speck = part.face_areas[torn].sum() < config.speck_area * part.face_areas.sum()
+    return torn & bool(speck)
 
 
 def _at_rest(part: TriangleMesh, weights: SkinWeights, fit: PosedFit, limits: UnposeConfig) -> TriangleMesh:

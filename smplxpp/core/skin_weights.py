@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int32
+from jaxtyping import Bool, Float64, Int, Int32
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 
@@ -67,6 +67,11 @@ class SkinWeights:
         row, slot = np.nonzero(self.joint_weights)
         column = self.joint_indices[row, slot]
         return csr_matrix((self.joint_weights[row, slot], (row, column)), (len(self), self.joint_count))
+
+    def of(self, rows: Int[np.ndarray, " n"]) -> SkinWeights:
+        """Return the weights of some of the vertices, with the policies of all components."""
+        names = ("joint_indices", "joint_weights", "matched", "distance", "angle", "component")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def pruned(self, max_influences: int, *, least: float = 0.0) -> SkinWeights:
         """Return the weights with at most `max_influences` joints a vertex, none below `least`, rows summing to 1.
