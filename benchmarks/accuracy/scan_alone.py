@@ -36,6 +36,8 @@ BODY_JOINTS = 22
 COMMAND = "python -m benchmarks scan_alone"
 _BEARERS = ("woman T-shirt jeans bob, A", "heavy man T-shirt shorts bald, T")
 _SCAN = ScanConfig(cell=0.008, views=26, resolution=512, faces=25000)
+_FINE = ScanConfig(cell=0.005, views=26, resolution=768, faces=70000)
+"""Scans of what is worn on the face: in cells of 8 mm a bridge of 8 mm is lost, and with it one of two lenses."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,8 @@ class ScanAlone:
             for kind in (*THINGS, *WORN) if "all" in self.things else self.things:
                 for who, side in zip(_BEARERS, ("left", "right"), strict=True):
                     thing = Thing(kind, side, (90, 50, 20))
-                    made = make_person(who, CAST[who], load_body(), seed=self.seed, scan=_SCAN, thing=thing)
+                    scan = _FINE if kind in ("glasses", "sunglasses", "goggles") else _SCAN
+                    made = make_person(who, CAST[who], load_body(), seed=self.seed, scan=scan, thing=thing)
                     yield from (variant(replace(made, name=f"{who}: {kind}"), one) for one in names)
             return
         if self.captured:

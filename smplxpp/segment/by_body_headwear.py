@@ -3,7 +3,8 @@
 Hair, a beard and a hood stand off the head as well. What tells a thing from them is measured in the frame of the head,
 whose body is first moved onto the scan's face alone, because a hat pulls any other fit:
 
-- *glasses*: before both eyes surface stands 8 mm and more off the face, where neither hair nor features are;
+- *glasses*: before both eyes surface stands 6 mm and more off the face, where neither hair nor features are; or a rim
+  or lenses rise over the cheeks below both eyes, by distance or colour, in a ring as narrow as no feature is;
 - *hats*: above the eyes, before the ears, a plate stands off the head, which has surface above and below it within
   2 cm, both level: a brim, or the peak of a cap. Undersides of buns are farther away, ponytails behind, edges of hoods
   narrow. The crown is what lies above the brim, down to the nearest fold or edge of colour;
@@ -41,6 +42,8 @@ class _Around:
         eye: distance of either eye from the origin, metres.
         ear: place of the left ear.
         area: of each face, square centimetres.
+        rise: by what rims of glasses rise over the face beside them: the distance of each face to the head, a unit for
+            1.3 mm, and with colours the distance of its colour to that of the face's skin, a unit for 0.1 in OKLab.
     """
 
     place: Float64[np.ndarray, "M 3"]
@@ -50,6 +53,24 @@ class _Around:
     eye: float
     ear: Float64[np.ndarray, " 3"]
     area: Float64[np.ndarray, " M"]
+    rise: Float64[np.ndarray, " M"]
+
+
+@dataclass(frozen=True)
+class _Rises:
+    """Rises of rims and lenses over the face about an eye, in units of `_Around.rise`.
+
+    Attributes:
+        unit: metres of distance from the face that count as much as 0.1 of colour in OKLab, twice the noise of either.
+        rim: of glasses without lenses about both eyes; of 24 bare heads, with a body that misses the face, at most 1.4.
+        lens: of lenses about both eyes; of those heads at most 2.3.
+        certain: evidence of faces of either, whose borders need no folds, because a thin ring has much border.
+    """
+
+    unit: float = 0.0013
+    rim: float = 1.6
+    lens: float = 3.0
+    certain: float = 8.0
 
 
 def find_headwear(
@@ -72,7 +93,7 @@ def find_headwear(
         lab: colours of the faces in OKLab; None: the cut follows folds alone.
     """
     nothing = FoundObjects.none(mesh.face_count)
-    head = _around_head(mesh, body, params)
+    head = _around_head(mesh, body, params, lab)
     if head is None:
         return nothing
     # Evidence of the head without things: what is none of them stays.
@@ -82,7 +103,7 @@ def find_headwear(
     for kind, least, find in (("glasses", 12.0, _glasses), ("a hat", 60.0, _hat), ("headphones", 60.0, _headphones)):
         own = find(head)
         if own is not None:
-            evidence = np.maximum(evidence, own)
+            evidence = np.where(own <= -_Rises.certain, own, np.maximum(evidence, own))
             kinds.append((kind, least, own > 0.5))
     if not kinds:
         return nothing
@@ -101,7 +122,7 @@ def find_headwear(
     count = int(piece.max(initial=0)) + 1
     paid, plain = (np.bincount(beside, value[border], count) for value in (bare, 2.0 * length))
     smooth = 0.6  # mean cost of a border as a share of a smooth one
-    cut &= (paid <= smooth * plain)[piece]
+    cut &= (paid <= smooth * plain)[piece] | np.isin(piece, piece[cut & (evidence >= _Rises.certain)])
     faces, notes = nothing.faces.copy(), []
     for kind, least, core in kinds:
         own = cut & np.isin(piece, piece[cut & core]) & ~faces
@@ -113,7 +134,9 @@ def find_headwear(
     return FoundObjects(faces, tuple(notes))
 
 
-def _around_head(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> _Around | None:
+def _around_head(
+    mesh: TriangleMesh, body: BodyModel, params: BodyParams, lab: Float64[np.ndarray, "M 3"] | None = None
+) -> _Around | None:
     """Return the scan about the head, moved onto the scan's face; None where there is no face or it fits none.
 
     Of the scan's faces at x within 4 cm of the face, with nearest vertices v of normals n, the small motion (t, w) of
@@ -160,14 +183,19 @@ def _around_head(mesh: TriangleMesh, body: BodyModel, params: BodyParams) -> _Ar
     along = np.einsum("ij,ij->i", mesh.face_centers - vertices[at], (normals @ spin.T)[at])
     local = (vertices[head] - middle) @ turn
     skull = local[own.region[head] == HEAD]
+    off = np.where(distance < 0.02, along, np.copysign(distance, along))
+    rise = off / _Rises.unit
+    if lab is not None:
+        rise = rise + row_lengths(lab - np.median(lab[near], axis=0)) / 0.1
     return _Around(
         (mesh.face_centers - middle) @ turn,
         mesh.face_normals @ turn,
-        np.where(distance < 0.02, along, np.copysign(distance, along)),
+        off,
         np.isin(own.region[at], (HEAD, NECK)),
         0.5 * float(np.linalg.norm(one - other)),
         skull[skull[:, 0].argmax()],
         1e4 * mesh.face_areas,
+        rise,
     )
 
 
@@ -180,22 +208,83 @@ def _rotation(turn: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
 
 
 def _glasses(head: _Around) -> Float64[np.ndarray, " M"] | None:
-    """Return evidence of glasses; None where neither lens nor frame stands before both eyes."""
+    """Return evidence of glasses; None where neither lens nor frame is before both eyes."""
     left, up, front = head.place.T
-    stands = 0.008  # metres off the face
+    stands = 0.006  # metres off the face; of bare faces a hundredth about either eye is as far off
     enough = 0.12  # share of the surface about an eye, which frames without lenses have, too
+    shares, certain = [], np.zeros(len(left), dtype=bool)
     for sign in (1.0, -1.0):
         eye = (np.abs(left - sign * head.eye) < 0.028) & (np.abs(up) < 0.024) & (front > 0) & (head.normal[:, 2] > 0.2)
-        if head.area[eye & (head.off > stands)].sum() < enough * head.area[eye].sum() or not eye.any():
-            return None
+        shares.append(head.area[eye & (head.off > stands)].sum() / max(float(head.area[eye].sum()), 1e-9))
+    for lens, least in ((False, _Rises.rim), (True, _Rises.lens)):
+        found = [_about_eye(head, sign, lens=lens) for sign in (1.0, -1.0)]
+        if min(rise for rise, _ in found) > least:
+            certain[np.concatenate([faces for _, faces in found])] = True
+    if min(shares) < enough and not certain.any():
+        return None
     # Before the eyes, and as far beside them as a frame is wide, all that stands off; behind, the temples, which are
     # thin, up to the ears.
     before = (front > 0.0) & (np.abs(left) < 0.08) & (np.abs(up) < np.interp(np.abs(left), (0.05, 0.06), (0.04, 0.025)))
-    out = np.where(before, np.interp(head.off, (0.004, 0.007, 0.012), (-1.0, 0.0, 1.0)), -0.5)
+    out = np.where(before, np.interp(head.off, (0.003, 0.005, 0.008), (-1.0, 0.0, 1.0)), -0.5)
+    if certain.any():
+        # Skin behind no lens and beside a frame is none of them.
+        out[(head.off < 0.003) & (front > -0.03) & (np.abs(left) < 0.08) & (np.abs(up) < 0.05)] = -_Rises.certain
+        out[certain] = _Rises.certain
     beside = (front <= 0.005) & (front > head.ear[2] + 0.005) & (np.abs(left) > 0.05) & (np.abs(up - 0.005) < 0.035)
     rows = np.flatnonzero(beside & head.near)
     out[rows] = _ridge(head, rows, axis=1)
     return out
+
+
+def _about_eye(head: _Around, sign: float, *, lens: bool) -> tuple[float, Int64[np.ndarray, " F"]]:
+    """Return how far a rim or a lens about an eye rises over the skin beside it, and the faces of it.
+
+    On rays from the eye the largest rise counts: of a rim over what is inside and outside of it (`_Around.rise`), of a
+    lens over what is outside, in distance alone, because eyes differ from skin in colour. From below the nose's side
+    round to the temple bare faces have neither brows nor narrow folds; glasses rise on most of these rays, so that
+    their median is returned. Other rays only tell where the border is.
+    """
+    across, up, front = sign * head.place[:, 0] - head.eye, head.place[:, 1], head.place[:, 2]
+    own = np.flatnonzero(head.near & (front > -0.035) & (np.abs(head.off) < 0.02) & (np.hypot(across, up) < 0.055))
+    place, weight = np.stack([across[own], up[own]], axis=1), head.area[own]
+    values = head.off[own] / _Rises.unit if lens else head.rise[own]
+    angles, radius = np.radians(np.arange(-170.0, 171.0, 20.0)), np.arange(0.002, 0.050, 0.002)  # metres
+    # By ray and radius: the rise there, and the value at half of it.
+    rises, levels = np.zeros((2, len(angles), len(radius)))
+    for n, angle in enumerate(angles):
+        ray = np.array([np.cos(angle), np.sin(angle)])
+        near = np.abs(place @ [-ray[1], ray[0]]) < 0.006
+        # The mean of the faces about a place on the ray, with a spread of 2.5 mm; nothing where there is no face.
+        share = np.exp(-0.5 * ((radius[:, None] - place[near] @ ray) / 0.0025) ** 2) * weight[near]
+        total = share.sum(axis=1)
+        mean = np.where(total > 1e-3, share @ values[near] / np.maximum(total, 1e-3), np.nan)
+        for k in np.flatnonzero((radius >= 0.016) & (radius <= 0.036)):
+            # The lowest from 6 to 12 mm farther out and in.
+            sides = (mean[k + 3 : k + 7], *(() if lens else (mean[k - 6 : k - 2],)))
+            if not any(np.isnan(side).all() for side in (mean[k : k + 1], *sides)):
+                rises[n, k] = max(0.0, float(mean[k] - max(np.nanmin(side) for side in sides)))
+                levels[n, k] = mean[k] - 0.5 * rises[n, k]
+    # The ring of most rise in all whose radius changes by at most 4 mm from ray to ray, by dynamic programming.
+    steps = np.array([np.roll(np.arange(len(radius)), step) for step in (-2, -1, 0, 1, 2)])
+    most, came = rises[0], []
+    for rise in rises[1:]:
+        came.append(steps[most[steps].argmax(axis=0), np.arange(len(radius))])
+        most = rise + most[steps].max(axis=0)
+    ring = [int(most.argmax())]
+    for back in reversed(came):
+        ring.insert(0, int(back[ring[0]]))
+    found, at = rises[np.arange(len(angles)), ring], np.array(ring)
+    rise = float(np.median(found[(angles > np.radians(-160.0)) & (angles < np.radians(40.0))]))
+    kept = found > 0.5 * rise
+    if kept.sum() < 0.5 * len(kept):
+        return 0.0, own[:0]
+    # Of the faces there, those that rise by half of it, as skin behind a frame does not.
+    turn = np.arctan2(place[:, 1], place[:, 0])
+    of_rays = (radius[at], levels[np.arange(len(angles)), at])
+    border, level = (np.interp(turn, angles[kept], of[kept], period=2.0 * np.pi) for of in of_rays)
+    outwards = np.hypot(*place.T) - border
+    there = outwards < 0.003 if lens else np.abs(outwards) < 0.005
+    return rise, own[there & (values > level)]
 
 
 def _ridge(head: _Around, rows: Int64[np.ndarray, " R"], *, axis: int) -> Float64[np.ndarray, " R"]:

@@ -344,6 +344,55 @@ def test_frames_without_lenses_are_glasses(open_body, stance, head):
     assert mesh.face_areas[found.faces & truth].sum() > 0.5 * mesh.face_areas[truth].sum()
 
 
+def rims(head: TriangleMesh, eyes: list[np.ndarray], *, off: float, lenses: bool) -> TriangleMesh:
+    """Rims of 5.6 mm about both eyes that stand off the skin behind them, down to it, as scans show thin glasses."""
+    turn, thick, pieces = np.linspace(0.0, 2.0 * np.pi, 21)[:-1], 0.0028, []
+    for eye in eyes:
+        ring = eye + np.stack([0.025 * np.cos(turn), 0.021 * np.sin(turn), 0.0 * turn], axis=1)
+        for point in ring:
+            behind = (np.hypot(*(head.vertices - point)[:, :2].T) < 0.005) & (head.vertices[:, 2] > point[2] - 0.03)
+            point[2] = head.vertices[behind, 2].max() + off - thick
+        tubes = [_tube(thick, tuple(a), tuple(b)) for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True)]
+        pieces += [np.concatenate([tube, tube - [0.0, 0.0, 0.01]]) for tube in tubes]
+        pieces += [np.concatenate([ring, ring - [0.0, 0.0, 0.015]])] * lenses
+    return _joined(pieces)
+
+
+@pytest.mark.parametrize(
+    ("off", "lenses", "colored"),
+    [(0.006, False, False), (0.008, False, False), (0.004, False, True), (0.007, True, False), (0.005, True, True)],
+)
+@pytest.mark.long
+def test_thin_glasses_that_a_scan_fused_with_the_face_are_found(open_body, stance, head, off, lenses, colored):
+    """Glasses within 8 mm of the face were skin: a rim is a narrow ring on the cheeks, a lens a step down to them."""
+    at = dict(zip(open_body.joint_names, stance[1].joints[0], strict=True))
+    eyes = [at[f"{side}_eye_smplhf"] for side in ("left", "right")]
+    mesh, truth = scanned_head(head, rims(head, eyes, off=off, lenses=lenses), cell=0.0055)
+    lab = np.where(truth[:, None], [0.3, 0.0, 0.0], [0.7, 0.04, 0.05]) if colored else None
+    found = find_headwear(mesh, open_body, stance[0], *face_adjacency(mesh.faces), lab=lab).faces
+    assert mesh.face_areas[found & truth].sum() > 0.5 * mesh.face_areas[truth].sum()
+    assert mesh.face_areas[found & ~truth].sum() < 0.5 * mesh.face_areas[truth].sum()
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.long
+def test_a_bare_face_that_the_body_misses_wears_no_glasses(open_body, stance, head, dark):
+    """A body of another shape misses cheeks and brows by millimetres; eyes, and what is under them, may be dark."""
+    mesh, _ = scanned_head(head)
+    eyes = [stance[1].joints[0, open_body.joint_names.index(f"{side}_eye_smplhf")] for side in ("left", "right")]
+    off = np.min([np.hypot(*(mesh.face_centers - eye)[:, :2].T) for eye in eyes], axis=0)
+    lab = np.array([0.7, 0.04, 0.05]) - np.interp(off, (0.01, 0.025), (0.4, 0.0))[:, None] * [1.0, 0.0, 0.0]
+    for seed in range(3):
+        betas = np.random.default_rng(seed).normal(0.0, 0.3, open_body.num_betas) * (
+            np.arange(open_body.num_betas) < 16
+        )
+        params = replace(stance[0], betas=betas[None] if stance[0].betas.ndim == 2 else betas)
+        moved = stance[1].joints[0] - open_body.forward(params).joints[0]
+        params = replace(params, transl=params.transl + moved[open_body.joint_names.index("left_eye_smplhf")])
+        found = find_headwear(mesh, open_body, params, *face_adjacency(mesh.faces), lab=lab if dark else None)
+        assert not found.faces.any(), found.notes
+
+
 @pytest.mark.long
 def test_hair_hoods_and_bare_heads_wear_nothing(open_body, stance, head):
     """A bun, a ponytail behind, two buns over the ears, one beside a bulge, long hair and a hood round the face."""
