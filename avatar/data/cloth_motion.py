@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -49,6 +49,8 @@ class ClothMotions:
         frames: all frames of the motion.
         fps: frames a second of their numbers.
         config: of the simulation; None: the defaults.
+        seen: returns where the particles of the garments were seen in a frame, by part, world, metres; empty where they
+            were not. In the pre-roll the cloth is drawn there, so that a run of frames starts as what was seen ends.
 
     Attributes:
         quality: what was measured of each garment in the frames that were simulated, without those of the pre-roll.
@@ -66,11 +68,13 @@ class ClothMotions:
         frames: Sequence[int],
         fps: float,
         config: ClothMotionConfig | None = None,
+        seen: Callable[[int], Mapping[str, np.ndarray]] = lambda frame: {},
     ) -> None:
         require_positive("frames a second of a motion with simulated clothes", fps)
         # Shapes are kept for the whole training, because a simulation can only be run in order.
         self.template, self.garments, self.config = template, tuple(garments), config or ClothMotionConfig()
         self._params, self._frames, self._fps = params, np.array(sorted(frames), dtype=np.int64), fps
+        self._seen = seen
         self._shapes: dict[int, ClothShape] = {}
         self.quality: list[ClothQuality] = []
 
@@ -102,16 +106,23 @@ class ClothMotions:
         for frame in known:
             if frame == run[0]:
                 driver.measure_anew()
-            # The duration of the first step does not matter, because the simulation starts cold there.
-            seconds = 1.0 if last is None else (frame - last) / self._fps
+            seconds = self._frame_seconds(frame, last)
             pose_drawn = self._params(frame)
             shape = driver.follow(paths[frame], seconds, pose_drawn if frame in wanted else None)
-            last = frame
             if frame in wanted:
                 self._shapes[frame] = shape
+            # What is measured is predicted from what lies before it alone: nothing of the run itself is looked at.
+            elif frame < run[0]:
+                for part, places in self._seen(frame).items():
+                    driver.draw_to(part, places, self._frame_seconds(frame, last))
+            last = frame
         self.quality = merged([*self.quality, *driver.quality])
         for note in driver.notes:
             warnings.warn(f"simulated clothes: {note}", GeometryWarning, stacklevel=2)
+
+    def _frame_seconds(self, frame: int, last: int | None) -> float:
+        """Return the seconds since the frame before; of the first one, where the simulation starts cold, a second."""
+        return 1.0 if last is None else (frame - last) / self._fps
 
     def _skinned(self) -> ClothShape:
         vertices = np.concatenate([garment.vertices for garment in self.garments])

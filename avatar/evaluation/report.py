@@ -20,6 +20,11 @@ SCHEMA = 1
 _SUBJECT = "evaluation report"
 SKINNING_ALONE = "skinning alone"
 """Name of the table row of the template after linear blend skinning, beside the models."""
+PASSES: Mapping[str, str] = {
+    "refined_poses": ", poses refined on training cameras",
+    "followed_clothes": ", clothes from where they were followed",
+}
+"""Fields of a report with held-out poses that are measured once more, and what their titles add."""
 SURFACE_SETS: Mapping[str, str] = {"training": "training frames", "held_out": "held-out frames"}
 
 
@@ -102,6 +107,8 @@ class EvalReport:
         inputs: origin of the inputs, as far as it is known.
         refined_poses: figures of held-out frames whose poses were refined on the training cameras' photographs; in
             `models` their poses are the tracker's.
+        followed_clothes: figures of students in held-out poses with simulated clothes that start where the surface was
+            followed in the training frames before; in `models` they start cold.
         poses: errors of the poses in use, by frames ("training frames" ...), where the exact poses are known.
     """
 
@@ -112,6 +119,7 @@ class EvalReport:
     conventions: dict[str, str] = field(default_factory=dict)
     inputs: InputProtocol = field(default_factory=InputProtocol)
     refined_poses: dict[str, ModelFigures] = field(default_factory=dict)
+    followed_clothes: dict[str, ModelFigures] = field(default_factory=dict)
     poses: dict[str, PoseError] = field(default_factory=dict)
     lpips: str | None = None
 
@@ -120,8 +128,8 @@ class EvalReport:
         # Means, spreads and counts are written for readers of the file; `from_dict` computes them from the views again.
         out = jsonable(self)
         out["inputs"]["name"] = self.inputs.name
-        for key, models in (("models", self.models), ("refined_poses", self.refined_poses)):
-            for name, model in models.items():
+        for key in ("models", *PASSES):
+            for name, model in getattr(self, key).items():
                 for what in ("mean", "spread", "counts"):
                     out[key][name][what] = jsonable({part: getattr(model, what)(part) for part in model.views})
                 _add_spreads(out[key][name]["surfaces"], model.surfaces)
@@ -152,7 +160,7 @@ class EvalReport:
                 skinning_alone=_surfaces(values["skinning_alone"]),
                 conventions=_texts(values["conventions"]),
                 inputs=InputProtocol.from_dict(values.get("inputs", {})),
-                refined_poses={name: _model(model) for name, model in values.get("refined_poses", {}).items()},
+                **{key: {name: _model(model) for name, model in values.get(key, {}).items()} for key in PASSES},
                 poses={name: _pose(error) for name, error in values.get("poses", {}).items()},
                 lpips=None if values.get("lpips") is None else as_text(values["lpips"], subject=f"{_SUBJECT}: lpips"),
             )

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 
 from avatar.evaluation.input_protocol import counted
 from avatar.evaluation.protocol import SETS
-from avatar.evaluation.report import SKINNING_ALONE, SURFACE_SETS, EvalReport, ModelFigures, Surfaces
+from avatar.evaluation.report import PASSES, SKINNING_ALONE, SURFACE_SETS, EvalReport, ModelFigures, Surfaces
 from avatar.evaluation.tables import Column, FigureTable
 from avatar.metrics.surface_quality import HEAD
 from smplxpp.core.labels import CLOTH_LABELS, LABELS, SKIN
 
 MEGABYTE = 1e6
-REFINED_POSES = ", poses refined on training cameras"
 
 
 SPREAD = ".spread"
@@ -94,10 +93,10 @@ def summary_table(report: EvalReport) -> FigureTable:
     )
 
 
-def image_table(report: EvalReport, name: str, *, refined: bool = False) -> FigureTable:
-    """Make the table of the image figures of one set of views, with refined poses if `refined`."""
-    models = report.refined_poses if refined else report.models
-    title = f"{SETS[name]}{REFINED_POSES}" if refined else SETS[name]
+def image_table(report: EvalReport, name: str, *, of: str | None = None) -> FigureTable:
+    """Make the table of the image figures of one set of views; `of` one of `PASSES`, or None for the models' own."""
+    models = getattr(report, of or "models")
+    title = f"{SETS[name]}{PASSES[of] if of else ''}"
     metric, lpips = report.metric or "", report.lpips or ""
     # The person's PSNR comes first, since the plain background inflates the figures of whole images.
     columns = (
@@ -153,7 +152,10 @@ def surface_table(report: EvalReport) -> FigureTable:
         ]
     # Skinning alone is the reference that every deformation has to improve upon.
     rows = {SKINNING_ALONE: surface_figures(report.skinning_alone)} if report.skinning_alone else {}
-    rows |= {name: surface_figures(model.surfaces) for name, model in report.models.items() if model.surfaces}
+    # The same poses with the clothes of `followed_clothes`: their rows stand beside the models' own.
+    followed = {f"{name}{PASSES['followed_clothes']}": model for name, model in report.followed_clothes.items()}
+    models = {**report.models, **followed}
+    rows |= {name: surface_figures(model.surfaces) for name, model in models.items() if model.surfaces}
     return FigureTable(
         tuple(columns), rows, report.inputs.caption(f"posed mesh and true surface; {report.inputs.sentence()}")
     )
@@ -199,8 +201,9 @@ def evaluation_tables(report: EvalReport) -> dict[str, FigureTable]:
     tables = {"summary": summary_table(report)}
     measured = [name for name in SETS if any(name in model.views for model in report.models.values())]
     tables |= {name: image_table(report, name) for name in measured}
-    again = [name for name in SETS if any(name in model.views for model in report.refined_poses.values())]
-    tables |= {f"{name}_refined": image_table(report, name, refined=True) for name in again}
+    for key in PASSES:
+        again = [name for name in SETS if any(name in model.views for model in getattr(report, key).values())]
+        tables |= {f"{name}_{key.split('_')[0]}": image_table(report, name, of=key) for name in again}
     tables |= {"poses": pose_table(report)}
     tables |= {"surface": surface_table(report), "cost": cost_table(report)}
     return {name: table for name, table in tables.items() if table.rows and table.columns}

@@ -193,18 +193,36 @@ def measure_outlines(
     return Outlines(float(np.mean(wrong[False])), float(np.mean(wrong[True])), len(wrong[True]))
 
 
+def seen_particles(
+    sequence: AvatarSequence, track: Track, garments: Sequence[Garment]
+) -> Callable[[int], dict[str, np.ndarray]]:
+    """Return what tells where the particles of each garment are on the tracked surface of a frame, world, metres.
+
+    Frames that were not tracked have none.
+    """
+
+    def seen(frame: int) -> dict[str, np.ndarray]:
+        if frame not in track.row:
+            return {}
+        world = sequence.rig.skin_to_numpy(sequence.pose(frame), track.displacements(frame))
+        return {garment.part: world[garment.particles] for garment in garments}
+
+    return seen
+
+
 def followed_particles(sequence: AvatarSequence, track: Track, garment: Garment, fps: float) -> Followed:
     """Return the positions of a garment's particles on the tracked surface, frame by frame; gaps are NaN."""
     # All frames between the first and the last, because the simulation needs even steps of time; those that were not
     # tracked stay NaN, and their poses repeat the last known one.
     frames = np.arange(min(track.row), max(track.row) + 1)
-    rig, poses, world = sequence.rig, [], np.full((len(frames), len(garment.particles), 3), np.nan)
+    poses, world = [], np.full((len(frames), len(garment.particles), 3), np.nan)
     confidence = np.ones(world.shape[:2])
     last = None
+    seen = seen_particles(sequence, track, [garment])
     for k, frame in enumerate(frames.tolist()):
         params = sequence.capture.params(frame)
         if frame in track.row and params is not None:
-            world[k] = rig.skin_to_numpy(sequence.pose(frame), track.displacements(frame))[garment.particles]
+            world[k] = seen(frame)[garment.part]
             confidence[k] = track.confidence(frame).cpu().numpy()[garment.particles]
         last = params if params is not None else last
         assert last is not None  # the first frame is a training frame, which has parameters

@@ -29,10 +29,12 @@ from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.metrics.surface_quality import SurfaceQuality, mean_surface, surface_quality
 from avatar.models.model_file import load_avatar
+from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Pose
+from avatar.training.loose_clothes import seen_particles
 from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
-from pipelines.runs.layout import GARMENTS, STUDENT
+from pipelines.runs.layout import GARMENTS, STUDENT, TEACHER
 from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.cloth import ClothDriver, ClothShape, Garment
 from smplxpp.cloth.garment_file import load_garments
@@ -128,6 +130,9 @@ class _Bench:
             raise InputError("run", expected="loose parts in 83_cloth, frames a second", received="none")
         self.fps = scene.capture.fps
         self.student = load_avatar(run / STUDENT, self.sequence.rig)
+        teacher = load_avatar(run / TEACHER, self.sequence.rig) if params is None else None
+        track = teacher.track if isinstance(teacher, TeacherAvatar) else None
+        self.seen = None if track is None else seen_particles(self.sequence, track, self.garments)
         self.held_out = scene.capture.splits.novel_pose_frames
         truths = {frame: scene.capture.truth_mesh(frame) for frame in self.held_out}
         self.truths = {frame: mesh for frame, mesh in truths.items() if mesh is not None}
@@ -150,6 +155,8 @@ class _Bench:
             ("simulated from the first frame on", ClothMotionConfig(pre_roll=1e6)),
         ):
             yield name, self._simulated(config)
+        if self.seen is not None:
+            yield "simulated from where the surface was followed", self._simulated(ClothMotionConfig(), seen=self.seen)
         yield "online: causal filter, from 0.7 s before", self._online()
 
     def measured(self, poses: Mapping[int, Pose]) -> dict[str, float | None]:
@@ -192,11 +199,10 @@ class _Bench:
             out[name] = round(1e3 * median(took[1:]), 2)
         return out
 
-    def _simulated(self, config: ClothMotionConfig) -> dict[int, Pose]:
+    def _simulated(self, config: ClothMotionConfig, **seen: Any) -> dict[int, Pose]:
         capture = self.sequence.capture
-        clothes = ClothMotions(
-            self.template, self.garments, params=capture.params, frames=capture.frames, fps=self.fps, config=config
-        )
+        given: dict[str, Any] = {"params": capture.params, "frames": capture.frames, "fps": self.fps}
+        clothes = ClothMotions(self.template, self.garments, **given, config=config, **seen)
         clothes.simulate(self.held_out)
         return {frame: self._with(frame, clothes.shape(frame)) for frame in self.truths}
 

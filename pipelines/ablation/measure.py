@@ -11,8 +11,8 @@ import numpy as np
 from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_models
 from avatar.evaluation.input_protocol import InputProtocol
 from avatar.evaluation.protocol import SETS, AsNew
-from avatar.evaluation.report import SURFACE_SETS, EvalReport, view_key
-from avatar.evaluation.summary import REFINED_POSES, garments, summary_figures
+from avatar.evaluation.report import PASSES, SURFACE_SETS, EvalReport, view_key
+from avatar.evaluation.summary import garments, summary_figures
 from avatar.evaluation.tables import Column, FigureTable
 from avatar.rig.rig import AvatarModel
 from pipelines.ablation.rows import Row
@@ -217,7 +217,7 @@ def ablation_table(result: AblationResult) -> FigureTable:
             Column(f"{name}.lpips", lpips, SETS[name], 4, "lower"),
         ]
     if any(r.report.refined_poses for r in result.rows.values()):
-        group = f"{SETS[NOVEL_POSE]}{REFINED_POSES}"
+        group = f"{SETS[NOVEL_POSE]}{PASSES['refined_poses']}"
         columns += [
             Column(f"{REFINED}{NOVEL_POSE}.psnr", "PSNR", group, 2, "higher"),
             Column(f"{REFINED}{NOVEL_POSE}.perceptual", metric, group, 4, "lower"),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from avatar.data.capture_digests import params_digest
 from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
@@ -12,12 +15,16 @@ from avatar.evaluation.evaluate import Evaluation, EvaluationConfig, evaluate_mo
 from avatar.evaluation.protocol import SETS, measured_splits, view_sets, with_people
 from avatar.evaluation.report import SURFACE_SETS, EvalReport, ModelFigures, view_key
 from avatar.evaluation.summary import evaluation_tables, garments, summary_figures
+from avatar.models.model_file import load_avatar
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.rig.rig import AvatarModel
 from avatar.training.engine.adam import pixel_size
+from avatar.training.loose_clothes import seen_particles
 from pipelines.runs import gates
 from pipelines.runs.code import TRAINING, sha256_file
 from pipelines.runs.folders import own_run_folder
-from pipelines.runs.layout import BEST_FIRST, EVALUATE_STAGE, GARMENTS
-from pipelines.runs.stage import Stage, StageOutput, StageRecord, run_stage
+from pipelines.runs.layout import BEST_FIRST, EVALUATE_STAGE, GARMENTS, TEACHER, TEACHER_STAGE
+from pipelines.runs.stage import Stage, StageOutput, StageRecord, read_manifest, run_stage
 from pipelines.stages.cloth import ClothMode, simulated_parts
 from pipelines.stages.evaluate_inputs import (
     REPORT_FILE,
@@ -31,11 +38,12 @@ from pipelines.stages.evaluate_inputs import (
     refined_digest,
     refined_poses,
 )
-from pipelines.stages.scene import TrainInputs, open_scene, refuse_seen
+from pipelines.stages.scene import TrainInputs, TrainScene, open_scene, refuse_seen
 from smplxpp.body import load_body
 from smplxpp.capture import Capture
 from smplxpp.cloth.quality import ClothQuality, all_checks, merged
 from smplxpp.core import Check, InputError, ProgressCallback, ignore_progress
+from smplxpp.core.files import as_object
 from smplxpp.core.files.atomic import atomic_write_bytes, atomic_write_text
 from smplxpp.figures import encode_png
 from smplxpp.figures.drawings import surface_picture, write_tiles
@@ -43,6 +51,8 @@ from smplxpp.metrics.comparison import MM
 from smplxpp.metrics.pose_error import CONVENTION as POSE_CONVENTION
 from smplxpp.template.template import Template
 
+SeenClothes = Callable[[int], Mapping[str, np.ndarray]]
+"""Where the particles of simulated parts were seen in a frame, world, metres; empty where they were not."""
 MATCHING_ERROR_PIXELS = 0.05
 """Error in pixels with which photographs locate a surface; points of a clear pattern are located to 0.05 to 0.1.
 
@@ -98,6 +108,7 @@ def evaluate(
     )
     # The key covers models, capture, true surfaces, garments and refined poses. Evaluation is repeated if any of them
     # changes.
+    seen = clothes.seen(run, scene, sequence)
     stage = Stage(
         name=EVALUATE_STAGE,
         config={"evaluation": config, "inputs": known, "scale": inputs.scale, "device": device, "cloth": clothes.mode},
@@ -106,6 +117,7 @@ def evaluate(
             **{path.relative_to(run).as_posix(): sha256_file(path) for path in files.values()},
             **measuring_digests(scene.capture, config),
             **clothes.digests,
+            **({} if seen is None else {TEACHER: sha256_file(run / TEACHER)}),
             **refined_digest(run, again),
             **({} if exact is None else {"capture/exact parameters": params_digest(exact)}),
         },
@@ -114,12 +126,11 @@ def evaluate(
         seed=config.seed,
     )
 
-    def _of_refined(capture: Capture) -> dict[str, ModelFigures]:
-        held_out = of_held_out_poses(config, capture)
-        if held_out is None:
+    def _again(there: AvatarSequence, models: Mapping[str, AvatarModel]) -> dict[str, ModelFigures]:
+        held_out = of_held_out_poses(config, there.capture)
+        if held_out is None or not models:
             return {}
-        there = clothes.sequence(capture, device=device)
-        found = evaluate_models(loaded, there, held_out, progress=progress).report.models
+        found = evaluate_models(models, there, held_out, progress=progress).report.models
         moved.extend(there.cloth.quality if there.cloth else ())
         return found
 
@@ -132,7 +143,12 @@ def evaluate(
         # Second pass: the same models in refined held-out poses, which separates errors of the pose from errors of the
         # model.
         if again is not None:
-            report = replace(report, refined_poses=_of_refined(again))
+            report = replace(report, refined_poses=_again(clothes.sequence(again, device=device), loaded))
+        # Third pass: clothes that go on from where the teacher followed them, in what the training has seen.
+        if seen is not None:
+            students = {name: model for name, model in loaded.items() if name not in ("fit", "teacher")}
+            there = clothes.sequence(scene.capture, device=device, seen=seen)
+            report = replace(report, followed_clothes=_again(there, students))
         # A synthetic capture knows the exact poses. Their errors are listed beside the figures.
         if exact is not None:
             captures = {"": scene.capture} | ({} if again is None else {", refined on training cameras": again})
@@ -160,8 +176,20 @@ class _Clothes:
         self.mode = mode if self.garments else "field"
         self.digests = {GARMENTS: sha256_file(run / GARMENTS)} if self.garments else {}
 
-    def sequence(self, capture: Capture, *, device: str) -> AvatarSequence:
-        """Open a capture and move the loose clothes of its held-out frames."""
+    def seen(self, run: Path, scene: TrainScene, sequence: AvatarSequence) -> SeenClothes | None:
+        """Return where the teacher followed the simulated clothes; None where they are not, or poses are others now."""
+        manifest = read_manifest(run / TEACHER_STAGE)
+        if self.mode != "simulate" or manifest is None or not (run / TEACHER).is_file():
+            return None
+        known, key = as_object(manifest.get("inputs", {}), subject=f"{TEACHER_STAGE}: inputs"), "capture/parameters"
+        if known.get(key) != scene.digests[key]:
+            return None
+        teacher = load_avatar(run / TEACHER, sequence.rig)
+        track = teacher.track if isinstance(teacher, TeacherAvatar) else None
+        return None if track is None else seen_particles(sequence, track, self.garments)
+
+    def sequence(self, capture: Capture, *, device: str, seen: SeenClothes = lambda frame: {}) -> AvatarSequence:
+        """Open a capture and move the loose clothes of its held-out frames, from where they were seen before them."""
         motions = None
         if self.garments:
             # Skinned clothes have no dynamics, so that the frame rate does not matter.
@@ -180,6 +208,7 @@ class _Clothes:
                 frames=capture.frames,
                 fps=fps,
                 config=ClothMotionConfig(mode="skin" if self.mode == "skin" else "simulate"),
+                seen=seen,
             )
         return AvatarSequence(capture, self.template, device=device, cloth=motions)
 

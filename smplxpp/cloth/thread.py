@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32, Int, Int64
+from jaxtyping import Float, Float32, Int, Int64
 
 from smplxpp.cloth.embedding import CarriedVertices
 from smplxpp.cloth.garment import Garment
@@ -121,6 +121,30 @@ class GarmentThread:
     def place(self, particles: Float32[np.ndarray, "n 3"]) -> None:
         """Put the particles elsewhere, metres from the driver's origin; their velocities stay."""
         self._state.position[:] = particles
+
+    def draw_to(self, seen: Float[np.ndarray, "n 3"], seconds: float, *, gain: float) -> None:
+        """Draw what hangs free towards where it was seen: the correction of an alpha-beta filter.
+
+        With the residual `r = seen - x`, smoothed over the cloth: `x <- x + gain r`, `v <- v + gain r / seconds`.
+
+        Args:
+            seen: metres from the driver's origin; NaN rows take the residual of their neighbours.
+            seconds: since particles were drawn last, or since the last step.
+            gain: in [0, 1]: how far what was seen is believed, against the simulation.
+        """
+        x, v = self._state.position, self._state.velocity
+        residual = np.asarray(seen, dtype=np.float64) - x
+        known = np.isfinite(residual).all(axis=1)
+        # Errors of what was seen differ from particle to particle, while what moves cloth does not.
+        values = np.column_stack([np.where(known[:, None], residual, 0.0), known])
+        a, b = self._model.edges.T
+        ends, others = np.r_[a, b], np.r_[b, a]
+        around = np.stack([np.bincount(ends, column[others], minlength=len(x)) for column in values.T], axis=1)
+        values = 0.5 * values + 0.5 * around / np.maximum(np.bincount(ends, minlength=len(x)), 1)[:, None]
+        pull = gain * values[:, :3] / np.maximum(values[:, 3:], 1e-9)
+        pull[self._pinned] = 0.0
+        x += pull.astype(np.float32)
+        v += (pull / seconds).astype(np.float32)
 
     def shift(self, by: Float32[np.ndarray, " 3"]) -> None:
         """Shift all stored places, metres, because their origin has moved by the opposite vector."""

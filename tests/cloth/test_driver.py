@@ -308,3 +308,44 @@ def test_the_ground_stops_what_falls_and_slows_what_slides():
     np.testing.assert_allclose(position[:4, 1], [0.1, 0.1, 0.1, 0.3])
     slid = (5.0 - 0.15 * 2.0) / 5.0
     np.testing.assert_allclose(velocity[:4], [[3 * slid, 0, 4 * slid], [0, 0, 0], [3, 1, 0], [3, -2, 4]], rtol=1e-6)
+
+
+def test_cloth_is_drawn_towards_where_it_was_seen_and_takes_up_its_motion():
+    one, placed = followed(30.0), followed(30.0)
+    before, loose = one.particles(PART), ~garment().pinned
+    seen = before + np.float32([0.02, 0.0, 0.01])
+    seen[0] = np.nan  # not seen: what its neighbours do
+    one.draw_to(PART, seen, 1 / 30, gain=0.5)
+    drawn = one.particles(PART) - before
+    np.testing.assert_allclose(drawn[loose], np.tile([0.01, 0.0, 0.005], (loose.sum(), 1)), atol=1e-6)
+    assert not drawn[~loose].any()  # what the body holds stays on it
+    placed.place(PART, one.particles(PART))
+    for each in (one, placed):
+        each.step(swaying(1.0 + 1 / 30), 1 / 30)
+    on = (one.particles(PART) - placed.particles(PART))[loose].mean(axis=0)
+    assert on[0] > 0.002 and on[2] > 0.001  # it goes on that way, which a place alone does not tell
+
+
+def test_the_more_is_believed_the_nearer_is_cloth_to_what_was_seen_and_nothing_is_nothing():
+    before = followed(30.0).particles(PART)
+    rng = np.random.default_rng(0)
+    seen = before + rng.normal(scale=0.01, size=before.shape) + [0.0, 0.0, 0.03]
+    left = []
+    for gain in (0.0, 0.5, 1.0):
+        one = followed(30.0)
+        one.draw_to(PART, seen, 1 / 30, gain=gain)
+        left.append(np.linalg.norm((one.particles(PART) - seen)[~garment().pinned], axis=1).mean())
+    assert left[0] > left[1] > left[2] > 0.001  # noise from particle to particle is not followed
+    one = followed(30.0)
+    one.draw_to(PART, np.full(before.shape, np.nan), 1 / 30)
+    np.testing.assert_array_equal(one.particles(PART), before)
+
+
+def test_what_was_seen_of_nobody_is_refused():
+    one = followed(30.0)
+    with pytest.raises(InputError, match="simulated part"):
+        one.draw_to("cape", one.particles(PART), 0.1)
+    with pytest.raises(InputError, match="shape"):
+        one.draw_to(PART, one.particles(PART)[1:], 0.1)
+    with pytest.raises(InputError, match="seconds"):
+        one.draw_to(PART, one.particles(PART), 0.0)

@@ -11,8 +11,9 @@ from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
 from smplxpp.capture import open_capture
 from smplxpp.cloth import ClothDriver, ClothShape
+from smplxpp.cloth.calibrate import with_values
 from smplxpp.core import BodyParams, GeometryWarning, InputError
-from tests.cloth.persons import person, standing
+from tests.cloth.persons import PART, person, standing
 from tests.cloth.test_driver import QUICK, garment, in_the_world
 from tests.dolls.dancing import NOVEL_POSES, dance, template, write_dance
 
@@ -30,8 +31,9 @@ def shaken(frame: int) -> BodyParams:
 
 
 def motions(params=pose, *, count: int = 60, fps: float = FPS, **config) -> ClothMotions:
+    seen = {"seen": config.pop("seen")} if "seen" in config else {}
     config = ClothMotionConfig(**{"smoothing": 0.0, "pre_roll": 0.2, "driver": QUICK, **config})
-    return ClothMotions(person(), [garment()], params=params, frames=range(count), fps=fps, config=config)
+    return ClothMotions(person(), [garment()], params=params, frames=range(count), fps=fps, config=config, **seen)
 
 
 def stepped(frames: range, params=pose) -> list[ClothShape]:
@@ -219,3 +221,27 @@ def test_the_run_about_a_frame_ends_where_training_begins(capture):
     runs = [sequence._run_of(frame) for frame in NOVEL_POSES]
     assert runs == [list(NOVEL_POSES)] * 2
     assert all(b - a == 1 for a, b in pairwise(runs[0])) and len(dance()) == NOVEL_POSES[-1] + 1
+
+
+def test_a_run_starts_from_what_was_seen_before_it_and_looks_at_nothing_later():
+    """The truth moves with another drag; what is seen of it before the run brings the run nearer."""
+    other = with_values(garment(), drag=12.0, pin_depth=garment().config.pin_depth)
+    driver, places, truth = ClothDriver(person(), [other], QUICK), {}, {}
+    for frame in range(60):
+        truth[frame] = driver.step(pose(frame), 1 / FPS)
+        places[frame] = driver.particles(PART)
+    asked = []
+
+    def seen(frame: int) -> dict[str, np.ndarray]:
+        asked.append(frame)
+        return {PART: places[frame]}
+
+    cold, drawn = motions(), motions(seen=seen)
+    for made in (cold, drawn):
+        made.simulate(range(30, 36))
+    assert asked == list(range(18, 30))
+    wrong = [np.mean([apart(made.shape(frame), truth[frame]) for frame in range(30, 36)]) for made in (cold, drawn)]
+    assert wrong[1] < 0.6 * wrong[0]
+    unseen = motions(seen=lambda frame: {})
+    unseen.simulate(range(30, 36))
+    np.testing.assert_array_equal(unseen.shape(35).displacements, cold.shape(35).displacements)

@@ -6,21 +6,30 @@ import json
 import shutil
 
 import pytest
+import torch
 
 from avatar import EvaluationConfig
 from avatar.data.cloth_motion import ClothMotions
 from avatar.data.sequence import AvatarSequence
 from avatar.evaluation.evaluate import evaluate_models
 from avatar.evaluation.protocol import AsNew
-from pipelines.runs.layout import GARMENTS, MODEL_FILES, REFINED_HELD_OUT_PARAMS
-from pipelines.runs.stage import read_manifest
+from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models.model_file import save_avatar
+from avatar.models.teacher_avatar import TeacherAvatar
+from avatar.models.tracked_surface import ControlCage, Track
+from avatar.rig.rig import Rig
+from pipelines.runs.layout import GARMENTS, MODEL_FILES, REFINED_HELD_OUT_PARAMS, TEACHER
+from pipelines.runs.stage import SCHEMA, read_manifest
 from pipelines.stages.evaluate_inputs import load_model
+from pipelines.stages.scene import TrainInputs, open_scene
 from smplxpp.body import load_params
 from smplxpp.capture import open_capture
+from smplxpp.cloth.calibrate import with_values
 from smplxpp.cloth.garment_file import load_garments, save_garments
 from smplxpp.core.params import BodyParams
 from tests.cloth.persons import PART, person
-from tests.dolls.skirted import garment, write_skirted
+from tests.dolls.skirted import NOVEL_POSES, garment, moved, write_skirted
+from tests.dolls.tiny import TINY_TEACHER
 from tests.pipelines.test_evaluate import draw_no_surfaces, evaluate, refused, write_models
 
 FEW = ("--sets", "novel_pose", "--every", "1", "--no-report", "--shown", "0", "--models", "student")
@@ -82,6 +91,40 @@ def test_poses_that_were_refined_have_their_skirt_simulated_too(trained, capture
     assert refined["views"] == own["views"] and refined["surfaces"]["held_out"] == own["surfaces"]["held_out"]
 
 
+def with_a_teacher(run, capture, digests) -> None:
+    """A teacher that followed the true skirt through the training frames, as its stage leaves it."""
+    torch.manual_seed(0)
+    rig = Rig(person())
+    teacher = TeacherAvatar(TINY_TEACHER, rig, sample_on_mesh(person(), SamplingConfig(count=200)))
+    cage = ControlCage(rig, person().vertex_count)
+    controls = torch.tensor(moved()[: NOVEL_POSES[0]]).float()[:, cage.vertices]
+    teacher.remember(Track({frame: frame for frame in range(len(controls))}, controls, cage))
+    (run / TEACHER).parent.mkdir()
+    save_avatar(run / TEACHER, teacher)
+    seen = {"cameras": ["Ring0"], "frames": list(range(NOVEL_POSES[0]))}
+    record = {"schema": SCHEMA, "key": "", "inputs": digests, "files": {}, "numbers": {"seen": seen}, "checks": []}
+    (run / TEACHER).with_name("manifest.json").write_text(json.dumps(record))
+
+
+@pytest.mark.long
+def test_clothes_go_on_from_where_the_teacher_followed_them_beside_a_cold_start(trained, capture, tmp_path, capsys):
+    run = shutil.copytree(trained, tmp_path / "run")
+    # A drag that is not the truth's: what was seen of the swing tells it, a cold start does not.
+    save_garments(run / GARMENTS, [with_values(garment(), drag=0.7, pin_depth=0.014)])
+    digests = open_scene(run, TrainInputs(capture, None, None, (), 1.0, None)).digests
+    with_a_teacher(run, capture, digests)
+    assert evaluate(run, capture, *FEW) == 0
+    answer = json.loads(capsys.readouterr().out)
+    cold, followed = (answer[key]["student"]["surfaces"]["held_out"]["mean"] for key in ("models", "followed_clothes"))
+    assert followed["labels"][PART]["p2s"] < 0.8 * cold["labels"][PART]["p2s"]
+    assert answer["followed_clothes"].keys() == {"student"}
+    assert (run / "95_evaluate" / "tables" / "novel_pose_followed.csv").is_file()
+    # Of a person who stands in other poses in these frames the teacher has seen nothing.
+    with_a_teacher(shutil.rmtree(run / "80_teacher") or run, capture, {**digests, "capture/parameters": "others"})
+    assert evaluate(run, capture, *FEW) == 0
+    assert json.loads(capsys.readouterr().out)["followed_clothes"] == {}
+
+
 @pytest.mark.long
 def test_other_garments_are_measured_anew_and_none_are_the_field(trained, capture, tmp_path, capsys):
     run = shutil.copytree(trained, tmp_path / "run")
@@ -97,8 +140,8 @@ def test_a_capture_without_its_frame_rate_is_refused_and_says_what_to_do(trained
     about = json.loads((silent / "capture.json").read_text())
     (silent / "capture.json").write_text(json.dumps({name: value for name, value in about.items() if name != "fps"}))
     assert "--cloth field" in refused(capsys, run, silent, *FEW)
-    for moved in ("field", "skin"):  # neither asks how long a frame lasts
-        assert evaluate(run, silent, *FEW, "--cloth", moved) == 0
+    for cloth in ("field", "skin"):  # neither asks how long a frame lasts
+        assert evaluate(run, silent, *FEW, "--cloth", cloth) == 0
 
 
 def test_a_damaged_file_of_garments_is_refused(trained, capture, tmp_path, capsys):
