@@ -18,6 +18,8 @@ from tests import shape_contracts
 # A shell starts what runs in the background with interrupts ignored, and children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+os.environ["TRITON_INTERPRET"] = "1"  # before torch imports Triton, whose kernels then need no GPU
+
 gc.disable()  # until all is collected: nothing that is imported goes away
 
 shape_contracts.install()  # before anything of the packages is imported

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,6 +25,11 @@ from avatar.rendering.on_device import record_graph
 from avatar.rig.rig import Pose, PosedAvatar, Rig
 from smplxpp.cloth.garment import Garment
 from smplxpp.core import ARRAY_NAMES, BodyParams, InputError, require_at_least
+
+if TYPE_CHECKING:
+    from avatar.models.fused_kernels import FusedField, FusedGaussians
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -134,14 +140,7 @@ class Student(nn.Module):
         bound = self.gaussians()
         if self.blend_shapes is None:
             return bound
-        # Coefficients z (1, n) of this pose: the first `head_shapes` belong to the head, the rest to the body.
-        shapes = self.blend_shapes.U.dtype
-        expression, theta, jaw = (one[None].to(shapes) for one in (pose.expression, pose.body_pose, pose.jaw))
-        z = self.blend_shapes.coefficients(expression, theta, jaw if self.blend_shapes.config.jaw else None)
-        # Body shapes fade in unseen poses and under simulated clothes; head shapes do not.
-        head = self.blend_shapes.config.head_shapes
-        of_head, of_body = z.clone(), self._pose_weight(pose) * z
-        of_head[..., head:], of_body[..., :head] = 0.0, 0.0
+        of_head, of_body = self.shape_coefficients(self.blend_shapes, pose)
         if pose.cloth is None:
             du, dc = self.blend_shapes(of_head + of_body)
         else:  # body shapes were learned on the tracked surface and do not hold on simulated clothes
@@ -150,6 +149,19 @@ class Student(nn.Module):
                 a + still * b for a, b in zip(self.blend_shapes(of_head), self.blend_shapes(of_body), strict=True)
             )
         return replace(bound, offset=bound.offset + du[0].to(bound.offset), dc=bound.dc + dc[0].to(bound.dc))
+
+    def shape_coefficients(
+        self, shapes: BlendShapes, pose: Pose
+    ) -> tuple[Float[Tensor, "1 P n"], Float[Tensor, "1 P n"]]:
+        """Return the coefficients of the head's shapes and of the body's in a pose, each 0 for the other's shapes."""
+        # Coefficients z (1, P, n) of this pose: the first `head_shapes` belong to the head, the rest to the body.
+        expression, theta, jaw = (one[None].to(shapes.U.dtype) for one in (pose.expression, pose.body_pose, pose.jaw))
+        z = shapes.coefficients(expression, theta, jaw if shapes.config.jaw else None)
+        # Body shapes fade in unseen poses and under simulated clothes; head shapes do not.
+        head = shapes.config.head_shapes
+        of_head, of_body = z.clone(), self._pose_weight(pose) * z
+        of_head[..., head:], of_body[..., :head] = 0.0, 0.0
+        return of_head, of_body
 
     def _pose_weight(self, pose: Pose) -> float | Tensor:
         """Return the weight of a pose as one of the training's, in [0, 1]; body shapes fade with it."""
@@ -222,9 +234,11 @@ class Student(nn.Module):
 
         return avatar.export_student(self, path, **options)
 
-    def compiled(self, *, dtype: torch.dtype = torch.float32, graph: bool = True) -> CompiledStudent:
+    def compiled(
+        self, *, dtype: torch.dtype = torch.float32, graph: bool = True, fused: bool = False
+    ) -> CompiledStudent:
         """Return the student as it is for films and streams of new poses on a GPU, see `CompiledStudent`."""
-        return CompiledStudent(self, dtype=dtype, graph=graph)
+        return CompiledStudent(self, dtype=dtype, graph=graph, fused=fused)
 
 
 class CompiledStudent:
@@ -238,13 +252,17 @@ class CompiledStudent:
         student: whose parameters must not change any more.
         dtype: of field and blend shapes; geometry and colours stay in float32.
         graph: record a CUDA graph on a GPU.
+        fused: use the Triton kernels of `fused_kernels`, which were tried on a CPU by Triton's interpreter alone. Their
+            first pose is compared with torch's; where they fail or differ, which is logged, torch computes.
 
     Example:
         >>> fast = student.compiled(dtype=torch.float16)
         >>> picture = avatar.render_view(fast(params.frame(0), camera.position), 0, camera, background)
     """
 
-    def __init__(self, student: Student, *, dtype: torch.dtype = torch.float32, graph: bool = True) -> None:
+    def __init__(
+        self, student: Student, *, dtype: torch.dtype = torch.float32, graph: bool = True, fused: bool = False
+    ) -> None:
         self.rig, self.student = student.rig, copy.copy(student)
         # Copies of what computes in another precision; the rest is shared.
         self.student._modules = dict(student._modules)
@@ -252,10 +270,16 @@ class CompiledStudent:
             part = getattr(student, name)
             if part is not None and dtype != torch.float32:
                 self.student._modules[name] = copy.deepcopy(part).to(dtype)
+        self._dtype, self._kernels = dtype, self._fused_kernels() if fused else None
         self._graph = graph and self.rig.device.type == "cuda"
         self._replay: tuple[Callable[[], object], PosedAvatar] | None = None
         self._widths: dict[str, int] = {}
         self._flat = False
+
+    @property
+    def fused(self) -> bool:
+        """Whether Triton's kernels compute; known after the first pose."""
+        return self._kernels is not None
 
     @property
     def recorded(self) -> bool:
@@ -285,6 +309,7 @@ class CompiledStudent:
         if not self._widths:
             self._widths, self._flat = widths, params.flat_hand_mean
             self._input = packed.to(self.rig.device)
+            self._compare_kernels()
             self._replay = record_graph(self._posed, subject="the student") if self._graph else None
         self._input.copy_(packed)
         if self._replay is None:
@@ -297,13 +322,50 @@ class CompiledStudent:
         *values, center = self._input.split([*self._widths.values(), 3])
         tensors = {name: value[None] for name, value in zip(self._widths, values, strict=True)}
         pose = self.rig.pose_on_device(tensors, flat_hand_mean=self._flat)
-        moved = self.student.displacements(pose)
-        moved = None if moved is None else moved.float()
+        field, codes, of_field = self.student.field, self.student.codes, self._kernels and self._kernels[0]
+        if field is not None and codes is not None and of_field is not None:
+            points = of_field.at_points(pose.body_pose[None].to(codes.codes.dtype), codes([None]))
+            found: Tensor | None = field.spread(points)[0]
+        else:
+            found = self.student.displacements(pose)
+        moved = None if found is None else found.float()
         vertices = self.rig.skin(pose, moved)
+        if self._kernels is not None:
+            shapes = self.student.blend_shapes
+            z = None if shapes is None else torch.cat(self.student.shape_coefficients(shapes, pose)).sum(0)
+            world, bound, colors = self._kernels[1](vertices, z, center)
+            return PosedAvatar(vertices, world, colors, bound, moved)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.student.compensated(pose)
         world = world_from_frames(bound, frames)
         return PosedAvatar(vertices, world, view_colors(bound, frames, world.means, center[None]), bound, moved)
+
+    def _fused_kernels(self) -> tuple[FusedField | None, FusedGaussians]:
+        """Return the kernels of the field, unless a regression stands for it, and of the Gaussians."""
+        from avatar.models.fused_kernels import FusedField, FusedGaussians  # compiles on import, where Triton is
+
+        made = self.student
+        field = None if made.field is None or made.regression is not None else FusedField(made.field)
+        return field, FusedGaussians(made.gaussians(), self.rig.faces, made.blend_shapes)
+
+    def _compare_kernels(self) -> None:
+        """Leave the kernels out if they fail, or if a pose by them is not that of torch."""
+        if self._kernels is None:
+            return
+        # Metres and shares of a colour: of float32's roundings, and of half precision, whose sums torch rounds, too.
+        kernels, apart = self._kernels, 1e-4 if self._dtype == torch.float32 else 1e-3
+        try:
+            found = self._posed()
+            self._kernels = None
+            truth = self._posed()
+            pairs = ((found.gaussians.means, truth.gaussians.means), (found.colors, truth.colors))
+            worst = max(float((a - b).abs().max()) for a, b in pairs)
+            if not worst <= apart:
+                raise RuntimeError(f"its Gaussians differ by {worst:.2g}")
+            self._kernels = kernels
+        except Exception as error:  # noqa: BLE001  whatever a compiler raises, torch computes the pose
+            self._kernels = None
+            log.warning("the student is not posed by Triton's kernels: %s", str(error).split("\n")[0][:300])
 
 
 def _make_field(config: FieldConfig, student: StudentConfig, rig: Rig) -> DeformationField:

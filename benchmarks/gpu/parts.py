@@ -203,7 +203,7 @@ def loader(job: Job, note: Note) -> None:
 
 
 def student(job: Job, note: Note) -> None:
-    """Frames a second of a student with the paper's sizes, pose included: float32, half, with and without graph.
+    """Frames a second of a student with the paper's sizes, pose included: float32, half, fused, without a graph.
 
     Those of its bundle in a player end with the picture in the CPU's memory.
     """
@@ -227,11 +227,11 @@ def student(job: Job, note: Note) -> None:
     note(gaussians=count, vertices=len(rig.vertices), trained=False, rows={})
     rows: dict[str, Any] = {}
     for name, dtype in (("float32", torch.float32), ("half", torch.float16)):
-        for way, graph in (("eager", False), ("graph", True)):
-            fast = model.compiled(dtype=dtype, graph=graph)
+        for way, graph, fused in (("graph", True, False), ("fused graph", True, True), ("eager", False, False)):
+            fast = model.compiled(dtype=dtype, graph=graph, fused=fused and not job.toy)
             # Half precision must not move Gaussians visibly: the largest distance from the plain student, millimetres.
             row: dict[str, Any] = {"difference_mm": largest_difference_mm(fast(params[-1], camera.position), truth)}
-            row["recorded"] = fast.recorded
+            row |= {"recorded": fast.recorded, "fused": fast.fused}
             rows[f"{name}, {way}"] = row
             for width, height in sizes:
                 seen = fitted(camera, width, height)

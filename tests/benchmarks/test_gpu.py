@@ -83,7 +83,9 @@ def test_photographs_a_second_are_counted_by_readers(job):
 def test_the_student_is_the_same_in_half_precision_and_without_checks(job):
     rows = found_by("student", job)["rows"]
     player = rows.pop("player")
-    assert list(rows) == ["float32, eager", "float32, graph", "half, eager", "half, graph"]
+    ways = ("graph", "fused graph", "eager")
+    assert list(rows) == [f"{numbers}, {way}" for numbers in ("float32", "half") for way in ways]
+    assert not any(row["fused"] for row in rows.values())  # toys are the CPU's, which Triton's kernels are not for
     assert player["48x64"]["fps"] > 0
     assert rows["float32, eager"]["difference_mm"] < 1e-3
     assert 0 < rows["half, eager"]["difference_mm"] < 5.0

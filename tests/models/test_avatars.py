@@ -10,6 +10,7 @@ import torch
 from avatar.gaussians.binding import world_from_local
 from avatar.gaussians.frames import triangle_frames
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
+from avatar.models import fused_kernels
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.pose_dependence import PoseRegression
 from avatar.models.student import Student, StudentConfig
@@ -335,6 +336,12 @@ def test_a_compiled_student_on_a_gpu_waits_for_nothing_and_says_when_it_has_no_g
         assert (second.gaussians.means.cpu() - first).abs().max() > 1e-3
     assert (counted.count, counted.sent) == (0, 1)  # the parameters
     assert caplog.text.count("not recorded as a CUDA graph") == 1 and not fast.recorded
+
+
+def test_fused_kernels_are_refused_without_triton(rig, monkeypatch):
+    monkeypatch.setattr(fused_kernels, "triton", None)
+    with pytest.raises(InputError, match="Leave fused out"):
+        whole_student(rig).compiled(fused=True)
 
 
 def test_a_compiled_student_refuses_other_parameters(rig):
