@@ -387,7 +387,6 @@ def test_plain_pickle_is_never_loaded():
 # Modules of under 60 lines with one user, and why each stands alone; all others join the module that uses them.
 SMALL_WITH_A_REASON = {
     "avatar.export.posed": "needs torch, which formats does not",
-    "avatar.models.networks.presets": "sizes of networks, apart from the trainings that use them",
     "smplxpp.capture.readers.thuman4": "one reader of a data set a file",
     "smplxpp.export.by_suffix": "keeps the writers of formats out of the light room of templates",
 }

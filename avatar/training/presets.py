@@ -8,7 +8,7 @@ from typing import TypeVar
 from avatar.gaussians.sampling import SamplingConfig
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
-from avatar.models.networks.presets import NetworkPreset, network_preset
+from avatar.models.networks.teacher import NetworkPreset, network_preset
 from avatar.models.student import StudentConfig
 from avatar.training.engine.adam import LearningRates
 from avatar.training.engine.optimization_task import PretrainConfig

@@ -24,9 +24,8 @@ from avatar.losses.perceptual import ShiftTolerantLPIPS
 from avatar.models.networks.blend_shapes import BlendShapeConfig, BlendShapes
 from avatar.models.networks.control_points import choose_control_points
 from avatar.models.networks.deformation_field import DeformationField, FieldConfig
-from avatar.models.networks.presets import NETWORK_PRESETS, network_preset
 from avatar.models.networks.sparse_lookups import MapSampler
-from avatar.models.networks.teacher import Teacher
+from avatar.models.networks.teacher import NETWORK_PRESETS, Teacher, network_preset
 from avatar.rendering.mesh_maps import MapFrame
 from benchmarks.support.results import store_results
 

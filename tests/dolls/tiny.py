@@ -6,8 +6,7 @@ from avatar.gaussians.sampling import SamplingConfig
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.deformation_field import FieldConfig
-from avatar.models.networks.presets import NetworkPreset
-from avatar.models.networks.teacher import TeacherConfig
+from avatar.models.networks.teacher import NetworkPreset, TeacherConfig
 from avatar.training.engine.optimization_task import PretrainConfig
 from avatar.training.fit.fit import FitConfig
 from avatar.training.fit_teacher import FitTeacherConfig

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from unittest import mock
 
-from avatar.models.networks.presets import NetworkPreset
+from avatar.models.networks.teacher import NetworkPreset
 from avatar.training import recipe
 from avatar.training.loose_clothes import ClothConfig
 from avatar.training.presets import TRAINING_PRESETS

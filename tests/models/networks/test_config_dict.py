@@ -9,8 +9,7 @@ import pytest
 from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.networks.config_dict import config_from_dict, config_to_dict
 from avatar.models.networks.deformation_field import FieldConfig
-from avatar.models.networks.presets import NETWORK_PRESETS
-from avatar.models.networks.teacher import TeacherConfig
+from avatar.models.networks.teacher import NETWORK_PRESETS, TeacherConfig
 from smplxpp.core.errors import InputError
 
 

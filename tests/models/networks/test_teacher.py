@@ -8,9 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from avatar.models.networks.presets import NETWORK_PRESETS, network_preset
 from avatar.models.networks.sparse_lookups import MapSampler
-from avatar.models.networks.teacher import Residuals, Teacher, TeacherConfig, local_offsets
+from avatar.models.networks.teacher import (
+    NETWORK_PRESETS,
+    Residuals,
+    Teacher,
+    TeacherConfig,
+    local_offsets,
+    network_preset,
+)
 from avatar.rendering.mesh_maps import MapFrame
 from smplxpp.core.errors import InputError
 
