@@ -13,7 +13,7 @@ clothes or an arm. A skirt beside a hand has such evidence, too; it continues sm
 out is dear. Bags have evidence where they stand off trunk and legs and the mirrored place of the other side is empty,
 because clothes hang off both. A minimum cut gives O; its pieces are kept where they are large enough, touch a hand or
 are lacking on the other side, leave the reach of clothes, and have a border that is short for their area, which a flap
-of cloth does not have.
+of cloth does not have. With colours, a second cut adds what has the colour of a piece at the hand that holds it.
 """
 
 from __future__ import annotations
@@ -129,26 +129,61 @@ def find_objects(
     relative = edge_weights(mesh, pairs, ends, SmoothingConfig(smoothness=1.0, floor=0.0, eta_convex=0.0), lab=lab)
     length = 100.0 * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
     cost = _LENGTH_COST * relative * (length.mean() if len(length) else 1.0)
-    unary = np.stack([np.zeros(mesh.face_count), -evidence * mesh.face_areas * _CM2], axis=1)
-    unary -= unary.min(axis=1, keepdims=True)
-    cut = minimize_potts(PottsProblem.from_costs(unary, pairs, cost))[0].astype(bool)
-    # What is left of either hand, where a face takes the part of the body that faces alike.
     charted, middle = chart_of_scan(mesh, body, params), posed.vertices[own.region == TRUNK].mean(axis=0)
-    left = (charted.region == HAND) & ~cut
-    hands = [
-        (posed.vertices[hand & (own.side == side)], float(mesh.face_areas[left & (charted.side == side)].sum()) * _CM2)
-        for side in (1, -1)
-    ]
-    paired = np.zeros(mesh.face_count)
     where = _Where(distance, to_hand, _sectors(mesh, middle), flat, lacked, pairs, length, cost)
-    found = _accepted(mesh, cut, where, hands, paired=paired)
-    # A wide sleeve has its like at the other arm, which is no thing; of two things in two hands both are found.
-    arms = np.flatnonzero(found.faces & np.isin(region, (ARM, HAND)) & (distance > 0.03))
-    if len(arms):
-        away = _from_mirrored(mesh, body, params, posed, arms, nearest[arms], among=~found.faces)
-        paired[arms] = away < 0.4 * distance[arms]
-        found = _accepted(mesh, cut, where, hands, paired=paired)
-    return found
+
+    def things_by(evidence: Float64[np.ndarray, " M"], known: Bool[np.ndarray, " M"]) -> FoundObjects:
+        unary = np.stack([np.zeros(mesh.face_count), -evidence * mesh.face_areas * _CM2], axis=1)
+        unary -= unary.min(axis=1, keepdims=True)
+        cut = minimize_potts(PottsProblem.from_costs(unary, pairs, cost))[0].astype(bool)
+        # What is left of either hand, where a face takes the part of the body that faces alike.
+        left = (charted.region == HAND) & ~cut
+        hands = [
+            (
+                posed.vertices[hand & (own.side == one)],
+                float(mesh.face_areas[left & (charted.side == one)].sum()) * _CM2,
+            )
+            for one in (1, -1)
+        ]
+        paired = np.zeros(mesh.face_count)
+        found = _accepted(mesh, cut, where, hands, paired=paired, known=known)
+        # A wide sleeve has its like at the other arm, which is no thing; of two things in two hands both are found.
+        arms = np.flatnonzero(found.faces & np.isin(region, (ARM, HAND)) & (distance > 0.03))
+        if len(arms):
+            away = _from_mirrored(mesh, body, params, posed, arms, nearest[arms], among=~found.faces)
+            paired[arms] = away < 0.4 * distance[arms]
+            found = _accepted(mesh, cut, where, hands, paired=paired, known=known)
+        return found
+
+    found = things_by(evidence, np.zeros(mesh.face_count, dtype=bool))
+    if lab is None or not found.faces.any():
+        return found
+    # Fitted fingers reach into a thing, whose other end then has no evidence but the colour of the end that was found.
+    for one in (1, -1):
+        at = (region == HAND) & (own.side[nearest] == one)
+        if (found.faces & at).any():
+            # Skin and sleeves within a forearm, metres, of the hands, not hair, which may be as brown as a bottle.
+            person = ~found.faces & ~at & (to_hand < 0.3)
+            alike = _alike(lab, found.faces, person, at & ~hangs)
+            evidence = np.maximum(evidence, (1.0 + _BOARD) * alike - 1.0)
+    more = things_by(evidence, found.faces)
+    return found if (found.faces & ~more.faces).any() else more
+
+
+def _alike(
+    lab: Float64[np.ndarray, "M 3"],
+    thing: Bool[np.ndarray, " M"],
+    person: Bool[np.ndarray, " M"],
+    faces: Bool[np.ndarray, " M"],
+) -> Float64[np.ndarray, " M"]:
+    """Return how surely some faces have the colours of a thing and none of the person's, 0 to 1."""
+    out = np.zeros(len(lab))
+    near = 10  # by the tenth nearest colour, because a few faces of either are wrong
+    if min(thing.sum(), person.sum()) > near and faces.any():
+        a, b = (cKDTree(lab[group]).query(lab[faces], k=near)[0][:, -1] for group in (thing, person))
+        # Differences of 0.02 in OKLab are just seen; where both have the colour, the share is 0.5.
+        out[faces] = np.interp((b + 0.02) / (a + b + 0.04), (0.6, 0.75), (0.0, 1.0))
+    return out
 
 
 def _from_mirrored(
@@ -255,6 +290,7 @@ def _accepted(
     hands: list[tuple[np.ndarray, float]],
     *,
     paired: Float64[np.ndarray, " M"],
+    known: Bool[np.ndarray, " M"],
 ) -> FoundObjects:
     """Keep the pieces of a cut that are things.
 
@@ -264,6 +300,7 @@ def _accepted(
         where: measures of faces and edges.
         hands: points of either hand of the body, and what the rest of the scan shows of it, square centimetres.
         paired: 1 where a face 3 cm off an arm or more has its like at the other arm, else 0.
+        known: faces of things; a piece with them need not show by its border that it is one.
     """
     inside, pairs = cut[where.pairs], where.pairs
     piece = component_labels(pairs[inside.all(axis=1)], len(cut))
@@ -294,9 +331,12 @@ def _accepted(
         # Squared length of the border by area times its mean cost is 0.1 of backpacks and 0.2 of a stick that goes on
         # smoothly into the fist about it, 1.5 and more of flaps, whose borders are long or smooth.
         apart = dear * length**2 < 0.4 * area
-        if dear > _SMOOTH_BORDER and not apart:
+        proven = bool(known[own].any())
+        if dear > _SMOOTH_BORDER and not apart and not proven:
             continue
-        if length**2 > _LONG_BORDER * area and not (clamped and dear < _CLAMPED_BORDER):
+        # Between fingers about a thing the border is long but lies in edges of colour: the product is 0.5 of bottles.
+        tight = proven or (held and dear * length**2 < 0.8 * area) or (clamped and dear < _CLAMPED_BORDER)
+        if length**2 > _LONG_BORDER * area and not tight:
             continue
         # What is off the hands is worn, from 150 cm2 on and beginning beside the body, where the other side of the
         # person lacks two fifths of it, or where it stands 12 cm off her.

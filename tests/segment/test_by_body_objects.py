@@ -125,6 +125,30 @@ def test_a_stick_is_found_on_both_sides_of_the_fist_that_it_goes_on_smoothly_int
     assert len(found.notes) == 2
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["bottle", "stick"])
+def test_both_ends_of_what_is_in_a_fist_are_found_by_their_colour_and_the_fist_stays(open_body, stance, kind):
+    """Fitted fingers bent into a bottle, so that one half of it was skin to which the next fit drew them."""
+    skin, thing = open_body.mesh(stance[1].vertices[0]), thing_mesh(Thing(kind, "left"), open_body, stance[1])
+    taken = simulate_scan(concatenate_meshes([skin, thing]), [], _COARSE)
+    mesh, area = taken.mesh, taken.mesh.face_areas
+    truth = (taken.face >= skin.face_count)[mesh.faces].sum(axis=1) >= 2
+    pose = stance[0].full_pose.copy()
+    fingers = [f"left_{name}{k}" for name in ("index", "middle", "ring", "pinky") for k in (1, 2, 3)]
+    pose[0, [open_body.joint_names.index(name) for name in fingers], 2] = -0.5
+    fitted = BodyParams.from_full_pose(
+        pose, betas=stance[0].betas, expression=stance[0].expression, transl=stance[0].transl
+    )
+    lab = np.where(truth[:, None], (0.4, 0.05, 0.06), (0.7, 0.04, 0.04))
+    lab += 0.01 * np.random.default_rng(0).normal(size=lab.shape)
+    found = find_objects(mesh, open_body, fitted, lab=lab).faces
+    assert area[found & truth].sum() > 0.95 * area[truth].sum()
+    assert area[found & ~truth].sum() < 0.05 * area[truth].sum()
+    # A colour that the person has about it tells nothing.
+    alike, plain = (find_objects(mesh, open_body, fitted, lab=lab).faces for lab in (np.full_like(lab, 0.5), None))
+    np.testing.assert_array_equal(alike, plain)
+
+
 @pytest.mark.parametrize("other", ["none", "of cloth", "in a hand"])
 def test_what_is_alike_at_both_arms_is_a_sleeve_unless_both_are_things(open_body, stance, other, monkeypatch):
     """One of a kimono's sleeves passed for a thing, because its border was shorter than the other's by a little."""
