@@ -194,8 +194,8 @@ def _settled(
 
 
 def _labelled(search: Search, best: Found, labeller: Labeller, *, colored: bool) -> Found:
-    """Fit a body with what is bare skin and without things that it holds or wears, and once more where the labels of
-    the fitted body call something else skin or a thing.
+    """Fit a body with what is bare skin, with colours without things that it holds or wears, and once more where the
+    labels of the fitted body call something else skin or a thing.
 
     A body that was fitted as clothed stays a centimetre or two within a person who is not, and what lies that far off
     it looks like clothes. Without colours it is therefore also fitted to the whole surface as skin: clothes show their
@@ -218,10 +218,14 @@ def _labelled(search: Search, best: Found, labeller: Labeller, *, colored: bool)
     skin, thing = np.zeros((2, len(search.fine)), bool)
     for _ in range(2):
         labels = labels_of(best)
-        if labels is None or np.mean((skin != (labels == SKIN.id)) | (thing != (labels == OBJECT.id))) < _SAME:
+        if labels is None:
             break
-        skin, thing = labels == SKIN.id, labels == OBJECT.id
-        # Hands and forearms were drawn onto the thing, and shape and shoulders after them.
+        found = labels == SKIN.id, (labels == OBJECT.id) & colored
+        if np.mean((skin != found[0]) | (thing != found[1])) < _SAME:
+            break
+        # Hands and forearms were drawn onto the thing, and shape and shoulders after them. Without colours its borders
+        # are unsure: a body that was fitted without a part of it made sleeves of the rest, and of bare forearms.
+        skin, thing = found
         rest = search.without(thing)
         best = rest.finished(rest.measured(best.name, best.state), skin[~thing])
     # Candidates are compared by what they explain of the whole surface.
