@@ -108,7 +108,7 @@ def evaluate(
     )
     # The key covers models, capture, true surfaces, garments and refined poses. Evaluation is repeated if any of them
     # changes.
-    seen = clothes.seen(run, scene, sequence)
+    seen = clothes.seen(run, scene, sequence, loaded.get("teacher"))
     stage = Stage(
         name=EVALUATE_STAGE,
         config={"evaluation": config, "inputs": known, "scale": inputs.scale, "device": device, "cloth": clothes.mode},
@@ -176,15 +176,21 @@ class _Clothes:
         self.mode = mode if self.garments else "field"
         self.digests = {GARMENTS: sha256_file(run / GARMENTS)} if self.garments else {}
 
-    def seen(self, run: Path, scene: TrainScene, sequence: AvatarSequence) -> SeenClothes | None:
-        """Return where the teacher followed the simulated clothes; None where they are not, or poses are others now."""
+    def seen(
+        self, run: Path, scene: TrainScene, sequence: AvatarSequence, teacher: AvatarModel | None
+    ) -> SeenClothes | None:
+        """Return where the teacher followed the simulated clothes; None where they are not, or poses are others now.
+
+        Args:
+            teacher: where it is loaded already, to be measured.
+        """
         manifest = read_manifest(run / TEACHER_STAGE)
         if self.mode != "simulate" or manifest is None or not (run / TEACHER).is_file():
             return None
         known, key = as_object(manifest.get("inputs", {}), subject=f"{TEACHER_STAGE}: inputs"), "capture/parameters"
         if known.get(key) != scene.digests[key]:
             return None
-        teacher = load_avatar(run / TEACHER, sequence.rig)
+        teacher = teacher or load_avatar(run / TEACHER, sequence.rig)
         track = teacher.track if isinstance(teacher, TeacherAvatar) else None
         return None if track is None else seen_particles(sequence, track, self.garments)
 

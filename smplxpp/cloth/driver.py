@@ -15,7 +15,7 @@ from smplxpp.cloth.model import SolverConfig
 from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.cloth.quality import ClothQuality
 from smplxpp.cloth.thread import GarmentThread
-from smplxpp.core import BodyParams, InputError, require_at_least, require_choice, require_positive
+from smplxpp.core import BodyParams, InputError, require_at_least, require_between, require_choice, require_positive
 from smplxpp.core.errors import one_line
 from smplxpp.template.template import Template
 
@@ -164,10 +164,11 @@ class ClothDriver:
                 frames alike.
 
         Raises:
-            InputError: no such part is simulated, another number of particles, no positive time.
+            InputError: no such part is simulated, another number of particles, no positive time, another gain.
         """
         thread = self._thread_of(part, seen)
         require_positive("seconds until particles are seen", seconds)
+        require_between("gain of what is seen", gain, 0.0, 1.0)
         thread.draw_to(seen - self._origin, seconds, gain=gain)
 
     def _thread_of(self, part: str, particles: Float[np.ndarray, "n 3"]) -> GarmentThread:

@@ -349,3 +349,5 @@ def test_what_was_seen_of_nobody_is_refused():
         one.draw_to(PART, one.particles(PART)[1:], 0.1)
     with pytest.raises(InputError, match="seconds"):
         one.draw_to(PART, one.particles(PART), 0.0)
+    with pytest.raises(InputError, match="gain"):
+        one.draw_to(PART, one.particles(PART), 0.1, gain=1.5)
