@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,6 +90,24 @@ def test_units_and_axes_are_the_users_before_the_formats_before_a_guess(tmp_path
     np.testing.assert_allclose(lying.position, Z_UP.T @ rig()["cam_01"].position, atol=1e-9)
     with pytest.raises(InputError, match="--up"):
         read_calibration(path, up="up")
+
+
+def test_a_board_of_opencap_that_lies_on_the_ground_has_z_down(tmp_path):
+    """The same cameras, once with the world of a standing board and once with that of one that lies."""
+    path = WRITERS["opencap"](rig(), tmp_path)
+    standing = read_calibration(path)
+    lying = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # rows: axes of the lying board in the standing one's world
+    for file in (tmp_path / "Videos").glob("*/*.pickle"):
+        content = pickle.loads(file.read_bytes())
+        content["rotation"] = content["rotation"] @ lying.T
+        file.write_bytes(pickle.dumps(content))
+    read = read_calibration(path)
+    assert not read.notes
+    for camera, expected in zip(read.cameras.values(), standing.cameras.values(), strict=True):
+        np.testing.assert_allclose(camera.K, expected.K)
+        # Both worlds stand on y, and may differ by a turn about it.
+        np.testing.assert_allclose(camera.cam_from_world[:3, 1], expected.cam_from_world[:3, 1], atol=1e-9)
+        np.testing.assert_allclose(camera.cam_from_world[:3, 3], expected.cam_from_world[:3, 3], atol=1e-9)
 
 
 def test_pictures_that_lie_on_their_side_do_not_tell_where_up_is(tmp_path):

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import wave
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ from PIL import Image
 
 from pipelines.commands.capture import CaptureConvertCommand
 from smplxpp.capture import open_capture
+from smplxpp.capture.readers.rig import find_videos
 from smplxpp.capture.video_files import Video, probe_video, video_frames
 from smplxpp.capture.video_sync import found_offsets, timeline
 from smplxpp.core import InputError
 from smplxpp.footage.turn_frames import sharpest_of_intervals
+from tests.capture.calibration_writers import opencap as write_opencap
 from tests.capture.calibration_writers import pose2sim as write_calibration
 from tests.capture.test_calibrations import rig
 
@@ -183,6 +186,26 @@ def test_options_that_do_not_fit_are_refused_before_anything_is_decoded(take, tm
         with pytest.raises(InputError, match=words):
             convert(take, tmp_path / "out", **options)
         assert not (tmp_path / "out").exists()
+
+
+def test_videos_and_calibrations_in_a_folder_of_each_camera(tmp_path):
+    """OpenCap's session: pickles in the cameras' folders, and below them a take with its synchronized copy."""
+    cameras = {f"Cam{k}": replace(camera, width=WIDTH, height=HEIGHT) for k, camera in enumerate(rig(count=2).values())}
+    session = tmp_path / "session"
+    write_opencap(cameras, session)
+    for k, name in enumerate(cameras):
+        folder = session / "Videos" / name / "InputMedia" / "walk"
+        write_video(folder / "walk.mov", fps=10.0, offset=0.0, shade=90 + 50 * k, heard=False)
+        (folder / "walk_sync.mp4").write_bytes((folder / "walk.mov").read_bytes())
+    for root in (session, session / "Videos"):
+        found = find_videos(root, list(cameras))
+        assert [path.name for path in found.values()] == ["walk_sync.mp4"] * 2 and list(found) == ["Cam0", "Cam1"]
+        out = tmp_path / f"out_{root.name}"
+        convert(root, out, frames="0,5")
+        assert len(open_capture(out).views()) == 4
+    (folder / "run.mov").write_bytes(b"")
+    with pytest.raises(InputError, match="several takes: run, walk"):
+        open_capture(session)
 
 
 def test_a_rotation_flag_is_followed_as_the_calibration_was(tmp_path):

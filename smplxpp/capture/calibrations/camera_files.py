@@ -80,7 +80,8 @@ _ROTATION = ("R", "rotation_matrix", "rotation", "rvec", "Rot", "rotation_vector
 _TRANSLATION = ("T", "t", "tvec", "translation", "translation_vector")
 _POSE = ("extrinsics", "extrinsic", "RT", "Rt", "cam_from_world", "extrinsic_matrix")
 _WIDTH, _HEIGHT = ("image_width", "width", "w"), ("image_height", "height", "h")
-_OPENCAP_FILE = "cameraIntrinsicsExtrinsics.pickle"
+OPENCAP_FILE = "cameraIntrinsicsExtrinsics.pickle"
+"""Name of OpenCap's file in the folder of each camera."""
 
 
 def is_opencap(content: Any) -> bool:
@@ -96,11 +97,12 @@ def is_opencv_yaml(content: Any) -> bool:
 
 
 def read_opencap(path: Path, content: Any) -> RigFile:
-    """OpenCap: `Videos/CAM/cameraIntrinsicsExtrinsics.pickle`, millimetres, the world of a standing checkerboard.
+    """OpenCap: `Videos/CAM/cameraIntrinsicsExtrinsics.pickle`, millimetres, the world of its checkerboard.
 
-    `x_cam = rotation X + translation`; y of the board points down. `imageSize` is height, width.
+    `x_cam = rotation X + translation`. Of a board that stands y points down, of one that lies on the ground z does; the
+    file does not say which, the lower edges of the pictures do. `imageSize` is height, width.
     """
-    beside = sorted(path.parent.parent.glob(f"*/{_OPENCAP_FILE}")) if path.name == _OPENCAP_FILE else [path]
+    beside = sorted(path.parent.parent.glob(f"*/{OPENCAP_FILE}")) if path.name == OPENCAP_FILE else [path]
     cameras = []
     for file in beside or [path]:
         found = content if file == path else safe_load(file)
@@ -124,7 +126,8 @@ def read_opencap(path: Path, content: Any) -> RigFile:
                 dist=() if dist is None else dist,
             )
         )
-    return RigFile(tuple(cameras), 1e-3, "-y")
+    down = sum(camera.R[1] for camera in cameras)
+    return RigFile(tuple(cameras), 1e-3, "-y" if down[1] > down[2] else "-z")
 
 
 def read_opencv_cameras(path: Path, content: Any) -> RigFile:

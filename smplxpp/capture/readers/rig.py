@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from smplxpp.capture.calibrations import find_calibration, read_calibration
+from smplxpp.capture.calibrations.camera_files import OPENCAP_FILE
 from smplxpp.capture.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FileSeries, images_beside, matched_names, subfolders
 from smplxpp.capture.keypoint_files import KeypointOptions
 from smplxpp.capture.keypoints import KeypointFiles, find_places
@@ -39,7 +40,7 @@ def detect(root: Path) -> bool:
         names = list(read_calibration(calibration).cameras)
     except InputError:
         return calibration.parent == root  # its error says more than that no layout fits
-    return any((find_keypoints(root, names), find_series(root, names, _IMAGES), find_videos(root, names)))
+    return bool(find_keypoints(root, names) or find_series(root, names, _IMAGES) or find_videos(root, names))
 
 
 def read(root: Path, options: ReaderOptions) -> Recording:
@@ -58,7 +59,8 @@ def read(root: Path, options: ReaderOptions) -> Recording:
         )
     calibrated = read_calibration(calibration, units=options.rig.units, up=options.rig.up)
     names = list(calibrated.cameras)
-    images, videos = find_series(root, names, _IMAGES), find_videos(root, names)
+    images = find_series(root, names, _IMAGES)
+    videos = {} if images else find_videos(root, names)
     places, masks = find_keypoints(root, names), find_series(root, names, _MASKS)
     if not (places or images or videos):
         raise InputError(
@@ -72,7 +74,7 @@ def read(root: Path, options: ReaderOptions) -> Recording:
     if sizes:
         calibrated = read_calibration(calibration, units=options.rig.units, up=options.rig.up, sizes=sizes)
     notes = [f"calibration {calibrated.path.name} ({calibrated.format}): {note}" for note in calibrated.notes]
-    if videos and not images:
+    if videos:
         notes.append(f"{len(videos)} videos, which `smplxpp capture convert` decodes to images")
     for what, found in (("keypoints", places), ("images", images)):
         missing = [name for name in names if name not in found]
@@ -151,27 +153,63 @@ def find_series(root: Path, names: list[str], folders: tuple[str, ...]) -> dict[
 
 
 def find_videos(root: Path, names: list[str]) -> dict[str, Path]:
-    """Return the video of each camera in the first folder that has those of two cameras."""
+    """Return the video of each camera in the first folder that has those of two cameras.
+
+    They lie in it, or in a folder a camera (`Cam0/InputMedia/walk/walk.mov`).
+
+    Raises:
+        InputError: folders of cameras hold several takes.
+    """
 
     def there(folder: Path) -> dict[str, Path]:
-        files = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()}
-        return {name: files[stem] for name, stem in matched_names(names, list(files)).items()}
+        files = {path.stem: path for path in _videos_in(folder)}
+        beside = {name: files[stem] for name, stem in matched_names(names, list(files)).items()}
+        return beside or _videos_of_folders(folder, matched_names(names, subfolders(folder)))
 
     return _first(root, _VIDEOS, there)
 
 
+def _videos_in(folder: Path, inside: str = "*") -> list[Path]:
+    return sorted(p for p in folder.glob(inside) if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file())
+
+
+def _videos_of_folders(folder: Path, matched: Mapping[str, str]) -> dict[str, Path]:
+    """Return the video in each camera's folder: the highest, and of a take and its synchronized copy the copy."""
+    levels = ("*", "*/*", "*/*/*")  # OpenCap's lie in `InputMedia/TAKE`
+    own = {name: next((v for at in levels if (v := _videos_in(folder / sub, at))), []) for name, sub in matched.items()}
+    takes = sorted({re.sub("[_-]?sync.*", "", path.stem.lower()) for videos in own.values() for path in videos})
+    if any(len(videos) > 1 for videos in own.values()) and len(takes) > 1:
+        raise InputError(
+            f"rig {folder}",
+            expected="one video in the folder of each camera",
+            received=f"several takes: {', '.join(takes[:6])}",
+            remedy="copy those of one take and the cameras' calibration into a folder of its own",
+        )
+    return {
+        name: next((path for path in videos if "sync" in path.stem.lower()), videos[0])
+        for name, videos in own.items()
+        if videos
+    }
+
+
 def _first(root: Path, folders: tuple[str, ...], there: Callable[[Path], dict]) -> dict:
-    """Return what the first of some folders holds of at least two cameras; nothing without one."""
+    """Return what the first of some folders, named in any case, holds of at least two cameras; nothing without one."""
+    spelled = {name.lower(): root / name for name in reversed(subfolders(root))}
     for name in folders:
-        folder = root / name
-        if folder.is_dir() and len(found := there(folder)) >= 2:
+        folder = root if name == "." else spelled.get(name.lower())
+        if folder is not None and len(found := there(folder)) >= 2:
             return found
     return {}
 
 
 def _calibration_near(root: Path) -> Path | None:
-    """Return the calibration in a folder, in its folders with `calib` in the name, or in those of the folders above."""
-    found = find_calibration(root)
+    """Return the calibration in a folder, in its folders with `calib` in the name, or in those of the folders above.
+
+    OpenCap keeps a file in the folder of each camera.
+    """
+    found = find_calibration(root) or next(
+        (path for at in ("*", "[Vv]ideos/*") for path in sorted(root.glob(f"{at}/{OPENCAP_FILE}"))), None
+    )
     if found is not None:
         return found
     for folder in (root, *list(root.parents)[:_PARENTS]):
