@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from smplxpp.capture.calibrations import FORMATS, find_calibration, format_of, read_calibration
 from smplxpp.capture.calibrations.xml_files import read_vicon
@@ -66,6 +67,47 @@ def test_known_points_fall_where_the_tool_projects_them(name, tmp_path):
         dist = (0.0, 0.0, 0.0, 0.0) if lens is None else (*lens.radial[:2], *lens.tangential)
         np.testing.assert_allclose(projected(camera, dist), projected(expected, dist), atol=1e-6)
         np.testing.assert_allclose(dist, (0.0,) * 4 if name == "vicon" else DIST, atol=1e-12)
+
+
+def _rows(matrix: np.ndarray, style: str) -> str:
+    """A matrix as Python's YAML libraries write nested lists: dashed, in brackets, half and half; as ROS writes it."""
+    rows = np.atleast_2d(matrix).tolist()
+    return {
+        "dashes": "".join("\n- " + "\n  ".join(f"- {value!r}" for value in row) for row in rows),
+        "brackets": f" {rows}",
+        "both": "".join(f"\n- {row}" for row in rows),
+        "ros": f"\n  rows: {len(rows)}\n  cols: {len(rows[0])}\n  data: {np.ravel(matrix).tolist()}",
+        "flat": f" {np.ravel(matrix).tolist()}",
+    }[style]
+
+
+@pytest.mark.parametrize("style", ["dashes", "brackets", "both", "ros", "flat"])
+@pytest.mark.parametrize("names", ["camera_matrix dist_coeff R T", "Camera_Matrix Distortion_Coefficients rvec tvec"])
+def test_yaml_of_other_writers_than_opencv(style, names, tmp_path):
+    true = rig()
+    for name, camera in true.items():
+        R, T = pose_in(camera, Z_UP, 1.0)
+        turn = Rotation.from_matrix(R).as_rotvec()[:, None] if "rvec" in names else R
+        values = (opencv_K(camera), np.array(DIST), turn, T[:, None])
+        text = "".join(f"{key}:{_rows(value, style)}\n" for key, value in zip(names.split(), values, strict=True))
+        (tmp_path / f"{name}.yaml").write_text(f"# by hand\nimage_width: 640\n{text}image_height: 480\n")
+    read = read_calibration(tmp_path)
+    for expected, (key, camera) in zip(true.values(), read.cameras.items(), strict=True):
+        np.testing.assert_allclose(projected(camera, DIST), projected(expected, DIST), atol=1e-6)
+        np.testing.assert_allclose(read.distortions[key].radial[:2], DIST[:2])
+
+
+def test_transposed_matrices_are_those_of_row_vectors(tmp_path):
+    """MATLAB's convention, which JARVIS keeps in OpenCV's YAML: intrinsics and rotation are both transposed."""
+    true = rig()
+    for name, camera in true.items():
+        R, T = pose_in(camera, Z_UP, 1e-3)
+        values = {"intrinsicMatrix": opencv_K(camera).T, "distortionCoefficients": np.array(DIST), "R": R.T, "T": T}
+        text = "".join(f"{key}:{_rows(value, 'ros')}\n" for key, value in values.items())
+        (tmp_path / f"{name}.yaml").write_text(text)
+    read = read_calibration(tmp_path, sizes={key: (640, 480) for key in true})
+    for expected, camera in zip(true.values(), read.cameras.values(), strict=True):
+        np.testing.assert_allclose(projected(camera, DIST), projected(expected, DIST), atol=1e-6)
 
 
 def test_the_folder_is_enough_and_settings_of_the_tool_are_passed_over(tmp_path):

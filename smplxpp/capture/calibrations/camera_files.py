@@ -42,19 +42,35 @@ def read_opencv_yaml(path: Path) -> dict[str, np.ndarray | list[str] | float | s
 
 
 def _value(key: str, block: list[str], path: Path) -> np.ndarray | list[str] | float | str:
-    # The four forms that occur: an OpenCV matrix, a scalar, a list in brackets, and a list of dashed lines.
-    if block[0].startswith("!!opencv-matrix"):
+    # The forms that occur: an OpenCV matrix with or without its tag, a scalar, and lists in brackets or of dashed
+    # lines, as Python's YAML libraries write them, of texts or of rows.
+    if block[0].startswith("!!opencv-matrix") or (not block[0] and block[1:2] and block[1].startswith("rows:")):
         return _matrix(key, " ".join(block[1:]), path)
     if len(block) == 1 and block[0] and not block[0].startswith("["):
         try:
             return float(ascii_numbers(block[0]))
         except ValueError:
             return block[0].strip('"')
-    if block[0].startswith("["):
-        items = " ".join(block).strip("[] ").split(",")
+    text = " ".join(block).strip()
+    if re.match(r"\[\s*\[|-\s+(-\s|\[)", text):
+        return _rows(key, text, path)
+    if text.startswith("["):
+        items = text.strip("[] ").split(",")
     else:
         items = [line.removeprefix("-") for line in block if line.startswith("-")]
     return [item.strip().strip('"') for item in items if item.strip()]
+
+
+def _rows(key: str, text: str, path: Path) -> np.ndarray:
+    """Return the matrix of a list of lists: `[[1, 2], [3, 4]]`, `- [1, 2] - [3, 4]` or `- - 1 - 2 - - 3 - 4`."""
+    rows = [part for part in re.split(r"-\s+-\s|\[", text.strip()) if part.strip(" -,")]
+    values = [re.sub(r"[\],]", " ", re.sub(r"(?<!\S)-\s", " ", row)).split() for row in rows]
+    try:
+        return np.array([[float(ascii_numbers(item).removeprefix(".")) for item in row] for row in values])
+    except ValueError as error:
+        raise InputError(
+            f"file {path}: {key}", expected="rows of as many numbers each", received=str(error)[:200]
+        ) from None
 
 
 def _matrix(key: str, text: str, path: Path) -> np.ndarray:
@@ -73,9 +89,9 @@ def _matrix(key: str, text: str, path: Path) -> np.ndarray:
         ) from None
 
 
-# Names that OpenCV users give to the parts of a camera, the commonest first.
-_K = ("camera_matrix", "K", "cameraMatrix", "intrinsic_matrix", "intrinsics", "M")
-_DIST = ("distortion_coefficients", "dist_coeffs", "dist_coefs", "dist", "D", "distCoeffs", "distortion")
+# Names that OpenCV users give to the parts of a camera, the commonest first, in any case and with or without signs.
+_K = ("camera_matrix", "K", "intrinsic_matrix", "intrinsics", "M", "mtx")
+_DIST = ("distortion_coefficients", "dist_coeffs", "dist_coefs", "dist_coeff", "dist", "D", "distortion")
 _ROTATION = ("R", "rotation_matrix", "rotation", "rvec", "Rot", "rotation_vector")
 _TRANSLATION = ("T", "t", "tvec", "translation", "translation_vector")
 _POSE = ("extrinsics", "extrinsic", "RT", "Rt", "cam_from_world", "extrinsic_matrix")
@@ -152,11 +168,15 @@ def _yaml_camera(path: Path, content: Mapping[str, Any]) -> FileCamera:
         R, T = pose[:3, :3], pose[:3, 3]
     else:
         R, T = _first(content, _ROTATION), _first(content, _TRANSLATION)
+    K = _first(content, _K)
+    if np.shape(K) == (3, 3) and not np.any(K[:2, 2]) and np.any(K[2, :2]):
+        # Points are rows times matrices there, as in MATLAB: both are transposed.
+        K, R = K.T, np.asarray(R, dtype=np.float64).T if np.shape(R) == (3, 3) else R
     sides = [_first(content, names) for names in (_WIDTH, _HEIGHT)]
     size = content.get("image_size") if any(side is None for side in sides) else sides
     dist = _first(content, _DIST)
     return file_camera(
-        path.stem, _first(content, _K), R, T, source=source, size=size, dist=() if dist is None else dist
+        path.stem, K, R, T, source=source, size=size, dist=() if dist is None else dist
     )
 
 
@@ -182,7 +202,14 @@ def _read_pair(path: Path) -> RigFile:
 
 
 def _first(content: Mapping[str, Any], names: tuple[str, ...]) -> Any:
-    return next((content[name] for name in names if name in content), None)
+    """Return the entry of the first of some names that is there, a list as the text of its items; None without one."""
+    spelled = {_plain(key): value for key, value in content.items()}
+    found = next((spelled[_plain(name)] for name in names if _plain(name) in spelled), None)
+    return " ".join(found) if isinstance(found, list) else found
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "")
 
 
 def _has_pose(content: Mapping[str, Any]) -> bool:
