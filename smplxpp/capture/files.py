@@ -218,8 +218,13 @@ def _exactly(camera: str, file: str) -> bool:
 
 
 def _within(camera: str, file: str) -> bool:
-    """Tell whether the words of the camera stand one after another in those of the file."""
+    """Tell whether the words of the camera stand one after another in those of the file.
+
+    anipose calls cameras by a letter that their files end with: `A` is that of `vid1-camA`.
+    """
     own, other = _tokens(camera), _tokens(file)
+    if len(camera) == 1 and re.search(rf"cam(era)?[-_ ]?{re.escape(camera)}$", file, re.IGNORECASE):
+        return True
     return any(other[k : k + len(own)] == own for k in range(len(other) - len(own) + 1))
 
 

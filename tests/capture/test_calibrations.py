@@ -197,6 +197,7 @@ def test_vicons_polynomial_is_inverted_within_the_image(tmp_path):
         (["22054", "22055"], ["Miqus_3_22055", "Miqus_1_22054"], {"22054": "Miqus_1_22054", "22055": "Miqus_3_22055"}),
         (["00_00", "00_10"], ["hd_00_00", "hd_00_10"], {"00_00": "hd_00_00", "00_10": "hd_00_10"}),
         (["A", "B"], ["Camera_B", "Camera_A"], {"A": "Camera_A", "B": "Camera_B"}),
+        (["A", "B"], ["vid1-camB", "vid1-camA"], {"A": "vid1-camA", "B": "vid1-camB"}),
         (["int_cam_1", "int_cam_2"], ["view1", "view2"], {"int_cam_1": "view1", "int_cam_2": "view2"}),
         (["left", "right"], ["cam1", "cam2"], {}),
         (["cam1_a", "cam1_b"], ["view1"], {}),

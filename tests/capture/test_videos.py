@@ -16,10 +16,12 @@ from PIL import Image
 from pipelines.commands.capture import CaptureConvertCommand
 from smplxpp.capture import open_capture
 from smplxpp.capture.readers.rig import find_videos
+from smplxpp.capture.registry import detect_format
 from smplxpp.capture.video_files import Video, probe_video, video_frames
 from smplxpp.capture.video_sync import found_offsets, timeline
 from smplxpp.core import InputError
 from smplxpp.footage.turn_frames import sharpest_of_intervals
+from tests.capture.calibration_writers import WRITERS
 from tests.capture.calibration_writers import opencap as write_opencap
 from tests.capture.calibration_writers import pose2sim as write_calibration
 from tests.capture.test_calibrations import rig
@@ -206,6 +208,27 @@ def test_videos_and_calibrations_in_a_folder_of_each_camera(tmp_path):
     (folder / "run.mov").write_bytes(b"")
     with pytest.raises(InputError, match="several takes: run, walk"):
         open_capture(session)
+
+
+@pytest.mark.parametrize(
+    ("tool", "take", "calibration", "name"),
+    [
+        ("caliscope", "recordings/walk", ".", "port_{}.mp4"),
+        ("anipose", "2026-01-01", "2026-01-01/calibration", "videos-raw/vid1-cam{}.mp4"),
+        ("opencv", "Trial", "Calibration", "Videos/GH{}.MP4"),
+    ],
+)
+def test_videos_where_tools_keep_them(tool, take, calibration, name, tmp_path):
+    """The calibration beside the folder of all takes, in one of its own; folders in any case."""
+    (tmp_path / calibration).mkdir(parents=True, exist_ok=True)
+    cameras = {f"cam_{k}": camera for k, camera in enumerate(rig(count=3).values(), start=1)}
+    WRITERS[tool](cameras, tmp_path / calibration)
+    for k in range(1, 4):
+        video = tmp_path / take / name.format(k)
+        video.parent.mkdir(parents=True, exist_ok=True)
+        video.write_bytes(b"")
+    assert detect_format(tmp_path / take) == "rig"
+    assert [path.stem[-1] for path in find_videos(tmp_path / take, list(cameras)).values()] == ["1", "2", "3"]
 
 
 def test_a_rotation_flag_is_followed_as_the_calibration_was(tmp_path):

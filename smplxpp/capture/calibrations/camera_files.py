@@ -175,9 +175,7 @@ def _yaml_camera(path: Path, content: Mapping[str, Any]) -> FileCamera:
     sides = [_first(content, names) for names in (_WIDTH, _HEIGHT)]
     size = content.get("image_size") if any(side is None for side in sides) else sides
     dist = _first(content, _DIST)
-    return file_camera(
-        path.stem, K, R, T, source=source, size=size, dist=() if dist is None else dist
-    )
+    return file_camera(path.stem, K, R, T, source=source, size=size, dist=() if dist is None else dist)
 
 
 def _read_pair(path: Path) -> RigFile:

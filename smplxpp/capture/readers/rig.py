@@ -25,7 +25,7 @@ LOOKS_FOR = "a calibration of a known tool, there or beside it, with keypoints, 
 _KEYPOINTS = ("keypoints", "pose-associated", "pose-sync", "pose", "poses", "openpose", "json", ".")
 _IMAGES = ("rgbs", "images", "imgs", "images_lr", "hdImgs", "kinect_color", "frames", ".")
 _MASKS = ("masks", "mask", "fmask_lr", "fmask", "kinect_mask", "mattes")
-_VIDEOS = ("videos", "video", "recordings", "synchronized_videos", "hdVideos", ".")
+_VIDEOS = ("videos", "video", "videos-raw", "recordings", "synchronized_videos", "hdVideos", ".")
 _PARENTS = 2  # folders above in which a session's calibration is looked for
 # The last number of a name is the frame: `cam01_000012.jpg`, `0005_img.jpg`.
 _NUMBERED = rf"(?:.*\D)?(?P<frame>\d+)\D*\.(?i:{'|'.join(suffix[1:] for suffix in IMAGE_SUFFIXES)})"
@@ -216,5 +216,5 @@ def _calibration_near(root: Path) -> Path | None:
         for name in subfolders(folder):
             if re.search("calib", name, re.IGNORECASE) and (found := find_calibration(folder / name)) is not None:
                 return found
-    # Some tools keep it beside the takes.
-    return next((f for folder in list(root.parents)[:1] if (f := find_calibration(folder)) is not None), None)
+    # Some tools keep it beside the takes, caliscope beside the folder of all takes.
+    return next((f for folder in list(root.parents)[:_PARENTS] if (f := find_calibration(folder)) is not None), None)
