@@ -58,12 +58,18 @@ class Obstacle:
         """Return a lower bound of each point's distance, metres; infinite far behind a garment.
 
         A point with a positive bound can move so far without penetrating. Unlike `distance` it is finite beside borders
-        too, where a small move may lead in front of the surface.
+        and outside of the box, from where a small move may lead in front of a garment or behind it. The sign means
+        nothing there, so that the bound is the distance less the depth up to which a point has penetrated.
         """
         bound = self._box_distance(points)
         near = bound <= self._max_depth
-        bound[near] = self._field.query(points[near]).distance
-        return bound if self.solid else np.where(bound > -2.0 * self._max_depth, bound, np.inf)
+        found = self._field.query(points[near])
+        if self.solid:
+            bound[near] = found.distance
+            return bound
+        bound -= self._max_depth
+        bound[near] = np.where(found.on_border, np.abs(found.distance) - self._max_depth, found.distance)
+        return np.where(bound > -2.0 * self._max_depth, bound, np.inf)
 
     def _box_distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance to the bounding box, metres, 0 inside, because far points need no search."""

@@ -72,7 +72,7 @@ from smplxpp.segment.by_body_prior import place_prior
 from smplxpp.segment.by_body_rings import ARM_END, ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 from smplxpp.segment.by_body_shape import ShapeEvidence, outfit_by_shape
 from smplxpp.segment.by_body_shells import garment_shells, of_whole_faces, split_long_faces
-from smplxpp.segment.by_body_waist import find_waist
+from smplxpp.segment.by_body_waist import find_waist, one_or_two
 from smplxpp.segment.graph_cut import (
     COST_SCALE,
     PottsProblem,
@@ -299,8 +299,9 @@ def weigh_evidence(
     # most 22 nats more in suits of one dye and overalls, 29 and more where the garments differ in colour.
     close_call = 25.0
     clothes = ~(layers.hair | layers.coat | objects.faces)
+    legs = legs_apart(chart, area, len(column))
     waist = find_waist(mesh, chart, outfit, pairs, ends, used=clothes, smoothing=config.smoothing)
-    seamless, legs = waist is not None and waist.seamless, legs_apart(chart, area, len(column))
+    seamless = waist is not None and waist.seamless
     if waist is not None and not waist.shown:
         waist = None
     if waist is not None and layers.bib:
@@ -308,6 +309,9 @@ def weigh_evidence(
         layers = replace(layers, bib=False)
     elif lab is not None and outfit.margins["lower_end"] > close_call:
         waist, seamless = None, False
+    if outfit.one_piece and not layers.bib:
+        # A top and a skirt of one cloth are one garment for the outline, but not for the surface.
+        outfit, waist = one_or_two(mesh, chart, outfit, pairs, ends, used=clothes, smoothing=config.smoothing)
     if waist is not None:
         outfit = replace(outfit, waist_step=np.inf)
     if seamless and not layers.bib:

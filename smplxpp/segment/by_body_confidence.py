@@ -56,11 +56,11 @@ def confidence_bound(
     most[arm] = np.where(own == UPPER.id, sleeve[ring], np.where(own == SKIN.id, bare[ring], 1.0))
     # Precision of rules on the procedural people of the benchmark `labels_by_body`, without colours on public
     # scans too, as the mean over people; leaving one out changes it by at most 0.17. One garment over trunk and legs
-    # is `upper`, although a truth may call a dress lower, or two garments of one cloth look like one; an `upper`
-    # without a coat is no jacket, cape or waistcoat.
+    # is `upper`, although a truth may call a dress lower (one of five without a seam at the waist), or two garments of
+    # one cloth look like one; an `upper` without a coat is no jacket, cape or waistcoat.
     upper = labels == UPPER.id
     if outfit.one_piece:
-        most[upper & np.isin(chart.region, (TRUNK, LEG))] *= 0.55
+        most[upper & np.isin(chart.region, (TRUNK, LEG))] *= 0.8 if outfit.seamless else 0.55
     if not layers.coat.any():
         most[upper] *= 0.93
     # Without colours skin and what lies on it like skin, leggings and tight tops, look the same. Three of four such
@@ -76,7 +76,7 @@ def confidence_bound(
     vague, cloth = 0.59, np.isin(labels, (UPPER.id, LOWER.id, OUTER.id))
     if layers.vague is not None:
         most[layers.vague & cloth] = np.minimum(most[layers.vague & cloth], vague)
-    if outfit.seamless:
+    if outfit.seamless and not outfit.one_piece:
         cloth &= np.isin(chart.region, (TRUNK, LEG))
         most[cloth] = np.minimum(most[cloth], vague)
     # A waist at which nothing steps is a guess: at 17 of 21 in scans of 46 people a fifth of the area within 12 cm or

@@ -82,7 +82,7 @@ class Outfit:
         sleeve: P(sleeve) in the arm's rings.
         waist_step: nats of the surface's step at the border of lower and upper garment; inf where colours, or
             folds, show it.
-        seamless: whether the surface has no seam at the waist, so that both may be one garment.
+        seamless: whether the surface has no seam at the waist: two garments may be one, and one garment is one.
     """
 
     shoe_top: float
@@ -97,11 +97,18 @@ class Outfit:
     seamless: bool = False
 
     def as_one_piece(self) -> Outfit:
-        """Return the outline with upper and lower garment as one, which is `upper`."""
-        column = self.column.copy()
+        """Return the outline with upper and lower garment as one without a seam, which is `upper`."""
+        column, start = self.column.copy(), self.lower_start if self.has_lower else self.upper_start
         column[:, UPPER.id] += column[:, LOWER.id]
         column[:, LOWER.id] = 0.0
-        return replace(self, lower_end=self.lower_start, upper_start=self.lower_start, column=column)
+        return replace(self, lower_end=self.lower_start, upper_start=start, column=column, seamless=True)
+
+    def in_two(self) -> Outfit:
+        """Return the outline of one garment over trunk and legs as two, which meet at the usual waist."""
+        column, below = self.column.copy(), STEP * (np.arange(len(self.column)) + 0.5) < _WAIST
+        column[below, LOWER.id] += column[below, UPPER.id]
+        column[below, UPPER.id] = 0.0
+        return replace(self, lower_start=self.upper_start, lower_end=_WAIST, upper_start=_WAIST, column=column)
 
     def alike(self, column: Rings) -> bool:
         """Return whether upper and lower garment have the same colours: a divergence of at most `ONE_CLOTH`."""

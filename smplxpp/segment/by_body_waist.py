@@ -41,6 +41,7 @@ class Waist:
         upper: whether a face lies above it.
         away: distance of each face to it, metres.
         folded: its length with folds as a share of that without.
+        height: of its middle, standard metres.
         top: height above which it cannot lie, standard metres.
     """
 
@@ -48,6 +49,7 @@ class Waist:
     upper: Bool[np.ndarray, " M"]
     away: Float64[np.ndarray, " M"]
     folded: float
+    height: float
     top: float
 
     @property
@@ -110,4 +112,30 @@ def find_waist(
     faces, above, away = np.zeros(mesh.face_count, bool), np.zeros(mesh.face_count, bool), np.zeros(mesh.face_count)
     faces[part], above[part] = (place > low) & (place < high), upper
     away[part] = cKDTree(border).query(mesh.face_centers[part])[0]
-    return Waist(faces, above, away, folded, high)
+    height = float(np.median(place[own[crossed]]))
+    return Waist(faces, above, away, folded, height, high)
+
+
+def one_or_two(
+    mesh: TriangleMesh,
+    chart: BodyChart,
+    outfit: Outfit,
+    pairs: Int64[np.ndarray, "P 2"],
+    ends: Int64[np.ndarray, "P 2"],
+    *,
+    used: Bool[np.ndarray, " M"],
+    smoothing: SmoothingConfig,
+) -> tuple[Outfit, Waist | None]:
+    """Ask the surface whether one garment over trunk and legs is one, as a dress, or two of one cloth.
+
+    Of nine people and scans in one garment for the outline, four are dressed in two: they have 0.2 to 0.49 of the
+    border's length, the dresses and the jumpsuit 0.67 to 0.79. Arguments as of `find_waist`.
+
+    Returns:
+        The outline in two and their border where the surface shows one above the hem; else the outline, whose
+        `seamless` says whether the surface speaks for one garment, and None.
+    """
+    waist = find_waist(mesh, chart, outfit.in_two(), pairs, ends, used=used, smoothing=smoothing)
+    if waist is not None and waist.shown and waist.height > outfit.upper_start + _BESIDE:
+        return outfit.in_two(), waist
+    return (outfit.as_one_piece() if waist is not None and waist.seamless else outfit), None
