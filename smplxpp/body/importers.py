@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from smplxpp.body.loader import load_body
 from smplxpp.body.model import BodyModel
 from smplxpp.body.param_layouts import LAYOUTS, Family, Frames, recognise, with_valid_frames
-from smplxpp.body.param_records import NotedReads, warn_of_unread, without_gaps
+from smplxpp.body.param_records import NotedReads, of_one_person, warn_of_unread, with_known_names, without_gaps
 from smplxpp.body.retarget import Skeleton
 from smplxpp.body.skeleton_params import SKELETON_SUFFIXES, load_skeleton
 from smplxpp.body.smpl_joints import is_open_body
@@ -170,7 +170,7 @@ def _first_frames(path: str | Path, layout: LayoutName) -> Frames | None:
     """Return the frames of the first file of a path as they stand there; None for a frame without people."""
     file = _frame_files(Path(path))[0]
     content, source = _content(file), f"file {file}"
-    content, _ = with_valid_frames(content)
+    content, _ = with_valid_frames(of_one_person(content, 0))
     name = recognise(content, source=source) if layout == "auto" else layout
     # Of several people the first one decides; a frame without people has no family.
     if isinstance(content, list):
@@ -197,7 +197,7 @@ def _read_parts(path: Path, layout: str, person: int | None, *, filled: list[int
     parts: list[Frames] = []
     absent: list[str] = []
     for file in files:
-        content = first if file is files[0] else _content(file)
+        content = of_one_person(first if file is files[0] else _content(file), person, source=f"file {file}")
         if filled is not None and len(files) == 1:
             content, invalid = with_valid_frames(content)
             filled += invalid
@@ -387,7 +387,7 @@ def _content(path: Path) -> Any:
     if suffix == ".npz":
         return safe_npz(path)
     if suffix == ".pkl":
-        return safe_load(path)
+        return with_known_names(safe_load(path))
     if suffix == ".npy":
         return safe_npy(path)
     if suffix != ".json":

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from smplxpp.core import ARRAY_NAMES, POSE_BLOCKS, GeometryWarning, matrix_from_rotvec, rotvec_from_matrix
-from smplxpp.core.errors import warn_of_left_out
+from smplxpp.core.errors import InputError, warn_of_left_out
 
 # Parts of `poses` that AMASS writes a second time, under names of their own, and what fits write of the posed body,
 # which follows from the parameters.
@@ -66,6 +66,59 @@ def warn_of_unread(records: Any, layout: str, source: str) -> None:
     # Files of frames get one text, so that it is shown once.
     source = re.sub(r"[0-9]{4,}", "#", source)
     warn_of_left_out(source, left, reason=f"not read in the layout {layout}", stacklevel=5)
+
+
+def with_known_names(content: Any) -> Any:
+    """Return AIST++'s record (`smpl_poses`, `smpl_trans`) by AMASS' names; everything else as it is.
+
+    Its positions are metres times `smpl_scaling`; it has one shape, the mean one, and 60 frames a second.
+
+    Example:
+        >>> dance = {"smpl_poses": np.zeros((2, 72)), "smpl_trans": np.full((2, 3), 95.0), "smpl_scaling": [95.0]}
+        >>> with_known_names(dance)["trans"].tolist()
+        [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    if not isinstance(content, Mapping) or not {"smpl_poses", "smpl_trans"} <= set(content):
+        return content
+    scale = float(np.ravel(content.get("smpl_scaling", 1.0))[0])
+    return {
+        "poses": content["smpl_poses"],
+        "trans": np.asarray(content["smpl_trans"], dtype=np.float64) / (scale or 1.0),
+        "betas": np.zeros(10),
+        "fps": 60.0,
+    }
+
+
+def of_one_person(content: Any, person: int | None, *, source: str = "file") -> Any:
+    """Return one person's record of a file that lists the people's `poses`, `trans` and `betas`, as 3DPW's do.
+
+    Args:
+        content: arrays by name; what has no such lists is returned as it is.
+        person: place in the lists; None: the only one.
+        source: the file, in messages.
+
+    Raises:
+        InputError: several people and none chosen, or a place that is none.
+    """
+    people = content.get("poses") if isinstance(content, Mapping) else None
+    try:
+        shapes = [np.shape(one) for one in people] if isinstance(people, (list, tuple, np.ndarray)) else []
+    except ValueError:  # ragged rows
+        return content
+    # Rows of 72 numbers and more; a pose of matrices or of joints has rows of 3 and 9.
+    whole = 60
+    if not shapes or any(len(shape) != 2 or shape[1] < whole for shape in shapes):
+        return content
+    if (person is None and len(shapes) > 1) or (person is not None and not 0 <= person < len(shapes)):
+        raise InputError(
+            f"{source}: people",
+            expected=f"one of {len(shapes)} people, by the place in their lists: 0 to {len(shapes) - 1}",
+            received="none chosen" if person is None else str(person),
+            remedy="choose one: person, --person",
+        )
+    place = person or 0
+    mine = {key: content[key][place] for key in ("poses", "trans", "betas") if len(content.get(key, ())) == len(shapes)}
+    return {**{key: value for key, value in content.items() if np.ndim(value) == 0}, **mine}
 
 
 _ROTATIONS = frozenset(name for name, _ in POSE_BLOCKS)

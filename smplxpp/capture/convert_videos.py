@@ -85,6 +85,9 @@ def convert_videos(
     record = {**asdict(config), "offsets": {name: round(offsets.get(name, 0.0), 4) for name in names}}
     claim_folder(capture, out, record)
     notes = [problem.message for problem in capture.problems if "videos, which" not in problem.message]
+    if config.sync != "none":
+        found = ", ".join(f"{name}={offsets[name]:.3f}" for name in names)
+        notes.append(f"cameras started, by their {config.sync}, at {found} s (--offset names other times)")
     written, kept = 0, 0
     for done, name in enumerate(names):
         new, old, missing = _write_images(

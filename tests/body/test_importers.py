@@ -423,3 +423,38 @@ def test_arrays_that_nobody_reads_are_named_once(tmp_path):
     with pytest.warns(GeometryWarning, match=r"not read in the layout amass: dmpls, soft$") as found:
         load_params(tmp_path / "b.npz", whose="body", up="y")
     assert len(found) == 1
+
+
+def test_dances_of_aist_are_amass_in_other_names_and_units(tmp_path):
+    """`smpl_scaling` units make a metre, and the dancer stands on y."""
+    rng = np.random.default_rng(5)
+    poses, trans = np.pad(rng.normal(scale=0.1, size=(4, 66)), ((0, 0), (0, 6))), rng.normal(size=(4, 3))
+    path = tmp_path / "gBR_sBM_cAll_d04_mBR0_ch01.pkl"
+    path.write_bytes(pickle.dumps({"smpl_poses": poses, "smpl_trans": 95.0 * trans, "smpl_scaling": np.array([95.0])}))
+    plain = tmp_path / "plain.npz"
+    np.savez(plain, poses=poses, trans=trans, betas=np.zeros(10))
+    with pytest.warns(GeometryWarning, match="parameters of SMPL,"):
+        read, expected = load_params(path), load_params(plain)
+    assert read.fps == 60.0
+    np.testing.assert_allclose(read.transl, expected.transl, atol=1e-12)
+    np.testing.assert_allclose(read.body_pose, expected.body_pose, atol=1e-12)
+
+
+def test_people_in_lists_are_chosen_by_their_place(tmp_path):
+    """3DPW's records: arrays of each person in lists, and what is not of the body beside them."""
+    rng = np.random.default_rng(6)
+    poses = np.pad(rng.normal(scale=0.1, size=(2, 5, 66)), ((0, 0), (0, 0), (0, 6)))
+    people = [{"poses": one, "trans": rng.normal(size=(5, 3))} for one in poses]
+    record = {key: [one[key] for one in people] for key in ("poses", "trans")}
+    record |= {"betas": [np.zeros(10)] * 2, "genders": ["m", "f"], "cam_poses": np.ones((5, 4, 4)), "sequence": "walk"}
+    path = tmp_path / "walk.pkl"
+    path.write_bytes(pickle.dumps(record))
+    with pytest.raises(InputError, match=r"walk\.pkl: people: expected one of 2 people.*0 to 1"):
+        load_params(path)
+    for place, one in enumerate(people):
+        alone = tmp_path / f"{place}.npz"
+        np.savez(alone, **one, betas=np.zeros(10))
+        with pytest.warns(GeometryWarning, match="parameters of SMPL,"):
+            read, expected = load_params(path, person=place), load_params(alone)
+        np.testing.assert_array_equal(read.transl, expected.transl)
+        np.testing.assert_array_equal(read.body_pose, expected.body_pose)
