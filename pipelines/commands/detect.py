@@ -31,7 +31,7 @@ class KeypointsConvert:
     out: Path
     """Folder to write CAM.npz into: `keypoints/` of a capture in our layout, or what `--keypoints` takes."""
     format: FormatName = "auto"
-    """Layout of the input; auto tells it by the keys. OpenPose's BODY_25B is told from BODY_25 by lengths."""
+    """Layout of the input; auto tells it by the keys. OpenPose's BODY_25B is recognised by its lengths."""
     person: OptionalInt = None
     """Id of the person in the files, or else the place in their lists; by default the most confident of each frame."""
     first_frame: OptionalInt = None
