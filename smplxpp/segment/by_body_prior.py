@@ -55,7 +55,7 @@ def place_prior(
     rest = 1.0 - out.sum(axis=1)
     out[column] += rest[column, None] * _column(chart.height[column], outfit, softness)
     # What hangs farther off a foot than leather is no shoe: the hem of wide trousers or of a dress over it.
-    off_foot = 0.08
+    off_foot, off_back = 0.08, 0.035
     out[column & (chart.distance > off_foot), SHOE.id] *= _BEYOND
     top = chart.region == TRUNK
     if waist is not None:
@@ -65,6 +65,11 @@ def place_prior(
     # Necklines: where the trunk meets the neck, skin replaces up to 45 % of the shirt.
     bare = 0.45 * _above(chart.height[top], NECK_BASE - 0.05, 0.03)
     out[top, SKIN.id], out[top, UPPER.id] = out[top, SKIN.id] + bare, out[top, UPPER.id] * (1 - bare)
+    # Behind, below the neck, a ponytail or a hood stands off the back, and no skin.
+    behind = top & (chart.height > NECK_BASE - 0.25) & (np.abs(chart.azimuth) > 0.5 * np.pi)
+    behind &= chart.distance > off_back
+    out[behind, HAIR.id] += (1.0 - _BEYOND) * out[behind, SKIN.id]
+    out[behind, SKIN.id] *= _BEYOND
     # Arms and hands: sleeve up to the cuff, then skin.
     sleeve = 1.0 - _above(chart.reach[arm], outfit.cuff, softness)
     out[arm, UPPER.id] += rest[arm] * sleeve

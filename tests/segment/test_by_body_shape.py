@@ -9,7 +9,7 @@ import pytest
 
 from smplxpp.core import TriangleMesh
 from smplxpp.core.labels import HAIR, LABELS, LOWER, SHOE, SKIN
-from smplxpp.segment.by_body_chart import FOOT, HEAD, BodyChart
+from smplxpp.segment.by_body_chart import FOOT, HEAD, TRUNK, BodyChart
 from smplxpp.segment.by_body_hems import Hems, roughness
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import Outfit
@@ -90,23 +90,25 @@ def test_what_goes_round_both_legs_is_a_dress_unless_it_ends_at_the_waist(hem):
     assert found.one_piece != hem
 
 
-def test_what_hangs_far_off_feet_and_face_is_no_shoe_and_no_skin():
-    """Hems of a hakama at the height of the shoes were shoes, and what of a brim hangs over the face was skin."""
-    nought = np.zeros(4)
+def test_what_hangs_far_off_feet_face_and_back_is_no_shoe_and_no_skin():
+    """Hems of a hakama at the height of the shoes were shoes, what of a brim hangs over the face was skin, and so was
+    the end of a ponytail of its colour."""
+    nought = np.zeros(6)
     place = BodyChart(
-        region=np.array([FOOT, FOOT, HEAD, HEAD]),
-        height=np.array([0.05, 0.05, 1.6, 1.6]),
+        region=np.array([FOOT, FOOT, HEAD, HEAD, TRUNK, TRUNK]),
+        height=np.array([0.05, 0.05, 1.6, 1.6, 1.44, 1.44]),
         reach=nought,
-        azimuth=nought,
+        azimuth=np.array([0.0, 0.0, 0.0, 0.0, 3.0, 3.0]),
         turn=nought,
-        face_height=np.array([0.0, 0.0, 0.5, 0.5]),
-        distance=np.array([0.01, 0.09, 0.01, 0.06]),
-        side=np.ones(4, dtype=np.int64),
+        face_height=np.array([0.0, 0.0, 0.5, 0.5, -0.3, -0.3]),
+        distance=np.array([0.01, 0.09, 0.01, 0.06, 0.01, 0.05]),
+        side=np.ones(6, dtype=np.int64),
     )
     outfit = Outfit(0.09, 0.09, 1.0, 1.0, 0.1, {}, np.zeros((88, len(LABELS))), np.zeros(45))
-    prior = place_prior(place, outfit, Layers.none(4), softness=0.035, body_softness=0.03)
+    prior = place_prior(place, outfit, Layers.none(6), softness=0.035, body_softness=0.03)
     assert prior[0].argmax() == SHOE.id and prior[2].argmax() == SKIN.id
     assert prior[1, SHOE.id] < prior[1, LOWER.id] and prior[3].argmax() == HAIR.id
+    assert prior[4, SKIN.id] > 0.3 and prior[5, SKIN.id] < 0.01 and prior[5, HAIR.id] > 0.3
 
 
 def test_a_hem_may_lie_higher_on_one_side():
