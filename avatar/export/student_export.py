@@ -129,7 +129,7 @@ def export_bundle(
 
 
 def seen_poses(student: Student) -> BodyParams | None:
-    """Return the poses of the training in order, at the place of the scan; None: not known."""
+    """Return the poses of the training in order, at its rate and the place of the scan; None: not known."""
     if student.pose_gate is None:
         return None
     # Stored poses are the 21 body joints alone; everything else (hands, place) comes from the pose of the scan.
@@ -137,7 +137,7 @@ def seen_poses(student: Student) -> BodyParams | None:
     reference = student.origin.reference
     reference = BodyParams.rest(betas=0) if reference is None else reference
     still = reference.select(np.zeros(len(poses), dtype=np.int64))
-    return replace(still, body_pose=poses, fps=reference.fps or DEFAULT_FPS)
+    return replace(still, body_pose=poses, fps=student.fps or DEFAULT_FPS)
 
 
 def bundle_of_student(student: Student, *, exact: bool = False) -> AvatarBundle:

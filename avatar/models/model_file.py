@@ -26,7 +26,7 @@ from avatar.models.tracked_surface import ControlCage, Track
 from avatar.rig.rig import THETA, Rig
 from smplxpp.core.errors import InputError
 from smplxpp.core.files.atomic import atomic_write_bytes
-from smplxpp.core.files.json_file import as_integer, as_list, as_object, shown
+from smplxpp.core.files.json_file import as_integer, as_list, as_number, as_object, shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -164,6 +164,7 @@ def save_avatar(path: str | Path, model: TeacherAvatar | Student, *, compact: bo
         about |= {
             "kind": "student",
             "frames": list(model.frames),
+            "fps": model.fps,
             "null_code_shown": model.codes is not None and model.codes.null_code_shown,
             "control_points": config.control_points,
             "still_body": config.still_body,
@@ -291,6 +292,8 @@ def _student(stored: StoredModel, rig: Rig, gaussians: BoundGaussians) -> Studen
         sizes = PoseRegression.shapes(*stored.directions("regression.basis"))
         regression = PoseRegression(**{k: stored.require(f"regression.{k}", size) for k, size in sizes.items()})
     student = Student(config, rig, gaussians, frames, blend_shapes=shapes, known_poses=known, regression=regression)
+    rate = stored.about.get("fps")  # older files: not known
+    student.fps = None if rate is None else as_number(rate, subject="fps", least=1e-3)
     if stored.about.get("null_code_shown", True):  # older files: the null code is zero
         show_null_code(student)
     return student

@@ -85,7 +85,12 @@ class Student(nn.Module):
         known_poses: theta of the training frames, radians; far from them the body's blend shapes fade. None: they do
             not fade.
         regression: displacements of the field's points in poses without a code; None: the field with the null code.
+
+    Attributes:
+        fps: of the training frames, a second; None: not known.
     """
+
+    fps: float | None = None
 
     def __init__(
         self,
@@ -215,7 +220,7 @@ class Student(nn.Module):
                 its.load_state_dict(mine.state_dict())
         if self.codes is not None and other.codes is not None:
             other.codes.null_code_shown = self.codes.null_code_shown
-        other.origin = self.origin
+        other.origin, other.fps = self.origin, self.fps
         return other
 
     def export(self, path: str | Path, **options: Any) -> dict[str, Any]:

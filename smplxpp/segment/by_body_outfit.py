@@ -303,14 +303,14 @@ def _hidden_top(runs: _RunCosts, place: np.ndarray) -> Float64[np.ndarray, " R1"
     """Return the cost of shoes that end at each border, nats: boots whose top no change of colours within 12 cm shows.
 
     The change is what two runs of four rings, below and above, cost less than one. At the tops of procedural knee boots
-    it is 14 nats and more, 20 at the black shoes of a real man in black trousers; light that fades along these gives
-    5 at most, and over 40 cm more than the shoes.
+    it is 14 nats and more, 18 at the black shoes of a real man in dark trousers; light that fades along these gives 5
+    at most, but over a leg 50 to 100 more than the shoes, which the cost exceeds.
     """
-    beside, least, cost, low_shoe = 4, 8.0, 60.0, 0.12  # rings of 15 mm; nats; nats; metres above the sole
+    beside, fading, least, cost, low_shoe = 4, 5.0, 8.0, 300.0, 0.12  # rings of 15 mm; three in nats; metres
     low, high = np.arange(len(place)) - beside, np.arange(len(place)) + beside
     low, high, border = np.maximum(low, 0), np.minimum(high, len(place) - 1), np.arange(len(place))
     change = runs.spread[low, high] - runs.spread[low, border] - runs.spread[border, high]
-    return np.where(place > low_shoe, cost * np.clip(1.0 - change / least, 0.0, 1.0), 0.0)
+    return np.where(place > low_shoe, cost * np.clip((least - change) / (least - fading), 0.0, 1.0), 0.0)
 
 
 def _cut_column(

@@ -139,9 +139,13 @@ def test_a_compact_file_is_within_half_precision_and_half_the_size(kind, rig, tm
         torch.testing.assert_close(a, b, rtol=0.01, atol=0.01)
 
 
-def test_frames_that_have_a_code_are_remembered(rig, tmp_path):
-    save_avatar(tmp_path / "a", make("student", rig))
-    assert load_avatar(tmp_path / "a", rig).frames == (0, 2, 3)
+@pytest.mark.parametrize("fps", [None, 12.5])
+def test_frames_that_have_a_code_and_their_rate_are_remembered(rig, tmp_path, fps):
+    made = make("student", rig)
+    made.fps = fps
+    save_avatar(tmp_path / "a", made.with_blend_shapes(made.blend_shapes))
+    again = load_avatar(tmp_path / "a", rig)
+    assert again.frames == (0, 2, 3) and again.fps == fps
 
 
 def test_a_teacher_comes_back_with_the_surface_that_it_remembers(rig, tmp_path):
@@ -353,7 +357,7 @@ def test_metadata_of_another_kind_is_refused_before_anything_is_made(kind, wrong
 def test_metadata_that_lacks_an_entry_is_refused(kind, rig, tmp_path):
     save_avatar(tmp_path / "good", make(kind, rig))
     about, tensors = content(tmp_path / "good")
-    for name in set(about) - {"null_code_shown", "still_body", "track_tells"}:  # older files lack these
+    for name in set(about) - {"null_code_shown", "still_body", "track_tells", "fps"}:  # older files lack these
         lacking = {other: value for other, value in about.items() if other != name}
         with pytest.raises(InputError, match=name if name != "topology" else "this template"):
             load_avatar(written(tmp_path / "bad", lacking, tensors), rig)

@@ -109,6 +109,11 @@ def test_a_student_of_a_run_is_opened_drawn_and_exported(run, capture, tmp_path)
         assert student.export(tmp_path / f"me{suffix}", params=params)["bytes"] > 1000
     with pytest.raises(InputError, match=r"\.avatar"):
         student.export(tmp_path / "me.txt")
+    # Without parameters a bundle plays the poses of the training at their rate.
+    student.fps = 12.5
+    student.export(tmp_path / "slow.avatar")
+    motion = avatar.load(tmp_path / "slow.avatar").motion
+    assert motion.fps == 12.5 and len(motion) == len(student.frames)
     alone = avatar.load(run / layout.STUDENT)
     assert torch.equal(alone.gaussians().dc, student.gaussians().dc)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -259,6 +260,7 @@ def compensate(
         known, expressions, jaws = (torch.stack(rows) for rows in zip(*shown, strict=True))
         student = on_drawn_face(student)
         made = student.with_blend_shapes(shapes, known_poses=known if config.null_share else None)
+        made.fps = frame_rate(sequence)
         if config.init_from_track and teacher is not None and teacher.track is not None:
             init_blend_shapes(made, sequence, teacher.track)
     # Only where the Gaussians learn on: they close what the colours of skin leave open between the clothes' own.
@@ -269,6 +271,12 @@ def compensate(
     # Gaussians have moved on since. New modules draw random numbers before they get their values.
     with fixed_seed(config.seed):
         return with_held_face(on_drawn_face(made), expressions, jaws).eval(), progress
+
+
+def frame_rate(sequence: AvatarSequence) -> float | None:
+    """Return the training frames a second, by the median step between them; None where the capture states no rate."""
+    fps, steps = sequence.capture.fps, np.diff(sequence.train_frames)
+    return None if fps is None else float(fps / max(np.median(steps), 1)) if len(steps) else fps
 
 
 def write_student(

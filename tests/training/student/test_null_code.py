@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from avatar.models.networks.blend_shapes import BlendShapeConfig
 from avatar.models.student import Student, StudentConfig
 from avatar.training.engine.session import Session
 from avatar.training.student.bake import BakeConfig, BakeTask, bake
+from avatar.training.student.compensate import frame_rate
 from tests.dolls.dancing import gaussians, sequence, write_dance
 from tests.dolls.tiny import TINY_FIELD
 
@@ -73,3 +75,10 @@ def test_the_null_code_that_training_shows_is_the_zero_vector(frames):
         student.codes.codes.add_(1.0)
     task.step(0)
     assert student.codes.codes.grad is None or not student.codes.codes.grad.any()
+
+
+@pytest.mark.parametrize(("frames", "fps"), [((0, 2, 4, 8), 10.0), ((3,), 20.0)])
+def test_the_rate_of_the_training_frames_is_that_of_the_capture_over_their_step(frames, fps):
+    capture = SimpleNamespace(fps=20.0)
+    assert frame_rate(SimpleNamespace(capture=capture, train_frames=frames)) == fps
+    assert frame_rate(SimpleNamespace(capture=SimpleNamespace(fps=None), train_frames=frames)) is None
