@@ -10,8 +10,8 @@ from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
 from smplxpp.core.mesh import TriangleMesh
-from smplxpp.transfer.anchors import LEAST_ADMISSIBILITY, point_admissibility
-from smplxpp.transfer.correspond import Correspondence
+from smplxpp.transfer.anchors import LEAST_ADMISSIBILITY, point_admissibility, smooth_step
+from smplxpp.transfer.correspond import Correspondence, closest_points
 
 
 @dataclass(frozen=True)
@@ -120,3 +120,36 @@ def _agreement(cosine: np.ndarray) -> np.ndarray:
     The floor of 0.02 is for linings, which face away from all skin near them and still belong there.
     """
     return np.maximum((1.0 + np.nan_to_num(cosine)) / 2.0, 0.02)
+
+
+def with_linings(
+    weights: Float64[np.ndarray, "N J"],
+    target: TriangleMesh,
+    normals: Float[np.ndarray, "N 3"],
+    angle: Float[np.ndarray, " N"],
+    *,
+    thickness: tuple[float, float],
+) -> Float64[np.ndarray, "N J"]:
+    """Return weights in which the inner side of cloth with two sides moves as the outer side does.
+
+    A lining faces the skin, so that it matches none of it: its weights come from elsewhere, and in another pose it
+    stands out of the cloth that it lines. It takes those of the outer side right behind it.
+
+    Args:
+        weights: rows sum to 1.
+        target: the cloth.
+        normals: of its vertices, outward.
+        angle: radians between them and the normals of the skin; NaN counts as outer side.
+        thickness: metres from which on a side follows the other less, and from which on not at all.
+    """
+    inner = angle > 0.5 * np.pi
+    outer = ~inner[target.faces].any(axis=1)
+    if not inner.any() or not outer.any():
+        return weights
+    sheet, used = target.submesh(outer)
+    found = closest_points(sheet, target)
+    # Cloth before it, as a sleeve beside the trunk, is another garment's side; opposite is within 60 degrees.
+    behind = ((found.interpolate(sheet, sheet.vertices) - target.vertices) * normals).sum(axis=1) < 0.0
+    lines = inner & behind & (found.angle > np.radians(120.0))
+    share = lines * (1.0 - smooth_step(found.distance, *thickness))
+    return weights + share[:, None] * (found.interpolate(sheet, weights[used]) - weights)

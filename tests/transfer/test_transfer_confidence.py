@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.accuracy.transfer_garments import Trial
 from smplxpp.body import load_body
+from smplxpp.core import TriangleMesh
 from smplxpp.people.garments.fitted import fitted_garments
 from smplxpp.people.garments.hair import hairstyles
 from smplxpp.people.garments.loose import loose_garments
@@ -105,6 +106,35 @@ def test_a_wide_sleeve_before_the_hip_follows_the_arm(mannequin, wardrobe):
 
 
 @pytest.mark.long
+def with_two_sides(mesh: TriangleMesh, thickness: float) -> TriangleMesh:
+    """Cloth as programs of fashion and games export it: a lining inside, sewn to the outer side at every border."""
+    faces, count = mesh.faces, mesh.vertex_count
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, edge, times = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    a, b = edges[times[edge.ravel()] == 1].T
+    border = np.concatenate([np.stack([b, a, a + count], axis=1), np.stack([b, a + count, b + count], axis=1)])
+    inside = mesh.vertices - thickness * mesh.vertex_normals
+    return TriangleMesh(
+        np.concatenate([mesh.vertices, inside]), np.concatenate([faces, faces[:, ::-1] + count, border])
+    )
+
+
+@pytest.mark.parametrize("name", ["trousers", "open jacket"])
+@pytest.mark.long
+def test_a_lining_moves_as_the_cloth_that_it_lines(mannequin, wardrobe, name):
+    """Linings face the skin, matched none of it and took weights from elsewhere: half of a jacket's were others."""
+    case = scan(mannequin, wardrobe[name], "mean", "T", seed=0)
+    config = TransferConfig.for_label(case.garment.label)
+    two_sides = with_two_sides(case.mesh, 0.006)
+    weights = transfer_weights(case.source, mannequin.body.weights, two_sides, config=config).dense()
+    outer, inner = np.split(weights, 2)
+    apart = 0.5 * np.abs(outer - inner).sum(axis=1)
+    assert np.percentile(apart, 99) < 0.05
+    # The outer side moves as it does without a lining.
+    single = transfer_weights(case.source, mannequin.body.weights, case.mesh, config=config).dense()
+    assert np.percentile(0.5 * np.abs(outer - single).sum(axis=1), 90) < 0.05
+
+
 def test_every_garment_is_a_mesh_with_weights_that_are_some(wardrobe):
     assert len(wardrobe) >= 16
     for garment in wardrobe.values():
