@@ -48,7 +48,7 @@ from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body import load_body, load_params
 from smplxpp.build.assemble import add_texture, assemble_parts
 from smplxpp.build.data import RestPart
-from smplxpp.build.locate import LEAST_CONFIDENCE, locate_in_scan, require_found
+from smplxpp.build.locate import LEAST_CONFIDENCE, locate_in_scan, require_found, strange_shape
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
 from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
 from smplxpp.build.scan import ScanFile, read_scan
@@ -94,12 +94,14 @@ def require_body(build: BuildContext, found: Mapping[str, Any]) -> None:
     """
     picture = build.run / NOT_FOUND_PICTURE
     picture.unlink(missing_ok=True)
-    if build.config.accept_failures or found["confidence"] >= LEAST_CONFIDENCE:
+    params = load_params(build.run / LOCATED_PARAMS)
+    believed = found["confidence"] >= LEAST_CONFIDENCE and strange_shape(params) is None
+    if build.config.accept_failures or believed:
         return
     scan = _read_scan(build).scaled(found.get("scale", 1.0))
     try:
         require_found(
-            *(scan.clean.mesh, load_body(build.inputs.body), load_params(build.run / LOCATED_PARAMS)),
+            *(scan.clean.mesh, load_body(build.inputs.body), params),
             confidence=found["confidence"],
             findings=found["findings"] or found["problems"],
             picture_file=picture,

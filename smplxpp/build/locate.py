@@ -48,7 +48,7 @@ def require_found(
     findings: Sequence[str],
     picture_file: Path | None = None,
 ) -> None:
-    """Refuse to build on a body that was found with too little confidence.
+    """Refuse to build on a body that was found with too little confidence, or with a shape that no person has.
 
     Args:
         scan: the surface, metres, +Y up.
@@ -59,16 +59,34 @@ def require_found(
         picture_file: file in which the caller will write the error's picture, for the message; None: it does not.
 
     Raises:
-        BodyNotFoundError: the confidence is below `LEAST_CONFIDENCE`.
+        BodyNotFoundError: the confidence is below `LEAST_CONFIDENCE`, or the shape is none.
     """
-    if confidence >= LEAST_CONFIDENCE:
+    strange = strange_shape(params)
+    if confidence >= LEAST_CONFIDENCE and strange is None:
         return
+    findings = findings if strange is None else (*findings, strange)
     what = "".join(f"; {finding}" for finding in findings)
     raise BodyNotFoundError(
         LocatedBody(params, confidence, findings=tuple(findings)),
         received=f"a body with a confidence of {confidence:.2g} (a build needs {LEAST_CONFIDENCE:g}){what}",
         remedy=_HELP if picture_file is None else f"look at {picture_file}; {_HELP}",
         picture=picture_within(scan, body, params),
+    )
+
+
+def strange_shape(params: BodyParams) -> str | None:
+    """Return a finding about a shape that no person has; None for that of a person.
+
+    Example:
+        >>> strange_shape(BodyParams.rest(betas=np.full(20, 1.5))) is None
+        True
+    """
+    # Mean square of the betas: people have 1, bodies found in heavy, thin and drawn ones up to 6.5; of a figure with
+    # limbs of other lengths the search made 90, with a waist of a hand's width.
+    most = 12.0
+    square = float(np.square(params.betas).mean()) if params.betas.size else 0.0
+    return (
+        f"a shape that no person has (betas of a mean square of {square:.0f}, people have 1)" if square > most else None
     )
 
 

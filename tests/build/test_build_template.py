@@ -190,3 +190,17 @@ def test_a_build_stops_with_the_finding_where_nobody_was_surely_found(small, mon
     # The picture shows the scan, and the body in it from front and side.
     assert error.picture is not None and error.picture.shape[1] > error.picture.shape[0]
     assert (error.picture < 250).any(axis=(0, 2)).mean() > 0.5
+
+
+def test_a_build_stops_at_a_shape_that_no_person_has(small, monkeypatch):
+    """A drawn figure's limbs made betas of a mean square of 90; a template with a waist like a wrist came of them."""
+    fit = load_params(PARAMS).frame(0)
+    strange = replace(fit, betas=np.where(np.arange(fit.betas.shape[1]) % 2, 9.0, -9.0)[None])
+
+    def located(file, body, **known):
+        numbers = {"confidence": 0.4, "findings": [], "problems": []}
+        return LocatedInScan(strange, np.zeros(0, np.int64), np.zeros(0, bool)), StageOutput([], numbers)
+
+    monkeypatch.setattr(template, "locate_in_scan", located)
+    with pytest.raises(BodyNotFoundError, match=r"a shape that no person has .*81, people have 1"):
+        build_template(small[1])

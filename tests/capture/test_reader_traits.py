@@ -264,6 +264,16 @@ def test_videos_without_a_calibration_of_theirs_are_told_so(alone):
     assert f"are there, but not of two cameras of {other} (cam_01, " in found.value.__notes__[0]
 
 
+def test_photographs_of_one_camera_are_told_of_the_turn(alone):
+    for k in range(8):
+        (alone / "images").mkdir(exist_ok=True)
+        (alone / "images" / f"IMG_{k:04d}.JPG").write_bytes(b"")
+    with pytest.raises(InputError) as found:
+        open_capture(alone)
+    assert found.value.__notes__[0].startswith("rig: photographs are there; a calibration")
+    assert "smplxpp capture turntable" in found.value.__notes__[0]
+
+
 def _made(folder: Path) -> Path:
     folder.mkdir()
     return folder

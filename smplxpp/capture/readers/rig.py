@@ -106,6 +106,11 @@ def what_is_missing(root: Path) -> str | None:
     count = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos)
     count = count or sum(name.lower().endswith("_json") for name in folders)
     if not count:
+        few = 6  # photographs that a turn has at least
+        places = (root / name for name in _IMAGES if (root / name).is_dir())
+        if any(sum(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir()) >= few for folder in places):
+            turn = "of a person who turns before one camera `smplxpp capture turntable` makes a capture"
+            return f"photographs are there; a calibration (docs/rigs.md) is not: --calibration names it; {turn}"
         return None
     if calibration is not None:
         # It may belong to other recordings of the folder that both lie in.
