@@ -68,7 +68,7 @@ from smplxpp.segment.by_body_hems import Hems, legs_apart, nats_for_hair, nats_f
 from smplxpp.segment.by_body_layers import Layers, around_both, coat_by_shape, find_layers
 from smplxpp.segment.by_body_objects import FoundObjects, find_objects
 from smplxpp.segment.by_body_outfit import Outfit, OutfitConfig, find_outfit
-from smplxpp.segment.by_body_prior import place_prior
+from smplxpp.segment.by_body_prior import place_prior, standing_collar
 from smplxpp.segment.by_body_rings import ARM_END, ARM_START, COLUMN_END, STEP, Rings, cloth_against_skin
 from smplxpp.segment.by_body_shape import ShapeEvidence, outfit_by_shape
 from smplxpp.segment.by_body_shells import garment_shells, of_whole_faces, split_long_faces
@@ -325,7 +325,13 @@ def weigh_evidence(
         coat, vague = coat_by_shape(chart, area, outfit, column, legs, pairs=pairs, upper=upper, lips=lab is None)
         layers = replace(layers, coat=coat & clothes, hair=layers.hair & ~coat, vague=vague)
     prior = place_prior(
-        chart, outfit, layers, softness=config.softness, body_softness=config.body_softness, waist=waist
+        chart,
+        outfit,
+        layers,
+        softness=config.softness,
+        body_softness=config.body_softness,
+        waist=waist,
+        collar=standing_collar(chart, area),
     )
     # Costs of colour are averaged over faces of like colour, and the distance to the body is added.
     blend = Blend.of(

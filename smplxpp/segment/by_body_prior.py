@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from smplxpp.core.labels import HAIR, LABELS, LOWER, OUTER, SHOE, SKIN, UPPER
 from smplxpp.segment.by_body_chart import ARM, FOOT, HAND, HEAD, LEG, NECK, NECK_BASE, TRUNK, WRIST, BodyChart
@@ -32,6 +32,7 @@ def place_prior(
     softness: float,
     body_softness: float,
     waist: Waist | None = None,
+    collar: Bool[np.ndarray, " M"] | None = None,
 ) -> Float64[np.ndarray, "M L"]:
     """Return P(label) at each face's place, before its colour is used; rows sum to 1.
 
@@ -42,6 +43,7 @@ def place_prior(
         softness: standard deviation of a hem about its ring, metres.
         body_softness: standard deviation of the body's place at head and hands, metres.
         waist: border of upper and lower garment that the surface shows, which goes before the outline's.
+        collar: faces of what stands all round the neck (`standing_collar`); None: there are none.
     """
     # Probability of labels that do not occur in a region; keeps logarithms finite.
     never = 1e-6
@@ -88,6 +90,11 @@ def place_prior(
     off = head & (chart.distance > off_face)
     out[off, HAIR.id] += (1.0 - _BEYOND) * out[off, SKIN.id]
     out[off, SKIN.id] *= _BEYOND
+    if collar is not None:
+        # Hair does not go round a throat, but long hair may lie on a collar.
+        over = 0.1
+        out[collar, UPPER.id] += (1.0 - over) * out[collar, HAIR.id]
+        out[collar, HAIR.id] *= over
     out /= out.sum(axis=1, keepdims=True)
     # Layers replace the outline where they were found.
     if layers.bald:
@@ -100,6 +107,21 @@ def place_prior(
     for mask, worn in ((layers.hair, HAIR), (layers.coat, OUTER)):
         out[mask] = unlayered * out[mask] + (1.0 - unlayered) * _only(worn.id)
     return out / out.sum(axis=1, keepdims=True)
+
+
+def standing_collar(chart: BodyChart, area: Float64[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
+    """Return the faces off neck and chin where these stand off all round the neck, as a turned-up collar does, or none.
+
+    In each of five sectors half of the neck's area has to stand 15 mm off. Of twelve people in public scans the one in
+    such a collar has 0.63 and more of each, in two poses; a ponytail over a shirt's collar has 0.27 behind.
+    """
+    neck, turn = chart.region == NECK, np.abs(chart.azimuth)
+    off = neck & (chart.distance > 0.015)
+    sectors, least = np.digitize(turn, [0.5, 1.05, 1.6, 2.4]), 0.5
+    share, whole = (np.bincount(sectors[part], area[part], minlength=5) for part in (off, neck))
+    if (share <= least * whole).any():
+        return np.zeros(len(area), dtype=bool)
+    return off | ((chart.region == HEAD) & (chart.distance > 0.035) & (chart.face_height < 0.1))
 
 
 def _cut_at(waist: Waist, out: np.ndarray, softness: float) -> None:

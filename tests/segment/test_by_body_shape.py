@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from smplxpp.core import TriangleMesh
-from smplxpp.core.labels import HAIR, LABELS, LOWER, SHOE, SKIN
-from smplxpp.segment.by_body_chart import FOOT, HEAD, TRUNK, BodyChart
+from smplxpp.core.labels import HAIR, LABELS, LOWER, SHOE, SKIN, UPPER
+from smplxpp.segment.by_body_chart import FOOT, HEAD, NECK, TRUNK, BodyChart
 from smplxpp.segment.by_body_hems import Hems, roughness
 from smplxpp.segment.by_body_layers import Layers
 from smplxpp.segment.by_body_outfit import Outfit
-from smplxpp.segment.by_body_prior import place_prior
+from smplxpp.segment.by_body_prior import place_prior, standing_collar
 from smplxpp.segment.by_body_rings import ARM_START, STEP, Rings
 from smplxpp.segment.by_body_shape import Chain, ShapeEvidence, outfit_by_shape
 
@@ -109,6 +109,31 @@ def test_what_hangs_far_off_feet_face_and_back_is_no_shoe_and_no_skin():
     assert prior[0].argmax() == SHOE.id and prior[2].argmax() == SKIN.id
     assert prior[1, SHOE.id] < prior[1, LOWER.id] and prior[3].argmax() == HAIR.id
     assert prior[4, SKIN.id] > 0.3 and prior[5, SKIN.id] < 0.01 and prior[5, HAIR.id] > 0.3
+
+
+@pytest.mark.parametrize("gap", [None, 0.0, 3.0])
+def test_what_goes_all_round_a_neck_is_a_collar_and_no_hair(gap):
+    """The turned-up collar of a fleece was hair, which stands off a neck behind and beside it, but never before it."""
+    azimuth = np.linspace(-np.pi, np.pi, 200)
+    nought = np.zeros(200)
+    # Skin shows where there is a gap: at the throat, as below long hair, or behind, as above a shirt's collar.
+    off = np.full(200, 0.03) if gap is None else np.where(np.abs(np.abs(azimuth) - gap) < 0.4, 0.002, 0.03)
+    place = BodyChart(
+        region=np.full(200, NECK),
+        height=np.full(200, 1.49),
+        reach=nought,
+        azimuth=azimuth,
+        turn=azimuth,
+        face_height=nought,
+        distance=off,
+        side=np.ones(200, dtype=np.int64),
+    )
+    collar = standing_collar(place, np.full(200, 1e-4))
+    assert collar.all() == collar.any() == (gap is None)
+    outfit = Outfit(0.09, 0.09, 1.0, 1.0, 0.1, {}, np.zeros((88, len(LABELS))), np.zeros(45))
+    prior = place_prior(place, outfit, Layers.none(200), softness=0.035, body_softness=0.03, collar=collar)
+    behind = np.abs(azimuth) > 2.5
+    assert (prior[behind, UPPER.id] > prior[behind, HAIR.id]).all() == collar.all()
 
 
 def test_a_hem_may_lie_higher_on_one_side():
