@@ -5,6 +5,7 @@
 The garments of a trained RUN are simulated along the held-out frames of its capture, each row from its own start, and
 held against the true surfaces beside skinning and the student's field. Poses are those that the run itself uses. The
 truth is for measuring alone. Chaos: the spread of the simulated surface over starts moved by half a millimetre.
+Rows of *fine* clothes have the same garments cut with particles 2 cm apart, in substeps of 1 ms.
 `--draws N` also drives the clothes by the run's poses with N draws of a tracker's noise: one draw is luck.
 """
 
@@ -36,7 +37,7 @@ from benchmarks.support.results import store_results
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS, STUDENT, TEACHER
 from pipelines.stages.scene import TrainInputs, open_scene
-from smplxpp.cloth import ClothDriver, ClothShape, Garment
+from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, Garment, SolverConfig, cut_garment
 from smplxpp.cloth.garment_file import load_garments
 from smplxpp.cloth.poses import CausalSmoother
 from smplxpp.core import BodyParams, InputError, TriangleMesh
@@ -46,6 +47,8 @@ SAMPLES = 50_000
 MOVED = 5e-4
 """Standard deviation, in metres, of the perturbed starts that measure chaos."""
 STARTS = 4
+SMALL_STEPS = DriverConfig(solver=SolverConfig(substep=1e-3))
+"""How fine clothes are stepped: corrections travel an edge a substep, and their edges are shorter."""
 SAME = 2e-3
 """Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
 
@@ -78,7 +81,8 @@ class LooseCloth:
             "protocol": bench.protocol,
             "frames": list(bench.truths),
             "parts": {
-                g.part: {"particles": len(g.particles), "drag_per_s": g.config.fabric.drag} for g in bench.garments
+                g.part: {"particles": len(g.particles), "fine": len(f.particles), "drag_per_s": g.config.fabric.drag}
+                for g, f in zip(bench.garments, bench.fine, strict=True)
             },
             "rows": {},
         }
@@ -130,9 +134,11 @@ class _Bench:
             raise InputError("run", expected="loose parts in 83_cloth, frames a second", received="none")
         self.fps = scene.capture.fps
         self.student = load_avatar(run / STUDENT, self.sequence.rig)
+        self.fine = [
+            cut_garment(scene.template, g.part, g.reference, replace(g.config, spacing=0.02)) for g in self.garments
+        ]
         teacher = load_avatar(run / TEACHER, self.sequence.rig) if params is None else None
-        track = teacher.track if isinstance(teacher, TeacherAvatar) else None
-        self.seen = None if track is None else seen_particles(self.sequence, track, self.garments)
+        self.track = teacher.track if isinstance(teacher, TeacherAvatar) else None
         self.held_out = scene.capture.splits.novel_pose_frames
         truths = {frame: scene.capture.truth_mesh(frame) for frame in self.held_out}
         self.truths = {frame: mesh for frame, mesh in truths.items() if mesh is not None}
@@ -155,8 +161,13 @@ class _Bench:
             ("simulated from the first frame on", ClothMotionConfig(pre_roll=1e6)),
         ):
             yield name, self._simulated(config)
-        if self.seen is not None:
-            yield "simulated from where the surface was followed", self._simulated(ClothMotionConfig(), seen=self.seen)
+        fine = ClothMotionConfig(driver=SMALL_STEPS)
+        yield "fine, cold start 0.7 s before", self._simulated(fine, self.fine)
+        for name, how, garments in (("simulated", ClothMotionConfig(), self.garments), ("fine,", fine, self.fine)):
+            if self.track is not None:
+                seen = seen_particles(self.sequence, self.track, garments)
+                there = self._simulated(how, garments, seen=seen)
+                yield f"{name} from where the surface was followed", there
         yield "online: causal filter, from 0.7 s before", self._online()
 
     def measured(self, poses: Mapping[int, Pose]) -> dict[str, float | None]:
@@ -187,8 +198,12 @@ class _Bench:
         """Milliseconds of CPU a step, medians: of a frame of the capture, and of 1/30 s."""
         out = {}
         frames = [f for f in self.sequence.capture.frames if self.sequence.capture.params(f) is not None][-24:]
-        for name, seconds in (("a frame of the capture", 1.0 / self.fps), ("1/30 s", 1.0 / 30.0)):
-            driver = ClothDriver(self.template, self.garments)
+        for name, seconds, garments, how in (
+            ("a frame of the capture", 1.0 / self.fps, self.garments, None),
+            ("1/30 s", 1.0 / 30.0, self.garments, None),
+            ("1/30 s, fine", 1.0 / 30.0, self.fine, SMALL_STEPS),
+        ):
+            driver = ClothDriver(self.template, garments, how)
             took = []
             for frame in frames:
                 params = self.sequence.params(frame)
@@ -199,10 +214,12 @@ class _Bench:
             out[name] = round(1e3 * median(took[1:]), 2)
         return out
 
-    def _simulated(self, config: ClothMotionConfig, **seen: Any) -> dict[int, Pose]:
+    def _simulated(
+        self, config: ClothMotionConfig, garments: list[Garment] | None = None, **seen: Any
+    ) -> dict[int, Pose]:
         capture = self.sequence.capture
         given: dict[str, Any] = {"params": capture.params, "frames": capture.frames, "fps": self.fps}
-        clothes = ClothMotions(self.template, self.garments, **given, config=config, **seen)
+        clothes = ClothMotions(self.template, garments or self.garments, **given, config=config, **seen)
         clothes.simulate(self.held_out)
         return {frame: self._with(frame, clothes.shape(frame)) for frame in self.truths}
 
