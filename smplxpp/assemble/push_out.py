@@ -2,7 +2,7 @@
 
 The displacement d of the vertices is sought that is smooth along the layer and satisfies the constraint
 
-    signed distance(x + d) >= clearance        at vertices, and at half the clearance at face centres
+    signed distance(x + d) >= clearance        at vertices, and at half the clearance at points on faces
 
 It is solved by projected Jacobi steps: one step of a damped Laplacian smoothing, then a projection of each vertex that
 violates the constraint along the gradient of the signed distance.
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
-from smplxpp.assemble.layers import TOUCHING, Obstacle, face_centers
+from smplxpp.assemble.layers import TOUCHING, Obstacle, face_points
 from smplxpp.core import TriangleMesh, require_at_least, require_between
 
 
@@ -60,7 +60,7 @@ def push_out(
 
     The displacement of each vertex becomes (1 - damping) x the mean of its neighbours', then every vertex nearer to an
     obstacle than the clearance moves out along the gradient of the signed distance. Vertices away from any contact keep
-    their place, and those around one follow it without a spike. A face centre that is too near moves its corners.
+    their place, and those around one follow it without a spike. A point on a face that is too near moves its corners.
 
     Args:
         mesh: N vertices, metres.
@@ -153,20 +153,28 @@ class _Wall:
     """
 
     def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, clearance: float) -> None:
-        self._mesh, self._centers, self._solid = mesh, face_centers(mesh, mesh.vertices), obstacle.solid
-        # Face centres keep half the clearance, because a chord runs below its arc.
+        self._mesh, self._points, self._solid = mesh, face_points(mesh), obstacle.solid
+        self._between = self._points.of(mesh, mesh.vertices)
+        # Points on faces keep half the clearance, because a chord runs below its arc.
         self._of_vertices = _Distances(obstacle, mesh.vertices, mesh.vertex_normals, clearance)
-        self._of_centers = _Distances(obstacle, self._centers, mesh.face_normals, 0.5 * clearance)
+        self._of_faces = _Distances(obstacle, self._between, mesh.face_normals[self._points.face], 0.5 * clearance)
 
     def vertex_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the vertices that are too near after a displacement d (N, 3), and their (n, 3) pushes."""
         normals = self._facing(facing).vertex_normals
         return self._push(self._mesh.vertices, d, normals, self._of_vertices, facing is None)
 
-    def center_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the faces whose centres are too near after a displacement d (N, 3), and their (m, 3) pushes."""
-        normals, moved = self._facing(facing).face_normals, face_centers(self._mesh, d)
-        return self._push(self._centers, moved, normals, self._of_centers, facing is None)
+    def face_push(self, d: np.ndarray, facing: TriangleMesh | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return corners (c,) of faces with points that are too near after a displacement d (N, 3), and their pushes.
+
+        The least displacement of the corners that moves a point by p is `p w_k / sum_j w_j^2`.
+        """
+        normals, moved = self._facing(facing).face_normals[self._points.face], self._points.of(self._mesh, d)
+        near, push = self._push(self._between, moved, normals, self._of_faces, facing is None)
+        weights = self._points.weights[near]
+        share = weights / np.einsum("ij,ij->i", weights, weights)[:, None]
+        corners = self._mesh.faces[self._points.face[near]]
+        return corners.ravel(), (share[:, :, None] * push[:, None]).reshape(-1, 3)
 
     def _facing(self, displaced: TriangleMesh | None) -> TriangleMesh:
         """Return the layer whose normals decide; a solid asks for none of a displaced layer, and they take long."""
@@ -226,16 +234,15 @@ def _project(
         facing: the displaced layer, whose normals decide; None uses the normals at the start, and leaves out pushes
             that lead to the far side of a limb.
     """
-    # Vertices move by their own push, and the corners of face centres by the mean of theirs.
+    # Vertices move by their own push, and the corners of faces by the mean of theirs.
     d = d.copy()
     for wall in walls:
         vertices, push = wall.vertex_push(d, facing)
         d[vertices] += push
-        faces, push = wall.center_push(d, facing)
-        corners = mesh.faces[faces].ravel()
+        corners, push = wall.face_push(d, facing)
         count = np.bincount(corners, minlength=len(d))
         for axis in range(3):
-            total = np.bincount(corners, np.repeat(push[:, axis], 3), minlength=len(d))
+            total = np.bincount(corners, push[:, axis], minlength=len(d))
             d[:, axis] += total / np.maximum(count, 1)
     length = np.sqrt(np.einsum("ij,ij->i", d, d))
     far = length > limit

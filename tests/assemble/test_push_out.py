@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from smplxpp.assemble import Obstacle, PushConfig, flipped_faces, measure_penetration, push_out, stand_off
+from smplxpp.assemble.layers import face_points
 from smplxpp.core import InputError, TriangleMesh
 
 module = sys.modules[push_out.__module__]  # the package has a function of its name
@@ -38,7 +39,7 @@ def test_a_dent_is_pushed_out_to_the_clearance():
     assert before.depth_max == pytest.approx(0.007, abs=5e-4)
     moved = outer.with_vertices(push_out(outer, [solid(inner)], PushConfig(clearance=1e-3)))
     after = measure_penetration(moved, solid(inner))
-    assert (after.vertices, after.face_centers) == (0, 0)
+    assert (after.vertices, after.face_points) == (0, 0)
     assert np.linalg.norm(moved.vertices, axis=1).min() > 0.1
     assert not flipped_faces(outer, moved.vertices).any()
     way = np.linalg.norm(moved.vertices - outer.vertices, axis=1)
@@ -189,3 +190,43 @@ def test_a_limit_that_nothing_reaches_changes_no_bit():
 def test_the_stand_off_is_the_parts_own_within_its_reach(gap, expected):
     # Chords run below the arcs: a ball of triangles is flatter by a fifth of a millimetre.
     assert stand_off(ball(0.1 + gap), solid(ball(0.1))) == pytest.approx(expected, abs=3e-4)
+
+
+def test_points_on_faces_lie_as_densely_as_asked_and_a_small_face_has_its_centre():
+    mesh = TriangleMesh(
+        np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0.04, 0, 0], [0, 0, 0.05]]), np.array([[0, 1, 2], [0, 3, 4]])
+    )
+    points = face_points(mesh, spacing=0.016)
+    assert np.bincount(points.face).tolist() == [1, 25]  # the longest edges: 14 and 64 mm
+    np.testing.assert_allclose(points.weights.sum(axis=1), 1.0)
+    at = points.of(mesh, mesh.vertices)
+    np.testing.assert_allclose(at[points.face == 0], mesh.face_centers[:1])
+    # Everywhere on the long face a point is near.
+    own = np.random.default_rng(0).dirichlet([1, 1, 1], 500) @ mesh.vertices[mesh.faces[1]]
+    assert np.linalg.norm(own[:, None] - at[None, points.face == 1], axis=2).min(axis=1).max() < 0.011
+
+
+def tube(radius: float, sections: int, rings: int, height: float) -> TriangleMesh:
+    """An open tube about the z axis, whose faces look outward."""
+    angle = 2 * np.pi * np.arange(sections) / sections
+    ring = radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    z = height * (np.arange(rings) - 0.5 * (rings - 1))[:, None, None] * [0.0, 0.0, 1.0]
+    k, j = np.indices((rings - 1, sections)).reshape(2, -1)
+    a, b = k * sections + j, k * sections + (j + 1) % sections
+    c, d = a + sections, b + sections
+    return TriangleMesh((ring + z).reshape(-1, 3), np.concatenate([np.c_[a, b, d], np.c_[a, d, c]]))
+
+
+def test_long_faces_do_not_cut_the_limb_between_their_corners():
+    """Skin showed as specks through smooth trousers, whose faces were four times as long as the mean."""
+    limb = trimesh.creation.capsule(0.4, 0.05, count=[90, 90])
+    inner = solid(TriangleMesh(np.asarray(limb.vertices), np.asarray(limb.faces)))
+    outer = tube(0.0612, 5, 8, 0.04)  # centres of faces are 1 mm outside, middles of edges 0.5 mm inside
+
+    def depth(mesh: TriangleMesh) -> float:
+        return 0.05 - np.hypot(*mesh.vertices[mesh.edges].mean(axis=1)[:, :2].T).min()
+
+    assert depth(outer) > 4e-4
+    moved = outer.with_vertices(push_out(outer, [inner], PushConfig(clearance=1e-3)))
+    assert depth(moved) < 0.0
+    assert measure_penetration(moved, inner).face_points == 0 < measure_penetration(outer, inner).face_points
