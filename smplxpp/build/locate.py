@@ -62,13 +62,15 @@ def require_found(
         BodyNotFoundError: the confidence is below `LEAST_CONFIDENCE`, or the shape is none.
     """
     strange = strange_shape(params)
-    if confidence >= LEAST_CONFIDENCE and strange is None:
-        return
-    findings = findings if strange is None else (*findings, strange)
+    found = f"a confidence of {confidence:.2g} (a build needs {LEAST_CONFIDENCE:g})"
+    if confidence >= LEAST_CONFIDENCE:
+        if strange is None:
+            return
+        found = strange
     what = "".join(f"; {finding}" for finding in findings)
     raise BodyNotFoundError(
         LocatedBody(params, confidence, findings=tuple(findings)),
-        received=f"a body with a confidence of {confidence:.2g} (a build needs {LEAST_CONFIDENCE:g}){what}",
+        received=f"a body with {found}{what}",
         remedy=_HELP if picture_file is None else f"look at {picture_file}; {_HELP}",
         picture=picture_within(scan, body, params),
     )

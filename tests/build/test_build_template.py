@@ -202,5 +202,5 @@ def test_a_build_stops_at_a_shape_that_no_person_has(small, monkeypatch):
         return LocatedInScan(strange, np.zeros(0, np.int64), np.zeros(0, bool)), StageOutput([], numbers)
 
     monkeypatch.setattr(template, "locate_in_scan", located)
-    with pytest.raises(BodyNotFoundError, match=r"a shape that no person has .*81, people have 1"):
+    with pytest.raises(BodyNotFoundError, match=r"a body with a shape that no person has .*81, people have 1"):
         build_template(small[1])
