@@ -289,7 +289,8 @@ def _check(name: str, array: np.ndarray, kinds: str, shape: tuple[int, ...], *, 
 def save_arrays(path: Path, groups: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Write `{group: {name: array}}` as `group/name`."""
     flat: dict[str, Any] = {f"{g}/{name}": array for g, arrays in groups.items() for name, array in arrays.items()}
-    np.savez(path, **flat)
+    # A bare person has no parts, and an archive without arrays would look damaged.
+    np.savez(path, **(flat or {"none": np.zeros(0)}))
 
 
 def load_arrays(path: Path) -> dict[str, dict[str, np.ndarray]]:
@@ -299,7 +300,10 @@ def load_arrays(path: Path) -> dict[str, dict[str, np.ndarray]]:
         InputError: missing, damaged or foreign file.
     """
     groups: dict[str, dict[str, np.ndarray]] = {}
-    for key, array in read_arrays(path, subject="stage file", remedy=_DAMAGED).items():
+    arrays = read_arrays(path, subject="stage file", remedy=_DAMAGED)
+    if list(arrays) == ["none"]:
+        return {}
+    for key, array in arrays.items():
         group, slash, name = key.partition("/")
         if not slash:
             raise InputError(f"stage file {path}", expected="arrays in groups", received=key, remedy=_DAMAGED)

@@ -52,7 +52,7 @@ from smplxpp.build.locate import LEAST_CONFIDENCE, locate_in_scan, require_found
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
 from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
 from smplxpp.build.scan import ScanFile, read_scan
-from smplxpp.build.segment import label_faces, vertex_labels
+from smplxpp.build.segment import label_faces, label_source, vertex_labels
 from smplxpp.build.validate import validate_template
 from smplxpp.core import BodyParams, StageOutput, write_ply
 from smplxpp.core.files.atomic import atomic_write_bytes
@@ -174,7 +174,8 @@ def clean(folder: Path, build: BuildContext) -> StageOutput:
     """Write one clean mesh within its face budget for every part that is not skin."""
     scan = load_prepared_scan(build.run)
     face_labels = load_scan_labels(build.run, scan.mesh.face_count)
-    parts, output = clean_scan(scan, face_labels, build.config, load_labels(build.run))
+    found = label_source(build.inputs) == "body"
+    parts, output = clean_scan(scan, face_labels, build.config, load_labels(build.run), found=found)
     save_parts(folder, parts)
     return output
 

@@ -19,6 +19,7 @@ from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, f
 from smplxpp.clean.shreds import cut_borders, drawn_out, find_shreds
 from smplxpp.core import (
     LABELS,
+    SKIN,
     Check,
     GeometryWarning,
     InputError,
@@ -43,10 +44,27 @@ _FOLDED = 1e-6
 
 
 def clean_scan(
-    scan: PreparedScan, face_labels: Integer[np.ndarray, " M"], config: BuildConfig, labels: Labels = LABELS
+    scan: PreparedScan,
+    face_labels: Integer[np.ndarray, " M"],
+    config: BuildConfig,
+    labels: Labels = LABELS,
+    *,
+    found: bool = False,
 ) -> tuple[dict[str, Part], StageOutput]:
-    """Make one clean mesh within its face budget for every part that is not skin."""
+    """Make one clean mesh within its face budget for every part that is not skin.
+
+    Args:
+        scan: prepared.
+        face_labels: (M,) label ids.
+        config: budgets and method.
+        labels: whose ids they are.
+        found: the body told the labels, so that skin alone is a bare and bald person, and no mistaken label set.
+    """
     settings = PartsConfig(face_budgets=config.budgets, method=config.remesh, labels=labels)
+    skin = [-1] + [label.id for label in labels if label.kind == SKIN.name]
+    if found and np.isin(face_labels, skin).all():
+        warnings.warn("no clothes, hair or shoes were found: the template is the body alone", GeometryWarning, 2)
+        return {}, StageOutput([], {})
     cleaned = clean_parts(scan.mesh, face_labels, config=settings, vertex_colors=scan.colors)
     parts, checks, numbers = {}, [], {}
     for name, part in cleaned.items():

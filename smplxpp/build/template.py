@@ -35,7 +35,7 @@ from smplxpp.build.register import Registration, register_observed
 from smplxpp.build.report import BuildReport, BuildResult
 from smplxpp.build.request import BuildRequest, opened, with_params
 from smplxpp.build.scan import ScanFile, read_scan
-from smplxpp.build.segment import label_faces
+from smplxpp.build.segment import label_faces, label_source
 from smplxpp.build.validate import validate_template
 from smplxpp.capture import Capture
 from smplxpp.clean.remesh import require_remesher
@@ -180,7 +180,7 @@ class _Build:
 
         # Cut the scan into parts, give them weights, bring them to the T-pose and put them onto the body.
         with self._step("clean") as step:
-            cleaned, step.output = clean_scan(scan, face_labels, config, labels)
+            cleaned, step.output = clean_scan(scan, face_labels, config, labels, found=label_source(inputs) == "body")
         with self._step("transfer") as step:
             posed, weights, step.output = transfer_to_parts(cleaned, fit, body, config, labels)
         with self._step("unpose") as step:

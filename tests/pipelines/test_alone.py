@@ -15,15 +15,18 @@ from PIL import Image
 from pipelines.commands.build import Build
 from pipelines.report.sections.register import locate_section
 from pipelines.runs.artefacts import load_located
-from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, NOT_FOUND_PICTURE, SEGMENT_STAGE
+from pipelines.runs.layout import LANDMARKS_FILE, LOCATE_STAGE, NOT_FOUND_PICTURE, SEGMENT_STAGE, TEMPLATE
 from pipelines.runs.stage import require_stage
 from smplxpp.body import load_body, load_params
-from smplxpp.build import locate
+from smplxpp.build import BuildConfig, locate
+from smplxpp.build.data import PreparedScan
+from smplxpp.build.parts import clean_scan
 from smplxpp.clean import Simplified, simplify
-from smplxpp.core import BACKGROUND, SKIN, TriangleMesh
+from smplxpp.core import BACKGROUND, SKIN, BodyParams, GeometryWarning, InputError, TriangleMesh
 from smplxpp.core.mesh_files.mesh_io import RawMesh, read_mesh, read_raw_mesh, write_ply
 from smplxpp.register.locate import BodyNotFoundError, Candidate, LocateConfig, LocatedBody
-from smplxpp.segment import read_labels
+from smplxpp.segment import SegmentedScan, read_labels
+from smplxpp.template import Template
 
 pytestmark = pytest.mark.long
 
@@ -182,3 +185,28 @@ def test_nothing_is_built_on_what_is_no_person(tmp_path, monkeypatch):
         Build(run_folder=tmp_path / "run", scan=tmp_path / "cube.ply", units="m", up="y", json=True).run()
     assert [path.name for path in (tmp_path / "run").glob("[0-9]*")] == [LOCATE_STAGE]
     assert (tmp_path / "run" / NOT_FOUND_PICTURE).is_file()
+
+
+def test_a_bare_and_bald_person_is_a_template_of_the_body_alone(tmp_path, monkeypatch):
+    """A mannequin was refused after its labels were found, with the advice to check the label set."""
+
+    def bare(mesh, *_, **__):
+        labels = np.full(mesh.face_count, SKIN.id)
+        return SegmentedScan(labels, np.ones(len(labels)), np.ones(len(labels), bool), 0, 0.0, 0.0)
+
+    monkeypatch.setattr(locate, "locate_body", partial(locate.locate_body, config=FEW))
+    monkeypatch.setattr("smplxpp.build.segment.label_by_body", bare)
+    pose = BodyParams.rest(betas=0).body_pose.copy()
+    pose[0, 47], pose[0, 50] = -0.9, 0.9  # arms lowered
+    vertices = BODY.forward(replace(BodyParams.rest(betas=0), body_pose=pose)).vertices[0]
+    write_ply(tmp_path / "bare.ply", TriangleMesh(vertices, BODY.faces))
+    with pytest.warns(GeometryWarning, match="the body alone"):
+        answer = Build(run_folder=tmp_path / "run", scan=tmp_path / "bare.ply", units="m", up="y", json=True).run()
+    assert answer["exit_status"] == 0
+    assert Template.load(tmp_path / "run" / TEMPLATE).part_names == ("body",)
+    assert "the template is the body alone" in (tmp_path / "run" / "report.html").read_text()
+    # Labels of a file that are skin alone are a mistaken label set.
+    mesh, gray = TriangleMesh(vertices, BODY.faces), np.full((len(vertices), 3), 128, np.uint8)
+    scan = PreparedScan(mesh, gray, np.arange(len(vertices)), np.arange(len(BODY.faces)))
+    with pytest.raises(InputError, match="label set"):
+        clean_scan(scan, np.full(len(BODY.faces), SKIN.id), BuildConfig())

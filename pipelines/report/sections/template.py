@@ -110,9 +110,14 @@ _METHODS = {
 }
 
 
+_BARE = "No clothes, hair or shoes were found: the template is the body alone."
+
+
 def parts_section(run: Path, record: StageRecord, cameras: list[Camera], checks: tuple[CheckRow, ...]) -> Section:
     """Show the parts and how simplification changed them."""
     parts = load_cleaned_parts(run)
+    if not parts:
+        return Section(title="Parts", text=(_BARE,), checks=checks)
     # Draw all parts together, coloured by their label.
     mesh = concatenate_meshes([part.mesh for part in parts.values()])
     labels = np.concatenate([np.full(part.mesh.face_count, part.label) for part in parts.values()])
@@ -146,6 +151,8 @@ def weights_section(run: Path, record: StageRecord, cameras: list[Camera], check
     """Show the skin weights of the parts."""
     parts = load_parts(run)
     weights = load_weights(run, parts)
+    if not parts:
+        return Section(title="Skin weights", text=(_BARE,), checks=checks)
     # Draw all parts together: joint colours mixed by weight, then matched against free cloth.
     mesh = concatenate_meshes([part.mesh for part in parts.values()])
     colors = np.concatenate([blend_joint_colors(weights[name]) for name in parts])
