@@ -48,7 +48,7 @@ from pipelines.stages.run_inputs import motion_of_build
 from smplxpp.body import load_body, load_params
 from smplxpp.build.assemble import add_texture, assemble_parts
 from smplxpp.build.data import RestPart
-from smplxpp.build.locate import LEAST_CONFIDENCE, locate_in_scan, require_found, strange_shape
+from smplxpp.build.locate import LEAST_CONFIDENCE, locate_in_scan, require_found
 from smplxpp.build.parts import clean_scan, transfer_to_parts, unpose_parts
 from smplxpp.build.prepare import given_params, pose_fit, prepare_scan, registered_frame, start_params
 from smplxpp.build.scan import ScanFile, read_scan
@@ -94,14 +94,14 @@ def require_body(build: BuildContext, found: Mapping[str, Any]) -> None:
     """
     picture = build.run / NOT_FOUND_PICTURE
     picture.unlink(missing_ok=True)
-    params = load_params(build.run / LOCATED_PARAMS)
-    believed = found["confidence"] >= LEAST_CONFIDENCE and strange_shape(params) is None
+    # Stages from before the shape was asked have no finding about it.
+    believed = found["confidence"] >= LEAST_CONFIDENCE and found.get("strange_shape") is None
     if build.config.accept_failures or believed:
         return
     scan = _read_scan(build).scaled(found.get("scale", 1.0))
     try:
         require_found(
-            *(scan.clean.mesh, load_body(build.inputs.body), params),
+            *(scan.clean.mesh, load_body(build.inputs.body), load_params(build.run / LOCATED_PARAMS)),
             confidence=found["confidence"],
             findings=found["findings"] or found["problems"],
             picture_file=picture,

@@ -207,6 +207,7 @@ def _located(
         "confidence": found.confidence,
         "problems": list(found.notes),
         "findings": list(found.findings),
+        "strange_shape": strange_shape(found.params),
         "moved": list(found.moved),
         "candidates": found.candidates,
         "bare": float(bare.mean()),

@@ -161,6 +161,25 @@ def test_landmarks_by_hand_are_believed_and_make_it_anew(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
+def test_a_command_stops_at_a_shape_that_no_person_has(tmp_path, monkeypatch):
+    fit = load_params(PERSON / "params" / "params.npz").frame(0)
+    drawn = replace(fit, betas=np.where(np.arange(fit.betas.shape[1]) % 2, 9.0, -9.0)[None])
+
+    def look(body, mesh, *, colors, landmarks, labeller):
+        return LocatedBody(drawn, 0.4, (), (Candidate("by hand", 0.0, 1.0, 1.0, 1.0),))
+
+    monkeypatch.setattr(locate, "locate_body", look)
+    scan, run = tmp_path / "coarse.ply", tmp_path / "run"
+    write_ply(scan, simplify(read_mesh(PERSON / "scans" / "scan_000000.ply").mesh, 9500).mesh)
+    build = Build(run_folder=run, scan=scan, units="m", up="y", until_stage=LOCATE_STAGE, json=True)
+    for _ in range(2):  # a stage that stands is asked again
+        with pytest.raises(BodyNotFoundError, match=r"a shape that no person has .*81, people have 1"):
+            build.run()
+        assert (run / NOT_FOUND_PICTURE).is_file()
+    assert replace(build, accept_failures=True).run()["checks"][0]["status"] == "warn"
+
+
+@pytest.mark.long
 def test_nothing_is_built_on_what_is_no_person(tmp_path, monkeypatch):
     monkeypatch.setattr(locate, "locate_body", partial(locate.locate_body, config=FEW))
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
