@@ -102,7 +102,7 @@ def of_one_person(content: Any, person: int | None, *, source: str = "file") -> 
     """
     people = content.get("poses") if isinstance(content, Mapping) else None
     try:
-        shapes = [np.shape(one) for one in people] if isinstance(people, (list, tuple, np.ndarray)) else []
+        shapes = [np.shape(one) for one in people] if people is not None and _rows(people) else []
     except ValueError:  # ragged rows
         return content
     # Rows of 72 numbers and more; a pose of matrices or of joints has rows of 3 and 9.
@@ -117,8 +117,14 @@ def of_one_person(content: Any, person: int | None, *, source: str = "file") -> 
             remedy="choose one: person, --person",
         )
     place = person or 0
-    mine = {key: content[key][place] for key in ("poses", "trans", "betas") if len(content.get(key, ())) == len(shapes)}
-    return {**{key: value for key, value in content.items() if np.ndim(value) == 0}, **mine}
+    mine = {key: content[key][place] for key in ("poses", "trans", "betas") if _rows(content.get(key)) == len(shapes)}
+    return {**{key: value for key, value in content.items() if not _rows(value)}, **mine}
+
+
+def _rows(value: Any) -> int:
+    """Return the length of a list or an array, 0 for anything else, as an array of a single number."""
+    listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim > 0)
+    return len(value) if listed else 0
 
 
 _ROTATIONS = frozenset(name for name, _ in POSE_BLOCKS)

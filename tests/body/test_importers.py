@@ -458,3 +458,11 @@ def test_people_in_lists_are_chosen_by_their_place(tmp_path):
             read, expected = load_params(path, person=place), load_params(alone)
         np.testing.assert_array_equal(read.transl, expected.transl)
         np.testing.assert_array_equal(read.body_pose, expected.body_pose)
+
+
+@pytest.mark.parametrize("key", ["poses", "trans"])
+def test_a_single_number_in_the_place_of_rows_is_named(tmp_path, key):
+    record = {"poses": np.zeros((1, 4, 72)), "trans": np.zeros((1, 4, 3)), "betas": np.zeros(10)} | {key: np.zeros(())}
+    np.savez(tmp_path / "walk.npz", **record)
+    with pytest.raises(InputError, match=r"walk\.npz"):
+        load_params(tmp_path / "walk.npz")

@@ -15,6 +15,7 @@ from smplxpp.people.garments.mannequin import Mannequin, shares
 from smplxpp.people.garments.wardrobe import scan, shape_betas
 from smplxpp.transfer import TransferConfig, transfer_weights
 from smplxpp.transfer.correspond import closest_points
+from smplxpp.transfer.extend import with_linings
 
 ARM = ("shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
 PAPER = TransferConfig.paper()
@@ -141,3 +142,29 @@ def test_every_garment_is_a_mesh_with_weights_that_are_some(wardrobe):
         weights = garment.cloth.weights
         assert weights.min() >= 0 and np.abs(weights.sum(axis=1) - 1).max() < 1e-9, garment.name
         assert garment.cloth.mesh.face_areas.min() > 0, garment.name
+
+
+@pytest.mark.parametrize(("rows", "follows"), [(30, True), (2, False)])
+def test_a_lining_takes_the_weights_behind_it_and_a_folded_hem_keeps_its_own(rows, follows):
+    """The step of weights at the edge of a hem that was folded in stretched a skirt by a quarter more."""
+    outer = sheet(30, 30, 0.0)
+    inner = sheet(rows, 30, -0.004)
+    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + outer.vertex_count])
+    target = TriangleMesh(np.concatenate([outer.vertices, inner.vertices]), faces)
+    turned = np.arange(target.vertex_count) >= outer.vertex_count
+    weights = np.random.default_rng(0).dirichlet([1.0, 1.0], target.vertex_count)
+    normals, angle = np.where(turned, -1.0, 1.0)[:, None] * [0.0, 0.0, 1.0], np.where(turned, np.pi, 0.0)
+    found = with_linings(weights, target, normals, angle, thickness=(0.025, 0.05))
+    np.testing.assert_array_equal(found[~turned], weights[~turned])
+    expected = weights[: inner.vertex_count] if follows else weights[turned]
+    np.testing.assert_allclose(found[turned], expected, atol=1e-9)
+
+
+def sheet(rows: int, columns: int, z: float) -> TriangleMesh:
+    """A plane that looks along +z, its vertices 1 cm apart, row by row."""
+    i, j = np.indices((rows, columns)).reshape(2, -1)
+    a = np.arange(rows * columns).reshape(rows, columns)[:-1, :-1].ravel()
+    faces = np.concatenate(
+        [np.stack([a, a + columns, a + 1], axis=1), np.stack([a + 1, a + columns, a + columns + 1], axis=1)]
+    )
+    return TriangleMesh(0.01 * np.stack([i, j, np.full(len(i), 100.0 * z)], axis=1), faces)
