@@ -238,9 +238,11 @@ def _separate(
     # Parts of one label lie side by side and are no obstacles to each other.
     for label in labels.layer_order:
         layer = [name for name, part in parts.items() if part.label == label]
+        # A foot yields to its shoe, whose long faces beside an arch or a heel would bulge.
+        of_layer = replace(push, spacing=np.inf) if is_shoe(labels[label]) else push
         for name in layer:
             mesh = parts[name].mesh
-            meshes[name], reports[name] = _separate_part(mesh, obstacles, push, (body, body_mesh))
+            meshes[name], reports[name] = _separate_part(mesh, obstacles, of_layer, (body, body_mesh))
             _warn_of_rest(name, reports[name])
         obstacles += [Obstacle(name, meshes[name], solid=False, max_depth=push.max_depth) for name in layer]
     return meshes, AssemblyReport(reports)

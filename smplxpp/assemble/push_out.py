@@ -32,6 +32,7 @@ class PushConfig:
             gentler the bulge.
         iterations: number of smoothing steps.
         max_depth: depth of penetration, metres, as `Obstacle` has it.
+        spacing: longest edge, metres, of a face that keeps its distance at its centre alone (`face_points`).
         reach: bounds of a part's stand-off (`stand_off`), metres, which limits its push.
     """
 
@@ -39,6 +40,7 @@ class PushConfig:
     damping: float = 0.25
     iterations: int = 20
     max_depth: float = 0.015
+    spacing: float = 0.016
     reach: tuple[float, float] = (0.010, 0.030)
 
     def __post_init__(self) -> None:
@@ -74,7 +76,7 @@ def push_out(
     """
     # Projected Jacobi steps, then projections alone, then repair of flipped faces.
     config = config or PushConfig()
-    walls = [_Wall(obstacle, mesh, config.clearance) for obstacle in obstacles]
+    walls = [_Wall(obstacle, mesh, config) for obstacle in obstacles]
     mean = _neighbour_mean(mesh)
     d = _project(mesh, np.zeros_like(mesh.vertices), walls, limit)
     for _ in range(config.iterations):
@@ -152,8 +154,9 @@ class _Wall:
     Signed distances at the start give lower bounds after a displacement, which save most queries.
     """
 
-    def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, clearance: float) -> None:
-        self._mesh, self._points, self._solid = mesh, face_points(mesh), obstacle.solid
+    def __init__(self, obstacle: Obstacle, mesh: TriangleMesh, config: PushConfig) -> None:
+        self._mesh, self._solid, clearance = mesh, obstacle.solid, config.clearance
+        self._points = face_points(mesh, spacing=config.spacing)
         self._between = self._points.of(mesh, mesh.vertices)
         # Points on faces keep half the clearance, because a chord runs below its arc.
         self._of_vertices = _Distances(obstacle, mesh.vertices, mesh.vertex_normals, clearance)
