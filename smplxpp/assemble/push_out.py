@@ -10,7 +10,7 @@ violates the constraint along the gradient of the signed distance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -74,8 +74,20 @@ def push_out(
     Returns:
         (N, 3) float64; the input if nothing is too near.
     """
-    # Projected Jacobi steps, then projections alone, then repair of flipped faces.
     config = config or PushConfig()
+    out = _pushed(mesh, obstacles, config, limit)
+    turned = int(flipped_faces(mesh, out).sum())
+    if turned and np.isfinite(config.spacing):
+        # Points between the corners may turn faces over that their centres alone do not.
+        other = _pushed(mesh, obstacles, replace(config, spacing=np.inf), limit)
+        out = other if flipped_faces(mesh, other).sum() < turned else out
+    return out
+
+
+def _pushed(
+    mesh: TriangleMesh, obstacles: list[Obstacle], config: PushConfig, limit: float
+) -> Float64[np.ndarray, "N 3"]:
+    # Projected Jacobi steps, then projections alone, then repair of flipped faces.
     walls = [_Wall(obstacle, mesh, config) for obstacle in obstacles]
     mean = _neighbour_mean(mesh)
     d = _project(mesh, np.zeros_like(mesh.vertices), walls, limit)
