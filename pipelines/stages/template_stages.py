@@ -83,14 +83,14 @@ def locate(folder: Path, build: BuildContext) -> StageOutput:
 
 
 def require_body(build: BuildContext, found: Mapping[str, Any]) -> None:
-    """Stop a build whose body was found with too little confidence, and leave a picture of it in the run.
+    """Stop a build whose body has too little confidence or a shape of nobody, and leave a picture of it in the run.
 
     Args:
         build: the run and its choices.
         found: numbers of the stage that located the body.
 
     Raises:
-        BodyNotFoundError: the confidence is too small, and failures are not accepted.
+        BodyNotFoundError: the confidence is too small or the shape is none, and failures are not accepted.
     """
     picture = build.run / NOT_FOUND_PICTURE
     picture.unlink(missing_ok=True)
