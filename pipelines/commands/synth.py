@@ -44,6 +44,8 @@ class Synth:
     """Clothes below the shirt: skirt (loose) or trousers (tight); by default a skirt (talking: trousers)."""
     skirt_pattern: OptionalText = None
     """Pattern of a skirt: plaid (default), stripes (vertical), hoops (horizontal), dots or plain."""
+    skirt_length: OptionalText = None
+    """Length of a skirt: knee (default), or calf (its hem halfway from the knees to the ankles)."""
     outside: float = 0.0
     """Millimetres (root mean square) of offsets of her body that no shape of the body model has, as real people do."""
     seed: int = 0
@@ -123,8 +125,9 @@ class Synth:
             require_at_least("--width", self.width, 8)
         clothes = kind.clothes if self.clothes is None else self.clothes
         require_choice("--clothes", clothes, CLOTHES)
-        if self.skirt_pattern is not None and clothes != "skirt":
-            raise InputError("--skirt-pattern", expected="clothes with a skirt", received=f"--clothes {clothes}")
+        for option, value in (("--skirt-pattern", self.skirt_pattern), ("--skirt-length", self.skirt_length)):
+            if value is not None and clothes != "skirt":
+                raise InputError(option, expected="clothes with a skirt", received=f"--clothes {clothes}")
         return SynthConfig(
             cameras=kind.cameras if self.cameras is None else self.cameras,
             frames=self.frames,
@@ -140,6 +143,7 @@ class Synth:
             clothes=clothes,
             outside=1e-3 * self.outside,
             skirt_pattern=self.skirt_pattern or SynthConfig.skirt_pattern,
+            skirt_length=self.skirt_length or SynthConfig.skirt_length,
             aspect=kind.aspect if self.width is None else self.width / self.size,
             texel=kind.texel,
         )

@@ -11,8 +11,9 @@ from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
 from smplxpp.body import BodyModel
-from smplxpp.core.mesh import TriangleMesh, normalize_rows
+from smplxpp.core.mesh import TriangleMesh, normalize_rows, row_lengths
 from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.core.topology import border_loops
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,3 +156,84 @@ def lift_outside(
         widened = np.maximum(smooth(mesh, missing, steps=smoothing), missing)
         vertices = vertices + widened * normalize_rows(smooth(mesh, where.gradient, steps=smoothing))
     return vertices
+
+
+def lowest_loop(mesh: TriangleMesh) -> Int[np.ndarray, " L"]:
+    """Return the border loop that hangs lowest: of a skirt its hem."""
+    return min(border_loops(mesh.faces), key=lambda loop: float(mesh.vertices[loop, 1].mean()))
+
+
+def lengthened(skirt: ClothMesh, hem: float, centre_z: float) -> ClothMesh:
+    """Return a skirt in the T-pose that continues below its hem with the same flare, its folds opening further.
+
+    Rows of new vertices lie as far apart as the old ones do, with the weights of the old hem above them.
+
+    Args:
+        skirt: its vertices and faces stay as they are.
+        hem: height of the new hem, metres.
+        centre_z: depth of the skirt's axis.
+    """
+    mesh, loop = skirt.mesh, lowest_loop(skirt.mesh)
+    offsets = skirt.vertices - [0.0, 0.0, centre_z]
+    angle, radius, y = np.arctan2(offsets[:, 0], offsets[:, 2]), np.hypot(offsets[:, 0], offsets[:, 2]), offsets[:, 1]
+    # The flare by angle: the slope of a line through the 20 cm above the hem, near each vertex of it.
+    low = y < y[loop].mean() + 0.2
+    near = np.exp(-((_turned(angle[loop, None] - angle[low]) / 0.06) ** 2))
+    near /= near.sum(axis=1, keepdims=True)
+    middle = near @ y[low]
+    away = y[low] - middle[:, None]
+    flare = (near * away * radius[low]).sum(axis=1) / (near * away**2).sum(axis=1)
+
+    edge = float(np.median(row_lengths(np.diff(skirt.vertices[mesh.edges], axis=1)[:, 0])))
+    depth = float(y[loop].mean()) - hem
+    rows = int(np.ceil(depth / (edge * np.sqrt(0.75))))
+    steps = row_lengths(np.roll(offsets[loop], -1, axis=0) - offsets[loop])
+    columns = int(np.ceil(steps.sum() / edge * (1.0 - depth * flare.mean() / radius[loop].mean())))
+    # Rows are staggered, which makes even triangles; shares of the loop's length tell where their vertices are.
+    above, share = loop, np.append(0.0, np.cumsum(steps))[:-1] / steps.sum()
+    ends = np.append(share, 1.0)
+    vertices, weights, faces, count = [skirt.vertices], [skirt.weights], [skirt.faces], len(skirt.vertices)
+
+    def along(values: Float[np.ndarray, "L _"], at: Float[np.ndarray, " C"]) -> Float[np.ndarray, "C _"]:
+        closed = np.concatenate([values, values[:1]])
+        return np.stack([np.interp(at, ends, column) for column in closed.T], axis=1)
+
+    for row in range(1, rows + 1):
+        at = (np.arange(columns) + 0.5 * (row % 2)) / columns
+        drop = depth * row / rows
+        sideways = offsets[loop][:, [0, 2]]
+        reach = 1.0 - (drop * flare / radius[loop])[:, None]
+        x, z = along(sideways * reach, at).T
+        height = along(offsets[loop, 1:2], at)[:, 0] - drop
+        vertices.append(np.stack([x, height, z + centre_z], axis=1))
+        weights.append(along(skirt.weights[loop], at))
+        below = count + np.arange(columns)
+        faces.append(_between(above, share, below, at))
+        above, share, count = below, at, count + columns
+    return ClothMesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(weights))
+
+
+def _turned(angle: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+    """Return angles between -pi and pi."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _between(
+    above: Int[np.ndarray, " A"],
+    at_above: Float[np.ndarray, " A"],
+    below: Int[np.ndarray, " B"],
+    at_below: Float[np.ndarray, " B"],
+) -> Int[np.ndarray, "M 3"]:
+    """Return the faces between two closed rows, whose vertices lie at shares of one turn, in one direction."""
+    faces, i, j = [], 0, 0
+    upper, lower = np.append(at_above, at_above[0] + 1.0), np.append(at_below, at_below[0] + 1.0)
+    while i < len(above) or j < len(below):
+        a, b = above[i % len(above)], below[j % len(below)]
+        # Of the two next edges the one whose middle comes first.
+        if j == len(below) or (i < len(above) and upper[i] + upper[i + 1] < lower[j] + lower[j + 1]):
+            i += 1
+            faces.append((above[i % len(above)], a, b))
+        else:
+            j += 1
+            faces.append((a, b, below[j % len(below)]))
+    return np.array(faces)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 
@@ -13,7 +14,17 @@ from smplxpp.body import BodyModel, load_body
 from smplxpp.core import BodyParams, InputError, TriangleMesh
 from smplxpp.core.files.array_file import read_arrays
 from smplxpp.people import textures
-from smplxpp.people.cloth_mesh import ClothMesh, clip, lift_outside, loop_subdivide, outer_faces, smooth, submesh
+from smplxpp.people.cloth_mesh import (
+    ClothMesh,
+    clip,
+    lengthened,
+    lift_outside,
+    loop_subdivide,
+    lowest_loop,
+    outer_faces,
+    smooth,
+    submesh,
+)
 from smplxpp.people.textures import skirt_colors
 from smplxpp.skinning import skin
 
@@ -22,6 +33,7 @@ LABEL_NAMES = ("background", "skin", "hair", "shoes", "upper", "lower", "other")
 PART_LABELS = np.array([1, 4, 5, 3, 2], dtype=np.uint8)
 """Label of each part."""
 CLOTHES = ("skirt", "trousers")
+SKIRT_LENGTHS = ("knee", "calf")
 PERSON_BETAS = np.array([0.35, 1.4, 0.3, 0.6] + [0.0] * 16)
 """Shape coefficients of the person: an adult woman of about average height."""
 
@@ -41,6 +53,7 @@ class Person:
         face: landmarks on the T-pose, for the colours.
         clothes: one of `CLOTHES`, the part "lower".
         skirt_pattern: name in `patterns.SKIRT_PATTERNS`.
+        skirt_length: one of `SKIRT_LENGTHS`; a pattern is spread evenly along the hem of the longer one.
     """
 
     tpose: TriangleMesh
@@ -53,6 +66,7 @@ class Person:
     face: textures.FaceMarks
     clothes: str = "skirt"
     skirt_pattern: str = "plaid"
+    skirt_length: str = "knee"
 
     def posed(self, params: BodyParams) -> tuple[Float[np.ndarray, "T V 3"], Float[np.ndarray, "T 55 4 4"]]:
         """Pose every layer by linear blend skinning; return its vertices and the joints' transforms from rest."""
@@ -86,7 +100,8 @@ class Person:
                 out[own] = textures.shirt_colors(points[own], joint["left_shoulder"])
             elif name == "lower":
                 if self.clothes == "skirt":
-                    out[own] = skirt_colors(points[own], joint["pelvis"][2], self.skirt_pattern)
+                    hem = None if self.skirt_length == "knee" else self._hem
+                    out[own] = skirt_colors(points[own], joint["pelvis"][2], self.skirt_pattern, hem)
                 else:
                     out[own] = textures.trouser_colors(points[own], joint["left_hip"], joint["left_ankle"])
             elif name == "shoes":
@@ -95,22 +110,27 @@ class Person:
                 out[own] = textures.hair_colors(points[own], seed=2)
         return np.clip(out, 0, 255).astype(np.uint8)
 
+    @cached_property
+    def _hem(self) -> Float[np.ndarray, "L 3"]:
+        mesh = self.tpose.submesh(self.face_part == PART_NAMES.index("lower"))[0]
+        return mesh.vertices[lowest_loop(mesh)]
+
 
 def face_marks(landmarks: Float[np.ndarray, "51 3"]) -> textures.FaceMarks:
     """Return the landmarks that are painted, of those in dlib's order from 17."""
     return textures.FaceMarks(brows=landmarks[:10], eyes=landmarks[19:31], lips=landmarks[31:43])
 
 
-def load_person(topology_file: Path, clothes: str = "skirt") -> Person:
+def load_person(topology_file: Path, clothes: str = "skirt", skirt_length: str = "knee") -> Person:
     """Return the person of `geometry/topology.npz` of the fixture, in one of `CLOTHES`.
 
     Raises:
         InputError: a missing file, missing keys, or parts that are not the fixture person's.
     """
-    return person_of(read_layers(topology_file, clothes), clothes)
+    return person_of(read_layers(topology_file, clothes, skirt_length), clothes, skirt_length)
 
 
-def read_layers(topology_file: Path, clothes: str = "skirt") -> dict[str, np.ndarray]:
+def read_layers(topology_file: Path, clothes: str = "skirt", skirt_length: str = "knee") -> dict[str, np.ndarray]:
     """Return the arrays of `geometry/topology.npz`, with the layers of her clothes.
 
     Raises:
@@ -132,10 +152,12 @@ def read_layers(topology_file: Path, clothes: str = "skirt") -> dict[str, np.nda
     parts = tuple(arrays["part_names"].tolist())
     if parts != PART_NAMES:
         raise InputError(f"file {topology_file}", expected=f"parts {PART_NAMES}", received=str(parts))
-    return arrays if clothes == "skirt" else with_trousers(arrays, load_body())
+    if clothes == "trousers":
+        return with_trousers(arrays, load_body())
+    return arrays if skirt_length == "knee" else with_calf_skirt(arrays, load_body())
 
 
-def person_of(arrays: dict[str, np.ndarray], clothes: str = "skirt") -> Person:
+def person_of(arrays: dict[str, np.ndarray], clothes: str = "skirt", skirt_length: str = "knee") -> Person:
     """Return the person whose arrays `read_layers` returned."""
     return Person(
         tpose=TriangleMesh(arrays["v_tpose"], arrays["faces"]),
@@ -147,6 +169,7 @@ def person_of(arrays: dict[str, np.ndarray], clothes: str = "skirt") -> Person:
         body=load_body(),
         face=face_marks(face_landmarks()),
         clothes=clothes,
+        skirt_length=skirt_length,
     )
 
 
@@ -190,9 +213,29 @@ def with_trousers(arrays: dict[str, np.ndarray], body: BodyModel) -> dict[str, n
         arrays: arrays of the file; the body's vertices come first.
         body: body model of the person.
     """
-    # The trousers take the place of the skirt's vertices and faces; what follows them moves up or down.
+    return _with_lower(arrays, make_trousers(body, arrays["v_tpose"][: body.vertex_count].astype(np.float64)))
+
+
+def with_calf_skirt(arrays: dict[str, np.ndarray], body: BodyModel) -> dict[str, np.ndarray]:
+    """Return the arrays of a person's `topology.npz` with the skirt lengthened to the middle of the calves.
+
+    Args:
+        arrays: arrays of the file; the body's vertices come first.
+        body: body model of the person.
+    """
+    faces = arrays["faces"][arrays["face_part"] == arrays["part_names"].tolist().index("lower")]
+    used = np.unique(faces)
+    skirt = ClothMesh(arrays["v_tpose"][used].astype(np.float64), np.searchsorted(used, faces), arrays["weights"][used])
+    skin = arrays["v_tpose"][: body.vertex_count].astype(np.float64)
+    joint = rest_joints(body, skin)
+    hem = 0.5 * (joint["left_knee"][1] + joint["left_ankle"][1])
+    return _with_lower(arrays, lengthened(skirt, hem, joint["pelvis"][2]))
+
+
+def _with_lower(arrays: dict[str, np.ndarray], cloth: ClothMesh) -> dict[str, np.ndarray]:
+    """Return the arrays of a person's `topology.npz` with other cloth as the part "lower"."""
+    # It takes the place of the skirt's vertices and faces; what follows them moves up or down.
     part = arrays["part_names"].tolist().index("lower")
-    cloth = make_trousers(body, arrays["v_tpose"][: body.vertex_count].astype(np.float64))
     vertex_part, face_part = arrays["vertex_part"], arrays["face_part"]
     first = int(np.flatnonzero(vertex_part == part)[0])
     kept = np.flatnonzero(vertex_part != part)

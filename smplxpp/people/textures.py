@@ -71,10 +71,10 @@ def weave(points: Float[np.ndarray, "N 3"], *, seed: int) -> Float[np.ndarray, "
 _LIGHT, _DARK = (222, 214, 196), (58, 40, 92)  # colours of all skirt patterns but the plaid
 
 
-def _plaid(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+def _plaid(at: Float[np.ndarray, "N _"]) -> Float[np.ndarray, "N 3"]:
     """Return broad dark bands and thin light lines, around and along."""
     ground, dark_band, thin_line = (150, 34, 44), (28, 60, 66), (236, 204, 120)
-    around, y = at.T
+    around, y = at[:, :2].T
     period = SKIRT_GIRTH / 12
     dark = 0.5 * (band(around, period=period, width=0.044) + band(y, period=0.11, width=0.044))
     colors = mix(ground, dark_band, dark)
@@ -84,28 +84,32 @@ def _plaid(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
     return colors + 0.8 * line[:, None] * (np.array(thin_line) - colors)
 
 
-def _stripes(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+def _stripes(at: Float[np.ndarray, "N _"]) -> Float[np.ndarray, "N 3"]:
     return mix(_LIGHT, _DARK, band(at[:, 0], period=SKIRT_GIRTH / 22, width=0.03))
 
 
-def _hoops(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+def _hoops(at: Float[np.ndarray, "N _"]) -> Float[np.ndarray, "N 3"]:
     return mix(_LIGHT, _DARK, band(at[:, 1], period=0.06, width=0.03))
 
 
-def _dots(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    """Return dots of 24 mm, 51 mm apart; every other row is shifted by half of that."""
+def _dots(at: Float[np.ndarray, "N _"]) -> Float[np.ndarray, "N 3"]:
+    """Return dots of 24 mm, 51 mm apart; every other row is shifted by half of that.
+
+    A third column of `at` is the length of cloth per length around where a skirt flares, so that dots stay round.
+    """
     across, down = SKIRT_GIRTH / 26, 0.05
     row = np.round(at[:, 1] / down)
     place = at[:, 0] / across + 0.5 * (row % 2)
-    away = np.hypot(across * (place - np.round(place)), at[:, 1] - down * row)
+    beside = across * (place - np.round(place))
+    away = np.hypot(beside if at.shape[1] == 2 else at[:, 2] * beside, at[:, 1] - down * row)
     return mix(_DARK, _LIGHT, np.clip((0.015 - away) / 0.006, 0.0, 1.0))
 
 
-def _plain(at: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+def _plain(at: Float[np.ndarray, "N _"]) -> Float[np.ndarray, "N 3"]:
     return mix(_LIGHT, _DARK, np.full(len(at), 0.5))
 
 
-SKIRT_PATTERNS: dict[str, Callable[[Float[np.ndarray, "N 2"]], Float[np.ndarray, "N 3"]]] = {
+SKIRT_PATTERNS: dict[str, Callable[[Float[np.ndarray, "N _"]], Float[np.ndarray, "N 3"]]] = {
     "plaid": _plaid,
     "stripes": _stripes,
     "hoops": _hoops,
@@ -121,9 +125,45 @@ def around_and_along(offsets: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 
     return np.stack([np.arctan2(x, z) * SKIRT_RADIUS, y], axis=1)
 
 
-def skirt_colors(points: Float[np.ndarray, "N 3"], centre_z: float, pattern: str = "plaid") -> Float[np.ndarray, "N 3"]:
-    """Return colours of one of `SKIRT_PATTERNS` in wool, whose uneven threads all but the plain one show."""
-    colors = SKIRT_PATTERNS[pattern](around_and_along(points - np.array([0.0, 0.0, centre_z])))
+def evenly_around(offsets: Float[np.ndarray, "N 3"], hem: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "N 3"]:
+    """Return metres around (shares of the hem's length) and along a skirt, and its girth over `SKIRT_GIRTH`.
+
+    Args:
+        offsets: from a point on the skirt's axis, y.
+        hem: the loop of its hem, from the same point.
+    """
+    # Lengths along the hem by angle; both close after one turn.
+    angle = np.arctan2(hem[:, 0], hem[:, 2])
+    order = np.argsort(angle)
+    angle, hem = angle[order], hem[order]
+    steps = row_lengths(np.diff(hem, axis=0, append=hem[:1]))
+    around = np.append(0.0, np.cumsum(steps)) - 0.5 * steps.sum()
+    angle = np.append(angle, angle[0] + 2 * np.pi)
+    x, y, z = offsets.T
+    turned = (np.arctan2(x, z) - angle[0]) % (2 * np.pi) + angle[0]
+    radius = np.hypot(hem[:, 0], hem[:, 2])
+    narrower = np.hypot(x, z) / np.interp(turned, angle, np.append(radius, radius[0]))
+    share = SKIRT_GIRTH / steps.sum()
+    return np.stack([share * np.interp(turned, angle, around), y, narrower / share], axis=1)
+
+
+def skirt_colors(
+    points: Float[np.ndarray, "N 3"],
+    centre_z: float,
+    pattern: str = "plaid",
+    hem: Float[np.ndarray, "L 3"] | None = None,
+) -> Float[np.ndarray, "N 3"]:
+    """Return colours of one of `SKIRT_PATTERNS` in wool, whose uneven threads all but the plain one show.
+
+    Args:
+        points: on the T-pose, metres.
+        centre_z: depth of the skirt's axis.
+        pattern: name of the pattern.
+        hem: the loop of the hem, along whose length the pattern is spread; None: by the angle around the axis.
+    """
+    centre = np.array([0.0, 0.0, centre_z])
+    at = around_and_along(points - centre) if hem is None else evenly_around(points - centre, hem - centre)
+    colors = SKIRT_PATTERNS[pattern](at)
     return colors if pattern == "plain" else colors * (1.0 + 0.09 * weave(points, seed=12))[:, None]
 
 

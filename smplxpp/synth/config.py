@@ -8,7 +8,7 @@ from typing import Literal
 
 from smplxpp.capture.recording import TURNTABLE
 from smplxpp.core.errors import require_at_least, require_choice, require_positive
-from smplxpp.people.fixture_person import CLOTHES
+from smplxpp.people.fixture_person import CLOTHES, SKIRT_LENGTHS
 from smplxpp.people.textures import SKIRT_PATTERNS
 from smplxpp.raster.soft_light import LightConfig
 from smplxpp.synth.motion import Motion, Performance, Turntable
@@ -92,6 +92,7 @@ class SynthConfig:
         outside: root mean square of smooth offsets of her body that no shape of the body model has, metres; so that a
             fit keeps a distance, as on real people.
         skirt_pattern: name in `patterns.SKIRT_PATTERNS`.
+        skirt_length: one of `SKIRT_LENGTHS`.
         aspect: width of body images by their height.
         texel: side of a cell of the texture atlas in metres (finer on the head). The atlas is several times as fast as
             procedural colours at every sample, from which it differs by 46 dB. 0: procedural colours.
@@ -117,6 +118,7 @@ class SynthConfig:
     clothes: str = "skirt"
     outside: float = 0.0
     skirt_pattern: str = "plaid"
+    skirt_length: str = "knee"
     aspect: float = 0.8
     texel: float = 0.0
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
@@ -134,6 +136,7 @@ class SynthConfig:
         require_choice("--layout", self.layout, ("simple", "actorshq"))
         require_choice("--clothes", self.clothes, CLOTHES)
         require_choice("--skirt-pattern", self.skirt_pattern, tuple(SKIRT_PATTERNS))
+        require_choice("--skirt-length", self.skirt_length, SKIRT_LENGTHS)
 
 
 def split_frames(frames: int) -> tuple[int, int]:

@@ -62,10 +62,10 @@ def make_capture(
         InputError: the file of layers is missing or another person's.
     """
     # Dress the person and simulate her performance.
-    layers = read_layers(topology_file, config.clothes)
+    layers = read_layers(topology_file, config.clothes, config.skirt_length)
     if config.outside:
         layers = with_offsets(layers, load_body(), Outside(noise=config.outside), seed=config.seed + 5)
-    person = replace(person_of(layers, config.clothes), skirt_pattern=config.skirt_pattern)
+    person = replace(person_of(layers, config.clothes, config.skirt_length), skirt_pattern=config.skirt_pattern)
     motion = motion_kind(config.motion).make(
         betas=person.betas,
         expression_names=person.body.expression_names,
@@ -289,7 +289,7 @@ reference: a relaxed A-pose, neutral face, cloth settled.
 `manifest.json` has the splits and the protocols `exact` and `tracked`, `checks.json` figures measured at its making.
 """
 _WORN = {
-    "skirt": "she wears a striped half-loose shirt and a loose skirt (pattern: {pattern}), both simulated",
+    "skirt": "she wears a striped half-loose shirt and a loose skirt{reach} (pattern: {pattern}), both simulated",
     "trousers": "she wears a striped half-loose shirt, simulated, over tight trousers that follow the skin",
 }
 
@@ -313,7 +313,9 @@ def _readme(manifest: dict, config: SynthConfig) -> str:
         seed=manifest["seed"],
         cameras=len(manifest["images"]),
         light=manifest["light"]["panorama"] if "light" in manifest else "even, brighter from above",
-        worn=_WORN[config.clothes].format(pattern=config.skirt_pattern),
+        worn=_WORN[config.clothes].format(
+            pattern=config.skirt_pattern, reach=" to the calves" if config.skirt_length == "calf" else ""
+        ),
         split=split,
         normals=listed(next(iter(manifest["normals"].values()))),
         truth=listed(manifest["truth_frames"]),

@@ -226,6 +226,7 @@ def test_options_left_out_are_as_the_motion_has_them(tmp_path):
     own = Synth(out=tmp_path / "c", motion="talking", cameras=5, width=320, clothes="skirt", truth_step=1)._config()
     assert (own.cameras, own.clothes, own.truth_step, own.aspect) == (5, "skirt", 1, 0.5)
     assert Synth(out=tmp_path / "d", skirt_pattern="dots")._config() == replace(made, skirt_pattern="dots")
+    assert Synth(out=tmp_path / "e", skirt_length="calf")._config() == replace(made, skirt_length="calf")
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     wide = camera_rig(points, points, count=3, size=640, seed=0)
     assert (wide[0].camera.width, wide[0].camera.height) == (512, 640)
@@ -243,6 +244,8 @@ def test_options_left_out_are_as_the_motion_has_them(tmp_path):
         (["--clothes", "kilt"], "trousers"),
         (["--skirt-pattern", "checks"], "plaid"),
         (["--clothes", "trousers", "--skirt-pattern", "dots"], "with a skirt"),
+        (["--skirt-length", "mini"], "calf"),
+        (["--clothes", "trousers", "--skirt-length", "calf"], "with a skirt"),
         (["--width", "0"], "--width"),
         (["--cameras", "0"], "--cameras"),
     ],
