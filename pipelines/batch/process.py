@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import errno
+import logging
+import math
 import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,12 +23,16 @@ from smplxpp.core.errors import InputError
 from smplxpp.core.files.json_file import as_object, read_json
 from smplxpp.core.files.paths import read_bytes
 
+log = logging.getLogger(__name__)
 Meaning = Literal["done", "refused", "failed", "system", "disk", "busy", "again", "stopped", "code"]
 """What an end means. `system`: another attempt may help; `disk`: it is full; `busy`: another process is in the run
 folder; `again`: a limit of time stopped the command, which continues when it is given once more; `code`: the installed
 code is not that of the batch."""
 PATIENCE = ("SIGINT", "SIGTERM", "SIGKILL")
 """How a command is asked to end, from the kindest: on the first it says what it keeps."""
+
+BOUND = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
+"""Words before a command that end it with this process, where the system can do that."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +78,10 @@ def run_process(
         stop: asked about every second whether the command shall end.
         began: takes the number of the process.
     """
-    bound = [setpriv, "--pdeathsig", "TERM"] if (setpriv := shutil.which("setpriv")) else []
     begin = time.perf_counter()
     with open(log, "ab") as errors, open(answer, "wb") as out:
         child = subprocess.Popen(
-            [*bound, *command],
+            [*BOUND, *command],
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=errors,
@@ -100,6 +106,62 @@ def run_process(
         peak_mb=0.0 if used is None else used.ru_maxrss * (1e-6 if sys.platform == "darwin" else 1.024e-3),
         stopped=asked,
     )
+
+
+def run_together(command: Sequence[str], count: int, *, captured: bool) -> tuple[int, str]:
+    """Run a command as processes of this machine that find each other by the variables that torchrun sets.
+
+    When one ends with an error, the others get some seconds to do so themselves, and are ended then; after a signal,
+    and by an interrupt, they are ended at once. The first one speaks; of others that fail the last line is shown.
+
+    Args:
+        command: program and arguments.
+        count: of processes, at least two.
+        captured: return the first one's standard output, after the exit status, instead of showing it.
+
+    Raises:
+        ChildProcessError: one was ended by a signal.
+    """
+    from avatar.training.engine.processes import torchrun_variables  # pulls torch in, which others need not wait for
+
+    grace = 10.0  # seconds in which an error is worded everywhere; messages of NCCL would be waited for, for hours
+    store, found_by = torchrun_variables()
+    variables = {"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // count)), **os.environ, **found_by}
+    children = list[subprocess.Popen]()
+    with tempfile.TemporaryDirectory(prefix="smplxpp_processes_") as folder, ExitStack() as files:
+        paths = [Path(folder) / str(rank) for rank in range(count)]
+        outputs = [files.enter_context(open(path, "wb")) for path in paths]
+        try:
+            for rank, output in enumerate(outputs):
+                child = subprocess.Popen(
+                    [*BOUND, *command],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL if rank else output if captured else None,
+                    stderr=output if rank else None,
+                    env={**variables, "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count)},
+                    start_new_session=True,
+                )
+                children.append(child)
+            until = math.inf
+            while not all([_ended(child) for child in children]) and time.monotonic() < until:
+                failed = [child.returncode for child in children if child.returncode]
+                if failed and until == math.inf:
+                    until = time.monotonic() + (grace if min(failed) > 0 else 0.0)
+                time.sleep(0.05)
+            ends = [child.returncode for child in children]  # of their own; None: still running
+        finally:
+            _end(*children)
+            del store
+        for rank, end in enumerate(ends):
+            if end is not None and end < 0:
+                raise ChildProcessError(
+                    f"process {rank} of {count}: expected to run to its end, received {_signal_name(-end)}. All are "
+                    "ended; SIGKILL is the system's where memory is out. The same command continues from the checkpoint"
+                )
+            if rank and end:
+                log.error("process %d of %d: %s", rank, count, _last_lines(paths[rank]) or f"exit status {end}")
+        status = ends[0] if ends[0] is not None else max(end or 0 for end in ends)
+        return status, read_bytes(paths[0]).decode(errors="replace")
 
 
 def own_program(module: str = "pipelines.cli") -> tuple[tuple[str, ...], dict[str, str]]:
@@ -139,7 +201,7 @@ def meaning_of(ended: Ended, *, log: Path, answer: Path, judged: bool) -> tuple[
             return "disk", error
         if error.get("received") == "a running one":
             return "busy", error
-        return ("system" if error.get("type") in ("MemoryError", "OSError") else "refused"), error
+        return ("system" if error.get("type") in ("MemoryError", "OSError", "ChildProcessError") else "refused"), error
     if ended.exit_status == 0 and content:
         return ("again" if content.get("finished") is False else "done"), None
     if ended.exit_status == 1 and content:
@@ -207,17 +269,18 @@ def _ended(child: subprocess.Popen) -> bool:
     return bool(pid)
 
 
-def _end(child: subprocess.Popen, *, patience: float = 10.0) -> None:
-    """End a process and its group, at first kindly; each word gets some seconds."""
+def _end(*children: subprocess.Popen, patience: float = 10.0) -> None:
+    """End processes and their groups, at first kindly; each word gets some seconds."""
     for name in PATIENCE:
-        with suppress(ProcessLookupError, PermissionError):
-            if hasattr(os, "killpg"):
-                os.killpg(child.pid, getattr(signal, name))
-            else:
-                child.terminate()
+        for child in [child for child in children if not _ended(child)]:
+            with suppress(ProcessLookupError, PermissionError):
+                if hasattr(os, "killpg"):
+                    os.killpg(child.pid, getattr(signal, name))
+                else:
+                    child.terminate()
         until = time.monotonic() + patience
         while time.monotonic() < until:
-            if _ended(child):
+            if all([_ended(child) for child in children]):
                 return
             time.sleep(0.02)
 

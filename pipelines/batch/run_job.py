@@ -228,7 +228,7 @@ class _Chain:
         begin = time.monotonic()
         try:
             ended = run_process(
-                [*words, *step.command, *self._limit(step)],
+                [*words, *step.command, *self._limit(step), *self._processes(step, environment)],
                 log=log,
                 answer=answer,
                 environment=environment,
@@ -253,13 +253,14 @@ class _Chain:
             variables["CUDA_VISIBLE_DEVICES"] = ""
         elif resources.gpus is not None:
             variables["CUDA_VISIBLE_DEVICES"] = resources.gpus
-        # A training on several GPUs is as many processes, which torchrun starts and ends together.
-        visible = variables.get("CUDA_VISIBLE_DEVICES", os.environ.get("CUDA_VISIBLE_DEVICES", ""))
-        processes = len(list(filter(None, visible.split(","))))
-        if step.step == "train" and processes > 1 and not resources.program:
-            launch = ["torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-            words = [*words[:-1], *launch, "-m", words[-1]]
         return words, variables
+
+    def _processes(self, step: StepRecord, variables: Mapping[str, str]) -> list[str]:
+        """Return the option of a training on several GPUs, which has a process for each; its own option goes first."""
+        visible = variables.get("CUDA_VISIBLE_DEVICES", os.environ.get("CUDA_VISIBLE_DEVICES", ""))
+        count = len(list(filter(None, visible.split(","))))
+        none = step.step != "train" or count < 2 or self.resources.program or "--processes" in step.command
+        return [] if none else ["--processes", str(count)]
 
     def _limit(self, step: StepRecord) -> list[str]:
         """Return the option that ends a training before the machine does; its own option goes first."""

@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,6 +22,7 @@ from pipelines.runs.artefacts import values_of
 from pipelines.runs.layout import FIT_STAGE
 from pipelines.runs.stage import StageRecord, how_to_continue
 from smplxpp.core.errors import InputError
+from smplxpp.core.files.json_file import parse_json
 
 if TYPE_CHECKING:
     from avatar.training.recipe import TrainConfig
@@ -112,6 +113,9 @@ class Train:
     """Size of the images to work on, 1 for every pixel."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where it is."""
+    processes: OptionalInt = None
+    """Processes of this machine that train together, one for each GPU; 0: as many as there are GPUs. They share the
+    poses of a step, which changes batches and rates (docs/training.md); by default one."""
     seed: int = 0
     """Seed of all random numbers."""
     force: bool = False
@@ -141,13 +145,13 @@ class Train:
     """Print the summary as JSON."""
 
     def run(self) -> dict[str, Any] | None:
-        """Train, write the report, print the figures; None on all but the first of several processes."""
+        """Train, write the report, print the figures; None where another process answers, or printed its answer."""
         require_avatar("training an avatar")
         if int(os.environ.get("RANK") or 0):
             logging.disable(logging.WARNING)  # rank 0 logs the same warnings
         from avatar.data.one_frame import views_of_turn
         from avatar.training.engine.processes import join_processes
-        from avatar.training.engine.resources import choose_device
+        from avatar.training.engine.resources import choose_device, count_gpus
         from avatar.training.recipe import with_processes
         from pipelines.runs.folders import keep_out_of_capture
         from pipelines.stages.models import TrainOptions
@@ -163,6 +167,11 @@ class Train:
         if self.dry_run:
             refines = wants_refinement(self.run_folder, inputs, self.refine_poses)
             return self._plan(choose_device(self.device) == "cuda", steps, refines=refines)
+        gpus = count_gpus(choose_device(self.device))
+        if "WORLD_SIZE" not in os.environ and self.processes not in (None, 1):
+            return self._together(gpus)
+        if self.processes is None and gpus > 1 and "WORLD_SIZE" not in os.environ:
+            log.info("%d GPUs are visible and one trains; with --processes 0 all do (docs/training.md)", gpus)
         with join_processes(choose_device(self.device)) as together:
             # Rank 0 decides and all open the scene, whose digests say that they train on the same data.
             first = together.run_on_rank0(lambda: wants_refinement(self.run_folder, inputs, self.refine_poses))
@@ -204,6 +213,27 @@ class Train:
             if not together.first:
                 return None
         return self._finish(records)
+
+    def _together(self, gpus: int) -> dict[str, Any] | None:
+        """Run this command in processes of this machine, which train together, and answer as the first one does."""
+        from pipelines.batch.process import own_program, run_together
+
+        count = self.processes or max(gpus, 1)
+        if count < 0 or count > (gpus or count):
+            most = f"at most {gpus}, the number of GPUs" if gpus else "a number, at least 0"
+            raise InputError("option processes", expected=most, received=str(count))
+        # The words of a command line that gives these options.
+        words = ["train", str(self.run_folder), "--processes", "1"]
+        for one in fields(self)[1:]:
+            value = getattr(self, one.name)
+            if value != one.default and one.name != "processes":
+                own = () if value is True else value if isinstance(value, tuple) else (value,)
+                words += [f"--{one.name.replace('_', '-')}", *map(str, own)]
+        program, variables = own_program()
+        os.environ.update(variables)
+        status, text = run_together([*program, *words], count, captured=self.json)
+        answer = parse_json(text.encode(), subject="answer of the first process") if text.strip() else {}
+        return {**answer, "exit_status": status} if status else answer or None
 
     def _plan(self, gpu: bool, steps: tuple[str, ...], *, refines: bool) -> dict[str, Any]:
         """Foretell what the stages take, as `smplxpp batch --dry-run` does for a fleet."""

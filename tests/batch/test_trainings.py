@@ -1,13 +1,17 @@
-"""Real trainings as jobs: a refinement in chunks of frames, and one subject on two processes by torchrun."""
+"""Real trainings as jobs: a refinement in chunks of frames, and one subject on two processes."""
 
 from __future__ import annotations
 
 import json
+import os
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pipelines.batch import process
 from pipelines.batch.jobs import Job
 from pipelines.batch.records import read_job
 from pipelines.batch.run_job import Resources, run_job
@@ -86,3 +90,47 @@ def test_a_job_with_two_gpus_trains_one_subject_on_two_processes_that_share_the_
     stages = json.loads((folder / "logs/train.json").read_text())["stages"]
     assert list(stages) == ["refine", "fit", "teacher", "bake", "compensate"] or "cloth" in stages
     assert read_job(tmp_path / "runs", "anna").state == "done"
+
+
+def ranks(text: str, folder, *, captured: bool = True):
+    """Two processes that leave their numbers in a folder and run a text with their `rank`."""
+    begin = "import os, sys, time; from pathlib import Path; rank = os.environ['RANK']; "
+    begin += "Path(sys.argv[1], rank).write_text(str(os.getpid())); "
+    words = [sys.executable, "-S", "-E", "-c", begin + "\n" + text, str(folder)]
+    return process.run_together(words, 2, captured=captured)
+
+
+def none_left(folder) -> bool:
+    for path in folder.iterdir():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.read_text()), 0)
+    return True
+
+
+def test_a_process_that_is_killed_ends_the_other_and_is_named(tmp_path):
+    text = "os.kill(os.getpid(), 9) if rank == '1' else time.sleep(60)"
+    begin = time.monotonic()
+    with pytest.raises(ChildProcessError, match="process 1 of 2: expected to run to its end, received SIGKILL"):
+        ranks(text, tmp_path)
+    assert time.monotonic() - begin < 10.0 and none_left(tmp_path)
+
+
+def test_processes_that_fail_by_themselves_leave_their_words(tmp_path, caplog):
+    text = "print('answer ' + rank); time.sleep(0.1 * (rank == '0')); sys.exit(2 if rank == '0' else 'no disk')"
+    assert ranks(text, tmp_path) == (2, "answer 0\n")
+    assert "process 1 of 2: no disk" in caplog.text
+
+
+def test_an_interrupt_ends_all_processes(tmp_path, monkeypatch):
+    sleep = time.sleep
+
+    def interrupted(seconds: float) -> None:
+        sleep(0.01)
+        if len([path for path in tmp_path.iterdir() if path.read_text()]) == 2:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(process.time, "sleep", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        ranks("time.sleep(60)", tmp_path)
+    assert none_left(tmp_path)

@@ -16,7 +16,9 @@ from avatar.models.model_file import load_avatar
 from avatar.rig.rig import Rig
 from avatar.training.presets import TRAINING_PRESETS
 from avatar.training.student.bake import BakeTask
+from pipelines.batch import process
 from pipelines.cli import main
+from pipelines.commands.train import Train
 from pipelines.runs.layout import TEMPLATE
 from pipelines.runs.stage import read_manifest
 from pipelines.stages import train as train_stage
@@ -279,30 +281,37 @@ def test_the_terminal_shows_figures(own, capture, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_torchrun_trains_with_two_processes(fitted, capture):
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        "2",
-        "-m",
-        "pipelines.cli",
-        "train",
-        str(fitted),
-        "--capture",
-        str(capture),
-        *SMALL,
-    ]
+def test_two_processes_that_the_command_starts_train_what_those_of_torchrun_do(fitted, capture, tmp_path):
+    other, answers = shutil.copytree(fitted, tmp_path / "other"), []
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
-    assert done.returncode == 0, done.stderr[-3000:]
-    answer = json.loads(done.stdout)  # the first process alone speaks
-    assert answer["finished"]
-    for stage in STAGES:
-        manifest = read_manifest(fitted / stage)
-        assert manifest["numbers"]["processes"] == 2 and manifest["config"]["training"]["poses_per_step"] >= 2
+    for run, launcher, own in ((fitted, torchrun, ()), (other, (), ("--processes", "2"))):
+        command = ["-m", "pipelines.cli", "train", str(run), "--capture", str(capture), *SMALL, *own]
+        done = subprocess.run(
+            [sys.executable, *launcher, *command], env=environment, capture_output=True, text=True, timeout=900
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        answers.append(json.loads(done.stdout))  # the first process alone speaks
+        assert answers[-1]["finished"]
+        for stage in STAGES:
+            manifest = read_manifest(run / stage)
+            assert manifest["numbers"]["processes"] == 2 and manifest["config"]["training"]["poses_per_step"] >= 2
+    assert same_models(fitted, other)
+
+
+def test_processes_get_the_options_of_the_command(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(process, "run_together", lambda *args, **options: asked.append((args, options)) or (0, "{}"))
+    command = Train(tmp_path / "run", tmp_path, preset="demo", hold_out=("A", "B"), no_report=True, processes=3)
+    assert command._together(gpus=4) is None
+    ((words, count), options) = asked[0]
+    after = words[words.index("train") + 1 :]
+    assert count == 3 and not options["captured"] and after[:3] == [str(tmp_path / "run"), "--processes", "1"]
+    assert after[3:] == ["--capture", str(tmp_path), "--preset", "demo", "--hold-out", "A", "B", "--no-report"]
+    assert Train(tmp_path / "run", tmp_path, processes=0)._together(gpus=4) is None and asked[1][0][1] == 4
+    for wrong in (5, -1):
+        with pytest.raises(InputError, match="option processes: expected at most 4, the number of GPUs"):
+            Train(tmp_path / "run", tmp_path, processes=wrong)._together(gpus=4)
 
 
 def test_the_option_for_tensorboard_reaches_the_training(fitted, capture, monkeypatch):

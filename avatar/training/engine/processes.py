@@ -214,13 +214,14 @@ class Distributed:
 
 @contextmanager
 def join_processes(device: str = "cpu") -> Iterator[Distributed]:
-    """Join the processes that `torchrun` started for the block; without torchrun yield this one alone.
+    """Join the processes that `train --processes` or `torchrun` started; yield this one alone where neither did.
 
     Args:
         device: "cpu" (messages by gloo) or "cuda" (NCCL; each process takes the GPU of its LOCAL_RANK).
 
     Raises:
         InputError: an environment that torchrun does not make, or more processes than GPUs.
+        ChildProcessError: another process ended, and this one waited for its message.
     """
     if "WORLD_SIZE" not in os.environ:
         yield Distributed(device=device)
@@ -233,7 +234,7 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
                 "processes",
                 expected=f"at most one for each of {torch.cuda.device_count()} GPUs",
                 received=f"local rank {local}",
-                remedy="start fewer with torchrun --nproc-per-node",
+                remedy="start fewer (--processes, or torchrun --nproc-per-node)",
             )
         torch.cuda.set_device(local)
         device = f"cuda:{local}"
@@ -243,8 +244,28 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
     )
     try:
         yield Distributed(rank, size, device)
+    except RuntimeError as error:
+        # gloo notices at once that another process is gone; its words name a socket.
+        if "by peer" not in str(error):
+            raise
+        raise ChildProcessError(
+            f"process {rank} of {size}: expected messages of the others, received none: one has ended. The same "
+            "command continues from the last checkpoint"
+        ) from error
     finally:
         dist.destroy_process_group()
+
+
+def torchrun_variables() -> tuple[dist.Store, dict[str, str]]:
+    """Return the variables by which processes of this machine find each other, and their store, to be kept till then.
+
+    The store is the caller's, as torchrun's is its agent's, so that no port has to be found before it is used.
+    """
+    store = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    return store, {
+        **{"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port)},
+        "TORCHELASTIC_USE_AGENT_STORE": "True",
+    }
 
 
 def _number(name: str) -> int:

@@ -380,6 +380,11 @@ def choose_device(name: str) -> str:
     return name
 
 
+def count_gpus(device: str) -> int:
+    """Return the number of GPUs that torch can use where the device is "cuda", else 0."""
+    return torch.cuda.device_count() if device == "cuda" else 0
+
+
 @contextmanager
 def fixed_seed(seed: int) -> Iterator[None]:
     """Seed the CPU's random numbers within the block, and restore their state after it."""
