@@ -50,11 +50,13 @@ class Neck:
         point: on the line from the limb's axis to the other one.
         direction: unit vector along it.
         width: over that of the narrower lobe, on the side where it is less narrow.
+        place: its distance from the limb's axis as a share of that between both axes.
     """
 
     point: np.ndarray
     direction: np.ndarray
     width: float
+    place: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +208,8 @@ def _neck(points: np.ndarray, own: np.ndarray, other: np.ndarray, tangent: np.nd
     if not all(lobes):
         return None
     width = (reach[at] / np.minimum(*(np.max(lobe, axis=0) for lobe in lobes))).max()
-    return Neck(own + 0.1 * (at + 0.5) * (other - own), direction, float(width))
+    middle = 0.1 * (at + 0.5)
+    return Neck(own + middle * (other - own), direction, float(width), middle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +244,7 @@ def septum_of(rings: list[tuple[int, Ring]], count: int, *, first: int | None = 
         first: the first plane of two tubes, where it is known. None: found by the necks.
     """
     necks = sorted(((i, ring.neck) for i, ring in rings if ring.neck is not None), key=lambda pair: pair[0])
-    first = _fused_from([(i, neck.width) for i, neck in necks]) if first is None else first
+    first = _fused_from(necks) if first is None else first
     grooved = [(i, neck) for i, neck in necks if first is not None and i >= first and neck.width <= _WIDEST]
     if first is None or not grooved:
         return None
@@ -254,16 +257,19 @@ def septum_of(rings: list[tuple[int, Ring]], count: int, *, first: int | None = 
     return Septum(first, points, normalize_rows(directions))
 
 
-def _fused_from(necks: list[tuple[int, float]]) -> int | None:
-    """Return the first plane from which on rings are of two fused tubes, by the widths of the planes' necks."""
-    narrow = [i for i, width in necks if width < _NARROW]
+def _fused_from(necks: list[tuple[int, Neck]]) -> int | None:
+    """Return the first plane from which on rings are of two fused tubes, by the planes' necks."""
+    # Legs touch midway between their axes, give or take a slice; folds of a long skirt lie anywhere, most beside a leg.
+    central = [(i, neck) for i, neck in necks if abs(neck.place - 0.5) < 0.2]
+    narrow = [i for i, neck in central if neck.width < _NARROW]
     if len(narrow) >= 3:
         return min(narrow)
     # Pleats hide the groove between the legs of a hakama, which is shallow but runs from the crotch to the hem.
-    grooved = [i for i, width in necks if width < _WIDEST]
-    if len(grooved) < _LONG:
+    grooved = [i for i, neck in central if neck.width < _WIDEST]
+    midway = abs(np.median([neck.place for _, neck in central if neck.width < _WIDEST] or [0.0]) - 0.5) < 0.1
+    if len(grooved) < _LONG or not midway:
         return None
-    onwards = [width for i, width in necks if i >= grooved[0]]
+    onwards = [neck.width for i, neck in necks if i >= grooved[0]]
     # Of a skirt between striding legs it gets deeper towards the hem.
     _, middle, last = np.array_split(onwards, 3)
     whole = len(grooved) > 0.8 * len(onwards) and last.mean() > middle.mean() - 0.02

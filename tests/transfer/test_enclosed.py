@@ -243,6 +243,22 @@ def test_a_hole_in_a_leg_and_a_torn_hem_change_only_their_own_rings(mannequin, w
     assert np.abs(holed.weights - whole.weights[used])[far].max() < 0.05
 
 
+def test_folds_of_a_long_skirt_beside_one_leg_are_no_gap_between_both(mannequin, worn):
+    """A simulated skirt to the calves was cut apart as trousers: a step drew its edges to 16 times their length."""
+    case = worn("wide trousers, hem 24 cm")
+    legs = limb_axes(case.source, mannequin.body.weights, extent(case.source), TransferConfig())[:2]
+    found = []
+    for share in (0.0, 0.25):
+        # A pair of folds in front and behind, midway between the legs and nearer to the left one, from hip to hem.
+        skirt = fused_legs(legs, neck=np.ones(40))
+        x, y, z = skirt.vertices.T
+        away = x - share * np.interp(y, legs[0].points[::-1, 1], 2.0 * legs[0].points[::-1, 0])
+        fold = 0.6 * np.exp(-((away / 0.03) ** 2))
+        found.append(enclosure(mannequin, case, skirt.with_vertices(np.stack([x, y, z * (1.0 - fold)], axis=1))))
+    assert (found[0].limb >= 0).mean() > 0.75
+    assert (found[1].limb == -1).all()
+
+
 def fused_legs(legs: list[LimbAxis], *, neck: np.ndarray, pleats: float = 0.0) -> TriangleMesh:
     """A tube about both legs, each of its 40 rows the union of two circles with this width of neck, or an oval where 1.
 
