@@ -31,7 +31,7 @@ from PIL import Image
 from benchmarks.gpu.timing import EnoughError, Probe, frames_a_second, largest_difference_mm, played, probed
 from benchmarks.support.results import ROOT
 from pipelines.runs.layout import BUILD_FILE, BUILD_STAGES, TEMPLATE
-from smplxpp.capture import open_capture
+from smplxpp.capture import Capture, open_capture
 from smplxpp.core.camera import Camera
 from smplxpp.core.files import atomic_write_text, jsonable
 from smplxpp.template.template import Template
@@ -111,13 +111,17 @@ def cpu(job: Job, note: Note) -> None:
 
 
 def steps(job: Job, note: Note) -> None:
-    """Warm steps of every stage of `gpu` and `paper` at 1500x2000, and how busy the GPU is; then faster ones."""
+    """Warm steps of every stage of `gpu` and `paper` at 1500x2000, and how busy the GPU is; then faster ones.
+
+    `foretold_gib` is what a training foretells of the GPU's memory, to be held against `gib` of the stages.
+    """
     import avatar
 
     size = (60, 80) if job.toy else (1500, 2000)
     capture = open_capture(enlarge(job.capture, job.work / "large", size, frames=3, cameras=4))
     rows: dict[str, Any] = {}
-    note(width=size[0], height=size[1], rows=rows)
+    foretold: dict[str, dict[str, float]] = {}
+    note(width=size[0], height=size[1], rows=rows, foretold_gib=foretold)
     # Every stage first; of what may be faster the teacher alone, whose networks it changes.
     orders: list[tuple[str, str, str | None]]
     orders = [(preset, "plain", None) for preset in ("gpu", "paper")]
@@ -133,6 +137,7 @@ def steps(job: Job, note: Note) -> None:
         try:
             with probed(probe):
                 chosen = _toy_preset(preset) if job.toy else preset
+                foretold[f"{preset}, {way}"] = _foretold(config.recipe(chosen, cloth="none"), capture)
                 out = job.work / "steps" / preset
                 avatar.train(_template(job), capture, out, preset=chosen, refine="off", cloth="none", config=config)
         except EnoughError:
@@ -143,6 +148,20 @@ def steps(job: Job, note: Note) -> None:
         note(rows=rows)
     if failed := [name for name, row in rows.items() if "error" in row]:
         raise RuntimeError(f"failed: {'; '.join(failed)}")
+
+
+def _foretold(recipe: Any, capture: Capture) -> dict[str, float]:
+    """Return the GiB of a GPU that the stages of a training are foretold to need at most, by the name of their step."""
+    from avatar.training.engine.resources import foretell_memory
+
+    splits, cameras = capture.splits, [capture.cameras[name] for name in capture.splits.train_cameras]
+    needs = foretell_memory(
+        recipe,
+        megapixels=1e-6 * max(camera.width * camera.height for camera in cameras),
+        images=len(cameras) * len(splits.train_frames),
+        frames=len(splits.train_frames),
+    )
+    return {step: need.device for step, need in needs.items()}
 
 
 WAYS: dict[str, dict[str, Any]] = {

@@ -12,6 +12,7 @@ clothes takes a range. Rates are of a single core.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -208,10 +209,12 @@ def training_works(recipe: Recipe, facts: Facts, rates: TrainingRates) -> dict[s
     track = preset.teacher.track
     if recipe.follows and track is not None:
         frames = facts.frames - facts.held_out_frames
+        # Each segment of a longer motion after the first is tracked with the reference frame and a run-in.
+        followed = frames + (math.ceil(frames / track.segment_frames) - 1) * (track.run_in + 1)
         for level in track.levels:
             # A frame's photographs are read once, for all of its steps.
             cameras = facts.cameras - facts.held_out_cameras
-            looks, reads = frames * level.steps * min(track.views, cameras), frames * cameras / len(track.levels)
+            looks, reads = followed * level.steps * min(track.views, cameras), followed * cameras / len(track.levels)
             works["teacher"].look(looks, size, level.halvings, reads=reads)
         for step in ("teacher", "bake", "compensate"):
             works[step].seconds += rates.frame_s[step] * frames

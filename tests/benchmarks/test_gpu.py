@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+import avatar
 import benchmarks.gpu.__main__ as gpu
+from benchmarks.gpu import parts
 from benchmarks.gpu.__main__ import GpuBenchmark, run_part
 from benchmarks.gpu.parts import PARTS, Job, enlarge
 from smplxpp.capture import open_capture
@@ -74,6 +76,14 @@ def test_warm_steps_of_all_stages_are_timed_and_profiled(job):
     assert list(rows["gpu, graphs"])[-2:] == ["Teacher", "whole_seconds"]
     figures = [row for rows_of in rows.values() for row in rows_of.values() if isinstance(row, dict)]
     assert all(one["steps_a_second"] > 0 and one["calls"] > 100 for one in figures)
+    assert set(found["foretold_gib"]) == set(rows)
+
+
+def test_memory_is_foretold_for_every_stage_that_is_timed(job):
+    capture = open_capture(job.capture)
+    found = {name: parts._foretold(avatar.TrainConfig().recipe(name), capture) for name in ("gpu", "paper")}
+    assert list(found["gpu"]) == ["track", "fit", "teacher", "bake", "compensate"]
+    assert "track" not in found["paper"] and found["paper"]["teacher"] > found["gpu"]["teacher"] > 0.1
 
 
 def test_photographs_a_second_are_counted_by_readers(job):

@@ -42,6 +42,16 @@ def test_codes():
     assert f"({view['fitted code']:.1f} dB; null code {view['null code']:.1f} dB)" in text
 
 
+def test_segments():
+    found = closed("segments")
+    text = " ".join((ROOT / "docs" / "training_method.md").read_text().split())
+    means = " and ".join(f"{seam['mean_mm']:.1f}" for seam in found["seams"])
+    apart = found["split from unsplit, mm"]["mean of the worst frame"]
+    assert f"seams are {means} mm on average, no frame is over {apart:.1f} mm" in text
+    truth = found["skirt from the truth, mm, by 50 frames"]
+    assert np.allclose(truth["split"], truth["unsplit"], atol=0.02)
+
+
 def test_motion():
     text = section("What drives the field", CHOICES).replace("*", "")
     rows = {person: closed(f"motion_codes_{person}")["rows"] for person in ("talking", "woman_casual")}

@@ -49,7 +49,7 @@ class TrackConfig:
         run_in: frames before a segment that are tracked with it and thrown away, so that it forgets how it began: the
             prediction keeps e^-4 of an error over 24 frames at 20 a second.
         seam: distance, metres, of two segments' clothes in frames that both have, 95th percentile over the vertices,
-            above which the later segment is tracked again from where the earlier one ended.
+            above which the later segment is tracked again from where the earlier one ended, until they meet.
         back: track back from the last frames to the first too, at all levels but the finest, and measure the drift.
         reference: frame on which the template was built, tracked first; None: the first training frame comes first.
         seed: of the order of views.

@@ -129,7 +129,12 @@ class _Segments:
         task: of all frames, which takes up what was found.
         segments: of its frames.
         session: of the tracking.
+
+    Attributes:
+        compared: last frames of those that are compared; single ones are noisy.
     """
+
+    compared = 4
 
     def __init__(self, task: TrackTask, segments: Sequence[Segment], session: Session) -> None:
         self.task, self.segments, self.session = task, segments, session
@@ -191,7 +196,7 @@ class _Segments:
         """Take up what was found, segment after segment outwards; None: time ran out."""
         if found is None:
             return self._progress(self._done(), time.perf_counter() - self.begin)
-        seams: list[dict[str, Any]] = []
+        seams = list[dict[str, Any]]()
         seconds = sum(float(one["seconds"]) for one in found)
         for number, (segment, order, arrays) in enumerate(zip(self.segments, self.orders, found, strict=True)):
             own = {
@@ -201,13 +206,13 @@ class _Segments:
             if segment.run_in:
                 # The neighbour has been taken up before, so that its surface is the one that counts.
                 seams.append(self._seam(segment, {frame: one[0] for frame, one in own.items()}))
-            if segment.run_in and seams[-1]["in_sequence"]:
-                task, progress = self._steps(f"segment_{number:03d}_in_sequence", self._after_neighbour(segment))
-                seconds += progress.seconds
-                if not progress.finished:
-                    return self._progress(self.total, seconds)
-                own = task.found_in(segment.frames)
             self.task.take({frame: own[frame] for frame in segment.frames})
+            if segment.run_in and seams[-1]["in_sequence"]:
+                again = self._in_sequence(number, {frame: one[0] for frame, one in own.items()})
+                seconds += sum(one.seconds for one in again)
+                if not again[-1].finished:
+                    return self._progress(self.total, seconds)
+                seams[-1]["again"] = min(len(again) * self.task.track_config.run_in, len(segment.frames))
         # A line for the log of the tracking; each segment has a log of its own.
         (self.session.folder / METRICS_FILE).unlink(missing_ok=True)
         append_metrics(
@@ -220,28 +225,51 @@ class _Segments:
     def _seam(self, segment: Segment, own: Mapping[int, Tensor]) -> dict[str, Any]:
         """Return how far a segment's surface is from its neighbour's in frames that both have, at the clothes."""
         assert segment.before is not None
-        compared_frames = 4  # the last ones of the run-in; single frames are noisy
-        both = [frame for frame in segment.run_in[-compared_frames:] if frame in self.segments[segment.before].frames]
-        cage, device = self.task.avatar.cage, self.task.sequence.device
-        apart = torch.stack([cage(self.task.solved[self.task.row[frame]] - own[frame].to(device)) for frame in both])
-        clothes = self.task.sequence.rig.cloth_mask
-        distances = apart[:, clothes if bool(clothes.any()) else ~clothes].norm(dim=-1).cpu().numpy()
-        mean, highest = (1e3 * float(value) for value in (distances.mean(), np.percentile(distances, 95.0)))
+        both = [frame for frame in segment.run_in if frame in self.segments[segment.before].frames]
+        mean, highest = self._apart(both, own)
         return {
             "frame": segment.frames[0],
-            "frames": len(both),
+            "frames": len(both[-self.compared :]),
             "mean_mm": mean,
             "p95_mm": highest,
             "in_sequence": highest > 1e3 * self.task.track_config.seam,
         }
 
-    def _after_neighbour(self, segment: Segment) -> FramesApart:
-        """Return a segment's frames as they are tracked after those before it, to the bits of one sequence."""
+    def _apart(self, frames: Sequence[int], own: Mapping[int, Tensor]) -> tuple[float, float]:
+        """Return mean and 95th percentile of how far clothes are from where they are now, in the last frames, mm."""
+        cage, device = self.task.avatar.cage, self.task.sequence.device
+        last = frames[-self.compared :]
+        apart = torch.stack([cage(self.task.solved[self.task.row[frame]] - own[frame].to(device)) for frame in last])
+        clothes = self.task.sequence.rig.cloth_mask
+        distances = apart[:, clothes if bool(clothes.any()) else ~clothes].norm(dim=-1).cpu().numpy()
+        return 1e3 * float(distances.mean()), 1e3 * float(np.percentile(distances, 95.0))
+
+    def _in_sequence(self, number: int, own: Mapping[int, Tensor]) -> list[Progress]:
+        """Track a segment again after its neighbour, until the surface is where the segment has it, or to its end.
+
+        Returns:
+            The progress of each run-in's length of frames; the last one may be unfinished.
+        """
+        config, frames, done = self.task.track_config, self.segments[number].frames, list[Progress]()
+        for begin in range(0, len(frames), config.run_in):
+            part = frames[begin : begin + config.run_in]
+            task, progress = self._steps(
+                f"segment_{number:03d}_in_sequence_{begin:04d}", self._after_those_before(part)
+            )
+            done.append(progress)
+            if not progress.finished:
+                break
+            self.task.take(task.found_in(part))
+            if self._apart(part, own)[1] <= 1e3 * config.seam:
+                break
+        return done
+
+    def _after_those_before(self, frames: Sequence[int]) -> FramesApart:
+        """Return frames as they are tracked after those before them, to the bits of one sequence."""
         # The predictor compares predictions of four frames, each made from the two frames before it.
         needed = 6
-        assert segment.before is not None
         first = self.task.order[0]
-        side = [frame for frame in self.task.order if (frame - first) * (segment.frames[0] - first) > 0]
-        until = side.index(segment.frames[0])
+        side = [frame for frame in self.task.order if (frame - first) * (frames[0] - first) > 0]
+        until = side.index(frames[0])
         known = dict.fromkeys((first, *side[max(0, until - needed) : until]))
-        return FramesApart(segment.frames, self.task.prediction, self.task.found_in(tuple(known)))
+        return FramesApart(frames, self.task.prediction, self.task.found_in(tuple(known)))

@@ -343,6 +343,21 @@ def test_a_segment_that_misses_its_neighbour_is_followed_after_it_to_the_same_bi
     assert torch.equal(found, whole) and not torch.equal(found, in_segments[0])
 
 
+@pytest.mark.long
+def test_a_segment_is_tracked_again_only_until_it_meets_itself(tmp_path_factory, tmp_path):
+    dance = sequence(write_dance(tmp_path_factory.mktemp("captures") / "longer", 16))
+    quick = replace(QUICK, segment_frames=5, run_in=2)
+    free, found = (
+        followed(dance, tmp_path / "free", quick),
+        followed(dance, tmp_path / "found", replace(quick, seam=0.02)),
+    )
+    near, far = seams(tmp_path / "found")
+    assert near["p95_mm"] < 20.0 < far["p95_mm"] and "again" not in near
+    assert far["again"] == 2  # of its four frames
+    changed = [frame for frame, (one, other) in enumerate(zip(free, found, strict=True)) if not torch.equal(one, other)]
+    assert changed == [10, 11]
+
+
 def test_processes_share_segments_and_find_the_bits_of_one(long_dance, in_segments, tmp_path):
     alone, folder = in_segments
     # Another process has tracked the second segment, and this one finds it.
