@@ -11,8 +11,14 @@ import pytest
 from benchmarks.support.people import body_outside, captured, captured_names
 from smplxpp.body import load_body
 from smplxpp.core import LABEL_BY_NAME, BodyParams, InputError
+from smplxpp.core.signed_distance import SignedDistanceField
+from smplxpp.core.topology import border_loops, face_components
 from smplxpp.people import CAST, OUTSIDERS, VARIANTS, access, people, person, variant
 from smplxpp.people.bodies import BUILDS, STANCES, Posing, betas_of, fitting_mannequin
+from smplxpp.people.cloth_mesh import ClothMesh
+from smplxpp.people.garments.cut import sewn
+from smplxpp.people.garments.loose import sewn_coat
+from smplxpp.people.garments.mannequin import Mannequin
 from smplxpp.people.garments.wardrobe import all_garments
 from smplxpp.people.making import make_person
 from smplxpp.people.outside import Outside, heel_blocks, outside_body, reachable
@@ -191,6 +197,32 @@ def test_heels_stand_on_the_floor_with_the_balls_of_the_feet(body):
     )
     around = (np.abs(mesh.face_normals[:, 1]) < 0.5) & (mesh.face_areas > 1e-9)
     assert (np.einsum("ij,ij->i", mesh.face_normals, side)[around] > 0).all()
+
+
+def test_a_coat_is_sewn_of_one_piece_over_its_skirt(body):
+    mannequin = Mannequin.of(body, np.zeros(body.num_betas))
+    skirt = all_garments(mannequin)["long skirt"].cloth
+    coat = sewn_coat(mannequin, skirt)
+    assert face_components(coat.faces).max() == 0
+    ways = np.concatenate([coat.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    assert len(np.unique(ways, axis=0)) == len(ways), "all faces look out"
+    assert len(border_loops(coat.faces)) == 3, "two cuffs; neckline, front and hem are one"
+    where = SignedDistanceField(skirt.mesh, solid=False).query(coat.vertices)
+    assert where.distance[~where.on_border].min() > 0.005
+    hem, knee = coat.vertices[:, 1].min(), mannequin.joints["left_knee"][1]
+    assert hem < knee < coat.vertices[:, 1].max() - 0.5
+
+
+def test_edges_of_different_counts_are_sewn_without_a_gap():
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    sheet = ClothMesh(flat, np.array([[0, 1, 3], [0, 3, 2]]), np.ones((4, 1)))
+    fine = ClothMesh(
+        np.array([[0.0, 2, 0], [0.2, 2, 0], [1, 2, 0], [0.5, 3, 0]]), np.array([[0, 1, 3], [1, 2, 3]]), np.ones((4, 1))
+    )
+    whole = sewn(sheet, np.array([2, 3]), fine, np.array([0, 1, 2]))
+    assert len(whole.faces) == 7
+    assert whole.mesh.face_areas.sum() == pytest.approx(2.5)
+    assert len(border_loops(whole.faces)) == 1
 
 
 def test_another_seed_gives_another_body_of_that_build(body):

@@ -164,6 +164,28 @@ def joined(*pieces: ClothMesh) -> ClothMesh:
     )
 
 
+def sewn(first: ClothMesh, edge: Int[np.ndarray, " A"], second: ClothMesh, to: Int[np.ndarray, " B"]) -> ClothMesh:
+    """Return two sheets as one: a strip of triangles joins an edge of either, both from the same end to the other.
+
+    The strip continues along the edge whose next vertex lies less far along it.
+    """
+    both = joined(first, second)
+    paths = [edge, to + len(first.vertices)]
+    along = []
+    for path in paths:
+        steps = np.linalg.norm(np.diff(both.vertices[path], axis=0), axis=1)
+        along.append(np.concatenate([[0.0], np.cumsum(steps) / steps.sum()]))
+    i, j, strip = 0, 0, []
+    while i + 1 < len(edge) or j + 1 < len(to):
+        if j + 1 == len(to) or (i + 1 < len(edge) and along[0][i + 1] <= along[1][j + 1]):
+            strip.append((paths[0][i], paths[0][i + 1], paths[1][j]))
+            i += 1
+        else:
+            strip.append((paths[0][i], paths[1][j + 1], paths[1][j]))
+            j += 1
+    return ClothMesh(both.vertices, np.concatenate([both.faces, np.array(strip)]), both.weights)
+
+
 def tube_along(curve: Float[np.ndarray, "R 3"], radii: Float[np.ndarray, " R"], *, sides: int = 24) -> tuple:
     """Return points and faces of a tube about a curve, normals outward, ends open."""
     # A frame across the curve, from a fixed vector that no curve here is parallel to.

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
+from smplxpp.core.topology import border_loops
 from smplxpp.people.cloth_mesh import ClothMesh, lift_outside
-from smplxpp.people.garments.cut import Garment, around, facing_out, grid_faces, hang, joined, layer, skirt_weights
+from smplxpp.people.garments.cut import (
+    Garment,
+    around,
+    facing_out,
+    grid_faces,
+    hang,
+    joined,
+    layer,
+    sewn,
+    skirt_weights,
+)
 from smplxpp.people.garments.mannequin import Mannequin
 from smplxpp.people.textures import ramp
 
@@ -98,21 +110,49 @@ def hung(
 
 def _coat(mannequin: Mannequin) -> ClothMesh:
     """Return a long coat, open in front: body and sleeves to the hips, and panels from there down."""
+    hip, knee = mannequin.joints["left_hip"][1], mannequin.joints["left_knee"][1]
+    top = _coat_body(mannequin, hip + 0.06, ease=0.018)
+    # The panels overlap the upper part by 1.5 cm.
+    panels = hung(mannequin, hip + 0.075, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.022)
+    return joined(top, panels)
+
+
+def _coat_body(mannequin: Mannequin, end: float, *, ease: float | Callable[[np.ndarray], np.ndarray]) -> ClothMesh:
+    """Return body and sleeves of a coat, open in front, down to a height."""
     j = mannequin.joints
-    hip, knee = j["left_hip"][1], j["left_knee"][1]
 
     def level(p: np.ndarray) -> np.ndarray:
         x, y, z = p.T
         # Open in front by 9 cm, with a round neckline, cut off at hips and wrists.
         front = np.where(z > mannequin.axis[1], np.abs(x) - 0.045, 1.0)
         neck = np.where(y > j["neck"][1] - 0.13, np.hypot(x, z - j["neck"][2] - 0.018) - 0.075, 1.0)
-        below = np.minimum(y - hip - 0.06, j["neck"][1] + 0.03 - y)
+        below = np.minimum(y - end, j["neck"][1] + 0.03 - y)
         return np.minimum(np.minimum(front, neck), np.minimum(below, j["left_wrist"][0] - 0.02 - np.abs(x)))
 
-    top = layer(mannequin, level, ease=0.018, fairing=10)
-    # The panels overlap the upper part by 1.5 cm.
-    panels = hung(mannequin, hip + 0.075, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.022)
-    return joined(top, panels)
+    return layer(mannequin, level, ease=ease, fairing=10)
+
+
+def sewn_coat(mannequin: Mannequin, over: ClothMesh) -> ClothMesh:
+    """Return a long coat of one piece, open in front, that hangs from the shoulders over a skirt."""
+    j = mannequin.joints
+    knee, chest = j["left_knee"][1], j["spine3"][1]
+    waist = j["spine1"][1] + 0.05
+
+    def ease(p: np.ndarray) -> np.ndarray:
+        # It lies on the shoulders and stands off the waistband.
+        return 0.009 + 0.011 * ramp(p[:, 1], chest + 0.1, waist)
+
+    top = _coat_body(mannequin, waist, ease=ease)
+    panels = hung(mannequin, waist - 0.014, knee - 0.05, legs=0.7, shins=0.3, gap=0.3, flare=0.15, stand_off=0.024)
+    (loop,) = (one for one in border_loops(top.faces) if top.vertices[one, 1].min() < waist + 0.01)
+    x, y, z = top.vertices[loop].T
+    # The lower edge runs around the back from one lower corner of the front opening to the other.
+    left, right = (int(np.where((z > 0) & (side * x > 0), y + np.abs(x), np.inf).argmin()) for side in (1.0, -1.0))
+    paths = [np.roll(loop, -a)[: (b - a) % len(loop) + 1] for a, b in ((left, right), (right, left))]
+    edge = min(paths, key=lambda path: top.vertices[path, 1].max())
+    edge = edge if edge[0] != loop[left] else edge[::-1]
+    coat = sewn(top, edge, panels, np.arange(100))
+    return coat.with_vertices(lift_outside(coat.mesh, over.mesh, clearance=0.006, solid=False))
 
 
 def _cape(mannequin: Mannequin) -> ClothMesh:
