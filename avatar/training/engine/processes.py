@@ -257,7 +257,7 @@ def join_processes(device: str = "cpu") -> Iterator[Distributed]:
 
 
 def torchrun_variables() -> tuple[dist.Store, dict[str, str]]:
-    """Return the variables by which processes of this machine find each other, and their store, to be kept till then.
+    """Return the variables that let processes of this machine find each other, and their store, to be kept till then.
 
     The store is the caller's, as torchrun's is its agent's, so that no port has to be found before it is used.
     """
