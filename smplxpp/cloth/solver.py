@@ -88,14 +88,10 @@ class ClothSolver:
             *(address(array, dtype) for array, dtype in arrays),
         )
         self._report = np.zeros(2, dtype=np.int64)
-        # With gravity and, to settle, without it.
-        self._forces, self._weightless = (
-            _Forces(
-                gravity,
-                *(fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction),
-                *(config.own_margin, config.most_speed, config.most_stretch, address(self._report, "int64")),
-            )
-            for gravity in (config.gravity, 0.0)
+        self._forces = _Forces(
+            config.gravity,
+            *(fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction),
+            *(config.own_margin, config.most_speed, config.most_stretch, address(self._report, "int64")),
         )
 
     @property
@@ -120,39 +116,6 @@ class ClothSolver:
         Raises:
             InputError: another number of moments, particles or vertices.
         """
-        self._advance(state, seconds, places, skin, self._forces)
-
-    def settle(
-        self,
-        state: ClothState,
-        place: Float32[np.ndarray, "n 3"],
-        skin: Float32[np.ndarray, "c 3"],
-        *,
-        substeps: int = 10,
-    ) -> None:
-        """Bring particles that were put elsewhere nearer to all constraints, in place; their velocities stay.
-
-        Left to a step, a correction within one substep would count as motion: 3 mm in 2 ms are 1.5 m/s.
-
-        Args:
-            place: where the particles would be on the body, metres.
-            skin: the collider's vertices.
-            substeps: from rest each. In five particles cover most of the distance that they cover in sixty.
-        """
-        velocity = state.velocity.copy()
-        for _ in range(substeps):
-            state.velocity[:] = 0.0
-            self._advance(state, self.config.substep, [place] * 4, [skin] * 4, self._weightless)
-        state.velocity[:] = velocity
-
-    def _advance(
-        self,
-        state: ClothState,
-        seconds: float,
-        places: Sequence[Float32[np.ndarray, "n 3"]],
-        skin: Sequence[Float32[np.ndarray, "c 3"]],
-        forces: _Forces,
-    ) -> None:
         for name, arrays, count in (
             ("particles", (state.position, state.velocity), len(self.model.inverse_mass)),
             ("four moments of places", places, len(self.model.inverse_mass)),
@@ -170,7 +133,7 @@ class ClothSolver:
         # Whole substeps of at most the configured length; the small term keeps round-off from adding one. The kernel
         # takes shorter ones where skin or cloth would move by more than the cloth's thickness in one.
         native_library().smplxpp_cloth_advance(
-            *(ctypes.byref(self._native), ctypes.byref(forces), ctypes.byref(moments)),
+            *(ctypes.byref(self._native), ctypes.byref(self._forces), ctypes.byref(moments)),
             ctypes.c_float(seconds),
             ctypes.c_int32(max(1, ceil(seconds / self.config.substep - 1e-6))),
             ctypes.c_int32(self.config.contacts_every),

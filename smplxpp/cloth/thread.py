@@ -53,15 +53,13 @@ class GarmentThread:
         self._edges = EdgeLengths(self._model.edges, self._model.lengths, 0.0)
         self._drawn = drawn_edges(garment, faces, beside=config.beside)
         self._resets = self._released = 0
-        # Whether particles were put elsewhere since the last step, where they may be against lengths and contacts.
-        self._moved = False
         self._state = ClothState.at_rest(garment.rest.vertices)
         self._places: list[Float32[np.ndarray, "n 3"]] = []
         self._surfaces: list[Float32[np.ndarray, "c 3"]] = []
 
     def reset(self, places: Float32[np.ndarray, "R 3"]) -> None:
         """Put the particles where skinning has them, at rest."""
-        self._state, self._moved = ClothState.at_rest(places[self._particles]), False
+        self._state = ClothState.at_rest(places[self._particles])
         self._places, self._surfaces = [places[self._particles]], [places[self._skin]]
 
     def begin_measuring(self) -> None:
@@ -88,9 +86,6 @@ class GarmentThread:
                 break
             surface = other.laid_over(self.garment.collider.vertices, surface)
         own = places[self._particles]
-        if self._moved:
-            self._solver.settle(self._state, self._places[-1], self._surfaces[-1])
-            self._moved = False
         # Four moments define the Catmull-Rom curves along which pins and collider move during the substeps.
         try:
             self._solver.advance(
@@ -126,7 +121,6 @@ class GarmentThread:
     def place(self, particles: Float32[np.ndarray, "n 3"]) -> None:
         """Put the particles elsewhere, metres from the driver's origin; their velocities stay."""
         self._state.position[:] = particles
-        self._moved = True
 
     def draw_to(self, seen: Float[np.ndarray, "n 3"], seconds: float, *, gain: float) -> None:
         """Draw what hangs free towards where it was seen: the correction of an alpha-beta filter.
@@ -151,7 +145,6 @@ class GarmentThread:
         pull[self._pinned] = 0.0
         x += pull.astype(np.float32)
         v += (pull / seconds).astype(np.float32)
-        self._moved = True
 
     def shift(self, by: Float32[np.ndarray, " 3"]) -> None:
         """Shift all stored places, metres, because their origin has moved by the opposite vector."""
