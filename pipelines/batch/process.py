@@ -1,4 +1,4 @@
-"""Run one command as a process of its own, and tell what its end means: done, refused, failed, or to be tried again."""
+"""Run a command as a process of its own, or as several that work together, and tell what its end means."""
 
 from __future__ import annotations
 

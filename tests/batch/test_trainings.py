@@ -108,11 +108,11 @@ def none_left(folder) -> bool:
 
 
 def test_a_process_that_is_killed_ends_the_other_and_is_named(tmp_path):
-    text = "os.kill(os.getpid(), 9) if rank == '1' else time.sleep(60)"
-    begin = time.monotonic()
+    # Who is not ended sleeps for an hour, so that no clock has to tell.
+    text = "os.kill(os.getpid(), 9) if rank == '1' else time.sleep(3600)"
     with pytest.raises(ChildProcessError, match="process 1 of 2: expected to run to its end, received SIGKILL"):
         ranks(text, tmp_path)
-    assert time.monotonic() - begin < 10.0 and none_left(tmp_path)
+    assert none_left(tmp_path)
 
 
 def test_processes_that_fail_by_themselves_leave_their_words(tmp_path, caplog):
@@ -132,5 +132,5 @@ def test_an_interrupt_ends_all_processes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(process.time, "sleep", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        ranks("time.sleep(60)", tmp_path)
+        ranks("time.sleep(3600)", tmp_path)
     assert none_left(tmp_path)
