@@ -122,7 +122,12 @@ class ClothDriver:
         # The same with the body's shape of the moment, where steps need it.
         self._shaped_rest = self._rest.copy()
         self._skin = self._rows[self._rows < template.body.vertex_count]
-        self._threads = [GarmentThread(g, self._rows, self.config, template.faces) for g in garments]
+        self._threads = [
+            GarmentThread(
+                g, self._rows, self.config, template.faces, layered=any(_touch(g, other) for other in garments)
+            )
+            for g in garments
+        ]
         self.quality = [ClothQuality(part=g.part) for g in garments]
         # What places are measured from: near the person, so that float32 knows micrometres wherever that stands.
         self._measure_from(np.zeros(3))
@@ -329,3 +334,9 @@ class ClothDriver:
             self.quality[k] = before.with_(now)
             if before.holds and not self.quality[k].holds:
                 self.notes.append(f"the cloth tears at {self._time:.2f} s: {now.sentence}")
+
+
+def _touch(one: Garment, other: Garment) -> bool:
+    """Whether one of two garments lies over the other one."""
+    over = any(np.isin(a.collider.vertices, b.vertices).any() for a, b in ((one, other), (other, one)))
+    return one is not other and over

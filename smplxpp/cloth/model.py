@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from smplxpp.cloth.cloth_mesh import edge_graph
 from smplxpp.core.errors import require_at_least, require_positive
@@ -56,7 +57,8 @@ class SolverConfig:
     Attributes:
         substep: seconds at most. Longer ones leave the cloth softer: corrections travel an edge a substep.
         contacts_every: substeps between two searches for contacts.
-        own_margin: metres that particles of one garment keep from each other; 0: they may pass through each other.
+        own_margin: metres that particles of one garment keep from each other, where they are no nearer at rest; 0: they
+            may pass through each other, unless the garment touches another one that is simulated.
         most_speed: metres a second; a safeguard, above what a garment does.
         most_stretch: longest edge over its length at rest: a hard bound at the end of every span of time.
         gravity: m/s^2 downwards.
@@ -93,6 +95,7 @@ class ClothModel:
         bend: compliance of a hinge.
         spring: m/N to the particle's place, inf where there is none; None: nowhere.
         anchor, tether: the particle that holds this one, -1 where none does, and the longest distance to it, metres.
+        apart: metres at rest to the nearest particle that no edge joins to it; `SolverConfig.own_margin` keeps no more.
     """
 
     faces: Int32[np.ndarray, "m 3"]
@@ -107,6 +110,7 @@ class ClothModel:
     bend: Float32[np.ndarray, " b"]
     anchor: Int32[np.ndarray, " n"]
     tether: Float32[np.ndarray, " n"]
+    apart: Float32[np.ndarray, " n"]
     spring: Float32[np.ndarray, " n"] | None = None
 
 
@@ -161,6 +165,7 @@ def build_model(
         bend=bend,
         anchor=anchor,
         tether=tether,
+        apart=_apart(rest),
         spring=spring,
     )
 
@@ -234,6 +239,17 @@ def _cotangents(
 ) -> Float[np.ndarray, " b"]:
     u, v = x[p] - x[at], x[q] - x[at]
     return np.einsum("hi,hi->h", u, v) / np.maximum(row_lengths(np.cross(u, v)), 1e-12)
+
+
+def _apart(rest: TriangleMesh) -> Float32[np.ndarray, " n"]:
+    """Return the distance from each particle to the nearest one that no edge joins to it; inf: there is none."""
+    n, edges = rest.vertex_count, rest.edges
+    most = int(np.bincount(edges.ravel(), minlength=n).max(initial=0))
+    # Of as many as neighbours, itself and one more, one at least is no neighbour.
+    away, near = cKDTree(rest.vertices).query(rest.vertices, k=list(range(1, most + 3)))
+    own = np.repeat(np.arange(n)[:, None], most + 2, axis=1)
+    joined = np.isin(np.minimum(own, near) * (n + 1) + np.maximum(own, near), edges @ [n + 1, 1]) | (near == own)
+    return np.where(joined, np.inf, away).min(axis=1).astype(np.float32)
 
 
 def _tethers(

@@ -49,7 +49,8 @@ class _Model(ctypes.Structure):
             (name, ctypes.c_void_p)
             for name in (
                 *("inverse_mass", "face", "edge", "length", "stretch", "compress", "hinge", "curvature"),
-                *("rest_curvature", "bend", "spring", "anchor", "tether", "collider_face", "margin", "deepest"),
+                *("rest_curvature", "bend", "spring", "anchor", "tether", "apart"),
+                *("collider_face", "margin", "deepest"),
             )
         ),
     ]
@@ -80,6 +81,7 @@ class ClothSolver:
             *((model.lengths, "float32"), (model.stretch, "float32"), (model.compress, "float32")),
             *((model.hinges, "int32"), (model.curvature, "float32"), (model.rest_curvature, "float32")),
             *((model.bend, "float32"), (model.spring, "float32"), (model.anchor, "int32"), (model.tether, "float32")),
+            (model.apart, "float32"),
             *((collider.faces, "int32"), (collider.margin, "float32"), (collider.deepest, "float32")),
         )
         self._native = _Model(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,8 @@ class GarmentThread:
         garment: what it is.
         rows: (R,) vertices of the template whose places it is given, increasing.
         faces: of the template, whose edges are measured as they are drawn.
+        layered: whether it touches another garment that is simulated. Cloth that lies in itself has no sides that
+            another layer could keep to: its particles stay their spacing apart then.
 
     Attributes:
         floor: height of the ground, metres from the driver's origin; None: there is none.
@@ -36,12 +39,16 @@ class GarmentThread:
         rows: Int64[np.ndarray, " R"],
         config: DriverConfig,
         faces: Int[np.ndarray, "F 3"],
+        *,
+        layered: bool = False,
     ) -> None:
         self.garment, self._config = garment, config
         self.floor: float | None = None
         self._model = garment.model()
         collider = garment.collider
-        self._solver = ClothSolver(self._model, collider.native, garment.config.fabric, config.solver)
+        margin = max(config.solver.own_margin, garment.config.spacing * layered)
+        solver = replace(config.solver, own_margin=margin)
+        self._solver = ClothSolver(self._model, collider.native, garment.config.fabric, solver)
         self._carried = CarriedVertices(
             *(garment.embedding, garment.rest.faces, self._solver.collider, len(garment.particles)),
             drawn_bounds(garment, faces, most=config.most_drawn, least=config.sliver, beside=config.beside),

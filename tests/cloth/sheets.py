@@ -132,5 +132,6 @@ def permuted(model: ClothModel, order: np.ndarray) -> ClothModel:
         inverse_mass=model.inverse_mass[order],
         anchor=np.where(model.anchor >= 0, new[model.anchor], -1)[order].astype(np.int32),
         tether=model.tether[order],
+        apart=model.apart[order],
         spring=None if model.spring is None else model.spring[order],
     )

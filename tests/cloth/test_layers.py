@@ -38,6 +38,28 @@ def depths(inner: ClothDriver, outer: ClothDriver, *, seconds: float = 1.2) -> n
     return np.array(found)
 
 
+def test_garments_that_touch_each_other_do_not_fold_into_themselves():
+    template, both = person(layers=2), garments()
+    layered, alone = ClothDriver(template, both, QUICK), ClothDriver(template, both[:1], QUICK)
+    nearest = []
+    for driver in (layered, alone):
+        own = []
+        for k in range(13):
+            driver.step(kicking(k / FPS), 1 / FPS)
+            own.append(near_itself(both[0], driver.particles(PART)))
+        nearest.append(np.min(own))
+    assert nearest[0] > 0.9 > 0.6 > nearest[1]
+
+
+def near_itself(garment: Garment, x: np.ndarray) -> np.ndarray:
+    """Of free particles: the distance to the nearest that no edge joins to them, over the spacing or that at rest."""
+    away = np.linalg.norm(x[:, None] - x[None], axis=2)
+    away[tuple(garment.rest.edges.T)] = away[tuple(garment.rest.edges[:, ::-1].T)] = np.inf
+    np.fill_diagonal(away, np.inf)
+    kept = np.minimum(garment.model().apart, garment.config.spacing)
+    return (away.min(axis=1) / kept)[~garment.pinned]
+
+
 @pytest.mark.long
 def test_an_outer_garment_stays_outside_an_inner_one():
     template, both = person(layers=2), garments()

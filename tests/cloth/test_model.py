@@ -82,6 +82,21 @@ def test_tethers_are_the_shortest_way_to_what_holds():
     assert (build_model(mesh, np.zeros(35), Fabric()).anchor == -1).all()
 
 
+def test_particles_are_as_far_apart_as_the_nearest_that_no_edge_joins():
+    mesh = hanging(cell=0.03)
+    folded = mesh.with_vertices(
+        np.where(np.arange(35)[:, None] == 34, mesh.vertices[0] + [0.0, 0.0, 0.004], mesh.vertices)
+    )
+    for sheet in (mesh, folded):
+        away = np.linalg.norm(sheet.vertices[:, None] - sheet.vertices[None], axis=2)
+        away[tuple(sheet.edges.T)] = away[tuple(sheet.edges[:, ::-1].T)] = np.inf
+        np.fill_diagonal(away, np.inf)
+        np.testing.assert_allclose(build_model(sheet, held(sheet), Fabric()).apart, away.min(axis=1), rtol=1e-6)
+    assert build_model(folded, held(folded), Fabric()).apart[0] == pytest.approx(0.004)
+    alone = TriangleMesh(np.eye(3), np.array([[0, 1, 2]]))
+    assert np.isinf(build_model(alone, np.zeros(3), Fabric()).apart).all()
+
+
 def test_nothing_holds_a_piece_of_its_own():
     one = hanging()
     both = TriangleMesh(np.concatenate([one.vertices, one.vertices + 1]), np.concatenate([one.faces, one.faces + 35]))

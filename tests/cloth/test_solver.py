@@ -347,6 +347,18 @@ def test_own_margin_keeps_layers_of_one_garment_apart():
     assert gaps[0.01] > 0.0095
 
 
+def test_own_margin_leaves_a_garment_as_it_is_at_rest():
+    """Of two layers sewn 4 mm apart a margin of 3 cm keeps 4 mm and no more."""
+    lower, upper = lying(5, 5), lying(5, 5, height=0.004)
+    both = TriangleMesh(np.concatenate([lower.vertices, upper.vertices]), np.concatenate([grid(5, 5), grid(5, 5) + 25]))
+    attachment = np.zeros(50)
+    attachment[:25] = 1.0
+    model = replace(build_model(both, attachment, PLAIN), anchor=np.full(50, -1, np.int32))
+    for gravity in (0.0, 9.81):
+        scene = Scene(model, both.vertices, config=SolverConfig(own_margin=0.03, gravity=gravity))
+        assert np.abs(scene.run(0.3).position - both.vertices).max() < 1e-3
+
+
 @pytest.mark.parametrize("name", ["edges", "faces", "hinges", "anchor", "collider"])
 @pytest.mark.parametrize("index", [35, -2, 2**31 - 1])
 def test_indices_beyond_the_arrays_are_refused(name, index):

@@ -95,6 +95,7 @@ def test_constraints_are_those_of_the_driver(dressed):
     for own, name in (
         *(("inverseMass", "inverse_mass"), ("lengths", "lengths"), ("stretch", "stretch"), ("compress", "compress")),
         *(("curvature", "curvature"), ("restCurvature", "rest_curvature"), ("bend", "bend"), ("tether", "tether")),
+        ("apart", "apart"),
     ):
         np.testing.assert_allclose(found[own], getattr(model, name).ravel(), rtol=2e-6, atol=1e-7, err_msg=name)
 

@@ -29,6 +29,7 @@ struct Model {
     const float* spring;               // n: m/N of the spring to its place, inf: none; null: nobody has one
     const int32_t* anchor;             // n: particle of the tether, -1: none
     const float* tether;               // n: metres at most
+    const float* apart;                // n: metres at rest to the nearest particle that no edge joins to it
     const int32_t* collider_face;      // 3 d
     const float* margin;               // c: metres that cloth keeps from it
     const float* deepest;              // c: metres; deeper cloth is on the other side

@@ -298,7 +298,7 @@ private:
             if (which[lane]) x_[size_t(four.particle[lane])] = own[lane];
     }
 
-    // Particles that came nearer than the margin, their own neighbours aside.
+    // Particles that came nearer than the margin, or than they are at rest, their own neighbours aside.
     void find_pairs() {
         const float reach = 1.5f * float(f_.own_margin);
         pairs_.clear();
@@ -308,7 +308,8 @@ private:
             own_.around(position_[i], [&](int32_t j) {
                 if (j <= i) return;
                 const Vec3 d = position_[i] - position_[j];
-                if (dot(d, d) < reach * reach && !neighbours(i, j)) pairs_.push_back({i, j});
+                if (dot(d, d) < reach * reach && !neighbours(i, j))
+                    pairs_.push_back({i, j, std::min(float(f_.own_margin), std::min(m_.apart[i], m_.apart[j]))});
             });
     }
 
@@ -323,8 +324,7 @@ private:
     static int64_t link(int32_t i, int32_t j) { return (int64_t(std::min(i, j)) << 32) | std::max(i, j); }
 
     void part() {
-        const float margin = float(f_.own_margin);
-        for (const auto& [i, j] : pairs_) {
+        for (const auto& [i, j, margin] : pairs_) {
             const float masses = w(i) + w(j);
             const Vec4 d = x_[size_t(i)] - x_[size_t(j)];
             const float l = length(d);
@@ -347,6 +347,7 @@ private:
 
     struct Pair {
         int32_t i, j;
+        float margin;
     };
     const Model& m_;
     const Forces& f_;

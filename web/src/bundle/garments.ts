@@ -98,6 +98,7 @@ function garment(piece: Map<string, Tensor>, k: number, about: Record<string, un
   return {
     part: asText(about.part, `garment ${k}: part`),
     fabric: numbers(asObject(config.fabric, `garment ${k}: fabric`), FABRIC),
+    spacing: options.spacing,
     pinDepth: options.pin_depth,
     band: options.band,
     reference: poseAt(reference, 0),

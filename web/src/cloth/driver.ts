@@ -50,7 +50,6 @@ export class ClothDriver {
   constructor(private readonly deformer: Deformer, garments: readonly Garment[], start: Partial<Pick<Simulation, "ramp" | "hold">> = {}) {
     const { native, avatar: { mesh, gaussians, simulation } } = deformer, V = mesh.vertices.length / 3;
     const numbers = (this.numbers = { ...simulation, ...start });
-    this.threads = garments.map((garment) => new GarmentThread(native, garment, mesh.faces, numbers));
     this.rows = garments.map(({ particles, collider, vertices }, k) => {
       const under = new Map<number, [number, number]>();
       garments.slice(0, k).forEach(({ vertices }, inner) => {
@@ -60,6 +59,9 @@ export class ClothDriver {
       const [own, touched, carried] = [particles, collider.vertices, vertices].map((rows) => new SkinnedRows(deformer, rows));
       return { particles: own, collider: touched, carried, under, runs: runsOf(vertices) };
     });
+    const inner = this.rows.map(({ under }) => new Set([...under.values()].map(([one]) => one)));
+    const layered = garments.map((_, k) => inner[k].size > 0 || inner.some((ones) => ones.has(k)));
+    this.threads = garments.map((garment, k) => new GarmentThread(native, garment, mesh.faces, numbers, layered[k]));
     [this.still, this.shapedRest] = [native.keep(mesh.vertices), native.keep(mesh.vertices)];
     this.skin = mesh.parts.filter((part) => !part).length;
     const share = new Float32Array(V);

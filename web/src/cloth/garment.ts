@@ -19,6 +19,8 @@ export interface Fabric {
 export interface Garment {
   part: string;
   fabric: Fabric;
+  /** Of its particles, metres. */
+  spacing: number;
   /** Metres along the cloth up to which it follows the body exactly, and over which simulation takes over. */
   pinDepth: number;
   band: number;

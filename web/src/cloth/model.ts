@@ -18,6 +18,8 @@ export interface ClothModel {
   /** (n,) the particle that holds this one, -1 where none does, and the longest distance to it, metres. */
   anchor: Int32Array;
   tether: Float32Array;
+  /** (n,) metres at rest to the nearest particle that no edge joins to it. */
+  apart: Float32Array;
 }
 
 type Vector = [number, number, number];
@@ -63,7 +65,7 @@ export function buildModel(garment: Garment, fixed: Uint8Array): ClothModel {
     stretch: Float32Array.from(stiffness, (value) => 1 / value),
     compress: Float32Array.from(stiffness, (value) => 1 / (fabric.compression * value)),
     ...hinges(garment, areas, fixed),
-    anchor, tether,
+    anchor, tether, apart: apart(rest, edges),
   };
 }
 
@@ -109,6 +111,22 @@ function pairedHalfEdges(faces: Int32Array, n: number): number[][] {
     else groups.set(key, [h]);
   }
   return [...groups].filter(([, group]) => group.length === 2).sort(([a], [b]) => a - b).map(([, group]) => group);
+}
+
+/** The distance from each particle to the nearest one that no edge joins to it. */
+function apart(rest: Float64Array, edges: Int32Array): Float32Array {
+  const n = rest.length / 3, squared = new Float64Array(n).fill(Infinity), joined = new Set<number>();
+  for (let e = 0; e < edges.length; e += 2) joined.add(edges[e] * n + edges[e + 1]);
+  for (let i = 0; i < n; ++i) {
+    for (let j = i + 1; j < n; ++j) {
+      const x = rest[3 * i] - rest[3 * j], y = rest[3 * i + 1] - rest[3 * j + 1], z = rest[3 * i + 2] - rest[3 * j + 2];
+      const away = x * x + y * y + z * z;
+      if ((away >= squared[i] && away >= squared[j]) || joined.has(i * n + j)) continue;
+      squared[i] = Math.min(squared[i], away);
+      squared[j] = Math.min(squared[j], away);
+    }
+  }
+  return Float32Array.from(squared, Math.sqrt);
 }
 
 /** The nearest fixed particle along the cloth, and the longest way to it; depths along the edges. */

@@ -66,9 +66,10 @@ export class GarmentThread {
   private readonly places: Moments;
   private readonly surfaces: Moments;
 
-  /** @param drawn the faces of the avatar. */
+  /** @param drawn the faces of the avatar. @param layered whether it touches another garment: its particles stay their spacing apart then. */
   constructor(
     private readonly native: Native, readonly garment: Garment, drawn: ArrayLike<number>, private readonly numbers: Simulation,
+    layered: boolean,
   ) {
     const { gravity, own_margin, most_speed, most_stretch } = numbers.solver;
     const { fabric, collider } = garment, n = garment.particles.length, c = collider.vertices.length;
@@ -83,10 +84,12 @@ export class GarmentThread {
     this.model = native.struct([n, garment.faces.length / 3, model.edges.length / 2, model.bend.length, c, collider.faces.length / 3], [
       ...[model.inverseMass, garment.faces, model.edges, model.lengths, model.stretch, model.compress, model.hinges, model.curvature,
         model.restCurvature, model.bend].map((array) => native.keep<Float32Array | Int32Array>(array)),
-      null, native.keep(model.anchor), native.keep(model.tether), colliderFaces, native.keep(collider.margin), deepest,
+      null, native.keep(model.anchor), native.keep(model.tether), native.keep(model.apart), colliderFaces, native.keep(collider.margin),
+      deepest,
     ]);
     this.forces = native.keep(Float64Array.of(
-      gravity, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, own_margin, most_speed, most_stretch, 0));
+      gravity, fabric.drag, fabric.normal_drag, fabric.inner_friction, fabric.friction, layered ? Math.max(own_margin, garment.spacing) : own_margin,
+      most_speed, most_stretch, 0));
     [this.places, this.surfaces] = [new Moments(native, n), new Moments(native, c)];
     this.moments = native.struct([], [...this.places.blocks, ...this.surfaces.blocks]);
   }
