@@ -37,14 +37,7 @@ public:
 
     // The points, cell by cell.
     const std::vector<int32_t>& order() const { return order_; }
-    // Calls visit with the points within the reach of a place, and with others about it; some of those twice.
-    template <class Visit>
-    void around(Vec3 p, Visit&& visit) const {
-        in(block(p), [&](int32_t begin, int32_t end) {
-            for (int32_t q = begin; q < end; ++q) visit(order_[size_t(q)]);
-        });
-    }
-    // The same with ranges of the order.
+    // Calls visit with ranges of the order: the points within the reach of a place, and others about it; some of those twice.
     template <class Visit>
     void in(Block b, Visit&& visit) const {
         for (int32_t i = b.x; i <= b.x + 1; ++i)

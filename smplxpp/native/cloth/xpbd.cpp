@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "cloth/constraints.hpp"
+#include "cloth/pairs.hpp"
 #include "cloth/surface.hpp"
 #include "cloth/vec3.hpp"
 #include "common/status.hpp"
@@ -22,11 +23,11 @@ using smplxpp::Constraints;
 using smplxpp::Contact;
 using smplxpp::dot;
 using smplxpp::Forces;
-using smplxpp::Grid;
 using smplxpp::length;
 using smplxpp::Mask4;
 using smplxpp::Model;
 using smplxpp::narrowed;
+using smplxpp::Pairs;
 using smplxpp::Soa;
 using smplxpp::Surface;
 using smplxpp::Vec3;
@@ -53,7 +54,7 @@ public:
         : m_(m), f_(f), position_(position), velocity_(velocity), n_(size_t(m.particles)), x_(n_ + 1), v_(n_ + 1), before_(n_ + 1),
           place_(n_), normal_(n_),
           skin_(size_t(m.collider_vertices) + 1), skin_before_(skin_.size()),
-          surface_(m.collider_vertices, m.collider_face, m.collider_faces) {}
+          surface_(m.collider_vertices, m.collider_face, m.collider_faces), pairs_(m, float(f.own_margin)) {}
 
     void advance(const Moments& moments, float seconds, int32_t substeps, int32_t contacts_every) {
         substeps = std::max(substeps, std::min(kShorter * substeps, needed(moments, seconds)));
@@ -71,12 +72,12 @@ public:
             if (looks || f_.normal_drag > 0) smplxpp::normals(x_.data(), m_.face, m_.faces, normal_);
             move(h);
             if (looks) find_contacts();
-            if (looks && f_.own_margin > 0) find_pairs();
+            if (looks && f_.own_margin > 0) pairs_.find(x_);
             constraints.stretch(x_);
             constraints.bend(x_);
             if (m_.spring) pull(h);
             hold();
-            if (f_.own_margin > 0) part();
+            pairs_.part(x_);
             touch();
             constraints.all_wait();
             for (int32_t k = 0; k < kSweeps && !constraints.limit(x_, k % 2 == 1, smplxpp::kShared, 1.0f); ++k) {}
@@ -298,43 +299,6 @@ private:
             if (which[lane]) x_[size_t(four.particle[lane])] = own[lane];
     }
 
-    // Particles that came nearer than the margin, or than they are at rest, their own neighbours aside.
-    void find_pairs() {
-        const float reach = 1.5f * float(f_.own_margin);
-        pairs_.clear();
-        std::transform(x_.begin(), x_.end() - 1, position_, narrowed);
-        own_.fill(position_, m_.particles, reach);
-        for (int32_t i = 0; i < m_.particles; ++i)
-            own_.around(position_[i], [&](int32_t j) {
-                if (j <= i) return;
-                const Vec3 d = position_[i] - position_[j];
-                if (dot(d, d) < reach * reach && !neighbours(i, j))
-                    pairs_.push_back({i, j, std::min(float(f_.own_margin), std::min(m_.apart[i], m_.apart[j]))});
-            });
-    }
-
-    bool neighbours(int32_t i, int32_t j) {
-        if (linked_.empty() && m_.edges) {
-            for (int64_t k = 0; k < m_.edges; ++k)
-                linked_.push_back(link(m_.edge[2 * k], m_.edge[2 * k + 1]));
-            std::sort(linked_.begin(), linked_.end());
-        }
-        return std::binary_search(linked_.begin(), linked_.end(), link(i, j));
-    }
-    static int64_t link(int32_t i, int32_t j) { return (int64_t(std::min(i, j)) << 32) | std::max(i, j); }
-
-    void part() {
-        for (const auto& [i, j, margin] : pairs_) {
-            const float masses = w(i) + w(j);
-            const Vec4 d = x_[size_t(i)] - x_[size_t(j)];
-            const float l = length(d);
-            if (masses == 0 || l >= margin || l < 1e-7f) continue;
-            const Vec4 step = d * ((margin - l) / (masses * l));
-            x_[size_t(i)] += step * w(i);
-            x_[size_t(j)] -= step * w(j);
-        }
-    }
-
     // Velocities of what was moved.
     void finish(float h) {
         const float over = 1.0f / h, most = float(f_.most_speed);
@@ -345,10 +309,6 @@ private:
         }
     }
 
-    struct Pair {
-        int32_t i, j;
-        float margin;
-    };
     const Model& m_;
     const Forces& f_;
     Vec3 *position_, *velocity_;
@@ -362,9 +322,7 @@ private:
     // What particles touch: first `sides_` fours of nearest places, then those on the other side of a fold.
     std::vector<Touches> touches_, folds_;
     size_t sides_ = 0;
-    std::vector<Pair> pairs_;
-    std::vector<int64_t> linked_;
-    Grid own_;
+    Pairs pairs_;
 };
 
 void check(const Model& m) {
