@@ -38,6 +38,7 @@ def depths(inner: ClothDriver, outer: ClothDriver, *, seconds: float = 1.2) -> n
     return np.array(found)
 
 
+@pytest.mark.long
 def test_garments_that_touch_each_other_do_not_fold_into_themselves():
     template, both = person(layers=2), garments()
     layered, alone = ClothDriver(template, both, QUICK), ClothDriver(template, both[:1], QUICK)
