@@ -13,6 +13,7 @@ starts from its nearest solved neighbour (`track.TrackTask`).
 
     L(d) = L_rec(render(d), photographs)                     photometric: L1, D-SSIM, opacity
          + smoothness  * mean |(d - s)_i - (d - s)_j|^2      first-order (membrane) smoothness about the shape s
+         + strain_weight * mean strain^2                     of edges of clothes against their lengths along the cloth
          + prior_weight * mean (d - a)^T W (d - a)           Gaussian prior about the anchor a, in directions W
          + body_motion_weight * mean rho(|d|)                pseudo-Huber penalty, off the clothes and near the skin
 

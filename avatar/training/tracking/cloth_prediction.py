@@ -25,6 +25,8 @@ CORRECTION_DECAY = 0.3
 
 Errors of a simulated swing are a difference of phase, which changes sign within a swing; an old correction is wrong.
 """
+COMPRESSION = 0.3
+"""Weight of a compressed edge beside that of a stretched one: between its particles cloth buckles."""
 ERROR_FLOOR = 1e-3
 """Metres added to every predictor's error; smaller errors are treated as equal."""
 
@@ -39,6 +41,42 @@ Predictor = Callable[[int, Solved], Float[Tensor, "K 3"]]
 
 
 @dataclass(frozen=True, eq=False)
+class ClothEdges:
+    """Edges of clothes that can be simulated, and what they measure at rest.
+
+    Attributes:
+        ends: vertices of the template; the body carries at most one of the two.
+        lengths: along the cloth in the reference pose, metres.
+    """
+
+    ends: Int[Tensor, "E 2"]
+    lengths: Float[Tensor, " E"]
+
+    @classmethod
+    def of(cls, garments: Sequence[Garment], device: torch.device) -> ClothEdges:
+        """Collect the edges of garments, those between two pinned particles left out."""
+        # Metres; shorter edges count as that long: the strain of a sliver is the noise of its ends.
+        shortest = 0.01
+        free = [~garment.pinned[garment.rest.edges].all(axis=1) for garment in garments]
+        ends = [one.particles[one.rest.edges[kept]] for one, kept in zip(garments, free, strict=True)]
+        lengths = [np.maximum(one.lengths[kept], shortest) for one, kept in zip(garments, free, strict=True)]
+        return cls(
+            torch.tensor(np.concatenate(ends), device=device),
+            torch.tensor(np.concatenate(lengths), dtype=torch.float32, device=device),
+        )
+
+    def strain(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, ""]:
+        """Return the mean over edges of `max(s, 0)^2 + COMPRESSION max(-s, 0)^2`, `s = |x_i - x_j| / l - 1`.
+
+        Args:
+            vertices: of the template in a pose, metres.
+        """
+        there = vertices[self.ends]
+        strain = (there[:, 0] - there[:, 1]).norm(dim=-1) / self.lengths - 1.0
+        return (strain.clamp(min=0.0).square() + COMPRESSION * strain.clamp(max=0.0).square()).mean()
+
+
+@dataclass(frozen=True, eq=False)
 class SimulatedControls:
     """Displacements of simulated clothes at the control points of a cage, frame by frame.
 
@@ -47,12 +85,14 @@ class SimulatedControls:
         share: in [0, 1], the simulation's share of a control point's displacement.
         part: garment of each control point, from 0 to P - 1; 0: not simulated.
         quality: what was measured of each garment.
+        edges: of the garments; None: their lengths are not known.
     """
 
     displacements: Mapping[int, Float[Tensor, "K 3"]]
     share: Float[Tensor, " K"]
     part: Int[Tensor, " K"]
     quality: Sequence[ClothQuality] = ()
+    edges: ClothEdges | None = None
 
 
 def simulate_controls(
@@ -100,6 +140,7 @@ def simulate_controls(
         torch.tensor(share[rows], device=controls.device),
         torch.tensor(part[rows], device=controls.device),
         clothes.quality,
+        ClothEdges.of(garments, controls.device),
     )
 
 

@@ -33,6 +33,8 @@ class TrackConfig:
         views: cameras a step.
         smoothness: weight of the mean squared difference of neighbouring control points' displacements, after the
             predicted shape is subtracted, 1/m^2.
+        strain_weight: weight of the mean squared strain of clothes that can be simulated. Cloth hardly stretches, and where
+            a pattern is matched a period off, it does on one side. Five times as much slows a swing down.
         prior_weight: weight of the Gaussian prior of simulated clothes about their prediction, along the surface in
             directions that photographs do not determine (along stripes; any on plain cloth), 1/m^2.
         body_motion_weight: weight of the mean displacement of control points off the clothes, 1/m. Parameters locate
@@ -55,10 +57,11 @@ class TrackConfig:
         seed: of the order of views.
     """
 
-    levels: tuple[Level, ...] = (Level(2, 20, 5e-3), Level(1, 16, 4e-3), Level(0, 20, 2e-3))
+    levels: tuple[Level, ...] = (Level(2, 20, 8e-3), Level(1, 16, 6e-3), Level(0, 20, 3e-3))
     control_points: int = 2400
     views: int = 4
     smoothness: float = 80.0
+    strain_weight: float = 1.0
     prior_weight: float = 1500.0
     body_motion_weight: float = 0.0
     tight_reach: float = 0.0
@@ -82,6 +85,7 @@ class TrackConfig:
             ("control_points", 1),
             ("views", 1),
             ("smoothness", 0),
+            ("strain_weight", 0),
             ("prior_weight", 0),
             ("body_motion_weight", 0),
             ("tight_reach", 0),

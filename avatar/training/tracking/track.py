@@ -176,6 +176,10 @@ class TrackTask(PhotometricTask):
         priors = self.priors(item.frame)
         # Smoothness of the difference from the predicted shape.
         total = total + self.track_config.smoothness * cage.roughness(controls - priors.rest_shape)
+        # Strain of the clothes whose lengths at rest are known.
+        simulated = self.prediction.simulated
+        if self.track_config.strain_weight and simulated is not None and simulated.edges is not None:
+            total = total + self.track_config.strain_weight * simulated.edges.strain(posed.vertices)
         # Gaussian prior about the anchor, in the directions that photographs do not determine.
         if self.track_config.prior_weight:
             off = controls - priors.anchor

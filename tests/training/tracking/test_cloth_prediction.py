@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import cos, exp
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,7 +14,9 @@ from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.losses.reconstruction import ReconstructionWeights
 from avatar.models.tracked_surface import TrackedAvatar
 from avatar.training.tracking.cloth_prediction import (
+    COMPRESSION,
     CORRECTION_DECAY,
+    ClothEdges,
     ClothPrediction,
     SimulatedControls,
     Solved,
@@ -22,6 +25,7 @@ from avatar.training.tracking.cloth_prediction import (
 from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track import TrackTask
 from smplxpp.capture import open_capture
+from smplxpp.cloth import cut_garment
 from smplxpp.core.labels import LOWER
 from tests.cloth.persons import person, standing
 from tests.dolls.skirted import moved, write_skirted
@@ -121,6 +125,20 @@ def test_a_skirt_is_simulated_through_every_second_frame(skirt):
     assert not last[~of_skirt].any() and last.abs().max() > 5e-3
 
 
+def test_strain_is_of_edges_along_the_cloth():
+    garment = cut_garment(person(), LOWER.name, standing())
+    edges = ClothEdges.of([garment], torch.device("cpu"))
+    at_rest = torch.tensor(person().pose(standing())[0], dtype=torch.float32)
+    lengths, kept = garment.lengths, ~garment.pinned[garment.rest.edges].all(axis=1)
+    assert 0 < kept.sum() < len(kept)
+    np.testing.assert_array_equal(edges.ends.numpy(), garment.particles[garment.rest.edges[kept]])
+    np.testing.assert_allclose(edges.lengths.numpy(), lengths[kept], rtol=1e-6)
+    # The skirt is smooth, so that its edges are hardly shorter than the way along it.
+    assert float(edges.strain(at_rest)) < 1e-4
+    stretched, pressed = (float(edges.strain(scale * at_rest)) for scale in (1.1, 0.9))
+    assert stretched == pytest.approx(0.01, rel=0.1) and pressed == pytest.approx(COMPRESSION * 0.01, rel=0.1)
+
+
 @pytest.mark.long
 def test_frames_numbers_are_names():
     poses = {k: standing(lifted=0.1 * k) for k in range(3)}
@@ -177,6 +195,20 @@ def test_frames_of_a_capture_start_nearer_to_a_skirt_that_swings(skirted):
 
 def test_without_a_reference_nothing_is_simulated(skirted):
     assert task(skirted, reference=None).prediction.simulated is None
+
+
+@pytest.mark.long
+def test_clothes_that_are_followed_hardly_stretch(skirted):
+    strains = {}
+    for weight in (0.0, 1.0, 20.0):
+        made = task(skirted, strain_weight=weight, levels=(Level(0, 8, 5e-3),), control_points=200)
+        for k in range(3 * made.track_config.steps):
+            made.step(k)
+        simulated, frame = made.prediction.simulated, made.order[2]
+        assert simulated is not None and simulated.edges is not None
+        posed = skirted.rig.skin(skirted.pose(frame), made.avatar.cage(made.solved[made.row[frame]]))
+        strains[weight] = float(simulated.edges.strain(posed))
+    assert strains[20.0] < 0.7 * strains[1.0] < strains[0.0]
 
 
 @pytest.mark.long
