@@ -68,12 +68,15 @@ class ClothEdges:
     def strain(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, ""]:
         """Return the mean over edges of `max(s, 0)^2 + COMPRESSION max(-s, 0)^2`, `s = |x_i - x_j| / l - 1`.
 
+        Clothes that the body carries wholly have no edges and no strain.
+
         Args:
             vertices: of the template in a pose, metres.
         """
         there = vertices[self.ends]
         strain = (there[:, 0] - there[:, 1]).norm(dim=-1) / self.lengths - 1.0
-        return (strain.clamp(min=0.0).square() + COMPRESSION * strain.clamp(max=0.0).square()).mean()
+        squared = strain.clamp(min=0.0).square() + COMPRESSION * strain.clamp(max=0.0).square()
+        return squared.sum() / max(len(squared), 1)
 
 
 @dataclass(frozen=True, eq=False)

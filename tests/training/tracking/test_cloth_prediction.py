@@ -26,6 +26,7 @@ from avatar.training.tracking.config import Level, TrackConfig
 from avatar.training.tracking.track import TrackTask
 from smplxpp.capture import open_capture
 from smplxpp.cloth import cut_garment
+from smplxpp.cloth.calibrate import with_values
 from smplxpp.core.labels import LOWER
 from tests.cloth.persons import person, standing
 from tests.dolls.skirted import moved, write_skirted
@@ -137,6 +138,13 @@ def test_strain_is_of_edges_along_the_cloth():
     assert float(edges.strain(at_rest)) < 1e-4
     stretched, pressed = (float(edges.strain(scale * at_rest)) for scale in (1.1, 0.9))
     assert stretched == pytest.approx(0.01, rel=0.1) and pressed == pytest.approx(COMPRESSION * 0.01, rel=0.1)
+
+
+def test_clothes_that_the_body_carries_wholly_have_no_strain():
+    carried = with_values(cut_garment(person(), LOWER.name, standing()), drag=2.5, pin_depth=10.0)
+    edges = ClothEdges.of([carried], torch.device("cpu"))
+    assert not len(edges.ends)
+    assert float(edges.strain(torch.tensor(person().vertices, dtype=torch.float32))) == 0.0
 
 
 @pytest.mark.long
