@@ -109,8 +109,9 @@ def with_a_teacher(run, capture, digests) -> None:
 @pytest.mark.long
 def test_clothes_go_on_from_where_the_teacher_followed_them_beside_a_cold_start(trained, capture, tmp_path, capsys):
     run = shutil.copytree(trained, tmp_path / "run")
-    # A drag that is not the truth's: what was seen of the swing tells it, a cold start does not.
-    save_garments(run / GARMENTS, [with_values(garment(), drag=0.7, pin_depth=0.014)])
+    # A drag far above the truth's: what was seen of the swing tells it, a cold start does not. With a drag near the
+    # truth's both are alike up to chaos, which the last bits of another kind of CPU decide.
+    save_garments(run / GARMENTS, [with_values(garment(), drag=8.0, pin_depth=0.014)])
     digests = open_scene(run, TrainInputs(capture, None, None, (), 1.0, None)).digests
     with_a_teacher(run, capture, digests)
     assert evaluate(run, capture, *FEW) == 0
