@@ -1,4 +1,4 @@
-"""Prediction of a frame's displacements: constant-velocity extrapolation and simulated clothes, weighted by errors."""
+"""What is known of a frame before its photographs: predicted displacements, and lengths that cloth keeps."""
 
 from __future__ import annotations
 

@@ -33,8 +33,9 @@ class TrackConfig:
         views: cameras a step.
         smoothness: weight of the mean squared difference of neighbouring control points' displacements, after the
             predicted shape is subtracted, 1/m^2.
-        strain_weight: weight of the mean squared strain of clothes that can be simulated. Cloth hardly stretches, and
-            where a pattern is matched a period off, it does on one side. Five times as much slows a swing down.
+        strain_weight: weight of the mean squared strain of simulated clothes; without `simulate` there is none. Cloth
+            hardly stretches, and where a pattern is matched a period off, it does on one side. Five times as much slows
+            a swing down.
         prior_weight: weight of the Gaussian prior of simulated clothes about their prediction, along the surface in
             directions that photographs do not determine (along stripes; any on plain cloth), 1/m^2.
         body_motion_weight: weight of the mean displacement of control points off the clothes, 1/m. Parameters locate
