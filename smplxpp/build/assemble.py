@@ -24,6 +24,7 @@ from smplxpp.body import BodyModel
 from smplxpp.build.completeness import photograph_views
 from smplxpp.build.config import BuildConfig, BuildInputs
 from smplxpp.build.data import Part, PosedFit, PreparedScan, RestPart
+from smplxpp.build.parts import without_lids
 from smplxpp.build.scan import raw_scan
 from smplxpp.clean.shreds import cut_borders
 from smplxpp.clean.smooth import smooth_cuts
@@ -72,7 +73,7 @@ def assemble_parts(
         scan: prepared, for the colours of the skin.
         face_labels: of the scan.
         fit: the posed body.
-        cleaned: the parts before bridges were cut, which tell the holes of a cut from openings.
+        cleaned: the parts before lids and bridges were cut; without lids they tell the holes of a cut from openings.
         parts: the same parts without bridges, in the T-pose.
         config: choices of the build.
         labels: what the ids of labels stand for.
@@ -97,7 +98,7 @@ def assemble_parts(
             scan_index=_of_file(scan, part.source_vertex),
         )
         canonical[name], filled[name] = _filled(
-            made, before, part, fit, taken=taken, legs=legs, config=config.fill_holes
+            made, without_lids(before, fit, labels), part, fit, taken=taken, legs=legs, config=config.fill_holes
         )
     # The clearance is given in millimetres by the user; every length inside the package is in metres.
     settings = AssemblyConfig(clearance=config.clearance_mm / MM, labels=labels)

@@ -17,6 +17,7 @@ from smplxpp.build.config import BuildConfig
 from smplxpp.build.data import Part, PosedFit, PreparedScan
 from smplxpp.clean import BridgeConfig, PartsConfig, clean_parts, cut_bridges, find_bridges, find_tears
 from smplxpp.clean.shreds import cut_borders, drawn_out, find_shreds
+from smplxpp.cloth.cloth_mesh import find_opening_lids
 from smplxpp.core import (
     LABELS,
     SKIN,
@@ -98,8 +99,8 @@ def transfer_to_parts(
     checks: list[Check] = []
     numbers: dict[str, Any] = {}
     axes = limb_axes(fit.mesh, body.weights, extent(fit.mesh), TransferConfig(joint_names=body.joint_names))
-    for name, part in cleaned.items():
-        label = labels[part.label]
+    for name, scanned in cleaned.items():
+        label, part = labels[scanned.label], without_lids(scanned, fit, labels)
         rule = PartRule.parse(config.rules.get(name, label.rule))
         pieces = rules_of_pieces(name, part.mesh, config.rules)
         if rule.kind in ("rigid", "isolate") and not pieces:
@@ -128,6 +129,7 @@ def transfer_to_parts(
             "rule": config.rules.get(name, label.rule),
             "report": report.as_dict(),
             "folded_vertices": int(folded.sum()),
+            "lid_faces": scanned.mesh.face_count - part.mesh.face_count,
             "web_faces": part.mesh.face_count - mesh.face_count,
             "web_area_share": 1.0 - float(mesh.face_areas.sum() / part.mesh.face_areas.sum()),
         }
@@ -146,6 +148,22 @@ def transfer_to_parts(
             ),
         ]
     return parts, weights, StageOutput(checks, numbers)
+
+
+def without_lids(part: Part, fit: PosedFit, labels: Labels) -> Part:
+    """Return clothing without the lids that a scan closes wide openings with (`find_opening_lids`); others as they are.
+
+    They are looked for where the pelvis is upright, as in the T-pose.
+    """
+    if labels[part.label] not in labels.cloth or labels[part.label].stiff:
+        return part
+    turn = fit.posed_from_rest[0, :3, :3]
+    own, body = (mesh.with_vertices(mesh.vertices @ turn) for mesh in (part.mesh, fit.mesh))
+    lids = find_opening_lids(own, body)
+    if not lids.any():
+        return part
+    mesh, kept = cut_bridges(part.mesh, lids)
+    return Part(mesh, part.label, part.source_vertex[kept], part.colors[kept])
 
 
 def cut_check(name: str, share: float) -> Check:

@@ -18,8 +18,11 @@ from smplxpp.template.template import BODY_PART, Template
 
 # Metres from an opening's border: a bridge is as wide as the gap between a hem and what it hangs over.
 REACH = 0.035
-# Cosine to the opening's axis from which a surface closes the opening instead of going on to it.
-_VERTEX, _FACE = 0.35, 0.2
+# The same where a bridge goes on evenly, as a lid under a wide skirt does: half of the widest hem's width.
+_LID_REACH = 0.3
+# Cosine to the opening's axis from which a surface closes the opening instead of going on to it; and of a lid beyond
+# `REACH`, where folds of a hem look aside.
+_VERTEX, _FACE, _LID = 0.35, 0.2, 0.5
 # Cosine of its axis to the vertical from which an opening looks up: shoulders lie about a neckline and look up as well.
 _UPWARDS = 0.3
 # Metres behind a bridge at which there is nothing but the inside of the garment; behind cloth that lies on the body
@@ -30,9 +33,10 @@ _HOLLOW = (0.03, 0.06)
 def find_opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
     """Find the faces of a template's clothes that close an opening, in the T-pose.
 
-    A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, look along the
-    opening's axis, which cloth that continues to the border does not, and have a hollow behind them. Small pieces that
-    only such faces join to the rest are bridges, too. A body without an inside has none. The array is read-only.
+    A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, or go on from
+    there as a lid, look along the opening's axis, which cloth that continues to the border does not, and have a hollow
+    behind them. Small pieces that only such faces join to the rest are bridges, too. A body without an inside has none.
+    The array is read-only.
     """
     if template not in _BRIDGES:
         _BRIDGES[template] = _opening_bridges(template)
@@ -62,8 +66,34 @@ def _opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
     return out
 
 
+def find_opening_lids(mesh: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray, " M"]:
+    """Find the faces of bridges over openings that reach farther than `REACH`, as a scan closes a wide skirt below.
+
+    Cameras do not look up into a skirt, and what none sees stays solid: its hem is joined to the calves, and the legs
+    to each other. Narrow bridges stay: they hide a gap and are no wider than a hem's fold.
+
+    Args:
+        mesh: a piece of clothing in the T-pose, oriented outwards.
+        body: the naked body in the T-pose, closed or nearly.
+    """
+    try:
+        field = SignedDistanceField(body, solid=True)
+    except InputError:  # without an inside of the body there are no hollows
+        return np.zeros(mesh.face_count, dtype=bool)
+    bridges = _bridges_of(mesh, field)
+    # A lid is a connected bridge with a vertex that far from every border.
+    borders = [loop for loop in border_loops(mesh.faces) if loop_length(mesh, loop) >= SHORTEST_OPENING]
+    if not borders or not bridges.any():
+        return np.zeros(mesh.face_count, dtype=bool)
+    far = (geodesics(mesh, np.concatenate(borders))[0] > REACH)[mesh.faces].any(axis=1)
+    piece = _connected(mesh, bridges)
+    return bridges & np.isin(piece, np.unique(piece[bridges & far]))
+
+
 def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, " M"]:
     bridges = np.zeros(mesh.face_count, dtype=bool)
+    normals = mesh.vertex_normals
+    smooth = normals[mesh.faces].mean(axis=1)
     for loop in border_loops(mesh.faces):
         if loop_length(mesh, loop) < SHORTEST_OPENING:
             continue
@@ -72,18 +102,34 @@ def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarra
             continue
         # Faces near such an opening that look along its axis close it like a lid: all corners do, or the face and
         # one corner.
-        near = geodesics(mesh, loop)[0] < REACH
-        looks = (near & (mesh.vertex_normals @ axis > _VERTEX))[mesh.faces]
+        distance = geodesics(mesh, loop)[0]
+        near = distance < REACH
+        looks = (near & (normals @ axis > _VERTEX))[mesh.faces]
         along = near[mesh.faces].any(axis=1) & (mesh.face_normals @ axis > _FACE)
-        bridges |= looks.all(axis=1) | (looks.any(axis=1) & along)
-    found = np.flatnonzero(bridges)
-    # Behind a true bridge there is air. Faces with the body behind them are the garment itself and stay.
+        start = _hollow(mesh, looks.all(axis=1) | (looks.any(axis=1) & along), body)
+        # A lid goes on from there.
+        beyond = _hollow(mesh, (distance < _LID_REACH)[mesh.faces].all(axis=1) & (smooth @ axis > _LID), body)
+        piece = _connected(mesh, start | beyond)
+        bridges |= np.isin(piece, np.unique(piece[start]))
+    return bridges | _crumbs(mesh, bridges)
+
+
+def _hollow(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"], body: SignedDistanceField) -> Bool[np.ndarray, " M"]:
+    """Return those of some faces behind which there is air; with the body behind them they are the garment itself."""
+    found = np.flatnonzero(faces)
     for depth in _HOLLOW:
         behind = mesh.face_centers[found] - depth * mesh.face_normals[found]
         found = found[body.query(behind).distance > 0] if len(found) else found
-    bridges[:] = False
-    bridges[found] = True
-    return bridges | _crumbs(mesh, bridges)
+    out = np.zeros(mesh.face_count, dtype=bool)
+    out[found] = True
+    return out
+
+
+def _connected(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"]) -> Int[np.ndarray, " M"]:
+    """Return the connected piece, from 0 on, of each of some faces; -1 for the others."""
+    piece = np.full(mesh.face_count, -1)
+    piece[faces] = face_components(mesh.faces[faces])
+    return piece
 
 
 def _crumbs(mesh: TriangleMesh, bridges: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
@@ -92,9 +138,8 @@ def _crumbs(mesh: TriangleMesh, bridges: Bool[np.ndarray, " M"]) -> Bool[np.ndar
 
     As cloth they would be carried by what is nearest, up to a decimetre away, and be torn when that swings.
     """
-    left = np.flatnonzero(~bridges)
-    piece = np.full(mesh.face_count, -1)
-    piece[left] = face_components(mesh.faces[left])
+    left = ~bridges
+    piece = _connected(mesh, left)
     pairs = face_adjacency(mesh.faces)[0]
     across = bridges[pairs[:, 0]] != bridges[pairs[:, 1]]
     beside = np.unique(piece[pairs[across]])

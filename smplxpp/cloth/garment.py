@@ -217,7 +217,15 @@ def usual_config(template: Template, part: str) -> GarmentConfig:
     if template.label_of(part).kind != HAIR.name:
         return GarmentConfig()
     return GarmentConfig(
-        fabric=Fabric(density=1.0, bend_stiffness=1e-4, drag=1.2, normal_drag=0.4, inner_friction=4.0, friction=0.3)
+        fabric=Fabric(
+            density=1.0,
+            compression=0.16,
+            bend_stiffness=1e-4,
+            drag=1.2,
+            normal_drag=0.4,
+            inner_friction=4.0,
+            friction=0.3,
+        )
     )
 
 

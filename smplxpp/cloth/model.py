@@ -23,7 +23,8 @@ class Fabric:
         density: kg a square metre.
         stretch_stiffness: N/m of a sheet that is pulled: an edge of length l between triangles of area A has the
             stiffness `stretch_stiffness A / l^2`.
-        compression: share of it with which an edge resists being shortened; a thread buckles.
+        compression: share of it with which an edge resists being shortened. Between particles that are centimetres
+            apart cloth buckles; edges that resist more hold a skirt open and stiff.
         bend_stiffness: N m: how strongly a hinge returns to its curvature at rest. 0: not at all, which saves a third
             of the time.
         slack: relative elongation of the path from an attachment that tethers allow.
@@ -35,7 +36,7 @@ class Fabric:
 
     density: float = 0.22
     stretch_stiffness: float = 660.0
-    compression: float = 0.16
+    compression: float = 0.03
     bend_stiffness: float = 1e-6
     slack: float = 0.0
     drag: float = 2.5

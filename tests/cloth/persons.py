@@ -21,12 +21,12 @@ WAIST, HEM = 0.95, 0.45
 
 @cache
 def person(
-    *, bridge: bool = False, tight: bool = True, outwards: bool = True, torn: bool = False, layers: int = 1
+    *, bridge: int = 0, tight: bool = True, outwards: bool = True, torn: bool = False, layers: int = 1
 ) -> Template:
     """Hips, two legs, a head, and a skirt from the waist to the knees.
 
     Args:
-        bridge: a ring of faces closes the hem inwards, as a scan does.
+        bridge: rings of faces that close the hem inwards, as a scan does, a centimetre each.
         tight: the waistband lies on the hips; else it hangs 9 cm from them.
         outwards: the skirt's faces look out.
         torn: a slit from hem to waist, and a piece that hangs together with nothing.
@@ -58,7 +58,7 @@ def _leg(name: str, x: float) -> Part:
     return Part(part.vertices + [x, 0.0, 0.0], part.faces, part.joints)
 
 
-def _skirt(*, bridge: bool, tight: bool, outwards: bool, torn: bool) -> Part:
+def _skirt(*, bridge: int, tight: bool, outwards: bool, torn: bool) -> Part:
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
     circle = np.stack([np.sin(angle), np.zeros(AROUND), np.cos(angle)], axis=1)
     t = np.linspace(0.0, 1.0, DOWN)
@@ -67,8 +67,7 @@ def _skirt(*, bridge: bool, tight: bool, outwards: bool, torn: bool) -> Part:
     rings = [
         circle * [0.158 + w, 0, 0.119 + w] + [0, (1 - s) * WAIST + s * HEM, 0] for s, w in zip(t, wide, strict=True)
     ]
-    if bridge:  # 3 cm inwards
-        rings += [rings[-1] * [s, 1, s] for s in (0.95, 0.9)]
+    rings += [rings[-1] * [s, 1, s] for s in 1.0 - 0.05 * np.arange(1, bridge + 1)]
     rows = len(rings)
     a = (np.arange(rows - 1)[:, None] * AROUND + np.arange(AROUND)).ravel()
     b = (np.arange(rows - 1)[:, None] * AROUND + (np.arange(AROUND) + 1) % AROUND).ravel()

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.accuracy.cloth_stress import dressed
 from smplxpp.body import load_body
 from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
-from smplxpp.cloth.cloth_mesh import find_opening_bridges
+from smplxpp.cloth.cloth_mesh import find_opening_bridges, find_opening_lids
 from smplxpp.cloth.garment import find_carriers, usual_config
 from smplxpp.core import HAIR, GeometryWarning, InputError, TriangleMesh
 from smplxpp.people.garments.cut import tube_along
@@ -115,20 +115,38 @@ def test_another_pin_depth_holds_more_without_cutting_anew():
 
 @pytest.mark.long
 def test_a_bridge_under_a_hem_is_found_and_cut_off():
-    template = person(bridge=True)
+    template = person(bridge=2)
     bridge = find_opening_bridges(template)
     heights = template.vertices[template.faces[bridge]][..., 1]
     assert bridge.sum() == 192 and np.ptp(heights) < 1e-9 and heights[0, 0] == pytest.approx(HEM)
-    with_bridge, without = cut(bridge=True), cut()
+    with_bridge, without = cut(bridge=2), cut()
     assert with_bridge.rest.face_areas.sum() == pytest.approx(without.rest.face_areas.sum(), rel=0.01)
     # Its vertices ride along.
     assert len(with_bridge.vertices) == len(without.vertices) + 96
     assert np.isfinite(with_bridge.vertex_depth).all() and with_bridge.share()[-96:].min() == 1.0
 
 
+@pytest.mark.parametrize("outwards", [True, False])
+def test_a_lid_under_a_wide_skirt_is_a_bridge_as_a_whole(outwards):
+    """The scan of a calf-length skirt closed all of it below; simulated, its hem was tied across."""
+    template, without = person(bridge=5, outwards=outwards), person(outwards=outwards)
+    bridge = find_opening_bridges(template)
+    assert bridge.sum() == 5 * 96 and np.ptp(template.vertices[template.faces[bridge]][..., 1]) < 1e-9
+    assert cut(bridge=5).rest.face_areas.sum() == pytest.approx(cut().rest.face_areas.sum(), rel=0.01)
+    # As a part of a scan it is cut; what is no wider than a hem's gap stays.
+    body = template.part_mesh(BODY_PART)
+    if outwards:
+        lids = find_opening_lids(template.part_mesh(PART), body)
+        np.testing.assert_array_equal(lids, bridge[template.part_faces(PART)])
+        for other in (person(bridge=2), without):
+            assert not find_opening_lids(other.part_mesh(PART), body).any()
+        inwards = TriangleMesh(body.vertices, body.faces[:, ::-1])
+        assert not find_opening_lids(template.part_mesh(PART), inwards).any()
+
+
 @pytest.mark.parametrize("moved", [0.05, -0.05])
 def test_a_dent_in_a_bridge_is_the_bridges(moved):
-    flat = person(bridge=True)
+    flat = person(bridge=2)
     bridge = find_opening_bridges(flat)
     ring = np.unique(flat.faces[bridge])
     # Of its inner edge: no face around such a vertex touches the skirt.
@@ -147,7 +165,7 @@ def test_a_skirt_without_a_bridge_has_none_and_nobody_takes_a_waist_for_one():
 
 
 def test_a_body_that_is_no_solid_has_no_bridges_and_carries_nothing():
-    template = person(bridge=True)
+    template = person(bridge=2)
     faces = template.faces.copy()
     body = template.part_faces(BODY_PART)
     faces[body] = faces[body][:, ::-1]
