@@ -21,10 +21,13 @@ REACH = 0.035
 # The same where a bridge goes on evenly, as a lid under a wide skirt does: half of the widest hem's width.
 _LID_REACH = 0.3
 # Cosine to the opening's axis from which a surface closes the opening instead of going on to it; and of a lid beyond
-# `REACH`, where folds of a hem look aside.
+# `REACH`, where folds of a hem look aside; and the mean, to the vertical, of a whole lid.
 _VERTEX, _FACE, _LID = 0.35, 0.2, 0.5
+_LEVEL = 0.3
 # Cosine of its axis to the vertical from which an opening looks up: shoulders lie about a neckline and look up as well.
 _UPWARDS = 0.3
+# The same of openings that may have a lid, hems: beyond `REACH` of a hood's or a scarf's border there is cloth.
+_DOWNWARDS = -0.7
 # Metres behind a bridge at which there is nothing but the inside of the garment; behind cloth that lies on the body
 # there is the body.
 _HOLLOW = (0.03, 0.06)
@@ -81,13 +84,13 @@ def find_opening_lids(mesh: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray
     except InputError:  # without an inside of the body there are no hollows
         return np.zeros(mesh.face_count, dtype=bool)
     bridges = _bridges_of(mesh, field)
-    # A lid is a connected bridge with a vertex that far from every border.
+    # A lid is a connected bridge with a face that far from every border.
     borders = [loop for loop in border_loops(mesh.faces) if loop_length(mesh, loop) >= SHORTEST_OPENING]
     if not borders or not bridges.any():
         return np.zeros(mesh.face_count, dtype=bool)
-    far = (geodesics(mesh, np.concatenate(borders))[0] > REACH)[mesh.faces].any(axis=1)
-    piece = _connected(mesh, bridges)
-    return bridges & np.isin(piece, np.unique(piece[bridges & far]))
+    far = (geodesics(mesh, np.concatenate(borders))[0] > REACH)[mesh.faces].all(axis=1)
+    piece = _level(mesh, bridges)
+    return np.isin(piece, np.unique(piece[(piece >= 0) & far]))
 
 
 def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, " M"]:
@@ -107,10 +110,12 @@ def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarra
         looks = (near & (normals @ axis > _VERTEX))[mesh.faces]
         along = near[mesh.faces].any(axis=1) & (mesh.face_normals @ axis > _FACE)
         start = _hollow(mesh, looks.all(axis=1) | (looks.any(axis=1) & along), body)
+        bridges |= start
         # A lid goes on from there.
-        beyond = _hollow(mesh, (distance < _LID_REACH)[mesh.faces].all(axis=1) & (smooth @ axis > _LID), body)
-        piece = _connected(mesh, start | beyond)
-        bridges |= np.isin(piece, np.unique(piece[start]))
+        if axis[1] < _DOWNWARDS:
+            beyond = _hollow(mesh, (distance < _LID_REACH)[mesh.faces].all(axis=1) & (smooth @ axis > _LID), body)
+            piece = _level(mesh, start | beyond)
+            bridges |= np.isin(piece, np.unique(piece[start & (piece >= 0)]))
     return bridges | _crumbs(mesh, bridges)
 
 
@@ -130,6 +135,17 @@ def _connected(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"]) -> Int[np.ndar
     piece = np.full(mesh.face_count, -1)
     piece[faces] = face_components(mesh.faces[faces])
     return piece
+
+
+def _level(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"]) -> Int[np.ndarray, " M"]:
+    """Return the connected piece, from 0 on, of each of some faces; -1 for others, and for pieces that are upright.
+
+    A lid is level as a whole, where the back of a rolled scarf is not: its area from below, over all of it.
+    """
+    piece = _connected(mesh, faces)
+    areas = np.bincount(piece[faces], mesh.face_areas[faces], 1)
+    below = np.bincount(piece[faces], -(mesh.face_areas * mesh.face_normals[:, 1])[faces], 1)
+    return np.where(faces & (below > _LEVEL * areas)[piece], piece, -1)
 
 
 def _crumbs(mesh: TriangleMesh, bridges: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:

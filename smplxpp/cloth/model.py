@@ -36,7 +36,7 @@ class Fabric:
 
     density: float = 0.22
     stretch_stiffness: float = 660.0
-    compression: float = 0.03
+    compression: float = 0.05
     bend_stiffness: float = 1e-6
     slack: float = 0.0
     drag: float = 2.5
