@@ -17,7 +17,8 @@ starts from its nearest solved neighbour (`track.TrackTask`).
          + prior_weight * mean (d - a)^T W (d - a)           Gaussian prior about the anchor a, in directions W
          + body_motion_weight * mean rho(|d|)                pseudo-Huber penalty, off the clothes and near the skin
 
-**Predictions** (`cloth_prediction.ClothPrediction`) give the start, the shape s and the anchor a. Two predictors exist:
+**Predictions** (`cloth_prediction.ClothPrediction`) give the start and the anchor a; s is a on simulated clothes and 0,
+skinning, elsewhere. Two predictors exist:
 extrapolation of the last two frames at constant velocity, and simulated cloth plus the last frame's correction, which
 decays exponentially. They are averaged with inverse mean squared errors over the last solved frames, for each garment.
 

@@ -212,23 +212,6 @@ class ClothPrediction:
         """
         return self._combined(frame, solved, self._decaying, preference=2.0)
 
-    def rest_shape(self, frame: int, solved: Solved) -> Float[Tensor, "K 3"]:
-        """Return the shape about which a frame's displacements are smooth: between 0 (skinning) and the simulation.
-
-        Both are weighted by the inverse of their mean squared error in the last solved frames.
-        """
-        if self.simulated is None:
-            return torch.zeros_like(next(iter(solved.values()))[0])
-        # In the recent frames: the error of skinning is the whole displacement, that of the simulation the difference
-        # to it.
-        own, errors = self.simulated.displacements, []
-        for one in self._recent(frame, solved):
-            found, observed = solved[one]
-            true = found - self._reference_offset(solved)
-            errors.append((_observed_part(true, observed), _observed_part(own[one] - true, observed)))
-        weight = self._simulation_weight(errors)
-        return weight[:, None] * own[frame]
-
     def _combined(self, frame: int, solved: Solved, other: Predictor, preference: float = 1.0) -> Tensor:
         """Return the weighted mean of the simulated prediction and another one.
 

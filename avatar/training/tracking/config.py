@@ -58,7 +58,7 @@ class TrackConfig:
         seed: of the order of views.
     """
 
-    levels: tuple[Level, ...] = (Level(2, 20, 8e-3), Level(1, 16, 6e-3), Level(0, 20, 3e-3))
+    levels: tuple[Level, ...] = (Level(2, 40, 10e-3), Level(1, 16, 6e-3), Level(0, 20, 3e-3))
     control_points: int = 2400
     views: int = 4
     smoothness: float = 80.0

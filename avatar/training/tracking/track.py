@@ -228,7 +228,10 @@ class TrackTask(PhotometricTask):
         anchor = self.prediction.anchor(frame, solved)
         # Start at the anchor in the directions that photographs do not determine.
         start = start + torch.einsum("kij,kj->ki", weight, anchor - start)
-        return FramePriors(start, self.prediction.rest_shape(frame, solved), anchor, weight)
+        # Simulated clothes are smooth about the anchor. About what a simulation alone predicts smoothness would hold a
+        # swing back; what is not simulated is smooth about skinning, without memory of the frames before.
+        rest_shape = (self.prediction.share * anchor[..., None])[..., 0]
+        return FramePriors(start, rest_shape, anchor, weight)
 
     def _observed(self, row: int) -> Tensor:
         """Return the projection I - W on the directions that a solved frame's photographs determined."""

@@ -69,8 +69,10 @@ def test_simulated_clothes_predict_a_swing_that_extrapolation_misses():
 
 def test_simulations_with_large_errors_have_little_weight():
     nonsense = simulated(3.0, scale=6.0)
-    shape, right = (ClothPrediction(1.0, one, 0, fps=FPS).rest_shape(8, solved(8)) for one in (nonsense, simulated()))
-    assert shape[:3].norm(dim=-1).max() < 0.1 * nonsense.displacements[8][0].norm()
+    wrong, right, none = (
+        ClothPrediction(1.0, one, 0, fps=FPS).anchor(8, solved(8)) for one in (nonsense, simulated(), None)
+    )
+    assert (wrong - none)[:3].norm(dim=-1).max() < 0.1 * nonsense.displacements[8][0].norm()
     torch.testing.assert_close(right[:3], swung(8)[:3], rtol=0.05, atol=0.0)
     assert start_error(ClothPrediction(1.0, nonsense, 0, fps=FPS)) < 1.3 * start_error(ClothPrediction(1.0, fps=FPS))
 
