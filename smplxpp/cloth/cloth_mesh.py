@@ -18,16 +18,10 @@ from smplxpp.template.template import BODY_PART, Template
 
 # Metres from an opening's border: a bridge is as wide as the gap between a hem and what it hangs over.
 REACH = 0.035
-# The same where a bridge goes on evenly, as a lid under a wide skirt does: half of the widest hem's width.
-_LID_REACH = 0.3
-# Cosine to the opening's axis from which a surface closes the opening instead of going on to it; and of a lid beyond
-# `REACH`, where folds of a hem look aside; and the mean, to the vertical, of a whole lid.
-_VERTEX, _FACE, _LID = 0.35, 0.2, 0.5
-_LEVEL = 0.3
+# Cosine to the opening's axis from which a surface closes the opening instead of going on to it.
+_VERTEX, _FACE = 0.35, 0.2
 # Cosine of its axis to the vertical from which an opening looks up: shoulders lie about a neckline and look up as well.
 _UPWARDS = 0.3
-# The same of openings that may have a lid, hems: beyond `REACH` of a hood's or a scarf's border there is cloth.
-_DOWNWARDS = -0.7
 # Metres behind a bridge at which there is nothing but the inside of the garment; behind cloth that lies on the body
 # there is the body.
 _HOLLOW = (0.03, 0.06)
@@ -36,8 +30,8 @@ _HOLLOW = (0.03, 0.06)
 def find_opening_bridges(template: Template) -> Bool[np.ndarray, " F"]:
     """Find the faces of a template's clothes that close an opening, in the T-pose.
 
-    A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, or go on from
-    there as a lid, look along the opening's axis, which cloth that continues to the border does not, and have a hollow
+    A scan runs from a hem's edge inwards to the leg. Such faces lie within `REACH` of the part's border, or continue
+    those as a lid, look along the opening's axis, which cloth that continues to the border does not, and have a hollow
     behind them. Small pieces that only such faces join to the rest are bridges, too. A body without an inside has none.
     The array is read-only.
     """
@@ -94,6 +88,9 @@ def find_opening_lids(mesh: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray
 
 
 def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, " M"]:
+    # A lid continues a bridge evenly under an opening that looks down, a hem: within half of the widest hem's width,
+    # its faces look along the axis more than folds of a hem do. Inside of a hood's or a scarf's border there is cloth.
+    downwards, lid_reach, lid_cosine = -0.7, 0.3, 0.5
     bridges = np.zeros(mesh.face_count, dtype=bool)
     normals = mesh.vertex_normals
     smooth = normals[mesh.faces].mean(axis=1)
@@ -111,10 +108,9 @@ def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarra
         along = near[mesh.faces].any(axis=1) & (mesh.face_normals @ axis > _FACE)
         start = _hollow(mesh, looks.all(axis=1) | (looks.any(axis=1) & along), body)
         bridges |= start
-        # A lid goes on from there.
-        if axis[1] < _DOWNWARDS:
-            beyond = _hollow(mesh, (distance < _LID_REACH)[mesh.faces].all(axis=1) & (smooth @ axis > _LID), body)
-            piece = _level(mesh, start | beyond)
+        if axis[1] < downwards:
+            inner = (distance < lid_reach)[mesh.faces].all(axis=1) & (smooth @ axis > lid_cosine)
+            piece = _level(mesh, start | _hollow(mesh, inner, body))
             bridges |= np.isin(piece, np.unique(piece[start & (piece >= 0)]))
     return bridges | _crumbs(mesh, bridges)
 
@@ -140,12 +136,13 @@ def _connected(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"]) -> Int[np.ndar
 def _level(mesh: TriangleMesh, faces: Bool[np.ndarray, " M"]) -> Int[np.ndarray, " M"]:
     """Return the connected piece, from 0 on, of each of some faces; -1 for others, and for pieces that are upright.
 
-    A lid is level as a whole, where the back of a rolled scarf is not: its area from below, over all of it.
+    A lid is level as a whole, where the back of a rolled scarf is not.
     """
+    level = 0.3  # share of a lid's area that is seen from below; lids between the folds of a skirt have 0.4 and more
     piece = _connected(mesh, faces)
     areas = np.bincount(piece[faces], mesh.face_areas[faces], 1)
     below = np.bincount(piece[faces], -(mesh.face_areas * mesh.face_normals[:, 1])[faces], 1)
-    return np.where(faces & (below > _LEVEL * areas)[piece], piece, -1)
+    return np.where(faces & (below > level * areas)[piece], piece, -1)
 
 
 def _crumbs(mesh: TriangleMesh, bridges: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
