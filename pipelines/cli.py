@@ -21,7 +21,7 @@ from pipelines.commands.help import alike, checked_arguments, command_help
 from pipelines.commands.terminal import OutputError, end_of_output, error_in_words, print_error, standard_streams
 from pipelines.runs.folders import refuse_old_run
 from smplxpp import __version__
-from smplxpp.core.errors import InputError, MissingExtraError
+from smplxpp.core.errors import InputError, MissingExtraError, ToldInputError
 from smplxpp.core.files.json_file import jsonable
 
 # command -> (module, dataclass, one line of help)
@@ -231,6 +231,8 @@ def _answer(args: list[str], console: Console) -> int:
     # A closed pipe is no error of the input: the caller gives it an exit status of its own.
     except OutputError:
         raise
+    except ToldInputError:
+        return USER_ERROR
     except (InputError, MissingExtraError, OSError) as error:
         print_error(error, console)
         if "--json" in rest:

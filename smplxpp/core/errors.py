@@ -42,6 +42,10 @@ class InputError(ValueError):
         super().__init__(f"{message} {remedy[:1].upper()}{remedy[1:]}{end}" if remedy else message)
 
 
+class ToldInputError(InputError):
+    """An error that another process of the same command prints."""
+
+
 class GeometryWarning(UserWarning):
     """A repair that was made or a questionable quantity: the result is usable, but should be looked at.
 

@@ -299,6 +299,15 @@ def test_two_processes_that_the_command_starts_train_what_those_of_torchrun_do(f
     assert same_models(fitted, other)
 
 
+@pytest.mark.long
+def test_an_error_of_the_inputs_is_told_once_by_all_processes(capture, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    (tmp_path / "run").mkdir()
+    command = ["-m", "pipelines.cli", "train", str(tmp_path / "run"), "--capture", str(capture), "--processes", "2"]
+    done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 2 and done.stderr.count("error:") == 1, done.stderr
+
+
 def test_processes_get_the_options_of_the_command(monkeypatch, tmp_path):
     asked = []
     monkeypatch.setattr(process, "run_together", lambda *args, **options: asked.append((args, options)) or (0, "{}"))

@@ -20,7 +20,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from smplxpp.core.errors import InputError
+from smplxpp.core.errors import InputError, ToldInputError
 from smplxpp.core.files.json_file import parse_json
 
 S = TypeVar("S")
@@ -127,7 +127,7 @@ class Distributed:
         if error is not None:
             raise error
         if "error" in answer:
-            raise InputError(answer["error"][0], **answer["error"][1])
+            raise ToldInputError(answer["error"][0], **answer["error"][1])
         # Tensors follow one by one, so that no process holds all of them twice.
         if not self.first:
             return _unpacked(answer["result"], kinds, self._receive)
@@ -157,16 +157,17 @@ class Distributed:
                 answer = {"same": same(result)}
             except Exception as caught:  # noqa: BLE001  raised again below, after the others know
                 error, answer = caught, {"error": _error_fields(caught, self.rank)}
-        # An own error is raised as it is, another process's in its words.
+        # The first process raises its own error as it is, or another's in its words, and tells it for all.
         answers = self._gather(answer)
-        if error is not None:
+        if error is not None and (self.first or not isinstance(error, InputError)):
             raise error
+        kind = InputError if self.first else ToldInputError
         for answer in answers:
             if "error" in answer:
-                raise InputError(answer["error"][0], **answer["error"][1])
+                raise kind(answer["error"][0], **answer["error"][1]) from error
         others = [str(rank) for rank, answer in enumerate(answers) if answer != answers[0]]
         if others:
-            raise InputError(
+            raise kind(
                 "inputs of the processes",
                 expected="the same files on every machine",
                 received=f"other contents on rank {', '.join(others)} than on rank 0",
