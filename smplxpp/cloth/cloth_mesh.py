@@ -78,13 +78,14 @@ def find_opening_lids(mesh: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray
     except InputError:  # without an inside of the body there are no hollows
         return np.zeros(mesh.face_count, dtype=bool)
     bridges = _bridges_of(mesh, field)
-    # A lid is a connected bridge with a face that far from every border.
+    # A lid is a connected bridge from the border to a face that far from every border.
     borders = [loop for loop in border_loops(mesh.faces) if loop_length(mesh, loop) >= SHORTEST_OPENING]
     if not borders or not bridges.any():
         return np.zeros(mesh.face_count, dtype=bool)
-    far = (geodesics(mesh, np.concatenate(borders))[0] > REACH)[mesh.faces].all(axis=1)
+    distance = geodesics(mesh, np.concatenate(borders))[0][mesh.faces]
     piece = _level(mesh, bridges)
-    return np.isin(piece, np.unique(piece[(piece >= 0) & far]))
+    found = [np.unique(piece[there]) for there in ((distance > REACH).all(axis=1), (distance == 0.0).any(axis=1))]
+    return np.isin(piece, np.setdiff1d(np.intersect1d(*found), -1))
 
 
 def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, " M"]:
