@@ -26,9 +26,10 @@ class CalibrationConfig:
     Attributes:
         drags: 1/s.
         pin_depths: metres. All pairs are tried; what lies between them is chaos's luck.
-        drag_prior: how far the garment's own drag is believed: the distance counts as larger by this share for each
-            squared factor of two from it. Slow motion tells drags hardly apart, and what was followed there is stiffer
-            than cloth; a motion that does tell finds the same drag with and without it.
+        prior: how far the garment's own drag and pin depth are believed: the distance counts as larger by this share
+            for each squared factor of two from them. Slow motion tells drags hardly apart, and what was followed there
+            is stiffer than cloth; a motion that does tell finds the same drag with and without it. Pin depths differ by
+            less than folds do by chance.
         least_motion: mean distance, in metres, of the tracked surface to skinning from which a part is loose.
         most_share: of skinning's distance to the followed surface that the simulation's may have for what was fitted to
             be kept; else the surface was followed too badly to say anything, and the values stay what they were.
@@ -37,7 +38,7 @@ class CalibrationConfig:
 
     drags: tuple[float, ...] = (0.625, 1.25, 2.5, 5.0, 10.0)
     pin_depths: tuple[float, ...] = (0.014, 0.03)
-    drag_prior: float = 0.08
+    prior: float = 0.08
     least_motion: float = 0.006
     most_share: float = 0.85
     blocks: int = 4
@@ -47,7 +48,7 @@ class CalibrationConfig:
             values = getattr(self, name)
             if not values or min(values) <= 0:
                 raise InputError(f"calibration: {name}", expected="one or more above 0", received=str(values))
-        for name in ("drag_prior", "least_motion"):
+        for name in ("prior", "least_motion"):
             require_at_least(f"calibration: {name}", getattr(self, name), 0.0)
         require_between("calibration: most_share", self.most_share, 0.0, 1.0)
         require_at_least("calibration: blocks", self.blocks, 2)
@@ -178,10 +179,9 @@ def calibrate(
         """The pair of the least distance in these frames, the prior counted."""
 
         def cost(pair: tuple[float, float]) -> float:
-            # The prior is quadratic in the logarithm of the drag: it grows with the octaves away from the fabric's
-            # value.
-            octaves = np.log2(pair[0] / garment.config.fabric.drag)
-            return float(table[pair][frames].mean() * (1.0 + config.drag_prior * octaves**2))
+            # The prior is quadratic in the logarithms: it grows with the octaves away from the garment's values.
+            octaves = np.log2(np.divide(pair, (garment.config.fabric.drag, garment.config.pin_depth)))
+            return float(table[pair][frames].mean() * (1.0 + config.prior * octaves @ octaves))
 
         return min(table, key=cost)
 
