@@ -21,3 +21,12 @@ def test_holes_that_cuts_leave_are_closed_in_the_template_and_the_report_counts_
     assert quality.faces == cut.face_count + filled["upper"]["faces"]
     assert (template.scan_index[template.vertex_part == template.part_names.index("upper")] < 0).any()
     assert "holes of cuts" in (person_run / "report.html").read_text()
+
+
+def test_the_lid_that_the_scan_closes_the_skirt_with_is_no_part_of_the_template(person_run):
+    numbers = json.loads((person_run / "40_transfer" / "manifest.json").read_text())["numbers"]
+    assert numbers["lower"]["lid_faces"] > 500 and numbers["upper"]["lid_faces"] == numbers["hair"]["lid_faces"] == 0
+    skirt = Template.load(person_run / TEMPLATE).part_mesh("lower")
+    assert mesh_quality(skirt).border_loops == 2  # waist and hem
+    # Of the skirt's area no more than a hem's fold looks down.
+    assert skirt.face_areas[skirt.face_normals[:, 1] < -0.8].sum() < 0.01 * skirt.face_areas.sum()
