@@ -86,10 +86,12 @@ def assemble_parts(
     words = ("hip", "knee", "ankle", "foot")
     own = [joint if any(word in joint for word in words) else "" for joint in body.joint_names]
     legs = np.array([1.0 * joint.startswith("left") - joint.startswith("right") for joint in own])
-    for name, before in cleaned.items():
+    for name, scanned in cleaned.items():
         # A part's vertices at rest come from the inverse skinning of its posed mesh. The faces are the same in both
         # poses.
         part = parts[name].posed
+        # What the transfer cut as lids left openings. They are found again, as stages keep parts as they were cleaned.
+        before = without_lids(scanned, fit, labels)
         made = CanonicalPart(
             mesh=part.mesh.with_vertices(parts[name].vertices),
             weights=parts[name].weights,
@@ -98,7 +100,7 @@ def assemble_parts(
             scan_index=_of_file(scan, part.source_vertex),
         )
         canonical[name], filled[name] = _filled(
-            made, without_lids(before, fit, labels), part, fit, taken=taken, legs=legs, config=config.fill_holes
+            made, before, part, fit, taken=taken, legs=legs, config=config.fill_holes
         )
     # The clearance is given in millimetres by the user; every length inside the package is in metres.
     settings = AssemblyConfig(clearance=config.clearance_mm / MM, labels=labels)
