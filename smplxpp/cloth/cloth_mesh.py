@@ -84,8 +84,8 @@ def find_opening_lids(mesh: TriangleMesh, body: TriangleMesh) -> Bool[np.ndarray
         return np.zeros(mesh.face_count, dtype=bool)
     distance = geodesics(mesh, np.concatenate(borders))[0][mesh.faces]
     piece = _level(mesh, bridges)
-    found = [np.unique(piece[there]) for there in ((distance > REACH).all(axis=1), (distance == 0.0).any(axis=1))]
-    return np.isin(piece, np.setdiff1d(np.intersect1d(*found), -1))
+    far, bordering = piece[(distance > REACH).all(axis=1)], piece[(distance == 0.0).any(axis=1)]
+    return np.isin(piece, np.setdiff1d(np.intersect1d(far, bordering), -1))
 
 
 def _bridges_of(mesh: TriangleMesh, body: SignedDistanceField) -> Bool[np.ndarray, " M"]:
