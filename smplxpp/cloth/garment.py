@@ -115,7 +115,8 @@ class GarmentConfig:
 
     Attributes:
         spacing: of its particles, metres.
-        collider_spacing: of the collider's vertices.
+        collider_spacing: of the collider's vertices, about as fine as a body's own; wider triangles cut into round limbs,
+            whose skin shows through drawn cloth.
         pin_depth: metres along the cloth from where the body carries it up to which it follows the body exactly.
         band: width, in metres, of the transition from skinning to simulation next to the pins.
         skin_margin, sheet_margin: metres that cloth keeps from the skin and from other clothes.
@@ -123,7 +124,7 @@ class GarmentConfig:
     """
 
     spacing: float = 0.03
-    collider_spacing: float = 0.03
+    collider_spacing: float = 0.02
     pin_depth: float = 0.03
     band: float = 0.03
     skin_margin: float = 0.007

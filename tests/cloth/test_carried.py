@@ -61,6 +61,26 @@ def test_what_is_carried_is_pushed_out_as_points_are_and_deep_vertices_by_less()
     assert 0.02 < pushed.mean() < 0.98
 
 
+def test_skin_does_not_come_through_the_middle_of_a_long_edge():
+    """A knee stood before a pleat whose vertices were all before the knee."""
+    sheet = hanging(5, 5, 0.06)
+    ends = sheet.edges[np.flatnonzero(np.ptp(sheet.vertices[sheet.edges], axis=1)[:, 1] == 0.0)[5]]
+    knee = ball(radius=0.03)
+    middle = sheet.vertices[ends].mean(axis=0) + np.array([0.0, 0.0, -0.02])
+    knee = knee.with_vertices(knee.vertices + middle)
+    lengths = np.linalg.norm(np.diff(sheet.vertices[sheet.edges], axis=1)[:, 0], axis=1)
+
+    def clearance(bounds):
+        embedding = embed(sheet.vertices, sheet)
+        carried = CarriedVertices(embedding, sheet.faces, collider(knee), sheet.vertex_count, bounds)
+        found = carried.at(sheet.vertices.astype(np.float32), knee.vertices.astype(np.float32), margin=0.002)
+        along = found[ends[0]] + np.linspace(0.0, 1.0, 31)[:, None] * (found[ends[1]] - found[ends[0]])
+        return np.linalg.norm(along - middle, axis=1).min() - 0.03
+
+    assert clearance(None) < -0.009
+    assert clearance((sheet.edges, 9.0 * lengths)) > 0.0
+
+
 def test_drawn_edges_keep_their_bound_where_what_carries_them_turns():
     """Vertices 24 mm off the simulated cloth were drawn apart to nine times their length in the fold of a skirt."""
     coarse = hanging(5, 7, 0.03)

@@ -10,10 +10,11 @@ import pytest
 
 from benchmarks.accuracy.cloth_stress import dressed
 from smplxpp.body import load_body
-from smplxpp.cloth import Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
+from smplxpp.cloth import DriverConfig, Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
 from smplxpp.cloth.cloth_mesh import find_opening_bridges, find_opening_lids
 from smplxpp.cloth.garment import find_carriers, usual_config
 from smplxpp.core import HAIR, GeometryWarning, InputError, TriangleMesh
+from smplxpp.core.signed_distance import SignedDistanceField
 from smplxpp.people.garments.cut import tube_along
 from smplxpp.people.garments.hair import hairstyles
 from smplxpp.people.garments.mannequin import Mannequin
@@ -78,6 +79,15 @@ def test_it_touches_skin_near_it_that_faces_out():
     skin = body.vertex_normals[collider.vertices[collider.faces]].mean(axis=1)
     assert (np.einsum("fi,fi->f", mesh.face_normals, skin) > 0.3).mean() > 0.98
     np.testing.assert_allclose(collider.margin, garment.config.skin_margin)
+
+
+def test_coarse_skin_lies_hardly_inside_of_the_skin_else_that_shows_through_drawn_cloth():
+    template, collider = person(), cut(GarmentConfig()).collider
+    skin = template.part_mesh(BODY_PART).vertices
+    coarse = TriangleMesh(template.vertices[collider.vertices], collider.faces)
+    found = SignedDistanceField(coarse, solid=False).query(skin)
+    near = (np.abs(found.distance) < 0.03) & ~found.on_border
+    assert np.quantile(found.distance[near], 0.98) < DriverConfig().drawn_margin
 
 
 def test_a_skirt_touches_all_of_the_leg_that_it_can_fall_over():

@@ -91,6 +91,26 @@ bool drawn_together(const Carried& in, Vec3* points, std::vector<uint8_t>& moved
     return any;
 }
 
+// Metres between the places of a drawn edge that are kept out of the skin: round skin of 3 cm radius is 2 mm before the middle of
+// such a chord, which is how far drawn vertices are kept out (drawn_margin of smplxpp/cloth/driver.py).
+constexpr float kSampled = 0.02f;
+
+// Brings long edges out of the skin that their ends are out of. A place at t that goes out by d takes the ends along, by
+// d (1 - t) / ((1 - t)^2 + t^2) and d t / ((1 - t)^2 + t^2), the least that does it.
+template <class Out>
+void edges_out(const Carried& in, Vec3* points, const std::vector<Vec3>& up, Out&& out) {
+    for (int64_t e = 0; e < in.edges; ++e) {
+        const int32_t i = in.edge[2 * e], j = in.edge[2 * e + 1];
+        const int32_t parts = int32_t(std::min(smplxpp::length(points[i] - points[j]) / kSampled, 8.0f)) + 1;
+        for (int32_t k = 1; k < parts; ++k) {
+            const float t = float(k) / float(parts), s = 1.0f - t;
+            const Vec3 place = points[i] * s + points[j] * t;
+            const Vec3 step = (out(place, unit(up[size_t(i)] * s + up[size_t(j)] * t)) - place) * (1.0f / (s * s + t * t));
+            points[i] = points[i] + step * s, points[j] = points[j] + step * t;
+        }
+    }
+}
+
 // The transform of a vertex: its joints' (J, 3, 4), blended.
 void blend(const Skinned& in, const float* transforms, int64_t vertex, float* __restrict m) {
     float sum[12] = {};
@@ -126,8 +146,8 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_carry(const Carried* in, const float* x, co
         Surface surface(in->collider_vertices, in->collider_face, in->collider_faces);
         surface.look((const Vec3*)skin);
         std::vector<Vec3> up(size_t(in->vertices));
-        const auto out = [&](Vec3 p, size_t v) {
-            return pushed_out(p, up[v], surface, in->collider_face, (const Vec3*)skin, margin, in->deepest, kDrawnOut);
+        const auto out = [&](Vec3 p, Vec3 normal) {
+            return pushed_out(p, normal, surface, in->collider_face, (const Vec3*)skin, margin, in->deepest, kDrawnOut);
         };
         for (int64_t v = 0; v < in->vertices; ++v) {
             const int64_t t = in->which[v];
@@ -136,13 +156,14 @@ SMPLXPP_EXPORT int32_t smplxpp_cloth_carry(const Carried* in, const float* x, co
             const Vec3 there = place[q[0]] * w[0] + place[q[1]] * w[1] + place[q[2]] * w[2] + tangent[size_t(2 * t)] * by[0] +
                                tangent[size_t(2 * t + 1)] * by[1];
             up[size_t(v)] = unit(normal[size_t(q[0])] * w[0] + normal[size_t(q[1])] * w[1] + normal[size_t(q[2])] * w[2]);
-            ((Vec3*)points)[v] = out(there + up[size_t(v)] * by[2], size_t(v));
+            ((Vec3*)points)[v] = out(there + up[size_t(v)] * by[2], up[size_t(v)]);
         }
+        edges_out(*in, (Vec3*)points, up, out);
         // What was drawn together may lie in the skin then; the lengths have the last word.
         std::vector<uint8_t> moved(size_t(in->vertices), 0);
         if (!drawn_together(*in, (Vec3*)points, moved)) return;
         for (size_t v = 0; v < moved.size(); ++v)
-            if (moved[v]) ((Vec3*)points)[v] = out(((Vec3*)points)[v], v);
+            if (moved[v]) ((Vec3*)points)[v] = out(((Vec3*)points)[v], up[v]);
         drawn_together(*in, (Vec3*)points, moved);
     });
 }
