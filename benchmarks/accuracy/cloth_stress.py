@@ -321,7 +321,9 @@ class Stress:
             surface = np.einsum("vij,vj->vi", blended[:, :, :3], rest) + blended[:, :, 3]
             skin = TriangleMesh(surface[: template.body.vertex_count], template.body.faces)
             inside.append(-SignedDistanceField(skin, solid=True).query(surface[some]).distance)
-            shows.append(_shown(skin, TriangleMesh(surface, template.faces[template.faces[:, 0] >= len(skin.vertices)])))
+            shows.append(
+                _shown(skin, TriangleMesh(surface, template.faces[template.faces[:, 0] >= len(skin.vertices)]))
+            )
             if self.sheet is not None:
                 self._draw(template, surface, first=k == 0)
         found, depth = driver.quality, np.concatenate(inside)

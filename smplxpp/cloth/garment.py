@@ -115,8 +115,8 @@ class GarmentConfig:
 
     Attributes:
         spacing: of its particles, metres.
-        collider_spacing: of the collider's vertices, about as fine as a body's own; wider triangles cut into round limbs,
-            whose skin shows through drawn cloth.
+        collider_spacing: of the collider's vertices, about as fine as a body's own; wider triangles cut into round
+            limbs, whose skin shows through drawn cloth.
         pin_depth: metres along the cloth from where the body carries it up to which it follows the body exactly.
         band: width, in metres, of the transition from skinning to simulation next to the pins.
         skin_margin, sheet_margin: metres that cloth keeps from the skin and from other clothes.
