@@ -127,7 +127,7 @@ class GarmentConfig:
     collider_spacing: float = 0.02
     pin_depth: float = 0.03
     band: float = 0.03
-    skin_margin: float = 0.007
+    skin_margin: float = 0.006
     sheet_margin: float = 0.003
     fabric: Fabric = field(default_factory=Fabric)
 
