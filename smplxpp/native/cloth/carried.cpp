@@ -101,7 +101,9 @@ template <class Out>
 void edges_out(const Carried& in, Vec3* points, const std::vector<Vec3>& up, Out&& out) {
     for (int64_t e = 0; e < in.edges; ++e) {
         const int32_t i = in.edge[2 * e], j = in.edge[2 * e + 1];
-        const int32_t parts = int32_t(std::min(smplxpp::length(points[i] - points[j]) / kSampled, 8.0f)) + 1;
+        const float length = smplxpp::length(points[i] - points[j]);
+        if (!(length > kSampled)) continue;  // nor one without a value
+        const int32_t parts = int32_t(std::min(length / kSampled, 8.0f)) + 1;
         for (int32_t k = 1; k < parts; ++k) {
             const float t = float(k) / float(parts), s = 1.0f - t;
             const Vec3 place = points[i] * s + points[j] * t;
