@@ -48,9 +48,10 @@ def find_carriers(
 
     A garment hangs on its upper openings, a waistband or a neckline, on tight ones, and on what it covers from above,
     shoulders and the crown. A hem is an opening too, but looks down and is not tight; the median of an opening's
-    distances decides. An apron, and a garment that is torn from one opening to another, have a single border: where
-    nothing else holds it, its upper half does, as far as it is tight or looks up and is near. Where there is no such
-    border either, the underside of a roll, as of a scarf, holds it on skin that looks up.
+    distances decides. The single border of a flat piece, a tie or an apron, is no opening: where nothing else holds it,
+    its upper half does, as far as it is tight or looks up and is near, and so does that of a garment that is torn from
+    one opening to another. Where there is no such border either, the underside of a roll, as of a scarf, holds it on
+    skin that looks up.
 
     Args:
         cloth: N vertices, without bridges.
@@ -72,9 +73,9 @@ def find_carriers(
     lies = (distance < TIGHT) & (cloth.vertex_normals[:, 1] > LIES)
     out = np.zeros(cloth.vertex_count, dtype=bool)
     out[cloth.faces[lies[cloth.faces].all(axis=1)]] = True
-    for loop in border_loops(cloth.faces):
-        if loop_length(cloth, loop) < SHORTEST_OPENING:
-            continue
+    loops = [loop for loop in border_loops(cloth.faces) if loop_length(cloth, loop) >= SHORTEST_OPENING]
+    # The only border of a flat piece goes about it, a tie's or an apron's, and is no opening.
+    for loop in loops if len(loops) > 1 or not _is_sheet(cloth) else []:
         # An opening that looks up is worn and may stand off farther; any other one holds only where it is tight.
         reach = WORN if opening_axis(cloth, loop)[1] > UP else TIGHT
         if float(np.median(distance[loop])) < reach:
@@ -91,6 +92,11 @@ def find_carriers(
         lies[used] = (found.distance < TIGHT) & (found.normal[:, 1] > LIES) & (facing < -LIES)
         out[cloth.faces[lies[cloth.faces].all(axis=1)]] = True
     return out
+
+
+def _is_sheet(cloth: TriangleMesh) -> bool:
+    """Return whether cloth is one flat piece without holes: of Euler's characteristic 1, as a disc is."""
+    return len(cloth.referenced) - len(cloth.edges) + cloth.face_count == 1
 
 
 def _border_looks_up(cloth: TriangleMesh) -> Bool[np.ndarray, " N"]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.accuracy.cloth_stress import dressed
+from benchmarks.accuracy.cloth_stress import dressed, wardrobe
 from smplxpp.body import load_body
 from smplxpp.cloth import DriverConfig, Fabric, Garment, GarmentConfig, SolverConfig, cut_garment
 from smplxpp.cloth.cloth_mesh import find_opening_bridges, find_opening_lids
@@ -51,6 +51,16 @@ def test_it_carries_all_vertices_of_the_part_and_the_pins_have_none_of_the_simul
     order = np.argsort(depth)
     assert (np.diff(share[order]) >= 0).all() and 0 < share.mean() < 1
     np.testing.assert_allclose(garment.embedding.carried(garment.rest), template.vertices[garment.vertices], atol=1e-6)
+
+
+def test_the_outline_of_a_tie_is_no_opening_that_holds_it():
+    """It lies on the chest all along, and was held all along, so that it did not swing."""
+    mannequin = Mannequin.of(load_body(), np.zeros(10))
+    tie = wardrobe(mannequin)["tie"]
+    garment = cut_garment(dressed(mannequin, tie), tie.label, mannequin.params)
+    height = garment.rest.vertices[:, 1]
+    middle = 0.5 * (height.min() + height.max())
+    assert garment.pinned.any() and not garment.pinned[height < middle - garment.config.pin_depth].any()
 
 
 def test_lengths_at_rest_are_those_of_the_cloth_not_of_its_chords():
