@@ -115,14 +115,18 @@ def test_a_seek_and_a_speed_take_the_sound_along(page):
     page.until("smplxppPlayer.player.time > 0.1")
     page.click(".bar .play")
     page.until("!smplxppPlayer.player.playing")
+    # By the audio's clock: on a busy machine the page may tell late what was heard early.
+    silent_from = page.evaluate(f"{CLOCK}.context.currentTime") + 0.3
     page.evaluate("new Promise(done => setTimeout(done, 300))")
     paused = page.evaluate("smplxppPlayer.player.time")
-    page.evaluate("answers.length = begins.length = 0; new Promise(done => setTimeout(done, 300))")
-    assert page.evaluate("smplxppPlayer.player.time") == paused and page.evaluate("begins.length") == 0
+    page.evaluate("answers.length = 0; new Promise(done => setTimeout(done, 300))")
+    assert page.evaluate("smplxppPlayer.player.time") == paused
+    assert max(page.evaluate("begins"), default=0.0) < silent_from
     page.evaluate("smplxppPlayer.player.speed = 0.5; smplxppPlayer.player.seek(1.6); 0")
     page.click(".bar .play")
     page.until("answers.length && !smplxppPlayer.player.playing")
     heard, answers = page.evaluate("begins"), np.array(page.evaluate("answers"), float)
+    heard = [at for at in heard if at >= silent_from]
     assert len(heard) == 1, heard  # the first click lies before
     now, latency, pose = answers[(answers[:, 2] > 1.65) & (answers[:, 2] < SECONDS)].T
     sound = CLICKS[1] + 0.5 * (now - latency - heard[0])

@@ -60,7 +60,6 @@ export class Animator {
   summary: Summary | null = null;
   /** What is played; at first that of the bundle. */
   motion: Motion | null = null;
-  playing = true;
   /** Begins again at its end; a motion with a clock never does. */
   loop = true;
   /** Seconds into the motion. */
@@ -98,6 +97,7 @@ export class Animator {
   onend: () => void = () => {};
   onerror: (message: string) => void = () => {};
 
+  private goes = true;
   protected still = false;
   protected changed = true;
   /** Seconds of the clothes since the last request. */
@@ -204,6 +204,16 @@ export class Animator {
     if (!now || !this.left) return now;
     const share = Math.min((performance.now() - this.left.at) / this.left.fade, 1), from = this.left.pose.translation;
     return from.map((value, k) => value + share * share * (3 - 2 * share) * (now[k] - value));
+  }
+
+  get playing(): boolean {
+    return this.goes;
+  }
+
+  /** Who stops it hears nothing more, also where the next picture is late. */
+  set playing(goes: boolean) {
+    this.goes = goes;
+    if (!goes) this.clock?.at(false, this.time, this.speed);
   }
 
   get duration(): number {
