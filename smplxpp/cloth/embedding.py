@@ -43,7 +43,8 @@ class CarriedVertices:
         faces: of the particles.
         collider: what they keep out of.
         particles: their number n.
-        bounds: pairs of vertices and the longest distances between them, metres; None: none.
+        bounds: drawn edges, as pairs of vertices, and how long each may be, metres; long ones are kept out of the
+            collider between their ends, too. None: none.
     """
 
     def __init__(
