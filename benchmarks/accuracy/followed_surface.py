@@ -19,11 +19,9 @@ from pathlib import Path
 from statistics import mean
 from typing import Annotated, Any
 
-import igl
 import numpy as np
 import torch
 import tyro
-from jaxtyping import Float, Int
 
 from avatar.data.sequence import AvatarSequence, camera_centers_of
 from avatar.gaussians.binding import BoundGaussians
@@ -37,15 +35,14 @@ from avatar.training.presets import training_preset
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.follow import follow_surface
 from benchmarks.support.results import store_results
+from benchmarks.support.same_points import SamePoints
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GAUSSIANS
-from pipelines.stages.scene import TrainInputs, TrainScene, open_scene
-from smplxpp.core import BodyParams, InputError, TriangleMesh
+from pipelines.stages.scene import TrainInputs, open_scene
+from smplxpp.core import InputError, TriangleMesh
 from smplxpp.core.spread import spread_inside
 
 SAMPLES = 30_000
-SAME = 2e-3
-"""Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
 LOOKED_AT = 6
 """Frames whose held-out views are rendered."""
 
@@ -120,8 +117,11 @@ class Bench:
         self.scene, self.capture, self.part = scene, scene.capture, part
         self.protocol = scene.capture.protocol or "exact"
         self.gaussians = load_bound(run / GAUSSIANS, faces=scene.template.faces)
-        self.reference = load_params_of_run(run).frame(0)
-        self.same = SamePoints.found(scene, self.reference, part)
+        own = np.unique(scene.template.faces[scene.template.part_faces(part)])
+        same = SamePoints.found(scene, load_params_of_run(run).frame(0), own)
+        if same is None:
+            raise InputError("capture", expected="true surfaces of training frames", received="none")
+        self.same = same
 
     def row(self, config: TrackConfig, every: int, *, seconds: float | None = None) -> dict[str, Any]:
         """Follow every n-th training frame of the first `seconds`, or of all, and measure the result."""
@@ -200,34 +200,6 @@ class Bench:
                 quality = view_quality(view, seen.image, seen.alpha, sequence.background, head=None)
                 found.append(quality.psnr)
         return mean(found)
-
-
-@dataclass(frozen=True, eq=False)
-class SamePoints:
-    """Vertices of the template and the points of true surfaces that they are."""
-
-    own: Int[np.ndarray, " K"]
-    corners: Int[np.ndarray, "K 3"]
-    weights: Float[np.ndarray, "K 3"]
-
-    @staticmethod
-    def found(scene: TrainScene, reference: BodyParams, part: str) -> SamePoints:
-        """Find the points of the truth that a part's vertices are, in the frame that the template was built from."""
-        template = scene.template
-        truth = None if scene.built_frame is None else scene.capture.truth_mesh(scene.built_frame)
-        own = np.unique(template.faces[template.part_faces(part)])
-        points = np.ascontiguousarray(template.pose(reference)[0][own])
-        if truth is None:
-            raise InputError("capture", expected="true surfaces of training frames", received="none")
-        squared, face, near = igl.point_mesh_squared_distance(points, truth.vertices, truth.faces)[:3]
-        close = squared < SAME**2
-        corners = truth.faces[face[close]]
-        a, b, c = (np.ascontiguousarray(truth.vertices[corners[:, k]]) for k in range(3))
-        return SamePoints(own[close], corners, igl.barycentric_coordinates(np.ascontiguousarray(near[close]), a, b, c))
-
-    def of(self, truth: TriangleMesh) -> Float[np.ndarray, "K 3"]:
-        """Return where they are in another frame."""
-        return np.einsum("kc,kcd->kd", self.weights, truth.vertices[self.corners])
 
 
 def _rounded(value: float | None) -> float | None:

@@ -20,11 +20,9 @@ from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Annotated, Any
 
-import igl
 import numpy as np
 import torch
 import tyro
-from jaxtyping import Float
 
 from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
@@ -34,6 +32,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.rig.rig import Pose
 from avatar.training.loose_clothes import seen_particles
 from benchmarks.support.results import store_results
+from benchmarks.support.same_points import SamePoints
 from pipelines.runs.artefacts import load_params_of_run
 from pipelines.runs.layout import GARMENTS, STUDENT, TEACHER
 from pipelines.stages.scene import TrainInputs, open_scene
@@ -49,8 +48,6 @@ MOVED = 5e-4
 STARTS = 4
 SMALL_STEPS = DriverConfig(solver=SolverConfig(substep=1e-3))
 """How fine clothes are stepped: corrections travel an edge a substep, and their edges are shorter."""
-SAME = 2e-3
-"""Metres from the truth within which a vertex in the reference frame stands for a point of it in all others."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +142,8 @@ class _Bench:
         if not self.truths:
             raise InputError("capture", expected="true surfaces of held-out frames", received="none")
         self.label = max(self.garments, key=lambda g: len(g.vertices)).part
-        self.same = _same_points(self.sequence, load_params_of_run(run).frame(0), self.garments, scene.built_frame)
+        own = np.concatenate([garment.vertices for garment in self.garments])
+        self.same = SamePoints.found(scene, load_params_of_run(run).frame(0), own)
 
     def rows(self) -> Iterator[tuple[str, Mapping[int, Pose]]]:
         """Motions of the measured frames, row by row."""
@@ -245,36 +243,6 @@ class _Bench:
 
     def _with(self, frame: int, shape: ClothShape) -> Pose:
         return self.sequence.rig.with_cloth(self.sequence.pose(frame), shape)
-
-
-@dataclass(frozen=True, eq=False)
-class _SamePoints:
-    """Vertices of the template and the points of true surfaces that they are."""
-
-    own: np.ndarray
-    faces: np.ndarray
-    weights: np.ndarray
-    vertices: int
-
-    def of(self, truth: TriangleMesh) -> Float[np.ndarray, "K 3"]:
-        return np.einsum("kc,kcd->kd", self.weights, truth.vertices[self.faces])
-
-
-def _same_points(
-    sequence: AvatarSequence, reference: BodyParams, garments: list[Garment], frame: int | None
-) -> _SamePoints | None:
-    """Find the points of the truth that the garments' vertices are, in the frame that the template was built from."""
-    truth = None if frame is None else sequence.capture.truth_mesh(frame)
-    if truth is None:
-        return None
-    own = np.concatenate([garment.vertices for garment in garments])
-    points = np.ascontiguousarray(sequence.rig.template.pose(reference)[0][own])
-    squared, face, near = igl.point_mesh_squared_distance(points, truth.vertices, truth.faces)[:3]
-    close = squared < SAME**2
-    corners = truth.faces[face[close]]
-    a, b, c = (np.ascontiguousarray(truth.vertices[corners[:, k]]) for k in range(3))
-    weights = igl.barycentric_coordinates(np.ascontiguousarray(near[close]), a, b, c)
-    return _SamePoints(own[close], corners, weights, len(truth.vertices)) if close.any() else None
 
 
 def _moved(pose: Pose, displacements: torch.Tensor | None) -> Pose:
