@@ -53,6 +53,12 @@ class LearnedGaussians(nn.Module):
         copies = {name: value.detach().cpu().clone() for name, value in bound.tensors.items()}
         return BoundGaussians(**copies, face_count=self.face_count, topology=self.topology)
 
+    def take(self, other: BoundGaussians) -> None:
+        """Take over the learned attributes of other Gaussians at the same places."""
+        with torch.no_grad():
+            for name in LEARNED:
+                getattr(self, name).copy_(other.tensors[name])
+
     def normalise_quats(self) -> None:
         """Normalise all quaternions, so that residuals added to them have one scale."""
         with torch.no_grad():

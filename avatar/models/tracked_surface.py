@@ -124,7 +124,13 @@ class TrackedAvatar(nn.Module):
     def forward(self, pose: Pose, camera_centers: Float[Tensor, "C 3"]) -> PosedAvatar:
         """Pose the avatar with the current displacements of its control points."""
         # Zero the still control points before interpolation; a skinned mesh then carries the Gaussians.
-        displacements = self.cage(self.moves * self.controls)
+        return self.displaced(pose, camera_centers, self.moves * self.controls)
+
+    def displaced(
+        self, pose: Pose, camera_centers: Float[Tensor, "C 3"], controls: Float[Tensor, "K 3"]
+    ) -> PosedAvatar:
+        """Pose the avatar with given displacements of its control points, metres."""
+        displacements = self.cage(controls)
         vertices = self.rig.skin(pose, displacements)
         frames = triangle_frames(vertices, self.rig.faces)
         bound = self.gaussians()
@@ -153,6 +159,14 @@ class Track:
     drift: Float[Tensor, " K"] | None = None
 
     __repr__ = one_line
+
+    def on(self, cage: ControlCage) -> Track:
+        """Return the surface with the control points of another cage, which take over what is at their vertices."""
+        at = cage.vertices
+        controls = torch.stack([self.cage(own)[at] for own in self.controls])
+        sigma = None if self.sigma is None else torch.stack([self.cage(own[:, None])[at, 0] for own in self.sigma])
+        drift = None if self.drift is None else self.cage(self.drift[:, None])[at, 0]
+        return Track(self.row, controls, cage, sigma, drift)
 
     def displacements(self, frame: int) -> Float[Tensor, "V 3"]:
         """Return the displacements of all vertices in a frame, metres along the axes of the T-pose."""

@@ -28,8 +28,9 @@ from avatar.training.engine.photometric_task import (
 )
 from avatar.training.engine.resources import compile_networks, fixed_seed
 from avatar.training.engine.session import PRETRAIN, TRACK, Session
-from avatar.training.tracking.config import TrackConfig
+from avatar.training.tracking.config import JointConfig, TrackConfig
 from avatar.training.tracking.follow import follow_surface
+from avatar.training.tracking.joint import correct_jointly
 from smplxpp.core.spread import spread_inside
 
 
@@ -116,6 +117,8 @@ class FitTeacherConfig(PhotometricConfig):
             distance.
         displacement: weight of `mean |dU|^2` over the Gaussians, in units of the maps.
         track: of the surface tracking that comes first; None, as in the paper: none.
+        joint: of the correction of tracked clothes and Gaussians by all frames at once; None: none. Not applied to a
+            template without clothes.
     """
 
     iterations: int = 600_000
@@ -123,12 +126,14 @@ class FitTeacherConfig(PhotometricConfig):
     view_jitter: float = 0.1
     displacement: float = 0.0
     track: TrackConfig | None = None
+    joint: JointConfig | None = None
 
     def starting_at(self, frame: int | None) -> FitTeacherConfig:
         """Return the configuration with a reference frame for its tracking; None: the tracking's own choice."""
         if self.track is None:
             return self
-        return replace(self, track=replace(self.track, reference=frame, seed=self.seed))
+        joint = self.joint and replace(self.joint, seed=self.seed)
+        return replace(self, track=replace(self.track, reference=frame, seed=self.seed), joint=joint)
 
 
 class TeacherTask(PhotometricTask):
@@ -214,6 +219,14 @@ def fit_teacher(
             return teacher.eval(), progress
         teacher.remember(track)
         session = session.after(progress)
+        # Correct it together with the Gaussians, with which the teacher starts.
+        if config.joint is not None and bool(sequence.rig.cloth_mask.any()):
+            gaussians, track, progress = correct_jointly(sequence, gaussians, track, config.joint, session)
+            if not progress.finished:
+                return teacher.eval(), progress
+            teacher.gaussians.take(gaussians)
+            teacher.remember(track)
+            session = session.after(progress)
     # Pretrain on the track. Networks whose output starts at zero need no pretraining to zero residuals.
     if config.pretrain is not None and (track is not None or not networks.zero_output):
         pretrain = config.pretrain

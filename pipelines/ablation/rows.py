@@ -187,7 +187,7 @@ class _Plan:
             self.stages["untracked"] = self.stages["full"]
         else:
             # The start of the paper: zero residuals, without tracking and without pretraining on a tracked surface.
-            from_zero = replace(teacher, track=None, pretrain=None)
+            from_zero = replace(teacher, track=None, joint=None, pretrain=None)
             self._add(replace(self.teacher, name=_folder("untracked_teacher"), config=from_zero, elsewhere=()))
             self._bake("untracked_bake", "untracked_teacher")
             self._compensate("untracked", "untracked_bake", teacher=None)
@@ -316,4 +316,5 @@ def _without_teacher(preset: TrainingPreset, training_frames: int) -> int:
     if teacher.track is None:
         return bake.iterations
     seen = teacher.iterations * teacher.views + training_frames * teacher.track.steps * teacher.track.views
+    seen += 0 if teacher.joint is None else teacher.joint.steps(training_frames)
     return bake.iterations + math.ceil(seen / bake.views)

@@ -17,7 +17,7 @@ from avatar.models.teacher_avatar import TeacherAvatar
 from avatar.training.engine.loop import METRICS_FILE, TENSORBOARD_FOLDER, Progress
 from avatar.training.engine.metrics_log import read_metrics
 from avatar.training.engine.resources import peak_memory
-from avatar.training.engine.session import BACK, PRETRAIN, TRACK, Session
+from avatar.training.engine.session import BACK, JOINT, PRETRAIN, TRACK, Session
 from avatar.training.tracking.follow import SEAMS_FILE, SIMULATED_FILE
 from pipelines.runs import gates
 from pipelines.runs.layout import KINDS, kind_name
@@ -28,7 +28,8 @@ from smplxpp.core.checks import Check
 from smplxpp.core.files import read_json
 
 TRACK_BACK = f"{TRACK}/{BACK}"
-BEFORE = {TRACK: "track_metrics.jsonl", TRACK_BACK: "track_back_metrics.jsonl", PRETRAIN: "pretrain_metrics.jsonl"}
+TRACKING = {TRACK: "track_metrics.jsonl", TRACK_BACK: "track_back_metrics.jsonl", JOINT: "joint_metrics.jsonl"}
+BEFORE = {**TRACKING, PRETRAIN: "pretrain_metrics.jsonl"}
 """Log files of tracking and pretraining, by their folder within the session's."""
 
 
@@ -123,7 +124,7 @@ def _output(
         "simulated_clothes": read_json(folder / SIMULATED_FILE) if (folder / SIMULATED_FILE).is_file() else [],
         "seams": read_json(folder / SEAMS_FILE) if (folder / SEAMS_FILE).is_file() else [],
         "convention": CONVENTION,
-        "seconds_of_tracking": seconds[TRACK] + seconds[TRACK_BACK],
+        "seconds_of_tracking": sum(seconds[part] for part in TRACKING),
         **_followed(model),
         "seconds_of_pretraining": seconds[PRETRAIN],
         "iterations_before": sum(lines[-1]["iteration"] for lines in before.values() if lines),

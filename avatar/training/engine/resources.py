@@ -194,6 +194,12 @@ def _bytes_before_networks(recipe: Any, pixels: float, *, images: int, frames: i
         kept = 4.0 * (3 + 9 + 3 + 2 * 9) * track.control_points * frames
         photographs = of_photograph * pixels * images / frames
         found["track"] = step + kept + photographs + 100.0 * count
+        joint = recipe.preset.teacher.joint
+        if joint is not None:
+            # One view, the Gaussians' attributes, and every frame's displacements beside corrections that learn.
+            learned = 16.0 * (25.0 * count + 3.0 * joint.control_points * frames)
+            corrected = (of_loss + of_view) * pixels + a_gaussian * count + learned
+            found["track"] = max(found["track"], corrected + 4.0 * 3.0 * joint.control_points * frames)
     return found
 
 

@@ -14,8 +14,8 @@ from avatar.training.engine.photometric_task import PhotometricConfig, Preview, 
 from avatar.training.engine.processes import Distributed
 from avatar.training.engine.resources import Compiled
 
-TRACK, PRETRAIN = "track", "pretrain"
-"""Folders of the tracking and of the pretraining, which precede a training."""
+TRACK, JOINT, PRETRAIN = "track", "joint", "pretrain"
+"""Folders of tracking, joint correction and pretraining, which precede a training."""
 BACK = "back"
 """Folder of the backward pass, inside that of the tracking."""
 

@@ -1,11 +1,13 @@
-"""Configuration of the surface tracking: resolution levels, weights of the loss, predictions."""
+"""Configurations of the surface tracking and of the joint correction of all frames."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
 from avatar.losses.reconstruction import ReconstructionWeights
-from smplxpp.core import InputError, require_at_least
+from avatar.training.engine.photometric_task import PhotometricConfig
+from avatar.training.fit.fit import FitConfig
+from smplxpp.core import InputError, require_at_least, require_positive
 
 
 @dataclass(frozen=True)
@@ -110,3 +112,51 @@ class TrackConfig:
     def coarse(self) -> TrackConfig:
         """Return the configuration without its finest level, if it has others."""
         return replace(self, levels=self.levels[:-1] or self.levels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointConfig:
+    """Choices of the joint correction (`joint.correct_jointly`): one view a step, the fit's losses and rates.
+
+    Attributes:
+        control_points: number of control points on the template.
+        iterations: number of steps at least; below it Gaussians have not settled.
+        frame_iterations: steps for each training frame at least.
+        lr: learning rate of the corrections at the start, metres; it falls exponentially to a tenth.
+        smoothness: weight of the mean squared difference of neighbouring control points' corrections, 1/m^2.
+        seed: of the order of views.
+    """
+
+    control_points: int = 6000
+    iterations: int = 3000
+    frame_iterations: int = 60
+    lr: float = 1e-3
+    smoothness: float = 1000.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("control_points", 1),
+            ("iterations", 1),
+            ("frame_iterations", 0),
+            ("smoothness", 0),
+            ("seed", 0),
+        ):
+            require_at_least(f"joint correction: {name}", getattr(self, name), least)
+        require_positive("joint correction: lr", self.lr)
+
+    def steps(self, frames: int) -> int:
+        """Return the number of steps of a motion."""
+        return max(self.iterations, self.frame_iterations * frames)
+
+    def photometric(self, frames: int) -> PhotometricConfig:
+        """Return the fit's losses and rates with the steps of a motion."""
+        return replace(FitConfig().photometric(), iterations=self.steps(frames), evaluations=1, seed=self.seed)
+
+    def shortened(self, share: float) -> JointConfig:
+        """Return the configuration with `share` of the steps."""
+        return replace(
+            self,
+            iterations=max(1, round(share * self.iterations)),
+            frame_iterations=round(share * self.frame_iterations),
+        )
