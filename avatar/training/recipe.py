@@ -268,7 +268,10 @@ def with_processes(preset: TrainingPreset, count: int) -> TrainingPreset:
             **{name: getattr(config, name) * math.sqrt(grown) for name in names},
         }
 
-    return _with_changes(preset, changes)
+    grown = _with_changes(preset, changes)
+    joint = grown.teacher.joint
+    joint = joint and replace(joint, poses=max(count, joint.poses))
+    return replace(grown, teacher=replace(grown.teacher, joint=joint))
 
 
 def _with_changes(preset: TrainingPreset, changes: Callable[[PhotometricConfig], Mapping[str, Any]]) -> TrainingPreset:

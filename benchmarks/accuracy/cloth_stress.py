@@ -44,7 +44,7 @@ from scipy.interpolate import PchipInterpolator
 from benchmarks.support.results import store_results
 from smplxpp.body import BodyModel, load_body
 from smplxpp.body.model import PosedBody
-from smplxpp.cloth import ClothDriver, DriverConfig, cut_garment
+from smplxpp.cloth import ClothDriver, ClothShape, DriverConfig, cut_garment
 from smplxpp.cloth import Garment as Simulated
 from smplxpp.cloth.poses import pose_between, reference_facing_as
 from smplxpp.cloth.quality import EdgeLengths
@@ -61,6 +61,7 @@ from smplxpp.raster import render_shaded
 from smplxpp.template.template import Template
 
 FPS, SECONDS = 30.0, 1.5
+SEEN_FROM = (0.6, 0.15, 1.0)
 START = DriverConfig(ramp=0.4, hold=0.2)
 _BLENDER = """
 import struct, sys, time, bpy, numpy as np
@@ -159,14 +160,23 @@ MOTIONS: Mapping[str, tuple[_Key, ...]] = {
     ),
 }
 
+SWING_AND_SIT: tuple[_Key, ...] = (
+    *((0.45 * k, {} if not k else (_STRIDE, _BACK)[k % 2], (0, 0, 0)) for k in range(5)),
+    *((1.9 + 0.4 * k, {"pelvis": (0, 65.0 * (-1) ** k, 0)}, (0, 0, 0)) for k in range(1, 4)),
+    *((3.4, {}, (0, 0, 0)), (4.4, {}, (0, 0, 0)), (5.3, _SIT, (0, -0.4, -0.2)), (7.0, _SIT, (0, -0.4, -0.2))),
+)
+"""Walks, turns about, stands still and sits down: the motion of `cloth_film`."""
 
-def motion(body: BodyModel, keys: Sequence[_Key], betas: Float[np.ndarray, " B"]) -> BodyParams:
+
+def motion(
+    body: BodyModel, keys: Sequence[_Key], betas: Float[np.ndarray, " B"], seconds: float = SECONDS
+) -> BodyParams:
     """Return a motion through key poses, monotone between them: seconds, turns over lowered arms, metres."""
     pose = np.zeros((len(keys), body.joint_count, 3))
     for k, (_, turns, _) in enumerate(keys):
         for name, degrees in {**_DOWN, **turns}.items():
             pose[k, body.joint_names.index(name)] = np.radians(degrees)
-    times, at = [key[0] for key in keys], np.arange(round(SECONDS * FPS) + 1) / FPS
+    times, at = [key[0] for key in keys], np.arange(round(seconds * FPS) + 1) / FPS
     moved = PchipInterpolator(times, pose)(np.minimum(at, times[-1]))
     return BodyParams.from_full_pose(
         moved,
@@ -315,10 +325,7 @@ class Stress:
                 driver.quality = [a.with_(b) for a, b in zip(before, driver.quality, strict=True)]
             if k % 6:
                 continue
-            rest = template.vertices.copy()
-            rest[shape.vertices] += shape.share[:, None] * shape.displacements
-            blended = (weights @ posed.posed_from_rest[0, :, :3].reshape(-1, 12)).reshape(-1, 3, 4)
-            surface = np.einsum("vij,vj->vi", blended[:, :, :3], rest) + blended[:, :, 3]
+            surface = drawn(template, weights, posed, shape)
             skin = TriangleMesh(surface[: template.body.vertex_count], template.body.faces)
             inside.append(-SignedDistanceField(skin, solid=True).query(surface[some]).distance)
             shows.append(
@@ -375,12 +382,22 @@ class Stress:
 
     def _draw(self, template: Template, surface: Float[np.ndarray, "V 3"], *, first: bool) -> None:
         mesh = template.mesh.with_vertices(surface)
-        (camera,) = fit_cameras(surface, directions=[(0.6, 0.15, 1.0)], height=300, width=220)
+        (camera,) = fit_cameras(surface, directions=[SEEN_FROM], height=300, width=220)
         image = render_shaded(mesh, camera, vertex_colors=template.vertex_colors)
         if first:
             self._pictures.append(image)
         else:
             self._pictures[-1] = np.concatenate([self._pictures[-1], image], axis=1)
+
+
+def drawn(
+    template: Template, weights: Float[np.ndarray, "V J"], posed: PosedBody, shape: ClothShape
+) -> Float[np.ndarray, "V 3"]:
+    """Return the posed vertices of a template whose simulated clothes are displaced before skinning."""
+    rest = template.vertices.copy()
+    rest[shape.vertices] += shape.share[:, None] * shape.displacements
+    blended = (weights @ posed.posed_from_rest[0, :, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+    return np.einsum("vij,vj->vi", blended[:, :, :3], rest) + blended[:, :, 3]
 
 
 def _shown(skin: TriangleMesh, cloth: TriangleMesh) -> float:

@@ -151,6 +151,12 @@ def test_several_processes_see_no_more_poses_than_one():
     assert four.teacher.lr == 2.0 * one.teacher.lr and four.fit == one.fit
     shapes = with_processes(replace(one, compensate=replace(one.compensate, poses_per_step=1)), 4).compensate
     assert (shapes.position_lr, shapes.color_lr) == (2.0 * one.compensate.position_lr, 2.0 * one.compensate.color_lr)
+    joint = training_preset("gpu").teacher.joint
+    shared = with_processes(training_preset("gpu"), 4).teacher.joint
+    assert joint is not None and shared is not None
+    # 6,000 frames: a quarter of the steps, each of four frames, at twice the rates.
+    assert (shared.steps(6000), joint.steps(6000)) == (90_000, 360_000)
+    assert (shared.photometric(6000).poses_per_step, shared.photometric(6000).attributes) == (4, 2.0)
     assert with_processes(one, 1) == one and with_processes(with_batch(one, 4), 4) == with_batch(one, 4)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 from avatar.losses.reconstruction import ReconstructionWeights
@@ -116,12 +117,13 @@ class TrackConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class JointConfig:
-    """Choices of the joint correction (`joint.correct_jointly`): one view a step, the fit's losses and rates.
+    """Choices of the joint correction (`joint.correct_jointly`): by the fit's losses and rates.
 
     Attributes:
         control_points: number of control points on the template.
-        iterations: number of steps at least; below it Gaussians have not settled.
-        frame_iterations: steps for each training frame at least.
+        iterations: number of views at least; with fewer, Gaussians have not settled.
+        frame_iterations: views of each training frame at least.
+        poses: frames a step, a view of each; `poses` times fewer steps then have sqrt(`poses`) times the rates.
         lr: learning rate of the corrections at the start, metres; it falls exponentially to a tenth.
         smoothness: weight of the mean squared difference of neighbouring control points' corrections, 1/m^2.
         seed: of the order of views.
@@ -130,6 +132,7 @@ class JointConfig:
     control_points: int = 6000
     iterations: int = 3000
     frame_iterations: int = 60
+    poses: int = 1
     lr: float = 1e-3
     smoothness: float = 1000.0
     seed: int = 0
@@ -139,6 +142,7 @@ class JointConfig:
             ("control_points", 1),
             ("iterations", 1),
             ("frame_iterations", 0),
+            ("poses", 1),
             ("smoothness", 0),
             ("seed", 0),
         ):
@@ -147,11 +151,18 @@ class JointConfig:
 
     def steps(self, frames: int) -> int:
         """Return the number of steps of a motion."""
-        return max(self.iterations, self.frame_iterations * frames)
+        return math.ceil(max(self.iterations, self.frame_iterations * frames) / self.poses)
 
     def photometric(self, frames: int) -> PhotometricConfig:
         """Return the fit's losses and rates with the steps of a motion."""
-        return replace(FitConfig().photometric(), iterations=self.steps(frames), evaluations=1, seed=self.seed)
+        return replace(
+            FitConfig().photometric(),
+            iterations=self.steps(frames),
+            poses_per_step=self.poses,
+            attributes=math.sqrt(self.poses),
+            evaluations=1,
+            seed=self.seed,
+        )
 
     def shortened(self, share: float) -> JointConfig:
         """Return the configuration with `share` of the steps."""

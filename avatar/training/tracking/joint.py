@@ -7,6 +7,7 @@ Here one set of Gaussians has to explain all frames, and the surfaces move where
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -20,7 +21,6 @@ from avatar.models.tracked_surface import Track, TrackedAvatar
 from avatar.training.engine.adam import ParameterGroup
 from avatar.training.engine.loop import Progress
 from avatar.training.engine.photometric_task import ALONE, PhotometricTask, TaskContext
-from avatar.training.engine.processes import Distributed
 from avatar.training.engine.session import JOINT, Session
 from avatar.training.tracking.config import JointConfig
 
@@ -28,7 +28,7 @@ from avatar.training.tracking.config import JointConfig
 class JointTask(PhotometricTask):
     """Learns the Gaussians' attributes and corrections of the clothes' control points in every tracked frame.
 
-    The loss of a step, one view of one frame t, is that of the fit with a membrane energy of the corrections c_t
+    The loss of a view of frame t is that of the fit with a membrane energy of the corrections c_t
     about what the tracker found:
 
         L = L_rec(render(d_t + c_t), photograph) + smoothness * mean |c_t,i - c_t,j|^2
@@ -53,7 +53,8 @@ class JointTask(PhotometricTask):
     ) -> None:
         self.tracked = track.on(avatar.cage)
         self.corrections = nn.Parameter(torch.zeros_like(self.tracked.controls))
-        group = ParameterGroup("corrections", {"corrections": self.corrections}, config.lr, lr_final_factor=0.1)
+        lr = config.lr * math.sqrt(config.poses)
+        group = ParameterGroup("corrections", {"corrections": self.corrections}, lr, lr_final_factor=0.1)
         super().__init__(sequence, avatar, config.photometric(len(sequence.train_frames)), [group], context)
         self.avatar, self.smoothness = avatar, config.smoothness
         # Bare skin, shoes and hair stay: joints place them better than photographs of few hundred pixels.
@@ -78,17 +79,13 @@ class JointTask(PhotometricTask):
         corrected = self.tracked.controls + self.learns * self.corrections.detach()
         return replace(self.tracked, controls=corrected)
 
-    def found(self) -> dict[str, Tensor]:
-        """Return the corrections and the Gaussians' attributes, by their keys in the checkpoint."""
-        return dict(self.learned)
-
 
 def correct_jointly(
     sequence: AvatarSequence, gaussians: BoundGaussians, track: Track, config: JointConfig, session: Session
 ) -> tuple[BoundGaussians, Track, Progress]:
     """Correct a tracked surface and its Gaussians by the photographs of all training frames at once.
 
-    Several processes wait for the first one, which sends them what it found.
+    Several processes share the frames of a step.
 
     Args:
         sequence: the training frames and views.
@@ -102,10 +99,6 @@ def correct_jointly(
     """
     count = min(config.control_points, len(sequence.rig.vertices))
     avatar = TrackedAvatar(sequence.rig, gaussians, count)
-    task = JointTask(sequence, avatar, track, config, replace(session.context, distributed=None))
-    progress = session.within(JOINT).run_alone(lambda: task, task.config)
-    first = (session.distributed or Distributed()).run_on_rank0(task.found)
-    with torch.no_grad():
-        for name, own in task.found().items():
-            own.copy_(first[name])
+    task = JointTask(sequence, avatar, track, config, session.context)
+    progress = session.within(JOINT).run(lambda: task, task.config, keep_end=True)
     return avatar.gaussians.snapshot(), task.track(), progress
