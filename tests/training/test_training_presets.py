@@ -65,6 +65,7 @@ def test_a_seed_reaches_every_stage_and_nothing_else(name):
     reseeded = preset.with_seed(7)
     assert {getattr(reseeded, stage).seed for stage in STAGES} == {7} and reseeded.fit.sampling.seed == 7
     assert reseeded.with_seed(0) == preset.with_seed(0)
+    assert {one.seed for one in (reseeded.teacher.track, reseeded.teacher.joint) if one is not None} <= {7}
 
 
 @pytest.mark.parametrize("name", TRAINING_PRESETS)
@@ -74,8 +75,11 @@ def test_a_share_is_one_of_the_iterations_alone(name):
         own, short = getattr(preset, stage), getattr(tenth, stage)
         assert short.iterations == round(0.1 * own.iterations)
         same = {"iterations": own.iterations}
-        same |= {name: getattr(own, name) for name in ("pretrain", "track") if hasattr(own, name)}
+        same |= {name: getattr(own, name) for name in ("pretrain", "track", "joint") if hasattr(own, name)}
         assert replace(short, **same) == own
+    if preset.teacher.joint is not None and tenth.teacher.joint is not None:
+        assert tenth.teacher.joint.steps(10) == 0.1 * preset.teacher.joint.steps(10)
+        assert tenth.teacher.joint.steps(1000) == 0.1 * preset.teacher.joint.steps(1000)
     for stage in ("teacher", "bake"):
         own, short = getattr(preset, stage), getattr(tenth, stage)
         share = short.iterations / own.iterations
