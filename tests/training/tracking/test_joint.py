@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from avatar.data.sequence import AvatarSequence
 from avatar.gaussians.sampling import SamplingConfig, sample_on_mesh
 from avatar.models.learned_gaussians import LEARNED
 from avatar.models.tracked_surface import ControlCage, Track
+from avatar.training.engine.processes import join_processes
 from avatar.training.engine.session import JOINT, Session
 from avatar.training.fit_teacher import FitTeacherConfig, fit_teacher
 from avatar.training.tracking.config import JointConfig
@@ -22,6 +27,7 @@ from tests.dolls.tiny import TINY_TEACHER
 from tests.training.tracking.test_track import CONFIG as TRACKING
 from tests.training.tracking.test_track import error, painted
 
+ROOT = Path(__file__).resolve().parents[3]
 CONFIG = JointConfig(control_points=60, iterations=240, frame_iterations=10, smoothness=10.0)
 SHORT = replace(CONFIG, iterations=8, frame_iterations=2)
 
@@ -81,6 +87,22 @@ def test_a_teacher_starts_from_what_was_corrected(frames, tmp_path):
     assert any(differ)
 
 
+@pytest.mark.slow
+def test_two_processes_share_the_frames_of_a_step(frames, tmp_path):
+    """Two real ones, started by torchrun, against one that takes both frames; their gradients are added in float32."""
+    shared = replace(SHORT, poses=2)
+    _, alone, _ = correct_jointly(frames, painted(), off_by(frames, 0.005), shared, Session(tmp_path / "alone"))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*command, __file__, str(tmp_path)], env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    first, second = (np.load(tmp_path / f"controls_{rank}.npy") for rank in (0, 1))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_allclose(first, alone.controls.numpy(), atol=1e-4)
+
+
 def test_without_clothes_nothing_is_corrected(frames, tmp_path):
     naked = AvatarSequence(frames.capture, template().naked())
     bound = sample_on_mesh(naked.rig.template, SamplingConfig(count=300, sh_degree=1))
@@ -111,3 +133,15 @@ def test_steps_follow_the_number_of_frames_and_are_shortened_with_it():
 def test_choices_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match="joint correction"):
         JointConfig(**wrong)
+
+
+if __name__ == "__main__":
+    with join_processes() as together:
+        made = Path(sys.argv[1])
+        if together.first:
+            write_dance(made / "capture")
+        together.run_on_rank0(lambda: None)
+        dance = sequence(made / "capture")
+        session, config = Session(made / "together", distributed=together), replace(SHORT, poses=2)
+        _, corrected, _ = correct_jointly(dance, painted(), off_by(dance, 0.005), config, session)
+        np.save(made / f"controls_{together.rank}.npy", corrected.controls.numpy())
