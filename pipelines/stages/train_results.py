@@ -30,7 +30,7 @@ from smplxpp.core.files import read_json
 TRACK_BACK = f"{TRACK}/{BACK}"
 TRACKING = {TRACK: "track_metrics.jsonl", TRACK_BACK: "track_back_metrics.jsonl", JOINT: "joint_metrics.jsonl"}
 BEFORE = {**TRACKING, PRETRAIN: "pretrain_metrics.jsonl"}
-"""Log files of tracking and pretraining, by their folder within the session's."""
+"""Log files of what precedes a training, by their folder within the session's."""
 
 
 def keep_logs(work: Path, folder: Path) -> None:

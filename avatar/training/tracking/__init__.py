@@ -30,4 +30,6 @@ solved, a Kalman filter with the information G / sigma^2 gives every control poi
 **Solver and schedule.** Adam, from coarse to fine: a part of the steps on photographs halved twice, once and not at all
 (`config.Level`), with a rate that falls exponentially within a level. An optional backward pass from the last frames to
 the first measures drift.
+
+**Afterwards** (`joint`) corrections of the clothes in all frames learn at once, together with the Gaussians.
 """

@@ -66,7 +66,7 @@ def test_a_dress_that_was_missed_is_found_and_the_body_stays(frames, tmp_path):
 
 def test_a_stopped_correction_goes_on_to_the_same_bits(frames, tmp_path):
     track, results = off_by(frames, 0.005), []
-    for name, limits in (("whole", (np.inf,)), ("stopped", (0.0, np.inf))):
+    for name, limits in (("whole", (np.inf,)), ("stopped", (0.0, np.inf, np.inf))):
         for seconds in limits:
             session = Session(tmp_path / name, max_seconds=seconds)
             bound, found, progress = correct_jointly(frames, painted(), track, SHORT, session)
