@@ -298,4 +298,7 @@ class CaptureDegradeCommand:
             labels = f"{100 * made.labels_wrong:.1f} % of the labels wrong"
             line = f"{made.out}: {made.frames} frames, keypoints of {made.cameras} cameras, {labels}"
             console.print(line, soft_wrap=True, highlight=False)
+            # The exact inputs are there, too, and are what a build takes by default.
+            step = f"next    smplxpp build RUN --capture {made.out} --protocol tracked"
+            console.print(step, soft_wrap=True, highlight=False, markup=False)
         return {**vars(made), "out": str(made.out)}

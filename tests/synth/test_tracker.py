@@ -170,6 +170,15 @@ def test_degrading_again_gives_the_same_and_refuses_what_is_in_use(scene_capture
     assert not (tmp_path / "three").exists()
 
 
+def test_the_next_command_names_the_protocol_because_exact_inputs_come_first(scene_capture, tmp_path, capsys):
+    out = tmp_path / "tracked"
+    assert main(["capture", "degrade", str(scene_capture), "--out", str(out)]) == 0
+    assert f"smplxpp build RUN --capture {out} --protocol tracked" in capsys.readouterr().out.replace("\n", "")
+    exact = open_capture(scene_capture).params(1).transl
+    assert (open_capture(out).params(1).transl == exact).all()
+    assert (open_capture(out, protocol="tracked").params(1).transl != exact).any()
+
+
 def test_a_capture_without_cameras_gets_a_ring(scene_capture, tmp_path, capsys):
     bare = tmp_path / "bare"
     (bare / "scans").mkdir(parents=True)
