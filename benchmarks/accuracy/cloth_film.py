@@ -25,7 +25,7 @@ from benchmarks.accuracy.cloth_stress import (
     START,
     SWING_AND_SIT,
     UNDER,
-    drawn,
+    drawn_surface,
     dressed,
     motion,
     wardrobe,
@@ -42,6 +42,8 @@ from smplxpp.people.garments.mannequin import Mannequin
 from smplxpp.raster import render_shaded
 
 SIZE = (289, 224)  # height and width of a picture, pixels; with its caption even, as MP4 requires
+# What the person reaches in the motion, metres: corners of a box that every picture shows.
+_ROOM = np.array([[x, y, z] for x in (-0.6, 0.6) for y in (-0.88, 0.98) for z in (-0.3, 0.3)])
 
 
 @dataclass(frozen=True)
@@ -105,15 +107,11 @@ class Person:
         shape = self.driver.step(params, 1.0 / FPS, posed=posed)
         self.longest = max(one.longest for one in self.driver.quality)
         self.resets = sum(one.resets for one in self.driver.quality)
-        mesh = self.template.mesh.with_vertices(drawn(self.template, self.weights, posed, shape))
+        mesh = self.template.mesh.with_vertices(drawn_surface(self.template, self.weights, posed, shape))
         height, width = SIZE
         (camera,) = fit_cameras(_ROOM, directions=[SEEN_FROM], height=height, width=width)
         image = render_shaded(mesh, camera, vertex_colors=self.template.vertex_colors)
         return caption(image, f"{self.name}  {self.longest:.2f}", size=10)
-
-
-# What the person reaches in the motion, metres: corners of a box that every picture shows.
-_ROOM = np.array([[x, y, z] for x in (-0.6, 0.6) for y in (-0.88, 0.98) for z in (-0.3, 0.3)])
 
 
 def _pictures(people: Sequence[Person], params: BodyParams, columns: int) -> Iterator[UInt8[np.ndarray, "H W 3"]]:

@@ -62,6 +62,7 @@ from smplxpp.template.template import Template
 
 FPS, SECONDS = 30.0, 1.5
 SEEN_FROM = (0.6, 0.15, 1.0)
+"""Direction from the person to the camera of all pictures."""
 START = DriverConfig(ramp=0.4, hold=0.2)
 _BLENDER = """
 import struct, sys, time, bpy, numpy as np
@@ -325,7 +326,7 @@ class Stress:
                 driver.quality = [a.with_(b) for a, b in zip(before, driver.quality, strict=True)]
             if k % 6:
                 continue
-            surface = drawn(template, weights, posed, shape)
+            surface = drawn_surface(template, weights, posed, shape)
             skin = TriangleMesh(surface[: template.body.vertex_count], template.body.faces)
             inside.append(-SignedDistanceField(skin, solid=True).query(surface[some]).distance)
             shows.append(
@@ -390,7 +391,7 @@ class Stress:
             self._pictures[-1] = np.concatenate([self._pictures[-1], image], axis=1)
 
 
-def drawn(
+def drawn_surface(
     template: Template, weights: Float[np.ndarray, "V J"], posed: PosedBody, shape: ClothShape
 ) -> Float[np.ndarray, "V 3"]:
     """Return the posed vertices of a template whose simulated clothes are displaced before skinning."""

@@ -28,8 +28,7 @@ from avatar.training.presets import TrainingPreset, training_preset
 from avatar.training.student.bake import BakeTask
 from avatar.training.student.compensate import CompensateTask
 from avatar.training.student.pretrain import PretrainFieldTask
-from avatar.training.tracking.config import JointConfig, TrackConfig
-from avatar.training.tracking.joint import JointTask
+from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.track import TrackTask
 from benchmarks.support.results import store_results
 from pipelines.runs import layout
@@ -203,7 +202,6 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
     baked = load_avatar(run / layout.BAKED, rig)
     student = load_avatar(run / layout.STUDENT, rig)
     track, pretrain, bake = preset.teacher.track, preset.teacher.pretrain, preset.bake
-    joint = preset.teacher.joint
 
     def tracking(config: TrackConfig) -> Callable[[int], Any]:
         gaussians = load_bound(run / layout.GAUSSIANS)
@@ -212,14 +210,9 @@ def profiles(run: Path, capture: Path, preset: TrainingPreset) -> dict[str, dict
         # A frame's steps are on images of several sizes: as many of each as in a whole frame.
         return lambda k: task.step(config.steps * (k // TIMED) + k % TIMED * config.steps // TIMED)
 
-    def correcting(config: JointConfig) -> Callable[[int], Any]:
-        avatar = TrackedAvatar(rig, load_bound(run / layout.GAUSSIANS), config.control_points)
-        return JointTask(sequence, avatar, teacher.track, config).step
-
     # Made one after the other: the bake's task freezes the teacher.
     tasks = {
         "tracking": track and (lambda: tracking(track)),
-        "joint correction": joint and (lambda: correcting(joint)),
         "teacher's pretraining": pretrain
         and (lambda: PretrainTeacherTask(sequence, teacher, pretrain, 0, teacher.track).step),
         "teacher": lambda: TeacherTask(sequence, teacher.train(), preset.teacher).step,

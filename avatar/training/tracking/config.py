@@ -127,6 +127,11 @@ class JointConfig:
         lr: learning rate of the corrections at the start, metres; it falls exponentially to a tenth.
         smoothness: weight of the mean squared difference of neighbouring control points' corrections, 1/m^2.
         seed: of the order of views.
+
+    Example:
+        >>> from avatar.training.presets import training_preset
+        >>> cpu = training_preset("cpu")
+        >>> preset = replace(cpu, teacher=replace(cpu.teacher, joint=JointConfig()))  # for `avatar.train`
     """
 
     control_points: int = 6000

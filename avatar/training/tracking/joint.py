@@ -28,8 +28,7 @@ from avatar.training.tracking.config import JointConfig
 class JointTask(PhotometricTask):
     """Learns the Gaussians' attributes and corrections of the clothes' control points in every tracked frame.
 
-    The loss of a view of frame t is that of the fit with a membrane energy of the corrections c_t
-    about what the tracker found:
+    The loss of a view of frame t is the fit's, and a membrane energy of the corrections c_t of what was tracked:
 
         L = L_rec(render(d_t + c_t), photograph) + smoothness * mean |c_t,i - c_t,j|^2
 
@@ -57,7 +56,7 @@ class JointTask(PhotometricTask):
         group = ParameterGroup("corrections", {"corrections": self.corrections}, lr, lr_final_factor=0.1)
         super().__init__(sequence, avatar, config.photometric(len(sequence.train_frames)), [group], context)
         self.avatar, self.smoothness = avatar, config.smoothness
-        # Bare skin, shoes and hair stay: joints place them better than photographs of few hundred pixels.
+        # Skin, shoes and hair stay: joints place them better than photographs of a few hundred pixels.
         self.learns = (~avatar.cage.off_clothes)[:, None].float()
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
