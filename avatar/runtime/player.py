@@ -363,9 +363,9 @@ class AvatarPlayer:
         return added
 
     def pose_similarity(self, theta: Float32[np.ndarray, " 63"], frame: int | None = None) -> float:
-        """Return the similarity of a pose to the training's poses, in [0, 1]: 1 within their usual distance."""
+        """Return the similarity of a pose to the training's poses, in [0, 1]: 1 within the bundle's scale."""
         # The excess x = (d - s) / s of the distance d to the nearest training pose (radians, over 63 angles) gives
-        # exp(-x^2 / 2): 1 up to the usual distance s, and 0.14 at three times it.
+        # exp(-x^2 / 2): 1 up to the scale s, and 0.14 at three times it.
         poses = self.bundle.tensors.get("poses.known")
         if poses is None or frame in self.bundle.about.frames:
             return 1.0
