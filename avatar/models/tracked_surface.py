@@ -67,6 +67,14 @@ class ControlCage(nn.Module):
         """Return the mean squared difference of neighbouring control points, m^2: a membrane energy."""
         return (controls[self.edges[:, 0]] - controls[self.edges[:, 1]]).square().sum(-1).mean()
 
+    def looseness(self, reach: float) -> Float[Tensor, " K"]:
+        """Return how free of the skin control points are: their distance from the naked body over `reach`, at most 1.
+
+        Args:
+            reach: metres; 0: all are free.
+        """
+        return (self.from_body / reach).clamp(max=1.0) if reach > 0.0 else torch.ones_like(self.from_body)
+
     def motion_off_clothes(self, controls: Float[Tensor, "K 3"], *, reach: float = 0.0) -> Float[Tensor, ""]:
         """Return the mean displacement from skinning of control points off the clothes, metres; 0 without any.
 
@@ -86,7 +94,7 @@ class ControlCage(nn.Module):
         total = moved[self.off_clothes].sum() / count
         if reach > 0.0:
             # Weight of each control point: 1 on clothes at the skin, 0 from `reach` on, and 0 off the clothes.
-            tight = (~self.off_clothes).float() * (1.0 - self.from_body / reach).clamp(min=0.0)
+            tight = (~self.off_clothes).float() * (1.0 - self.looseness(reach))
             total = total + (tight * saturation * moved / (saturation + moved)).sum() / count
         return total
 

@@ -126,6 +126,8 @@ class JointConfig:
         poses: frames a step, a view of each; `poses` times fewer steps then have sqrt(`poses`) times the rates.
         lr: learning rate of the corrections at the start, metres; it falls exponentially to a tenth.
         smoothness: weight of the mean squared difference of neighbouring control points' corrections, 1/m^2.
+        tight_reach: distance from the naked body in the T-pose, metres, from which clothes are corrected in full;
+            nearer ones in proportion; 0: all in full. What a tight shirt gains in training frames, new poses lose.
         seed: of the order of views.
 
     Example:
@@ -140,6 +142,7 @@ class JointConfig:
     poses: int = 1
     lr: float = 1e-3
     smoothness: float = 1000.0
+    tight_reach: float = 0.04
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -149,6 +152,7 @@ class JointConfig:
             ("frame_iterations", 0),
             ("poses", 1),
             ("smoothness", 0),
+            ("tight_reach", 0),
             ("seed", 0),
         ):
             require_at_least(f"joint correction: {name}", getattr(self, name), least)

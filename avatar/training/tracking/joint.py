@@ -56,8 +56,9 @@ class JointTask(PhotometricTask):
         group = ParameterGroup("corrections", {"corrections": self.corrections}, lr, lr_final_factor=0.1)
         super().__init__(sequence, avatar, config.photometric(len(sequence.train_frames)), [group], context)
         self.avatar, self.smoothness = avatar, config.smoothness
-        # Skin, shoes and hair stay: joints place them better than photographs of a few hundred pixels.
-        self.learns = (~avatar.cage.off_clothes)[:, None].float()
+        # Skin, shoes and hair stay: joints place them better than photographs of a few hundred pixels; so, in part, do
+        # clothes that lie on the skin.
+        self.learns = ((~avatar.cage.off_clothes).float() * avatar.cage.looseness(config.tight_reach))[:, None]
 
     def loss(self, item: Item) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Return the loss of a frame's views and its terms."""

@@ -64,6 +64,21 @@ def test_a_dress_that_was_missed_is_found_and_the_body_stays(frames, tmp_path):
     assert torch.equal(bound.face_index, painted().face_index)
 
 
+def test_clothes_near_the_skin_are_corrected_in_proportion_to_their_distance(frames, tmp_path):
+    before, moved = off_by(frames, 0.008), {}
+    for reach in (0.0, 0.04, 10.0):
+        config = replace(SHORT, tight_reach=reach)
+        _, after, _ = correct_jointly(frames, painted(), before, config, Session(tmp_path / str(reach)))
+        moved[reach] = (after.controls - before.on(after.cage).controls).norm(dim=-1).amax(dim=0)
+    cage = after.cage
+    loose, tight = ~cage.off_clothes & (cage.from_body > 0.04), ~cage.off_clothes & (cage.from_body < 0.01)
+    assert loose.any() and tight.any()
+    # Adam moves what it may move by the rate a step; a correction is that, times the share of it that counts.
+    assert float(moved[0.04][tight].max()) < 0.4 * float(moved[0.0][tight].max())
+    assert float(moved[0.04][loose].median()) > 0.9 * float(moved[0.0][loose].median())
+    assert float(moved[10.0].max()) < 0.05 * float(moved[0.0].max())
+
+
 def test_a_stopped_correction_goes_on_to_the_same_bits(frames, tmp_path):
     track, results = off_by(frames, 0.005), []
     for name, limits in (("whole", (np.inf,)), ("stopped", (0.0, np.inf, np.inf))):
@@ -129,7 +144,9 @@ def test_steps_follow_the_number_of_frames_and_are_shortened_with_it():
     assert JointConfig().photometric(10).iterations == 3000
 
 
-@pytest.mark.parametrize("wrong", [{"control_points": 0}, {"iterations": 0}, {"lr": 0.0}, {"smoothness": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"control_points": 0}, {"iterations": 0}, {"lr": 0.0}, {"smoothness": -1.0}, {"tight_reach": -0.1}]
+)
 def test_choices_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match="joint correction"):
         JointConfig(**wrong)
