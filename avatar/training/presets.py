@@ -16,7 +16,7 @@ from avatar.training.fit.fit import PRESETS, FitConfig
 from avatar.training.fit_teacher import FitTeacherConfig
 from avatar.training.student.bake import BakeConfig
 from avatar.training.student.compensate import CompensateConfig
-from avatar.training.tracking.config import Level, TrackConfig
+from avatar.training.tracking.config import JointConfig, Level, TrackConfig
 from smplxpp.core.errors import require_choice
 
 LOCAL_PARTS = 256
@@ -149,6 +149,7 @@ class _Size:
         track: levels of the tracking.
         body_motion_weight: see `TrackConfig`.
         tight_reach: see `TrackConfig`.
+        joint: correction of all frames at once, see `FitTeacherConfig`; None: none.
         pretrain: the teacher's iterations before it sees photographs.
         field: pretraining of the student's field before the bake.
         fit: iterations of the fit.
@@ -179,6 +180,7 @@ class _Size:
     compensate: _Steps
     averaged: float = 0.2
     penalties: float = 1.0
+    joint: JointConfig | None = None
     surface_normals: bool = False
     perceptual: float = 0.0
     poses: tuple[int, int, int] = (1, 1, 1)
@@ -222,6 +224,7 @@ def _tracked(name: str, size: _Size) -> TrainingPreset:
                 tight_reach=size.tight_reach,
                 still_body=True,
             ),
+            joint=size.joint,
         ),
         bake=BakeConfig(
             iterations=size.bake.iterations,
@@ -309,6 +312,7 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             track=TrackConfig().levels,
             body_motion_weight=1.0,
             tight_reach=0.04,
+            joint=JointConfig(),
             pretrain=2000,
             field=_Steps(10_000, 3e-3),
             fit=10_000,
@@ -333,14 +337,15 @@ TRAINING_PRESETS: dict[str, TrainingPreset] = {
             body_motion_weight=1.0,
             # Photographs do not determine where a plain shirt lies on the skin; without this it drifts.
             tight_reach=0.04,
+            joint=JointConfig(),
             pretrain=350,
             field=_Steps(3000, 3e-3),
             fit=600,
             rates=LearningRates(),
             # At the usual rates Gaussians of hair end millimetres short of their place, which costs heads a decibel.
-            teacher=_Steps(350, 2e-3, 3.0),
+            teacher=_Steps(200, 2e-3, 3.0),
             bake=_Steps(900, 1e-3, 3.0),
-            compensate=_Steps(2400, 1e-3, 2.0),
+            compensate=_Steps(2000, 1e-3, 2.0),
             # Light that leaks through from hidden places moves Gaussians farther at these rates.
             penalties=5.0,
         ),

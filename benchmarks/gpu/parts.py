@@ -179,7 +179,9 @@ def _toy_preset(name: str) -> Any:
     from avatar.training.presets import training_preset
 
     small, like = training_preset("demo"), training_preset(name)
-    teacher = replace(small.teacher, track=None if like.teacher.track is None else small.teacher.track)
+    joint = like.teacher.joint and replace(like.teacher.joint, control_points=800, iterations=100, frame_iterations=5)
+    track = None if like.teacher.track is None else small.teacher.track
+    teacher = replace(small.teacher, track=track, joint=joint)
     short = replace(small, teacher=teacher).shortened(0.1)
     return replace(short, fit=replace(short.fit, iterations=8))
 

@@ -8,7 +8,6 @@ import pytest
 
 from avatar.training.presets import TRAINING_PRESETS, training_preset, with_iterations
 from avatar.training.recipe import TrainConfig, with_batch, with_processes
-from avatar.training.tracking.config import JointConfig
 from smplxpp.core.errors import InputError
 
 STAGES = ("fit", "teacher", "bake", "compensate")
@@ -66,6 +65,7 @@ def test_a_seed_reaches_every_stage_and_nothing_else(name):
     reseeded = preset.with_seed(7)
     assert {getattr(reseeded, stage).seed for stage in STAGES} == {7} and reseeded.fit.sampling.seed == 7
     assert reseeded.with_seed(0) == preset.with_seed(0)
+    assert {one.seed for one in (reseeded.teacher.track, reseeded.teacher.joint) if one is not None} <= {7}
 
 
 @pytest.mark.parametrize("name", TRAINING_PRESETS)
@@ -77,6 +77,9 @@ def test_a_share_is_one_of_the_iterations_alone(name):
         same = {"iterations": own.iterations}
         same |= {name: getattr(own, name) for name in ("pretrain", "track", "joint") if hasattr(own, name)}
         assert replace(short, **same) == own
+    if preset.teacher.joint is not None and tenth.teacher.joint is not None:
+        assert tenth.teacher.joint.steps(10) == 0.1 * preset.teacher.joint.steps(10)
+        assert tenth.teacher.joint.steps(1000) == 0.1 * preset.teacher.joint.steps(1000)
     for stage in ("teacher", "bake"):
         own, short = getattr(preset, stage), getattr(tenth, stage)
         share = short.iterations / own.iterations
@@ -137,14 +140,6 @@ def test_of_a_turn_a_student_is_fitted_without_a_teacher_and_options_still_count
     assert TrainConfig().recipe("cpu").preset == own
 
 
-def test_a_joint_correction_takes_seed_and_share():
-    preset = training_preset("cpu")
-    preset = replace(preset, teacher=replace(preset.teacher, joint=JointConfig()))
-    seeded, tenth = preset.with_seed(7).teacher.joint, preset.shortened(0.1).teacher.joint
-    assert seeded is not None and seeded.seed == 7
-    assert tenth is not None and (tenth.steps(10), tenth.steps(1000)) == (300, 6000)
-
-
 def test_several_processes_see_no_more_poses_than_one():
     """A batch of 1 grew to 4 for four processes at the same number of steps: four times the work in the same hours."""
     one = training_preset("paper")
@@ -160,9 +155,9 @@ def test_several_processes_see_no_more_poses_than_one():
     assert four.teacher.lr == 2.0 * one.teacher.lr and four.fit == one.fit
     shapes = with_processes(replace(one, compensate=replace(one.compensate, poses_per_step=1)), 4).compensate
     assert (shapes.position_lr, shapes.color_lr) == (2.0 * one.compensate.position_lr, 2.0 * one.compensate.color_lr)
-    joint, gpu = JointConfig(), training_preset("gpu")
-    shared = with_processes(replace(gpu, teacher=replace(gpu.teacher, joint=joint)), 4).teacher.joint
-    assert shared is not None
+    joint = training_preset("gpu").teacher.joint
+    shared = with_processes(training_preset("gpu"), 4).teacher.joint
+    assert joint is not None and shared is not None
     # 6,000 frames: a quarter of the steps, each of four frames, at twice the rates.
     assert (shared.steps(6000), joint.steps(6000)) == (90_000, 360_000)
     assert (shared.photometric(6000).poses_per_step, shared.photometric(6000).attributes) == (4, 2.0)
