@@ -133,7 +133,7 @@ class JointConfig:
     Example:
         >>> from avatar.training.presets import training_preset
         >>> cpu = training_preset("cpu")
-        >>> preset = replace(cpu, teacher=replace(cpu.teacher, joint=JointConfig()))  # for `avatar.train`
+        >>> without = replace(cpu, teacher=replace(cpu.teacher, joint=None))  # for `avatar.train`
     """
 
     control_points: int = 6000
