@@ -92,7 +92,7 @@ class ClothMotions:
         if unknown:
             raise InputError("frames to simulate", expected="some of the motion's", received=str(unknown[:8]))
         if self.config.mode == "skin":
-            self._shapes |= dict.fromkeys(run, self._skinned())
+            self._shapes |= dict.fromkeys(run, self.skinned())
             return
         # Frames of pre-roll and run that have parameters, and the poses between them.
         first = run[0] - self.config.pre_roll * self._fps
@@ -124,7 +124,8 @@ class ClothMotions:
         """Return the seconds since the frame before; of the first one, where the simulation starts cold, a second."""
         return 1.0 if last is None else (frame - last) / self._fps
 
-    def _skinned(self) -> ClothShape:
+    def skinned(self) -> ClothShape:
+        """Return the shape of clothes that stay where skinning has them."""
         vertices = np.concatenate([garment.vertices for garment in self.garments])
         share = np.concatenate([garment.share() for garment in self.garments])
         return ClothShape(vertices, np.zeros((len(vertices), 3), np.float32), share)

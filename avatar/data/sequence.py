@@ -190,15 +190,22 @@ class AvatarSequence:
         self._poses.move_to_end(frame)
         return self._poses[frame]
 
-    def as_new_pose(self, frame: int) -> Pose:
-        """Return the pose of a training frame marked as new: without its code, with simulated clothes.
+    def as_new_pose(self, frame: int, *, seen: Float[Tensor, "V 3"] | None = None) -> Pose:
+        """Return the pose of a training frame marked as new: without its code, with its loose clothes as in new poses.
 
-        The first request simulates all training frames in order, from one cold start.
+        Args:
+            frame: of the training.
+            seen: displacements of the vertices, metres along the axes of the T-pose: loose clothes lie there. None:
+                they are simulated; the first request simulates all training frames in order, from one cold start.
         """
         # A training frame has a code and no simulated clothes otherwise; here it is treated as an unseen one.
         pose = self.pose(frame).as_new()
         if self.cloth is None:
             return pose
+        if seen is not None:
+            pose = self.rig.with_cloth(pose, self.cloth.skinned(), time=self.cloth.time(frame))
+            assert pose.cloth is not None
+            return replace(pose, cloth=replace(pose.cloth, displacements=seen))
         self.cloth.simulate(self.train_frames)
         return self.rig.with_cloth(pose, self.cloth.shape(frame), time=self.cloth.time(frame))
 

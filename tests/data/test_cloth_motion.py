@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 
 from avatar.data.cloth_motion import ClothMotionConfig, ClothMotions
 from avatar.data.sequence import AvatarSequence
@@ -179,6 +180,10 @@ class Told:
         moved = np.full((len(it), 3), 0.01 * frame, np.float32)
         return ClothShape(it, moved, np.ones(len(it), np.float32))
 
+    def skinned(self) -> ClothShape:
+        it = np.flatnonzero(template().cloth_mask)
+        return ClothShape(it, np.zeros((len(it), 3), np.float32), np.full(len(it), 0.5, np.float32))
+
     def time(self, frame: int) -> float:
         return frame / 10.0
 
@@ -214,6 +219,19 @@ def test_training_frames_as_new_ones_are_simulated_in_order_from_one_start(captu
     assert sequence.pose(2).cloth is None
     without = AvatarSequence(capture, template()).as_new_pose(2)
     assert without.frame is None and without.cloth is None
+
+
+def test_training_frames_as_new_ones_take_clothes_as_they_were_seen(capture):
+    told = Told()
+    sequence = AvatarSequence(capture, template(), cloth=told)
+    seen = torch.full((len(template().vertices), 3), 0.03)
+    new = sequence.as_new_pose(2, seen=seen)
+    assert new.frame is None and new.known == 0.0 and new.time == 0.2
+    assert told.asked == []  # nothing is simulated for what was seen
+    # Of a garment's vertices each moves by its share, everything else as the model has it.
+    moved, cloth = sequence.rig.displaced(new, torch.zeros_like(seen)), template().cloth_mask
+    np.testing.assert_allclose(moved[cloth].numpy(), 0.5 * 0.03, rtol=1e-6)
+    assert not moved[~cloth].any()
 
 
 def test_the_run_about_a_frame_ends_where_training_begins(capture):

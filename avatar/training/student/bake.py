@@ -182,13 +182,24 @@ class BakeTask(PhotometricTask):
         # ones.
         noise = self.generator(frame)
         if self.config.null_share and noise.random() < self.config.null_share:
-            pose = self.sequence.as_new_pose(frame)
+            pose = new_pose_as_seen(self.student, self.sequence, frame)
         if self.config.pose_noise:
             # Noise on theta regularises the field like a penalty on its slope with the pose; skinning keeps the true
             # pose.
             moved = torch.tensor(noise.normal(size=len(pose.body_pose)) * self.config.pose_noise)
             pose = replace(pose, body_pose=pose.body_pose + moved.to(pose.body_pose))
         return pose
+
+
+def new_pose_as_seen(student: Student, sequence: AvatarSequence, frame: int) -> Pose:
+    """Return the pose of a training frame marked as new, with its loose clothes where the student has them in it.
+
+    Nothing but the clothes' own motion is left out of a new pose: a simulation swings a centimetre beside the
+    photographs, and Gaussians that learn their colours there lose every pattern finer than that.
+    """
+    with torch.no_grad():
+        seen = student.displacements(sequence.pose(frame))
+    return sequence.as_new_pose(frame, seen=seen)
 
 
 def _labels(rendering: Rendering) -> Float[Tensor, "H W 3"]:

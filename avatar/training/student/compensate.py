@@ -34,6 +34,7 @@ from avatar.training.engine.photometric_task import (
 from avatar.training.engine.resources import fixed_seed
 from avatar.training.engine.session import Session
 from avatar.training.engine.unseen import color_clothed_skin, hold_colors
+from avatar.training.student.bake import new_pose_as_seen
 from avatar.training.student.prune import pruned_to
 from avatar.training.student.unseen_motion import on_drawn_face, with_held_face
 from smplxpp.core import InputError, require_at_least, require_between
@@ -217,7 +218,7 @@ class CompensateTask(PhotometricTask):
         # A share of the poses is shown as new ones.
         pose = self.sequence.pose(item.frame)
         if self.config.null_share and self.generator(item.frame).random() < self.config.null_share:
-            pose = self.sequence.as_new_pose(item.frame)
+            pose = new_pose_as_seen(self.student, self.sequence, item.frame)
         # L_rec on all views; the gradients reach the blend shapes, and the attributes by their own rates.
         posed = self.student(pose, camera_centers_of(views))
         total, terms, _ = self.compared(posed, views)
