@@ -316,5 +316,5 @@ def _without_teacher(preset: TrainingPreset, training_frames: int) -> int:
     if teacher.track is None:
         return bake.iterations
     seen = teacher.iterations * teacher.views + training_frames * teacher.track.steps * teacher.track.views
-    seen += 0 if teacher.joint is None else teacher.joint.poses * teacher.joint.steps(training_frames)
+    seen += 0 if teacher.joint is None else teacher.joint.looks * teacher.joint.steps(training_frames)
     return bake.iterations + math.ceil(seen / bake.views)

@@ -217,7 +217,7 @@ def training_works(recipe: Recipe, facts: Facts, rates: TrainingRates) -> dict[s
             looks, reads = followed * level.steps * min(track.views, cameras), followed * cameras / len(track.levels)
             works["teacher"].look(looks, size, level.halvings, reads=reads)
         if preset.teacher.joint is not None:
-            works["teacher"].look(preset.teacher.joint.poses * preset.teacher.joint.steps(frames), size)
+            works["teacher"].look(preset.teacher.joint.looks * preset.teacher.joint.steps(frames), size)
         for step in ("teacher", "bake", "compensate"):
             works[step].seconds += rates.frame_s[step] * frames
         if recipe.cloth is not None:

@@ -123,7 +123,9 @@ class JointConfig:
         control_points: number of control points on the template.
         iterations: number of views at least; with fewer, Gaussians have not settled.
         frame_iterations: views of each training frame at least.
-        poses: frames a step, a view of each; `poses` times fewer steps then have sqrt(`poses`) times the rates.
+        poses: frames a step.
+        views: cameras of each frame; posing it costs as much as drawing it twice. Steps of n views are n times fewer,
+            at sqrt(n) times the rates.
         lr: learning rate of the corrections at the start, metres; it falls exponentially to a tenth.
         smoothness: weight of the mean squared difference of neighbouring control points' corrections, 1/m^2.
         tight_reach: distance from the naked body in the T-pose, metres, from which clothes are corrected in full;
@@ -140,6 +142,7 @@ class JointConfig:
     iterations: int = 3000
     frame_iterations: int = 60
     poses: int = 1
+    views: int = 3
     lr: float = 1e-3
     smoothness: float = 1000.0
     tight_reach: float = 0.04
@@ -151,6 +154,7 @@ class JointConfig:
             ("iterations", 1),
             ("frame_iterations", 0),
             ("poses", 1),
+            ("views", 1),
             ("smoothness", 0),
             ("tight_reach", 0),
             ("seed", 0),
@@ -160,7 +164,17 @@ class JointConfig:
 
     def steps(self, frames: int) -> int:
         """Return the number of steps of a motion."""
-        return math.ceil(max(self.iterations, self.frame_iterations * frames) / self.poses)
+        return math.ceil(max(self.iterations, self.frame_iterations * frames) / self.looks)
+
+    @property
+    def looks(self) -> int:
+        """Number of views a step."""
+        return self.poses * self.views
+
+    @property
+    def rate(self) -> float:
+        """Factor on the rates of a step of one view."""
+        return math.sqrt(self.looks)
 
     def photometric(self, frames: int) -> PhotometricConfig:
         """Return the fit's losses and rates with the steps of a motion."""
@@ -168,7 +182,8 @@ class JointConfig:
             FitConfig().photometric(),
             iterations=self.steps(frames),
             poses_per_step=self.poses,
-            attributes=math.sqrt(self.poses),
+            views=self.views,
+            attributes=self.rate,
             evaluations=1,
             seed=self.seed,
         )

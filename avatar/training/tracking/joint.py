@@ -7,7 +7,6 @@ Here one set of Gaussians has to explain all frames, and the surfaces move where
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -52,8 +51,8 @@ class JointTask(PhotometricTask):
     ) -> None:
         self.tracked = track.on(avatar.cage)
         self.corrections = nn.Parameter(torch.zeros_like(self.tracked.controls))
-        lr = config.lr * math.sqrt(config.poses)
-        group = ParameterGroup("corrections", {"corrections": self.corrections}, lr, lr_final_factor=0.1)
+        rate = config.lr * config.rate
+        group = ParameterGroup("corrections", {"corrections": self.corrections}, rate, lr_final_factor=0.1)
         super().__init__(sequence, avatar, config.photometric(len(sequence.train_frames)), [group], context)
         self.avatar, self.smoothness = avatar, config.smoothness
         # Skin, shoes and hair stay: joints place them better than photographs of a few hundred pixels; so, in part, do

@@ -28,7 +28,7 @@ from tests.training.tracking.test_track import CONFIG as TRACKING
 from tests.training.tracking.test_track import error, painted
 
 ROOT = Path(__file__).resolve().parents[3]
-CONFIG = JointConfig(control_points=60, iterations=240, frame_iterations=10, smoothness=10.0)
+CONFIG = JointConfig(control_points=60, iterations=240, frame_iterations=10, views=1, smoothness=10.0)
 SHORT = replace(CONFIG, iterations=8, frame_iterations=2)
 
 
@@ -141,7 +141,9 @@ def test_another_cage_has_the_same_surface(frames):
 def test_steps_follow_the_number_of_frames_and_are_shortened_with_it():
     assert (CONFIG.steps(4), CONFIG.steps(100)) == (240, 1000)
     assert CONFIG.shortened(0.5).steps(100) == 500
-    assert JointConfig().photometric(10).iterations == 3000
+    # Three views a step: a third of the steps, at sqrt(3) times the rates.
+    several = JointConfig().photometric(10)
+    assert (several.iterations, several.views, several.attributes) == (1000, 3, pytest.approx(3**0.5))
 
 
 @pytest.mark.parametrize(
