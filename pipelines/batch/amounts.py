@@ -94,8 +94,8 @@ class TrainingRates:
         }
     )
     look_s: float = 0.001
-    look_s_mp: float = 0.13
-    look_s_kg: float = 0.0006
+    look_s_mp: float = 0.19
+    look_s_kg: float = 0.00085
     drawn: float = 0.4
     pose_s: Mapping[str, float] = field(
         default_factory=lambda: {
