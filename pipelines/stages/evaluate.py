@@ -306,6 +306,14 @@ def evaluation_checks(report: EvalReport, *, overlap: float, pixel: float) -> li
                     explanation="decibels fall with fine patterns and small images, too: look at the pictures",
                 )
             )
+            if "detail" in mean:
+                checks.append(
+                    gates.DETAIL.check(
+                        f"{name}, {SETS[part]}: detail",
+                        mean["detail"],
+                        explanation="what is finer than five pixels, as a multiple of the photographs'; low: blurred",
+                    )
+                )
             perceptual = gates.PERCEPTUAL.get(report.metric or "")
             if distance is not None and perceptual is not None:
                 checks.append(perceptual.check(f"{name}, {SETS[part]}: {report.metric} of the image", distance))

@@ -10,7 +10,7 @@ import torch
 
 from avatar.data.views import View
 from avatar.losses.perceptual import PerceptualDistance
-from avatar.metrics.view_quality import ViewQuality, eight_bit, head_shown, mean_quality, view_quality
+from avatar.metrics.view_quality import ViewQuality, detail, eight_bit, head_shown, mean_quality, view_quality
 from smplxpp.core import Camera, TriangleMesh
 from tests.dolls.standing import doll
 
@@ -53,6 +53,36 @@ def test_colours_outside_the_screen_are_clamped_first():
     it = view()
     image = it.composited(BLACK) - (it.opacity() == 0)[..., None] * 3.0
     assert view_quality(it, image, it.opacity(), BLACK, head=None).psnr_image == pytest.approx(120.0)
+
+
+def test_detail_falls_with_blur_and_not_with_a_shift():
+    """A picture of the mean of many places has better decibels than a sharp one at a wrong place, and less detail."""
+    rng = np.random.default_rng(0)
+    pattern = torch.tensor(rng.uniform(size=(64, 64, 3)), dtype=torch.float32)
+    shown = torch.zeros(64, 64, dtype=torch.bool)
+    shown[10:54, 10:54] = True
+    moved = pattern.roll((2, 3), dims=(0, 1))
+    blurred = torch.stack([pattern.roll((k, 2 * k), dims=(0, 1)) for k in range(-3, 4)]).mean(dim=0)
+    assert (blurred - pattern).square().mean() < 0.7 * (moved - pattern).square().mean()
+    assert detail(moved, pattern, shown) == pytest.approx(1.0, abs=0.02)
+    assert detail(blurred, pattern, shown) < 0.45
+    assert detail(0.5 + 0.25 * (pattern - 0.5), pattern, shown) == pytest.approx(0.25, rel=1e-5)
+    noisy = pattern + torch.tensor(rng.normal(size=(64, 64, 3)) * 0.3, dtype=torch.float32)
+    assert detail(noisy, pattern, shown) > 1.2
+
+
+def test_detail_is_of_what_both_show_away_from_silhouettes():
+    pattern = torch.tensor(np.random.default_rng(0).uniform(size=(32, 32, 3)), dtype=torch.float32)
+    shown = torch.zeros(32, 32, dtype=torch.bool)
+    shown[8:24, 8:24] = True
+    outside = torch.where(shown[..., None], pattern, torch.ones(3))
+    assert detail(outside, pattern, shown) == pytest.approx(1.0, rel=1e-6)
+    shown[12::4] = False  # no window of five pixels is left
+    shown[:, 12::4] = False
+    assert detail(pattern, pattern, shown) is None
+    assert detail(pattern, torch.zeros(32, 32, 3), torch.ones(32, 32, dtype=torch.bool)) is None
+    it = view()
+    assert view_quality(it, it.composited(BLACK), it.opacity(), BLACK, head=None).detail == pytest.approx(1.0)
 
 
 def test_the_head_alone_counts_neither_its_box_nor_what_is_not_the_person():

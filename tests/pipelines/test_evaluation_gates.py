@@ -45,6 +45,15 @@ def test_a_perceptual_distance_is_graded_by_its_metric(distance, status):
         assert {check.status for check in found} == expected
 
 
+@pytest.mark.parametrize(("detail", "status"), [(0.9, "pass"), (0.7, "warn"), (0.4, "fail"), (None, None)])
+def test_a_blurred_student_is_said_so_whatever_its_decibels(detail, status):
+    views = {"novel_view": {"Cam0_0": replace(view(25.0), detail=detail)}}
+    report = EvalReport("doll", None, {"student": ModelFigures(views)})
+    found = {check.name: check for check in evaluation_checks(report, overlap=0.99, pixel=0.001)}
+    check = found.get("student, novel views: detail")
+    assert (None if check is None else check.status) == status
+
+
 @pytest.mark.parametrize(("gain", "status"), [(1.0, "pass"), (-0.5, "warn"), (-1.5, "fail")])
 def test_a_student_that_is_no_better_than_one_frames_gaussians_is_said_so(gain, status):
     found = checks(25.0 + gain, fit=25.0)["student against one frame's Gaussians, novel views"]
