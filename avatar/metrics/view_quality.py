@@ -147,6 +147,8 @@ def detail(
     """
     # A window of five pixels holds a period of what a few hundred pixels show of weaves, stripes and dots.
     side = 5
+    if min(shown.shape) < side:
+        return None
     inside = F.avg_pool2d(shown.float()[None], side, stride=1)[0] == 1.0
     finest = []
     for one in (image, reference):

@@ -81,6 +81,7 @@ def test_detail_is_of_what_both_show_away_from_silhouettes():
     shown[:, 12::4] = False
     assert detail(pattern, pattern, shown) is None
     assert detail(pattern, torch.zeros(32, 32, 3), torch.ones(32, 32, dtype=torch.bool)) is None
+    assert detail(pattern[:4], pattern[:4], torch.ones(4, 32, dtype=torch.bool)) is None
     it = view()
     assert view_quality(it, it.composited(BLACK), it.opacity(), BLACK, head=None).detail == pytest.approx(1.0)
 

@@ -56,7 +56,7 @@ class BakeConfig(PhotometricConfig):
         tau: of the semantic labels, radians a metre.
         code_lr_factor: learning rate of the frame codes, as a multiple of `lr`.
         null_share: share of the poses that are shown as new ones: with the null code, which is trained by this, or with
-            the regression.
+            the regression; loose clothes lie where the student has them in the frame.
         pose_noise: standard deviation of the noise on the field's theta, radians; skinning has the true pose.
     """
 
@@ -194,8 +194,8 @@ class BakeTask(PhotometricTask):
 def new_pose_as_seen(student: Student, sequence: AvatarSequence, frame: int) -> Pose:
     """Return the pose of a training frame marked as new, with its loose clothes where the student has them in it.
 
-    Nothing but the clothes' own motion is left out of a new pose: a simulation swings a centimetre beside the
-    photographs, and Gaussians that learn their colours there lose every pattern finer than that.
+    A simulation swings a centimetre beside the photographs, and Gaussians that learn their colours there lose every
+    pattern finer than that.
     """
     with torch.no_grad():
         seen = student.displacements(sequence.pose(frame))
