@@ -142,7 +142,7 @@ def detail(
 
     Example:
         >>> stripes = torch.arange(32).remainder(4).lt(2).float().expand(32, 32)[..., None].repeat(1, 1, 3)
-        >>> detail(0.5 + 0.25 * (stripes - 0.5), stripes, torch.ones(32, 32, dtype=torch.bool))
+        >>> round(detail(0.5 + 0.25 * (stripes - 0.5), stripes, torch.ones(32, 32, dtype=torch.bool)), 3)
         0.25
     """
     # A window of five pixels holds a period of what a few hundred pixels show of weaves, stripes and dots.

@@ -69,7 +69,9 @@ class Facts:
 
 @dataclass(frozen=True)
 class TrainingRates:
-    """Rates of the stages of a training, seconds of one core; measured on two captures at two sizes each.
+    """Rates of the stages of a training, seconds of one core.
+
+    Measured on two captures at two sizes each; those of looks, on trainings of three people by `cpu`.
 
     Attributes:
         start_s: of each stage: opening, what it takes over, its files and figures.

@@ -124,7 +124,7 @@ class JointConfig:
         iterations: number of views at least; with fewer, Gaussians have not settled.
         frame_iterations: views of each training frame at least.
         poses: frames a step.
-        views: cameras of each frame; posing it costs as much as drawing it twice. Steps of n views are n times fewer,
+        views: cameras of each frame; posing it costs as much as drawing it once. Steps of n views are n times fewer,
             at sqrt(n) times the rates.
         lr: learning rate of the corrections at the start, metres; it falls exponentially to a tenth.
         smoothness: weight of the mean squared difference of neighbouring control points' corrections, 1/m^2.

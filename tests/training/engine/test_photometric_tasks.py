@@ -28,9 +28,9 @@ from avatar.training.student.compensate import CompensateConfig, CompensateTask,
 from avatar.training.student.pretrain import DistillationTargets, PretrainFieldTask
 from avatar.training.tracking.config import TrackConfig
 from avatar.training.tracking.track import TrackTask
-from smplxpp.cloth import ClothShape
 from smplxpp.core.errors import InputError
-from tests.dolls.dancing import gaussians, sequence, template, varied, write_dance
+from tests.data.test_cloth_motion import Told
+from tests.dolls.dancing import gaussians, sequence, varied, write_dance
 from tests.dolls.tiny import TINY_FIELD, TINY_TEACHER
 from tests.dolls.toy import copied, same_state
 from tests.losses.test_reconstruction import MeanDifference
@@ -186,23 +186,11 @@ def test_the_semantic_term_of_the_mesh_pulls_the_field_alone(frames):
     assert "field.body.last.weight" in touched and not any(name.startswith("gaussians") for name in touched)
 
 
-class Garments:
-    """Takes the place of simulated clothes: all that is drawn of them is half theirs; nothing may be simulated."""
-
-    def skinned(self) -> ClothShape:
-        cloth = np.flatnonzero(template().cloth_mask)
-        return ClothShape(cloth, np.zeros((len(cloth), 3), np.float32), np.full(len(cloth), 0.5, np.float32))
-
-    def time(self, frame: int) -> float:
-        return frame / 10.0
-
-
 @pytest.mark.parametrize("stage", ["bake", "compensate"])
 def test_new_poses_of_a_training_have_their_clothes_where_the_student_saw_them(stage, frames, monkeypatch):
     """On simulated clothes, which lie elsewhere than on the photographs, Gaussians would learn to be blurred."""
-    task = make(
-        stage, frames.with_cloth(Garments()), null_share=1.0, **({"pose_noise": 0.0} if stage == "bake" else {})
-    )
+    told = Told()
+    task = make(stage, frames.with_cloth(told), null_share=1.0, **({"pose_noise": 0.0} if stage == "bake" else {}))
     with torch.no_grad():
         for network in (task.student.field.body, task.student.field.cloth):
             network.last.bias += 0.05
@@ -213,6 +201,7 @@ def test_new_poses_of_a_training_have_their_clothes_where_the_student_saw_them(s
     )
     item = task.micro_batches(0)[0]
     task.loss(item)
+    assert told.asked == []  # nothing is simulated
     (new,) = posed
     assert new.frame is None and new.known == 0.0 and new.time == item.frame / 10.0
     seen = task.student.displacements(frames.pose(item.frame))
